@@ -207,6 +207,7 @@ impl Gram {
 
     /// `X'X` row by row, `width` values each; only its lower triangle is valid. The width comes second.
     pub fn finish(&mut self) -> (&[f64], usize) {
+        // The block that is begun, however few rows it has.
         self.fold();
         (&self.sums, self.width)
     }

@@ -481,6 +481,7 @@ pub fn fit(
 
 /// Knots over the range of the values that are there.
 fn knots<'a>(values: impl Iterator<Item = &'a f64>, pieces: usize) -> Knots {
+    // Gaps are NaN, which `min` and `max` pass over.
     let empty = (f64::INFINITY, f64::NEG_INFINITY);
     let (low, high) = values.fold(empty, |(low, high), v| (low.min(*v), high.max(*v)));
     Knots { low, high, pieces }

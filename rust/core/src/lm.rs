@@ -323,6 +323,7 @@ impl System {
         // NaN is compared apart: sensitivities may overflow where the run does not.
         let exploded = !self.last.0.is_empty() && (now.is_nan() || now > most_growth * before);
         if exploded {
+            // Those of the point that is gone back to: no Jacobian is taken again.
             self.jtj.copy_from_slice(&self.last.0);
             self.jte.copy_from_slice(&self.last.1);
         } else {

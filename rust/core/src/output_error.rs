@@ -285,6 +285,7 @@ impl<M: Parametric> Problem for FreeRun<'_, M> {
         for experiment in 0..self.records.len() {
             sum += self.run(&model, theta, experiment)?;
         }
+        // A run that overflows is a trial that is refused.
         Some(0.5 * sum / self.weight + self.ridged(theta)).filter(|c| c.is_finite())
     }
 

@@ -101,6 +101,7 @@ impl<C: InLanes, S: Notes, const N: usize> Kernel for Grouped<'_, '_, C, S, N> {
                 let now = Now { k, r, g, signals };
                 turn::<_, _, _, N>(&mut groups, notes, &mut ends, now);
             }
+            // All have run away, as in a search that begins with wild gains: the rest of the reference is saved.
             if ends.running == 0 {
                 return ends.outcomes;
             }

@@ -40,6 +40,7 @@ pub(super) struct ScalarPlant<'a, V, R> {
     known: KernelPlant<'a>,
     regressor: R,
     position: f64,
+    // The level in the type: `Plant` has no room for it, and the step of a network has to know in which registers it is.
     level: PhantomData<V>,
 }
 

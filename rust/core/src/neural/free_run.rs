@@ -11,7 +11,8 @@
 //! ```
 //!
 //! Networks of one group of hidden units and up to four past outputs keep weights and past outputs in registers ([`together`]); the
-//! others go through memory ([`Chain::alone`]). Two runs side by side take 102 cycles a sample where one takes 76 (AVX-512; with AVX2
+//! others go through memory ([`Chain::alone`]), by which a free run of 8 units takes 12 to 16 % longer and a training 2 to 3 % (Zen 4,
+//! `free_run` with 1 to 4 past outputs and `training_8` of the kernels' example, least and median of 100 and 150). Two runs side by side take 102 cycles a sample where one takes 76 (AVX-512; with AVX2
 //! 117 and 90, on the baseline 234 and 139: docs/PERFORMANCE.md), which pays where Levenberg and Marquardt try two dampings at once.
 
 use super::network::{self, Network};

@@ -399,6 +399,7 @@ impl Problem for FreeRun<'_> {
     }
 
     fn costs_below(&mut self, thetas: [&[f64]; 2], limit: f64) -> [Option<f64>; 2] {
+        // One pass over the inputs with both networks; each run has the bits that it has alone.
         self.simulate(thetas, limit)
     }
 

@@ -99,6 +99,7 @@ fn state_before(scratch: &Scratch, nx: usize) -> &[f64] {
 struct Memory {
     x: Vec<f64>,
     covariance: Vec<f64>,
+    // F P, the gain's numerator P H' and H: kept from sample to sample, so that a step allocates nothing.
     room: Vec<f64>,
     row: Vec<f64>,
     gain: Vec<f64>,

@@ -6,8 +6,8 @@
 //!   s  = C x + D v + c + G h
 //! ```
 //!
-//! [`Network::step`] takes any sizes; [`Network::step_small`] one output and sizes that the compiler knows, 6 % faster (47 against 50 ns a
-//! sample on an Intel Xeon at 2.5 GHz).
+//! [`Network::step`] takes any sizes; [`Network::step_small`] one output and sizes that the compiler knows: a run takes 10 % longer without it
+//! (`state_space_run` of the kernels' example, Zen 4, least and median of 200), a training as long.
 
 use super::output::OutputFunction;
 use super::shape::Shape;

@@ -286,6 +286,7 @@ impl Problem for Training<'_> {
     }
 
     fn costs_below(&mut self, thetas: [&[f64]; 2], limit: f64) -> [Option<f64>; 2] {
+        // Each run has the bits that it has alone.
         self.simulate(thetas, limit, self.monitor)
     }
 

@@ -27,7 +27,8 @@
 //!
 //! Why it is there: against the general recursion, sample by sample, a training of 3 states and 15 units takes 5 % less by the least and
 //! 11 % by the median of 7 runs (processor time, Zen 4; 150 against 166 ns a sample for the recursion alone on an Intel Xeon). Two groups
-//! at once fill the latency of the products where there are 32 registers; a Zen 4 does not show it (-2 to -3 %).
+//! at once fill the latency of the products where there are 32 registers, by count; a Zen 4 shows nothing (`state_space_training_8`, least
+//! and median of 80 alike), and where registers are as wide as units it has not been measured.
 
 use super::network::{Network, rises_of};
 use super::sensitivities::{Recursion, Sensitivities, weigh};
