@@ -343,61 +343,23 @@ impl Network {
     /// `dx+/dx = A + E diag(1 - h^2) Wx` and `ds/dx = C + G diag(1 - h^2) Wx` from `rises`, `1 - h^2`.
     #[inline(always)]
     pub fn slopes<V: F64x8>(&self, rises: &[Lanes], slopes: &mut [Lanes]) {
-        for (at, slope) in slopes.iter_mut().enumerate() {
-            let [sum] = self.slope::<V, 1>(at, rises);
-            sum.store(&mut slope.0);
-        }
-    }
-
-    /// [`Network::slopes`] of several samples, in the first `used` of the groups of each.
-    #[inline(always)]
-    pub fn slopes_of<V: F64x8, const ROOM: usize>(
-        &self,
-        rises: &[Lanes],
-        slopes: &mut [[Lanes; ROOM]],
-        used: usize,
-    ) {
-        let groups = self.groups();
-        // Four samples at once: a product's weights are loaded once for them, and eight sums are under way.
-        let (fours, rest) = slopes.as_chunks_mut::<4>();
-        let (first, last) = rises.split_at(fours.len() * 4 * groups);
-        for (slopes, rises) in fours.iter_mut().zip(first.chunks_exact(4 * groups)) {
-            // `used` of them have entries: room is for the most states.
-            for at in 0..used.min(ROOM) {
-                let sums = self.slope::<V, 4>(at, rises);
-                for (slopes, sum) in slopes.iter_mut().zip(sums) {
-                    sum.store(&mut slopes[at].0);
-                }
-            }
-        }
-        for (slopes, rises) in rest.iter_mut().zip(last.chunks_exact(groups)) {
-            self.slopes::<V>(rises, &mut slopes[..used]);
-        }
-    }
-
-    /// Lanes `at` of the slopes of some samples side by side.
-    #[inline(always)]
-    fn slope<V: F64x8, const SAMPLES: usize>(&self, at: usize, rises: &[Lanes]) -> [V; SAMPLES] {
-        let groups = self.groups();
+        let products = self.products.chunks_exact(self.groups() * LANES);
         // slope_at = base_at + sum over units of product_at,i (1 - h_i^2): lanes are entries, a unit's number is spread.
-        let (products, _) = self.products[at * groups * LANES..].as_chunks::<LANES>();
-        // Two sums side by side: one alone would wait for each product.
-        let mut even = [V::load(&self.base[at].0); SAMPLES];
-        let mut odd = [V::splat(0.0); SAMPLES];
-        for (g, products) in products.iter().enumerate().take(groups) {
-            for lane in (0..LANES).step_by(2) {
-                let (left, right) = (V::load(&products[lane].0), V::load(&products[lane + 1].0));
-                for k in 0..SAMPLES {
-                    let rises = &rises[k * groups + g].0;
-                    even[k] = even[k].add_product(V::splat(rises[lane]), left);
-                    odd[k] = odd[k].add_product(V::splat(rises[lane + 1]), right);
+        for ((slope, base), products) in slopes.iter_mut().zip(&self.base).zip(products) {
+            // Two sums side by side: one alone would wait for each product. Four samples side by side, with their products
+            // loaded once, took less than 1 % off a training (Zen 4).
+            let (mut even, mut odd) = (V::load(&base.0), V::splat(0.0));
+            let (products, _) = products.as_chunks::<LANES>();
+            for (rises, products) in rises.iter().zip(products) {
+                for lane in (0..LANES).step_by(2) {
+                    let (left, right) =
+                        (V::load(&products[lane].0), V::load(&products[lane + 1].0));
+                    even = even.add_product(V::splat(rises.0[lane]), left);
+                    odd = odd.add_product(V::splat(rises.0[lane + 1]), right);
                 }
             }
+            even.add(odd).store(&mut slope.0);
         }
-        for (even, odd) in even.iter_mut().zip(odd) {
-            *even = even.add(odd);
-        }
-        even
     }
 }
 

@@ -212,7 +212,10 @@ impl Block {
     #[inline(always)]
     fn incline<V: F64x8, const NX: usize>(&mut self, network: &Network, count: usize) {
         let used = (NX * (NX + 1)).div_ceil(LANES);
-        network.slopes_of::<V, SLOPES>(&self.rises, &mut self.slopes[..count], used);
+        let rises = self.rises.chunks_exact(network.groups());
+        for (slopes, rises) in self.slopes[..count].iter_mut().zip(rises) {
+            network.slopes::<V>(rises, &mut slopes[..used]);
+        }
         for (slopes, (steepness, _)) in self.slopes.iter_mut().zip(self.outputs).take(count) {
             // The output function is the identity most often.
             if steepness != 1.0 {
