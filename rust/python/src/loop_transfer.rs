@@ -7,8 +7,8 @@ use sewfast_control::Standard;
 use sewfast_core::Result;
 use sewfast_core::loop_transfer::{self, Loop, Path, Plant};
 
-use crate::arrays::{array1, raise, slice};
 use crate::control::controller::{Section, cascade};
+use crate::seam::{array1, raise, slice};
 
 type Values<'py> = PyReadonlyArray1<'py, f64>;
 
