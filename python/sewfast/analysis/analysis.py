@@ -369,7 +369,7 @@ def text(a: Analysis) -> str:
     ]
     table += [[w.name, *_cells(w.score)] for w in a.what_if]
     lines += [*rows(table), ""]
-    lines.append(str(a.judgement) if a.judgement is not None else "a loop runs away")
+    lines.append(str(a.judgement) if a.judgement is not None else "a loop diverges")
     return "\n".join(lines)
 
 

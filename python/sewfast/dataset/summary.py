@@ -421,7 +421,7 @@ def _noise_advice(output: ColumnSummary) -> Iterator[str]:
     if known and output.noise > NOISY * output.std:
         yield (
             f"white noise is {output.noise / output.std:.0%} of what {output.name} does: excite "
-            "more strongly or record longer; prefer output error to arx, which noise bends"
+            "more strongly or record longer; prefer output error to arx, which noise biases"
         )
 
 

@@ -195,9 +195,7 @@ def summary(lines: Sequence[Line]) -> str:
         return f"useless here ({free.shown}); first {_step([free])}"
     shown = "" if free is None else f" ({free.shown})"
     if free is not None and free.verdict == "info":
-        return (
-            "the output is constant here, which says nothing about the model; record one that moves"
-        )
+        return "the output is constant here, which does not test the model; record one that moves"
     follows = f"the free run follows the data{shown}"
     if free is not None and free.verdict == "warn":
         follows = f"not good enough to tune on: the free run follows the data loosely{shown}"

@@ -456,7 +456,7 @@ def _input_range(model: DynamicModel, first: DynamicModel) -> FloatArray:
     if not ranges:
         raise DataError(
             "operating range: expected a model that stores the range of its training inputs, "
-            "received one without; identify it anew, or give the operating points"
+            "received one without; identify it again, or give the operating points"
         )
     limits: FloatArray = np.array(ranges, dtype=np.float64)
     return limits

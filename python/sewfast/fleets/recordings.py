@@ -108,7 +108,7 @@ def jobs_of(
             )  # fmt: skip
         if job.file in seen:
             raise SettingError(
-                f"expected every recording once, got {job.file} twice; take one of them out"
+                f"expected every recording once, got {job.file} twice; remove one of them"
             )
         seen.add(job.file)
     return jobs

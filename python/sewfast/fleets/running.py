@@ -271,7 +271,7 @@ def _ended(running: Collection[Any], connected: Any) -> Any:
         except CancelledError:
             missed = "scheduler: expected it to stay, got a connection that is closed"
     raise SettingError(
-        f"{missed}; start it again and repeat the call: with `out` it goes on from what is done"
+        f"{missed}; start it again and repeat the call: with `out` it continues where it stopped"
     )
 
 
@@ -427,7 +427,7 @@ class Journal:
             try:
                 self._file.write((json.dumps(line) + "\n").encode())
             except OSError as error:
-                remedy = "make room; the same call goes on from what is done"
+                remedy = "make room; the same call continues where it stopped"
                 raise unwritable(ModelFileError, self.place, error, remedy) from error
 
     def __exit__(self, *_: object) -> None:

@@ -270,7 +270,7 @@ class Simulation:
             raise FitError(
                 name="equations", expected="finite derivatives at the start of the record",
                 received=str(single.tolist()),
-                remedy="start from other parameters, or mend a division by nothing there",
+                remedy="start from other parameters, or avoid a division by zero there",
             )  # fmt: skip
         rng = np.random.default_rng(0)
         states = speed * np.ones((self.states, 8)) + rng.standard_normal((self.states, 8)) * 50.0
@@ -376,7 +376,7 @@ def fit_equations(
         raise FitError(
             name="equations", expected="a finite free run from the start's parameters",
             received="NaN or infinity on the way",
-            remedy="start from other parameters, or take more substeps than "
+            remedy="start from other parameters, or use more substeps than "
             f"{substeps} a sample: substeps={2 * substeps}",
         )  # fmt: skip
     found = least_squares(

@@ -40,7 +40,6 @@ _KINDS: dict[str, Callable[[Task], Model]] = {
 SHARE_OF_FIT = 0.9
 """Share of a time budget for the fits; the rest is for the evidence stored with the model."""
 NETWORKS = ("neural_oe", "neural_ss")
-LINEAR_WIDTH = 10
 EVIDENCE_RATE, LEAST_EVIDENCE = 2.5e5, 2_000
 """Samples times parameters whose evidence takes a second on a slow machine."""
 _SEARCHED = ("auto", "neural_ss")

@@ -295,7 +295,7 @@ def _guessed(
     for unit, scale in _SMALLER if given is not None and given < 0.01 * step else ():
         # not for a grid far finer than the rows
         if given is not None and 0.5 * given < step * scale < 2.0 * given:
-            return scale, (f"{table.path.name}: column {name!r} is taken as {unit}, as Ts says",)
+            return scale, (f"{table.path.name}: column {name!r} counts {unit}, according to Ts",)
     if step < LONG or given is not None:
         return 1.0, ()
     ways = " or ".join(
@@ -378,7 +378,7 @@ def _grid(table: Table, name: str, t: FloatArray, period: float, given: float | 
         raise DataError(
             f"{table.path}: column {name!r}: expected time stamps that a grid of Ts = {Ts:.4g} s "
             f"has up to {most} samples for, received {len(t)} over {t[-1]:.4g} s, with a step of "
-            f"{t[k + 1] - t[k]:.4g} s at {table.row(int(rows[k + 1]))}; take that row out, or "
+            f"{t[k + 1] - t[k]:.4g} s at {table.row(int(rows[k + 1]))}; remove that row, or "
             "give a longer sample time (Ts, --ts)"
         )
     if t[-1] < 2.0 * Ts:

@@ -89,7 +89,7 @@ def _own(path: Path, file: int) -> None:
     except BlockingIOError:
         raise SettingError(
             name=str(path), expected="a file that nobody else writes",
-            received="one in which a recording is being made, which is kept",
+            received="one with a recording in progress, which is kept",
             remedy="choose another name",
         ) from None  # fmt: skip
     except (ImportError, OSError):

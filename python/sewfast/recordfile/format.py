@@ -181,7 +181,7 @@ def parse(data: bytes) -> dict[str, Any]:
     except RecursionError as e:
         raise ValueError("it is nested too deeply") from e
     if not isinstance(content, dict):
-        raise ValueError("it is no JSON object")
+        raise ValueError("it is not a JSON object")
     return content
 
 

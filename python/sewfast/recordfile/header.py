@@ -157,7 +157,7 @@ class Header:
             raise SettingError(
                 name="version", expected=f"{VERSION} of {FORMAT!r}",
                 received=str(content.get("version"))[:60],
-                remedy="a newer sewfast may be able to read it",
+                remedy="try a newer sewfast",
             )  # fmt: skip
         names = ("name", "Ts", "columns", "n", "counts_per_rev", "device", "settings", "started")
         if missing := [name for name in names if name not in content]:

@@ -86,7 +86,7 @@ def chunks(raw: bytes) -> Iterator[Chunk]:
                 raise DataError(
                     name="chunks", received=f"{unpacked} bytes in {chunk.stop} of the file",
                     expected=f"at most {MOST_RATIO} times the file, and {LARGEST_FILE >> 30} GiB",
-                    remedy="the file is no recording; a long one is recorded in parts",
+                    remedy="the file is not a recording; record long runs in parts",
                 )  # fmt: skip
             yield chunk
         elif claim is not None:
@@ -95,7 +95,7 @@ def chunks(raw: bytes) -> Iterator[Chunk]:
                 raise DataError(
                     name="chunks", expected="heads of chunks with their chunks",
                     received=f"{at} bytes with heads alone",
-                    remedy="the file is no recording that was damaged",
+                    remedy="the file is not a damaged recording",
                 )  # fmt: skip
         at = at + 1 if chunk is None else chunk.stop
 
@@ -544,7 +544,7 @@ def _checked_event(content: Mapping[str, Any]) -> Mapping[str, Any]:
     detail = content.get("detail")
     known = isinstance(content.get("kind"), str) and isinstance(detail, dict)
     if not known or not (index is None or _is_number(index)) or type(elapsed) not in (int, float):
-        raise ValueError("it is no event")
+        raise ValueError("it is not an event")
     plain("event", dict(content))
     kept = {"kind": content["kind"], "index": index, "elapsed": elapsed, "detail": detail}
     return MappingProxyType(kept)
@@ -553,7 +553,7 @@ def _checked_event(content: Mapping[str, Any]) -> Mapping[str, Any]:
 def _checked_completeness(content: Mapping[str, Any]) -> Mapping[str, Any]:
     numbers = _is_number(content.get("received")) and _is_number(content.get("end"))
     if not isinstance(content.get("outcome"), str) or not numbers:
-        raise ValueError("it is no account of completeness")
+        raise ValueError("it is not a completeness message")
     return content
 
 

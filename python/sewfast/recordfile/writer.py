@@ -47,7 +47,7 @@ def require_ending(path: str | os.PathLike[str]) -> Path:
         raise SettingError(
             name=str(found), expected=f"a recording's name, which ends in {ENDING}",
             received=found.suffix or "none",
-            remedy="rename it, and `sewfast.recordfile.export` makes other formats of it",
+            remedy="rename it; `sewfast.recordfile.export` converts it to other formats",
         )  # fmt: skip
     return found
 
@@ -76,7 +76,7 @@ def require_replaceable(path: str | os.PathLike[str], *, overwrite: bool) -> Non
     try:
         header = read_header(found)
     except DataError:
-        raise _kept(found, "a file that may be one") from None
+        raise _kept(found, "a file that can be one") from None
     if not _is_computed(header):
         device = header.device.get("name", "a drive")
         raise _kept(found, f"one of {str(device)[:60]!r} of {header.started[:19]}")
@@ -515,7 +515,7 @@ def export(
     recording = read_recording(path)
     if Path(out).exists() and Path(out).samefile(path):
         raise SettingError(
-            name=str(out), expected="another file than the recording, which cannot be had again",
+            name=str(out), expected="another file than the recording, which cannot be made again",
             received="the same", remedy="choose another name",
         )  # fmt: skip
     require_replaceable(out, overwrite=overwrite or _is_earlier(Path(out), recording))
