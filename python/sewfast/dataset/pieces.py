@@ -318,7 +318,11 @@ def split_at_gaps(
         raise SettingError(f"shortest: expected a number of samples above 0, got {shortest!r}")
     if of not in ("any", "inputs"):
         raise SettingError(f"of: expected 'any' or 'inputs', received {of!r}")
-    pieces = [(e, a, n) for e in data.experiments for a, n in runs(_without_gap(e, of))]
+    pieces = [
+        (e, a, n)
+        for e in data.experiments
+        for a, n in runs(e.measured if of == "any" else e.known_inputs)
+    ]
     kept = tuple(e.cut(a, a + n) for e, a, n in pieces if n >= shortest)
     if not kept:
         longest = max((n for _, _, n in pieces), default=0)
@@ -333,10 +337,6 @@ def split_at_gaps(
         if n < shortest
     )
     return replace(data, experiments=kept, notes=(*data.notes, *dropped))
-
-
-def _without_gap(e: Experiment, of: str) -> NDArray[np.bool_]:
-    return e.measured if of == "any" else e.known_inputs
 
 
 # --- Missing samples: outputs taken out of the score, inputs filled by a stated assumption --------

@@ -431,17 +431,15 @@ def _samples(recording: RecordedFile) -> Iterator[Message]:
     gaps = iter((*recording.gaps, (len(recording), 0)))
     begin = 0
     for first, count in gaps:
-        for k, row in zip(range(begin, first), _rows(recording, begin, first), strict=True):
+        columns = [
+            format.numbers(n, np.array(c[begin:first])) for n, c in recording.columns.items()
+        ]
+        for k, *row in zip(range(begin, first), *columns, strict=True):
             at = header.time_ns(k)
             own = {"index": k, "t": round(k * header.Ts, 9)}
             data = format.dumps({**own, **dict(zip(recording.columns, row, strict=True))})
             yield Message(Topic.SAMPLES, at, at, data)
         begin = first + count
-
-
-def _rows(recording: RecordedFile, begin: int, end: int) -> Iterable[tuple[Any, ...]]:
-    columns = [format.numbers(n, np.array(c[begin:end])) for n, c in recording.columns.items()]
-    return zip(*columns, strict=True)
 
 
 def _account(recording: RecordedFile) -> dict[str, Any]:
