@@ -68,7 +68,7 @@ def linearise(
     Raises
     ------
     SettingError
-        For a model of another package.
+        For an object that is no compiled model, linear, lagged or state space.
     """
     u = np.ascontiguousarray(u, dtype=np.float64)
     if hasattr(core, "a") and hasattr(core, "offset"):

@@ -15,8 +15,8 @@ from ..errors import DataError, SettingError
 from .response import Complex, FrequencyResponse
 
 SEGMENTS = 16
-"""Default number of half segments of a record: gives bands of a fifth of the gain at a coherence of
-one half."""
+"""Default number of segments, which overlap by half: gives bands of a fifth of the gain at a
+coherence of one half."""
 LEAST = 16
 """Least samples of a segment or period."""
 LARGEST = 1e150
@@ -138,7 +138,7 @@ def spectral(
         of the noise. Without it, the response under feedback is that of the plant if there is no
         noise, and minus one over the controller if there is only noise.
     segment : int, optional
-        Samples of a segment; by default 16 overlapping half segments make up the record.
+        Samples of a segment; by default 16 segments, which overlap by half, fill the record.
     labels
         `u_unit`, `y_unit`, `from_counts`, `provenance` of the result.
 
