@@ -26,7 +26,7 @@ Progress: TypeAlias = Callable[[int, int, float], object]
 BLOCKS = 10
 """Number of parts of the later data, for the standard error of a difference between structures."""
 ABOUT_AS_WELL = 1.005
-"""Ratio of free-run errors below which they count as equal: a tenth of the noise, if that is all."""
+"""Ratio of free-run errors below which they count as equal: a tenth of the noise, if only that."""
 EXACT = 1e-3
 """Error due to the unknown inputs before the later part, in standard deviations of the output."""
 IV_ITERATIONS = 10
