@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray, runs
+from ..arrays import FloatArray, is_whole, runs
 from ..errors import DataError, SettingError
 from .pieces import require_sane
 
@@ -240,8 +240,7 @@ def mark_outliers(
     number = isinstance(threshold, (int, float, np.number)) and not isinstance(threshold, bool)
     if not number or not threshold > 0.0:
         raise SettingError(f"threshold: expected a number above 0, received {threshold!r}")
-    odd = isinstance(window, (int, np.integer)) and not isinstance(window, bool)
-    if not odd or window < 3 or window % 2 == 0 or window > 1001:
+    if not is_whole(window) or window < 3 or window % 2 == 0 or window > 1001:
         raise SettingError(f"window: expected an odd number from 3 to 1001, received {window!r}")
     require_sane(data)
     series = _series(data, model)

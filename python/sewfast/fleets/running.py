@@ -18,9 +18,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .. import storage
+from ..arrays import is_whole
 from ..control.controller import Controller
 from ..errors import ModelFileError, SettingError, unreadable, unwritable
 from ..kinds import KINDS, Kind
@@ -148,7 +147,7 @@ def _require_settings(workers: Any, controller: Any, seed: Any, model: Any) -> N
         raise SettingError(
             name="model", expected=", ".join(KINDS), received=repr(model), remedy="take 'oe'"
         )
-    if workers is not None and not (_is_whole(workers) and workers >= 0):
+    if workers is not None and not (is_whole(workers) and workers >= 0):
         raise SettingError(
             f"workers: expected a whole number of 0 or more, got {workers!r}; 0 works in this "
             "process, None takes every core"
@@ -158,7 +157,7 @@ def _require_settings(workers: Any, controller: Any, seed: Any, model: Any) -> N
             f"controller: expected a Controller, got {type(controller).__name__}; load one with "
             "load_controller"
         )
-    if not (_is_whole(seed) and 0 <= seed < 2**64):
+    if not (is_whole(seed) and 0 <= seed < 2**64):
         raise SettingError(
             f"seed: expected a whole number from 0 to 2^64 - 1, got {seed!r}; take 0"
         )
@@ -175,10 +174,6 @@ def _require_cluster(client: Any, scheduler: Any) -> None:
             name="scheduler", expected="an address as text", received=repr(scheduler),
             remedy="for example 'tcp://host:8786'; a client goes to `client`",
         )  # fmt: skip
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 # --- Where it is done -----------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, is_whole
 from ..errors import DataError, SettingError
 from .response import Complex, FrequencyResponse
 
@@ -203,7 +203,7 @@ def _explained(value: Complex, Suu: FloatArray, residual: FloatArray) -> FloatAr
 def _segment(segment: int | None, n: int) -> int:
     if segment is None:
         return max(2 * (n // (SEGMENTS + 1)), LEAST)
-    if not isinstance(segment, (int, np.integer)) or isinstance(segment, bool) or segment < LEAST:
+    if not is_whole(segment) or segment < LEAST:
         raise SettingError(
             name="segment", expected=f"at least {LEAST} samples", received=repr(segment)
         )

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import is_whole
 from ..errors import SettingError
 
 FORMAT, VERSION = "sewfast.recording", 1
@@ -177,12 +178,11 @@ def _positive(what: str, value: object) -> float:
 
 
 def _whole_number(value: object) -> int:
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not whole or not 0 <= value <= 2**53:  # type: ignore[operator]
+    if not is_whole(value) or not 0 <= value <= 2**53:
         raise SettingError(
             name="n", expected="a whole number of samples or None", received=repr(value)
         )
-    return int(value)  # type: ignore[call-overload, no-any-return]
+    return int(value)
 
 
 def _columns(columns: object) -> Mapping[str, str]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import is_whole
 from ..errors import DataError, SettingError
 from ..writers import write_table
 from . import format
@@ -338,12 +339,11 @@ class RecordWriter:
 
 
 def _index(what: str, value: object) -> int:
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not whole or not 0 <= value <= format.EXACT:  # type: ignore[operator]
+    if not is_whole(value) or not 0 <= value <= format.EXACT:
         raise DataError(
             name=what, expected="the number of a sample, 0 or more", received=repr(value)
         )
-    return int(value)  # type: ignore[call-overload, no-any-return]
+    return int(value)
 
 
 def save_columns(
