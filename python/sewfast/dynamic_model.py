@@ -84,8 +84,8 @@ class Core(Protocol):
 class DynamicModel(ABC):
     """A model of one plant that can run, in the units of the data it was identified from.
 
-    The interface for validation and evidence; users have a `sewfast.Model`, which builds on them and
-    documents the parameters.
+    The interface for validation and evidence; users have a `sewfast.Model`, which builds on them
+    and documents the parameters.
     """
 
     core: Any

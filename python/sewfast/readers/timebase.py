@@ -150,7 +150,7 @@ class Grid:
         missing = _means(unknown.astype(np.float64), edges, ends) > TOLERANCE
         return np.where(missing, np.nan, means)
 
-    def says(self, name: str) -> str:
+    def note(self, name: str) -> str:
         """What was done, for the notes."""
         steps = np.diff(self.t)
         gaps = self.gaps
@@ -232,20 +232,20 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
                 remedy="state the sample time in seconds (Ts, --ts), or name the column (time=...)",
             )  # fmt: skip
         return TimeBase(float(given))
-    scale, said = _unit(table, name)
+    scale, notes = _unit(table, name)
     t = _seconds(table, name, scale or 1.0)
     steps = np.diff(t)
     period = float(np.median(steps[steps > 0.0]))
     if scale is None:
-        scale, said = _guessed(table, name, period, given)
+        scale, notes = _guessed(table, name, period, given)
         t, steps, period = t * scale, steps * scale, period * scale
     if np.abs(steps - period).max() <= TOLERANCE * period:
         # the mean step is exact even where every printed time is rounded
         found = float(t[-1] / len(steps))
         Ts = found if given is None else _agreed(table, f"column {name!r}", found, given)
-        return TimeBase(Ts, None, said)
+        return TimeBase(Ts, None, notes)
     grid = _grid(table, name, t, period, given)
-    return TimeBase(grid.Ts, grid, (*said, grid.says(table.path.name)))
+    return TimeBase(grid.Ts, grid, (*notes, grid.note(table.path.name)))
 
 
 def _agreed(table: Table, source: str, found: float, given: float) -> float:

@@ -369,7 +369,7 @@ class Filing:
             if self.is_made:
                 self._finish(item)
         except Exception as e:
-            # callers must be told of any error
+            # callers must learn of any error
             self.failure = e
         finally:
             if self.is_made:
