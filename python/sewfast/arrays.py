@@ -52,7 +52,7 @@ def in_unit(number: str, unit: str) -> str:
     return f"{number} {unit}" if unit else number
 
 
-# --- What a caller hands over -> read-only columns of float64 -------------------------------------
+# --- Arguments -> read-only columns of float64 ----------------------------------------------------
 
 
 FloatArray: TypeAlias = NDArray[np.float64]

@@ -459,7 +459,7 @@ def _require_no_state(initial_state: ArrayLike | None) -> None:
         )
 
 
-# --- Why `identify` chose the model, as a table for `print` ---------------------------------------
+# --- The choice of `identify` as a table for `print` ----------------------------------------------
 
 
 _COLUMNS = 5

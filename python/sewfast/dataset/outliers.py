@@ -17,7 +17,7 @@ from .pieces import require_sane
 if TYPE_CHECKING:
     from .dataset import Dataset
 
-# --- What one column says of its sensor: white noise, quantum, limits -----------------------------
+# --- The sensor of a column: white noise, quantum, limits -----------------------------------------
 
 
 MAD = 1.4826
@@ -72,7 +72,7 @@ def share_at_limits(column: FloatArray) -> tuple[float, float]:
     return low, high
 
 
-# --- Where the power of a signal lies -------------------------------------------------------------
+# --- The spectrum of a signal ---------------------------------------------------------------------
 
 
 LONGEST = 4096
@@ -125,7 +125,7 @@ def top(frequency: FloatArray, power: FloatArray) -> float | None:
     return float(frequency[min(found, len(frequency) - 1)])
 
 
-# --- Outliers: marks of single wrong outputs, which a separate step may take out ------------------
+# --- Outliers: marks of single wrong outputs ------------------------------------------------------
 
 
 class Simulates(Protocol):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .dataset import Dataset
     from .experiment import Experiment
 
-# --- What a data set must fulfil before it is used ------------------------------------------------
+# --- Checks of a data set before it is used -------------------------------------------------------
 
 
 INPUT_REMEDY = (
@@ -169,7 +169,7 @@ def require_finite(column: FloatArray, what: str, start: int, remedy: str) -> No
     )
 
 
-# --- Parts of a data set: ranges, fractions, what lies between gaps -------------------------------
+# --- Parts of a data set: ranges, fractions, pieces between gaps ----------------------------------
 
 
 SHORTEST_PIECE = 100
@@ -339,7 +339,7 @@ def split_at_gaps(
     return replace(data, experiments=kept, notes=(*data.notes, *dropped))
 
 
-# --- Missing samples: outputs taken out of the score, inputs filled by a stated assumption --------
+# --- Missing samples: outputs without weight, inputs filled by a stated assumption ----------------
 
 
 BoolArray: TypeAlias = NDArray[np.bool_]

@@ -322,7 +322,7 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-# --- What to do about the numbers that a summary of data shows ------------------------------------
+# --- Advice on the figures of a summary -----------------------------------------------------------
 
 
 LIMITED = 0.02
@@ -449,7 +449,7 @@ def nice(value: float) -> float:
     return float(max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)) * power)
 
 
-# --- The picture of a data set: columns over time with what is missing or stands out, and spectra -
+# --- The picture: columns over time with gaps and outliers, and spectra ---------------------------
 
 
 INPUT, OUTPUT, MISSING, OUTLIER = "#333333", "#0072B2", "#D55E00", "#CC0000"

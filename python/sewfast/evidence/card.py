@@ -150,7 +150,7 @@ class VerdictTable:
         return "\n".join(found)
 
 
-# --- The closing sentence of a report card: good enough or not, because of what, what to do first -
+# --- The conclusion of a report card: good enough or not, why, what to do first -------------------
 
 
 _NAMED = 3
@@ -226,7 +226,7 @@ def _step(lines: Sequence[Line]) -> str:
     return "read the lines above"
 
 
-# --- ReportCard: how far a model can be trusted, one line per question with its verdict -----------
+# --- ReportCard: how far a model can be trusted, in lines with verdicts ---------------------------
 
 
 FORMAT = "sewfast.report_card"

@@ -310,8 +310,10 @@ class OperatingPoint:
         return found
 
     def bandwidth(self, i: int = 0) -> float:
-        """Where the gain of input i first falls to 1/sqrt 2 of the steady one [Hz]; NaN if "
-        "never."""
+        """Frequency at which the gain of input i first falls to 1/sqrt 2 of the steady one [Hz].
+
+        NaN if it never does.
+        """
         steady = abs(self.dc_gain[i])
         if not 0.0 < steady < math.inf:
             return math.nan

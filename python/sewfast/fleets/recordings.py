@@ -33,7 +33,7 @@ TRAINED = 0.7
 """Share of a recording for identification; the figures are computed on the rest."""
 
 
-# --- What there is to do --------------------------------------------------------------------------
+# --- Jobs -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

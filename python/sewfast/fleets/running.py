@@ -176,7 +176,7 @@ def _require_cluster(client: Any, scheduler: Any) -> None:
         )  # fmt: skip
 
 
-# --- Where it is done -----------------------------------------------------------------------------
+# --- Workers --------------------------------------------------------------------------------------
 
 
 def _worked(
@@ -365,7 +365,7 @@ def _workers_without_ctrl_c() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-# --- What is kept on the way ----------------------------------------------------------------------
+# --- Journal --------------------------------------------------------------------------------------
 
 
 @dataclass

@@ -203,7 +203,7 @@ def load_equations(path: str | os.PathLike[str]) -> EquationFit:
     )
 
 
-# --- What is asked of the function ----------------------------------------------------------------
+# --- Calls of the function ------------------------------------------------------------------------
 
 
 def _not_callable(equations: object) -> SettingError:

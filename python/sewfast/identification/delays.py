@@ -107,7 +107,7 @@ def _chunks(e: Experiment, na: int, lags: int) -> Iterator[FloatArray]:
         yield rows[np.isfinite(rows).all(axis=1)]
 
 
-# --- delay: how long the output takes to answer ---------------------------------------------------
+# --- delay: the dead time of each input -----------------------------------------------------------
 
 
 LONGEST = 30

@@ -243,7 +243,7 @@ def _changed(core: _core.GreyBox, **values: Any) -> _core.GreyBox:
 _DERIVED = ("nx", "nk", "n_inputs", "integrator", "hidden")
 
 
-# --- The network beside it ------------------------------------------------------------------------
+# --- The network ----------------------------------------------------------------------------------
 
 
 def _at_any_time(look: Look | None) -> Callable[[], None]:

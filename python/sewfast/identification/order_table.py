@@ -447,7 +447,7 @@ def _is_not_worse(errors: FloatArray, least: FloatArray) -> bool:
     return float(difference.mean()) <= 2.0 * float(difference.std(ddof=1)) / math.sqrt(n)
 
 
-# --- Lipschitz quotients: how many lags it takes to explain an output -----------------------------
+# --- Lipschitz quotients: the number of lags that explain an output -------------------------------
 
 
 POINTS = 600

@@ -220,7 +220,7 @@ class Search(Trials):
         new = self.simplest(better)
         return new if new.converged else self.continued([new], 30, [0])[0]
 
-    # --- what is tried --------------------------------------------------------------------------
+    # --- structures to try ------------------------------------------------------------------------
 
     def _likely(self) -> list[Structure]:
         """Sizes near the linear order, with every output function that the data suggest."""

@@ -12,7 +12,7 @@ from .. import _core
 from ..dataset import FloatArray
 from ..errors import SettingError, not_installed
 
-# --- ContinuousModel: the differential equation that a zero-order hold turns into a linear model --
+# --- ContinuousModel: the differential equation behind a zero-order hold --------------------------
 
 
 NODES = 8
@@ -332,7 +332,7 @@ def _product(factors: list[FloatArray]) -> FloatArray:
     return product
 
 
-# --- python-control and scipy.signal: objects of theirs from arrays, and arrays from their objects
+# --- Conversion from and to objects of python-control and scipy.signal ----------------------------
 
 
 _PURPOSE = "its linear systems (to_tf and to_ss give plain arrays)"

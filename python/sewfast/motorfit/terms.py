@@ -203,7 +203,7 @@ def _too_fast(records: Records, terms: tuple[str, ...]) -> dict[str, str]:
     return {t: why for t, order in ORDERS.items() if t in terms and order * turn > 0.5 * math.pi}
 
 
-# --- Which terms there are ------------------------------------------------------------------------
+# --- Choice of terms ------------------------------------------------------------------------------
 
 
 def _with_limit(task: Task, state: State, terms: tuple[str, ...]) -> State:

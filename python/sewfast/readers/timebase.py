@@ -219,8 +219,8 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
     if stated and (table.Ts_source == "the header" or name is None):
         assert table.Ts is not None
         if given is None:
-            notes = (f"{table.path.name}: Ts = {table.Ts:g} s, from {table.Ts_source}",)
-            return TimeBase(table.Ts, None, () if table.Ts_source == "the header" else notes)
+            note = f"{table.path.name}: Ts = {table.Ts:g} s, from {table.Ts_source}"
+            return TimeBase(table.Ts, None, () if table.Ts_source == "the header" else (note,))
         return TimeBase(_agreed(table, table.Ts_source, table.Ts, given))
     if name is None:
         if given is None:

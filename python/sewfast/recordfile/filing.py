@@ -19,7 +19,7 @@ from . import format
 from .format import Assembler, Message, Topic, opening
 from .header import Header, bearable
 
-# --- A file that grows by whole pieces: what is in it is complete, whatever stops the writer ------
+# --- Sink: a file that grows by whole pieces ------------------------------------------------------
 
 
 _BATCH = 1 << 16
@@ -241,7 +241,7 @@ def replacing(target: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-# --- Filing: the thread that owns a recording's file; what callers give it, it writes in order ----
+# --- Filing: the thread that owns a recording's file ----------------------------------------------
 # A separate thread, because Ctrl-C is raised in the main thread at any point and could leave half a
 # chunk. The thread also writes samples that have waited long enough even if no call comes, and
 # keeps a slow disk from blocking the link.

@@ -42,7 +42,7 @@ from .format import (
 )
 from .header import LARGEST_HEADER, MOST_MISSING, Header, bearable, plain
 
-# --- The whole chunks of an MCAP file, and what between them is damaged ---------------------------
+# --- The whole chunks of an MCAP file, and the damage between them --------------------------------
 # Only data covered by a checksum are trusted: chunks are searched for, not reached by the lengths
 # of the records before them. A chunk's head states its size three times (twice if compressed), and
 # its CRC-32 covers the rest. The search has a budget, because each head without a chunk costs a
@@ -226,7 +226,7 @@ def _u32(raw: bytes, at: int) -> int:
     return value
 
 
-# --- read_recording: an MCAP recording in whatever state -> RecordedFile --------------------------
+# --- read_recording: an MCAP recording, whole or damaged -> RecordedFile --------------------------
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -22,7 +22,7 @@ from .format import Assembler, Message, Topic, opening
 from .header import MOST_MISSING, Header, bearable, plain
 from .reader import RecordedFile, read_header, read_recording
 
-# --- What is not written over: a recording of a drive, which cannot be had again ------------------
+# --- Protected files: recordings of a drive, which cannot be made again ---------------------------
 
 
 ENDING = ".mcap"
@@ -368,7 +368,7 @@ def save_columns(
         writer.samples(0, columns)
 
 
-# --- A recording with one message a sample: what plotting programs draw as curves without more ado
+# --- A recording with one message per sample, as plotting programs need it ------------------------
 
 
 CHUNK_SAMPLES, CHUNK_BYTES = 500, 1 << 20
@@ -453,7 +453,7 @@ def _account(recording: RecordedFile) -> dict[str, Any]:
     }
 
 
-# --- A recording -> CSV, Parquet, .mat, .npz, or MCAP with one message a sample -------------------
+# --- A recording -> CSV, Parquet, .mat, .npz, or MCAP with one message per sample -----------------
 
 
 def _is_earlier(out: Path, recording: RecordedFile) -> bool:
