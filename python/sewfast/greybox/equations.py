@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import storage
-from ..arrays import FloatArray, as_column
+from ..arrays import FloatArray, as_column, require_whole
 from ..errors import DataError, FitError, SettingError
 from ..frequency.shaft import Parameter
 from ..identification.least_squares import least_squares
@@ -343,10 +343,7 @@ def fit_equations(
     if not callable(equations):
         raise _not_callable(equations)
     for name, count in (("states", states), ("substeps", substeps)):
-        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 1000:
-            raise SettingError(
-                name=name, expected="a whole number from 1 to 1000", received=repr(count)
-            )
+        require_whole(name, count, 1, 1000)
     names, start, low, high = _starts(parameters)
     simulation = Simulation(equations, names, states, substeps)
     first = records.pieces[0]

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Literal
 
+from ..arrays import require_whole
 from ..dataset import Dataset, require_dataset
 from ..dataset.experiment import in_effect
 from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
@@ -331,11 +332,7 @@ def _require_settings(**settings: object) -> None:
     for name, value in settings.items():
         if value is None and name != "seed":
             continue
-        low, high = least.get(name, 1), most.get(name, 1_000_000)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise SettingError(
-                f"{name}: expected a whole number from {low} to {high}, received {value!r}"
-            )
+        require_whole(name, value, least.get(name, 1), most.get(name, 1_000_000))
 
 
 def _require_meaning(
