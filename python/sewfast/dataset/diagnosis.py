@@ -142,7 +142,7 @@ def diagnose(data: Dataset) -> Diagnosis:
     Parameters
     ----------
     data : Dataset
-        Values may be missing.
+        Values can be missing.
 
     Returns
     -------

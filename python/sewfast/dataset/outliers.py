@@ -307,7 +307,7 @@ def _levelled(rows: FloatArray, level: float) -> FloatArray:
 
 
 def _medians(rows: FloatArray) -> FloatArray:
-    """Median of each row over what is not NaN; NaN where nothing is."""
+    """Median of each row without NaN; NaN if all of it is."""
     ordered = np.sort(rows, axis=1)
     count = np.isfinite(ordered).sum(axis=1)
     index, row = np.maximum(count, 1), np.arange(len(rows))

@@ -177,7 +177,7 @@ SHORTEST_PIECE = 100
 
 
 def take(data: Dataset, text: str) -> Dataset:
-    """`"A:B"` of every experiment, 0-based, end excluded; A or B may be left out.
+    """`"A:B"` of every experiment, 0-based, end excluded; A or B can be left out.
 
     Raises
     ------
@@ -302,7 +302,7 @@ def split_at_gaps(
     Parameters
     ----------
     shortest : int
-        Samples that a piece must have; shorter ones are left out, which `notes` says. The
+        Least samples of a piece; shorter ones are left out, with a note. The
         initial state alone takes 20.
     of : {"any", "inputs"}
         Whether a gap in the output splits an experiment, or only one in an input.

@@ -416,7 +416,7 @@ def _limits(output: ColumnSummary) -> Iterator[str]:
 
 
 def _noise_advice(output: ColumnSummary) -> Iterator[str]:
-    # the square of a tiny output may be 0
+    # the square of a tiny output can be 0
     known = output.moves and output.std > 0.0 and math.isfinite(output.noise)
     if known and output.noise > NOISY * output.std:
         yield (

@@ -73,7 +73,7 @@ def fleet(
         As for `identify`. Linear output error by default: its gain and residence time can be
         compared from run to run, and it takes a fraction of a second.
     controller : Controller, optional
-        Tuned anew for every model, from these settings.
+        Tuned separately for every model, from these settings.
     before : path or Fleet, optional
         An earlier result (`.csv`, `.json`, `.parquet`): `drifts` lists the quantities that have
         moved beyond their bands.

@@ -82,7 +82,7 @@ def identify(
     ----------
     data : Dataset
         Training data: inputs complete; outputs that are NaN were not measured and have no weight.
-        With weights, the costs that are minimised and the errors on what is held out are weighted
+        With weights, the minimised costs and the errors on held-out data are weighted
         (a sample of weight 0 counts as not measured); starts, scalings, output functions, the guard
         and the evidence stored with the model ignore them. `iv` takes no weights between 0 and the
         largest.

@@ -21,7 +21,7 @@ STARTING_SCALE = 1.0
 
 
 def trained(task: Task, model: Model) -> Model:
-    """The model after further iterations of its own kind of fit on the task's data.
+    """The model after further iterations of its kind of fit on the task's data.
 
     Raises
     ------

@@ -225,7 +225,7 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
     if name is None:
         if given is None:
             for spoiled in filter(_is_time, table.unusable):
-                table.resolve(spoiled)  # says why it cannot be used
+                table.resolve(spoiled)  # raises with the reason
             raise SettingError(
                 name=str(table.path), expected="a column t or time",
                 received=f"{', '.join(table.names[:30])}",
