@@ -195,7 +195,7 @@ class DynamicModel(ABC):
         SettingError
             For an initial state together with a data set, whose outputs determine it.
         FitError
-            Where the model is unstable on this input.
+            If the model is unstable on this input.
 
         Examples
         --------
@@ -396,7 +396,7 @@ class DynamicModel(ABC):
         Raises
         ------
         ModelFileError
-            Where the file cannot be written.
+            If the file cannot be written.
         """
         storage.write(path, FORMAT, VERSION, self.to_dict())
 

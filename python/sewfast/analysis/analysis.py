@@ -455,7 +455,7 @@ def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> li
     Raises
     ------
     SettingError
-        Where matplotlib is not installed or the folder cannot be written to.
+        If matplotlib is not installed or the folder cannot be written to.
     """
     drawn = a.figures()
     from ..plotting import style, svg

@@ -334,7 +334,7 @@ class OperatingPoint:
         Raises
         ------
         SettingError
-            Where python-control is not installed.
+            If python-control is not installed.
         """
         try:
             import control

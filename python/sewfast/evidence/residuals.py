@@ -249,9 +249,9 @@ class Residuals:
         Raises
         ------
         DataError
-            Where the data do not match the model or leave nothing to judge.
+            If the data do not match the model or leave nothing to judge.
         FitError
-            Where the model is unstable on this input.
+            If the model is unstable on this input.
         """
         require_dataset(data, "data")
         require_init(init)

@@ -201,7 +201,7 @@ def blackbox_series(raw: bytes) -> Iterator[tuple[str, FloatArray, Any]]:
     Raises
     ------
     ValueError
-        Where the header is damaged or no frame can be read.
+        If the header is damaged or no frame can be read.
     """
     starts = [m.start() for m in re.finditer(re.escape(BLACKBOX), raw)]
     names: list[str] = []

@@ -78,7 +78,7 @@ class Table:
         Raises
         ------
         DataError
-            Where the file has no such column, or it cannot be used.
+            If the file has no such column, or it cannot be used.
         """
         name = printable(name)
         for candidate in (name, split_unit(name)[0]):

@@ -61,7 +61,7 @@ def read_delimited(path: Path, raw: bytes) -> Table:
     Raises
     ------
     DataError
-        Where the file is not a table of that kind.
+        If the file is not a table of that kind.
     """
     layout = _layout(path, _decode(path, raw))
     fast = _fast_pass(layout)

@@ -205,10 +205,10 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
     Raises
     ------
     DataError
-        Where time goes back, or even time stamps disagree with `given` by more than 1 %, or are
+        If time goes back, or even time stamps disagree with `given` by more than 1 %, or are
         such that a grid would have far more samples than there are rows.
     SettingError
-        Where there is neither a time column nor a sample time.
+        If there is neither a time column nor a sample time.
     """
     if given is not None and not (
         isinstance(given, (int, float, np.number)) and math.isfinite(given) and given > 0
@@ -290,7 +290,7 @@ def _guessed(
     Raises
     ------
     SettingError
-        Where seconds would make a sample time that no machine uses.
+        If seconds would make a sample time that no machine uses.
     """
     for unit, scale in _SMALLER if given is not None and given < 0.01 * step else ():
         # not for a grid far finer than the rows

@@ -82,7 +82,7 @@ def _own(path: Path, file: int) -> None:
     Raises
     ------
     SettingError
-        Where another recorder holds the lock.
+        If another recorder holds the lock.
     """
     try:
         _lock(file)
@@ -103,7 +103,7 @@ def _lock(file: int, *, free: bool = False) -> None:
     Raises
     ------
     BlockingIOError
-        Where another process holds it.
+        If another process holds it.
     """
     try:
         import fcntl
@@ -153,9 +153,9 @@ class Sink:
     Raises
     ------
     SettingError
-        Where the file exists and `overwrite` is False, or another recorder is writing to it.
+        If the file exists and `overwrite` is False, or another recorder is writing to it.
     DataError
-        Where it cannot be created: a folder, no such folder, no permission.
+        If it cannot be created: a folder, no such folder, no permission.
     """
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
@@ -187,7 +187,7 @@ class Sink:
         Raises
         ------
         OSError
-            Where it does not fit; the file then ends before the piece.
+            If it does not fit; the file then ends before the piece.
         """
         rest = memoryview(piece)
         try:
@@ -227,7 +227,7 @@ def replacing(target: Path) -> Iterator[Path]:
     Raises
     ------
     DataError
-        Where the file cannot be written.
+        If the file cannot be written.
     """
     if target.is_dir():
         raise _folder(target)

@@ -148,7 +148,7 @@ class Header:
         Raises
         ------
         SettingError
-            Where it is of another format or version, or a value is missing or unusable.
+            If it is of another format or version, or a value is missing or unusable.
         """
         if content.get("format") != FORMAT:
             raise SettingError(
@@ -215,7 +215,7 @@ def plain(what: str, content: Mapping[str, Any]) -> dict[str, Any]:
     Raises
     ------
     SettingError
-        Where a value is none of these.
+        If a value is none of these.
     """
     try:
         text = json.dumps(dict(content), allow_nan=False, ensure_ascii=False, default=_python)

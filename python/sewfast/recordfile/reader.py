@@ -74,7 +74,7 @@ def chunks(raw: bytes) -> Iterator[Chunk]:
         For a file with more heads without chunks than damage can explain, and for one that unpacks
         to more than `MOST_RATIO` times its size.
     SettingError
-        Where a chunk is compressed and zstandard is not installed.
+        If a chunk is compressed and zstandard is not installed.
     """
     at, left, unpacked = 0, BUDGET * len(raw) + LARGEST_CHUNK, 0
     while (at := raw.find(CHUNK.to_bytes(1, "little"), at)) >= 0:
@@ -373,7 +373,7 @@ def read_recording(path: str | os.PathLike[str]) -> RecordedFile:
     Raises
     ------
     DataError
-        Where the file cannot be read, is not an MCAP file, or both copies of its header message
+        If the file cannot be read, is not an MCAP file, or both copies of its header message
         are damaged.
     """
     path = _named(path)

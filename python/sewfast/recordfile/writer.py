@@ -69,7 +69,7 @@ def require_replaceable(path: str | os.PathLike[str], *, overwrite: bool) -> Non
     Raises
     ------
     SettingError
-        Where the file is protected.
+        If the file is protected.
     """
     found = Path(path)
     if overwrite or found.suffix.lower() != ENDING or not _is_there(found):
@@ -89,7 +89,7 @@ def require_free(paths: Iterable[str | os.PathLike[str] | None], *, overwrite: b
     Raises
     ------
     SettingError
-        Where one of the files exists.
+        If one of the files exists.
     """
     for path in paths:
         if path is not None and not overwrite and _is_there(Path(path)):
@@ -149,9 +149,9 @@ class RecordWriter:
     Raises
     ------
     SettingError
-        Where the file exists and `overwrite` is False, or zstandard is not installed.
+        If the file exists and `overwrite` is False, or zstandard is not installed.
     DataError
-        Where it cannot be written.
+        If it cannot be written.
 
     Notes
     -----
@@ -230,7 +230,7 @@ class RecordWriter:
         Raises
         ------
         DataError
-            Where columns do not match the header, samples are repeated or the file cannot be
+            If columns do not match the header, samples are repeated or the file cannot be
             written any further.
         """
         first = _index("first", first)
@@ -289,7 +289,7 @@ class RecordWriter:
         SettingError
             For a detail without a JSON form.
         DataError
-            Where the file cannot be written any further.
+            If the file cannot be written any further.
         """
         index = None if index is None else _index("index", index)
         content = plain(f"event {kind!r}", {"kind": str(kind), "index": index, "detail": detail})
@@ -313,7 +313,7 @@ class RecordWriter:
         Raises
         ------
         DataError
-            Where that could not be written; the samples before it are whole.
+            If that could not be written; the samples before it are whole.
         """
         if not self._closed:
             self._filing.put(End(str(outcome), taken or 0))
@@ -362,7 +362,7 @@ def save_columns(
     Raises
     ------
     DataError
-        Where columns do not match the header or the file cannot be written.
+        If columns do not match the header or the file cannot be written.
     """
     with replacing(Path(path)) as temporary, RecordWriter(temporary, header) as writer:
         writer.samples(0, columns)
@@ -386,7 +386,7 @@ def save_curves(
     Raises
     ------
     DataError
-        Where the file cannot be written.
+        If the file cannot be written.
     SettingError
         For compression without zstandard.
     """
@@ -500,9 +500,9 @@ def export(
     Raises
     ------
     DataError
-        Where the recording cannot be read or the other file cannot be written.
+        If the recording cannot be read or the other file cannot be written.
     SettingError
-        Where the extension is unknown or its package is not installed, `out` is the recording
+        If the extension is unknown or its package is not installed, `out` is the recording
         itself or another one that cannot be made again, or another format is to be compressed.
     """
     if compress and Path(out).suffix.lower() != ENDING:
