@@ -31,7 +31,7 @@ _FAREWELL = 5.0
 
 
 class FmuProcess:
-    """An FMU in a process of its own, advanced by requests.
+    """An FMU in a separate process, advanced by requests.
 
     Parameters
     ----------

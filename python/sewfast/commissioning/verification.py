@@ -138,7 +138,7 @@ def predict(
     Parameters
     ----------
     pushes : sequence of array, optional
-        For each reference, a command added behind the limits: the load over the turn.
+        For each reference, a command added after the limiter: the load over the turn.
 
     Raises
     ------
