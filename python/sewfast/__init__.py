@@ -142,7 +142,7 @@ __all__ = [
     "write_table",
 ]
 
-# names are loaded when first used, so that `import sewfast` and `sewfast --help` cost nothing
+# names are loaded on first use, so that `import sewfast` and `sewfast --help` are fast
 _HOMES = {
     "_core": "__version__",
     "commissioning": "Commissioning bode commission",

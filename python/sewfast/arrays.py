@@ -1,4 +1,4 @@
-"""Columns of numbers as the package keeps them, their names and units, runs of True in a mask."""
+"""Columns of numbers in the package's form, their names and units, runs of True in a mask."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class HasUnits(Protocol):
 
 
 class HasSource(HasUnits, Protocol):
-    """A data set, which knows where it came from."""
+    """A data set, with the name of its source."""
 
     @property
     def source(self) -> str: ...
 
 
 def require_same_units(one: HasUnits, other: HasSource) -> None:
-    """Raise `DataError` where a unit is known on both sides and differs."""
+    """Raise `DataError` if a unit is known on both sides and differs."""
     mine = (*one.input_units, one.output_unit)
     for unit, received in zip(mine, (*other.input_units, other.output_unit), strict=True):
         if unit and received and spelled(unit) != spelled(received):
@@ -43,12 +43,12 @@ def require_same_units(one: HasUnits, other: HasSource) -> None:
 
 
 def labelled(name: str, unit: str) -> str:
-    """`name [unit]`, or the name alone where the unit is unknown."""
+    """`name [unit]`, or the name alone for an unknown unit."""
     return f"{name} [{unit}]" if unit else name
 
 
 def in_unit(number: str, unit: str) -> str:
-    """`number unit`, or the number alone where the unit is unknown."""
+    """`number unit`, or the number alone for an unknown unit."""
     return f"{number} {unit}" if unit else number
 
 
@@ -75,7 +75,7 @@ def as_float(values: ArrayLike, what: str) -> FloatArray:
 
 
 def frozen(array: FloatArray) -> FloatArray:
-    """A new array that nobody writes to, so that it needs no copy."""
+    """A new array made read-only without a copy."""
     array = np.ascontiguousarray(array)
     array.flags.writeable = False
     return array
@@ -97,7 +97,7 @@ def as_column(values: ArrayLike, what: str, n: int | None = None) -> FloatArray:
 
 
 def as_inputs(values: ArrayLike, n: int) -> FloatArray:
-    """(N, nu), where a single input may come as (N,)."""
+    """Inputs as (N, nu); a single input can be (N,)."""
     array = as_float(values, "u")
     if array.ndim == 1:
         array = array.reshape(-1, 1)

@@ -15,7 +15,7 @@ from .errors import DataError, SettingError, not_installed
 
 PACKAGE = "nonlinear_benchmarks"
 TESTED_VERSION = "1.0.1"
-"""Version of the package whose windows docs/BENCHMARKS.md speaks of."""
+"""Version of the package with the windows of docs/BENCHMARKS.md."""
 
 _NAMES = {
     "coupled_drives": "CED",
@@ -35,14 +35,14 @@ class Benchmark(NamedTuple):
     Attributes
     ----------
     train : Dataset
-        To identify from; whatever is needed to choose by is to be taken from it too.
+        Training data, which must also provide any data for selection.
     test : Dataset
         Its experiments are the official test records, in the package's order.
     n : int
-        First samples of each test record that set the initial state and are not scored.
+        First samples of each test record that determine the initial state and are not scored.
     name : str
     version : str
-        Of the package that said where the windows lie.
+        Version of the package that defines the windows.
     """
 
     train: Dataset
@@ -53,14 +53,14 @@ class Benchmark(NamedTuple):
 
 
 def names() -> tuple[str, ...]:
-    """Benchmarks that `load` knows."""
+    """Names of the benchmarks that `load` reads."""
     return tuple(_NAMES)
 
 
 def load(name: str, folder: str | os.PathLike[str] | None = None) -> Benchmark:
     """Read a benchmark with the windows of the package `nonlinear_benchmarks`.
 
-    The package fetches a record the first time, from its authors' page, and keeps it.
+    The package downloads a record the first time, from its authors' page, and keeps it.
 
     Parameters
     ----------
@@ -77,9 +77,9 @@ def load(name: str, folder: str | os.PathLike[str] | None = None) -> Benchmark:
     Raises
     ------
     SettingError
-        For an unknown name, or where the package is missing.
+        For an unknown name, or if the package is missing.
     DataError
-        Where the record can be neither found nor fetched.
+        If the record can be neither found nor downloaded.
 
     Notes
     -----
@@ -119,7 +119,7 @@ def _version() -> str:
 
 
 def _each(found: Any) -> list[Any]:
-    """The package gives one record, or a tuple of records."""
+    """A list of the package's records: it returns one, or a tuple."""
     one = not isinstance(found, Iterable) or hasattr(found, "sampling_time")
     return [found] if one else list(found)
 

@@ -26,7 +26,7 @@ class Comparison(Plotted):
     Attributes
     ----------
     names : tuple of str
-        Of the models, in the order in which they were given.
+        Names of the models, in the given order.
     parameters : tuple of int
         Number of fitted parameters of each model; for an ensemble the sum over its members.
     validations : tuple of Validation or None
@@ -34,7 +34,7 @@ class Comparison(Plotted):
     failures : tuple of str
         The reason if it diverges; otherwise empty.
     unit : str
-        Of errors and output.
+        Unit of errors and output.
     """
 
     names: tuple[str, ...]
@@ -52,7 +52,7 @@ class Comparison(Plotted):
         Raises
         ------
         KeyError
-            For another name, or a model that runs away.
+            For another name, or a model that diverges.
         """
         found = dict(zip(self.names, self.validations, strict=True)).get(name)
         if found is None:
@@ -88,7 +88,7 @@ class Comparison(Plotted):
         }
 
     def drawing(self) -> Drawing:
-        """The measured output, every free run over it, and their errors below."""
+        """Draw the measured output, every free run over it, and their errors below."""
         if not self._scored:
             raise SettingError("expected a model that stays bounded on these data; all run away")
         found = {name: self[name] for name in self._scored}
@@ -148,7 +148,7 @@ class Comparison(Plotted):
         return header, tuple(rows)
 
     def _notes(self) -> list[str]:
-        """The best one, and what speaks against single models."""
+        """The best model, and objections to others."""
         found = [f"{n}: {why}" for n, why in zip(self.names, self.failures, strict=True) if why]
         for name in self._scored:
             found += [f"{name}: {note}" for note in self[name].notes]
@@ -181,7 +181,7 @@ def compare(
     SettingError
         If there is no model or no data.
     DataError
-        If a model does not fit the data; the message names the model.
+        If a model does not match the data; the message names the model.
     """
     given: list[Any] = list(models)
     if data is None and given and isinstance(given[-1], Dataset):

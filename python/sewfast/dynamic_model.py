@@ -28,7 +28,7 @@ from .tables import html_of
 FORMAT = "sewfast.model"
 VERSION = 1
 INIT = 20
-"""Samples that set the initial state, unless told otherwise."""
+"""Default number of samples that determine the initial state."""
 _STEPS_SHOWN = 4
 
 
@@ -40,9 +40,9 @@ class FreeRunJacobian(NamedTuple):
     y : array, shape (N,)
         The free run.
     theta : array, shape (N, p)
-        By the parameters, in the order of `Model.theta` and `DynamicModel.parameter_names`.
+        Derivatives by the parameters, in the order of `Model.theta` and `Model.parameter_names`.
     state : array, shape (N, s)
-        By the initial state, in the order of `Model.state_names`.
+        Derivatives by the initial state, in the order of `Model.state_names`.
     """
 
     y: FloatArray
@@ -51,14 +51,14 @@ class FreeRunJacobian(NamedTuple):
 
 
 def require_init(init: int) -> None:
-    """A whole number of samples, or a `SettingError`."""
+    """Raise a `SettingError` unless `init` is a whole number of samples."""
     whole = isinstance(init, (int, np.integer)) and not isinstance(init, bool)
     if not whole or init < 0:
         raise SettingError(f"init: expected a whole number of 0 or more, received {init!r}")
 
 
 def real_numbers(values: ArrayLike, name: str, expected: str) -> FloatArray:
-    """A copy as C-contiguous float64, or a `DataError` for what is no array of real numbers."""
+    """A copy as C-contiguous float64; raises a `DataError` for anything but real numbers."""
     try:
         given = np.asarray(values)
         if given.dtype.kind == "c":
@@ -69,7 +69,7 @@ def real_numbers(values: ArrayLike, name: str, expected: str) -> FloatArray:
 
 
 class Core(Protocol):
-    """What the compiled models share."""
+    """Common interface of the compiled models."""
 
     def rest_state(self) -> FloatArray: ...
     def simulate(self, u: FloatArray, state: FloatArray) -> FloatArray: ...
@@ -82,10 +82,9 @@ class Core(Protocol):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DynamicModel(ABC):
-    """A model of one plant that runs, in the units of the data it was identified from.
+    """A model of one plant that can run, in the units of the data it was identified from.
 
-    What validation and evidence need of a model; `sewfast.Model`, which builds on them, is what
-    users have.
+    The interface for validation and evidence; users have a `sewfast.Model`, which builds on them.
 
     Parameters
     ----------
@@ -119,11 +118,11 @@ class DynamicModel(ABC):
     @property
     @abstractmethod
     def orders(self) -> dict[str, int]:
-        """`na`, `nb`, `nk` and whatever else sizes the model."""
+        """`na`, `nb`, `nk` and other sizes of the model."""
 
     @abstractmethod
     def parameters(self) -> dict[str, Any]:
-        """Everything that the compiled model is made from, as JSON values."""
+        """All parameters of the compiled model, as JSON values."""
 
     @abstractmethod
     def describe(self) -> list[str]:
@@ -155,7 +154,7 @@ class DynamicModel(ABC):
 
     @property
     def members(self) -> tuple[DynamicModel, ...]:
-        """The models that an ensemble consists of; a single model has none."""
+        """The members of an ensemble; empty for a single model."""
         return ()
 
     @property
@@ -188,27 +187,27 @@ class DynamicModel(ABC):
         Parameters
         ----------
         data : Dataset or array, shape (N,) or (N, n_inputs)
-            Inputs are complete; outputs of a data set may be NaN, and are not looked at after the
-            initial ones. An array holds inputs alone, in the model's units and at its sample time.
+            Inputs must be complete; outputs of a data set can be NaN, and are not used after the
+            initial ones. An array has only inputs, in the model's units and at its sample time.
         init : int
-            The initial state is estimated from this many measured outputs, the first ones; 0 starts
-            from rest.
+            The initial state is estimated from the first `init` measured outputs; 0 starts from
+            rest.
         initial_state : array, shape (s,), optional
-            Of a run on an array; its entries are `state_names`. By default rest.
+            Initial state of a run on an array, as listed in `state_names`. By default rest.
 
         Returns
         -------
         list of array, shape (N,), or array, shape (N,)
-            In the output's unit, from the first sample on: one per experiment of a data set, of an
-            array the run itself.
+            In the output's unit, from the first sample on: one run per experiment of a data set, or
+            the run on an array.
 
         Raises
         ------
         DataError
-            Where the data do not fit the model: inputs, sample time, shapes, values that are not
+            If the data do not match the model: inputs, sample time, shapes, values that are not
             finite.
         SettingError
-            For an initial state together with a data set, whose outputs set it.
+            For an initial state together with a data set, whose outputs determine it.
         FitError
             Where the model is unstable on this input.
 
@@ -229,7 +228,7 @@ class DynamicModel(ABC):
         try:
             return [self.core.simulate(e.u, self.initial_state(e, init)) for e in data.experiments]
         except SewfastError:
-            # the core looks at every input, too, but does not know where it came from
+            # the core checks every input, too, but cannot name its origin
             data.require_inputs()
             raise
 
@@ -253,8 +252,8 @@ class DynamicModel(ABC):
     ) -> list[FreeRunJacobian] | FreeRunJacobian:
         """Free run and its derivatives by every parameter and by the initial state.
 
-        The sensitivities run along with the model, so that they are exact: what training, standard
-        errors and bands are computed from. An estimated initial state counts as given.
+        The sensitivities are simulated together with the model and exact; training, standard errors
+        and bands use the same ones. An estimated initial state counts as given.
 
         Parameters
         ----------
@@ -271,7 +270,7 @@ class DynamicModel(ABC):
         Raises
         ------
         DataError, SettingError, FitError
-            As for `simulate`; for an ensemble also where any member is unstable on this input.
+            As for `simulate`; for an ensemble also if any member is unstable on this input.
         """
         if not isinstance(data, Dataset):
             return self._jacobian(self._inputs(data), self._state(initial_state))
@@ -291,12 +290,12 @@ class DynamicModel(ABC):
         Parameters
         ----------
         data : Dataset
-            Inputs are complete. In the place of an output that was not measured (NaN, or of weight
-            0) stands the model's own prediction of it.
+            Inputs must be complete. An output that was not measured (NaN, or of weight 0) is
+            replaced by the model's prediction of it.
         horizon : int
             1 is one-step prediction.
         init : int
-            As for `simulate`; it matters for the first samples only.
+            As for `simulate`; it only affects the first samples.
 
         Returns
         -------
@@ -318,10 +317,10 @@ class DynamicModel(ABC):
         ]
 
     def initial_state(self, experiment: Experiment, init: int) -> FloatArray:
-        """What a run over an experiment starts from, by its first `init` measured outputs.
+        """The initial state of a run over an experiment, from its first `init` measured outputs.
 
-        Past outputs y(-1), y(-2), .. of a lagged model, the states of a state-space model. Where
-        some of the first outputs are missing, more samples are looked at.
+        Past outputs y(-1), y(-2), .. of a lagged model, or the states of a state-space model. If
+        some of the first outputs are missing, more samples are used.
         """
         require_init(init)
         if init == 0:
@@ -362,7 +361,7 @@ class DynamicModel(ABC):
         return u
 
     def _state(self, values: ArrayLike | None) -> FloatArray:
-        """An initial state as the core takes it; None is rest."""
+        """An initial state for the core; None is rest."""
         rest: FloatArray = self.core.rest_state()
         if values is None:
             return rest
@@ -406,7 +405,7 @@ class DynamicModel(ABC):
         }
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the model as versioned JSON, whole or not at all; `load_model` reads it.
+        """Write the model as versioned JSON for `load_model`; the file is complete or absent.
 
         Raises
         ------
@@ -494,7 +493,7 @@ def choice_lines(training: Mapping[str, Any], unit: str) -> list[str]:
 
 
 def verdict_lines(training: Mapping[str, Any]) -> list[str]:
-    """The closing words: good enough to tune on or not, because of what, what to do next."""
+    """The verdict in lines: whether it is good enough to tune on, why, and what to do next."""
     verdict = training.get("verdict")
     if not isinstance(verdict, Mapping):
         return []

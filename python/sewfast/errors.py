@@ -1,4 +1,4 @@
-"""The exceptions of the package: one family, each also of the built-in kind a caller expects."""
+"""The exceptions of the package: one family, each also of the built-in kind that callers expect."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 
 class SewfastError(Exception):
-    """Base class of all errors; the message says what was expected, what came, what to do.
+    """Base class of all errors; the message has the expected and received values and a remedy.
 
     It can be raised with its fields, from which the message is made:
     ``name: expected ..., received ...; remedy``. It can also be raised with a whole message of this
@@ -18,7 +18,7 @@ class SewfastError(Exception):
     name : str or None
         Name of the refused item: an argument, a column, a file, a port.
     expected, received, remedy : str or None
-        What was expected, what came instead, what to do.
+        Expected value, received value, what to do.
 
     Examples
     --------
@@ -68,7 +68,7 @@ def _fields(message: str) -> tuple[str | None, ...]:
     else:
         expected, received = rest[:at], rest[at + 2 :].partition(" ")[2]
         ends = [i for i in range(len(received)) if received.startswith("; ", i)]
-        # a text in quotes may hold a semicolon
+        # text in quotes can contain a semicolon
         end = next((i for i in ends if received.count("'", 0, i) % 2 == 0), len(received))
         received, remedy = received[:end], received[end + 2 :]
     return name[2:] or None, expected, received or None, remedy or None
@@ -120,7 +120,7 @@ Kind = TypeVar("Kind", bound=SewfastError)
 
 
 def located(kind: type[Kind], place: object, error: BaseException) -> Kind:
-    """The error of a part as one of the whole: the place stands before the part's name."""
+    """The error of a part with its place put before the name."""
     if not isinstance(error, SewfastError) or error.expected is None:
         return kind(f"{place}: {error}")
     name = f"{place}: {error.name}" if error.name else f"{place}"
@@ -128,7 +128,7 @@ def located(kind: type[Kind], place: object, error: BaseException) -> Kind:
 
 
 def unreadable(kind: type[Kind], path: object, error: BaseException) -> Kind:
-    """The refusal of a file that is not there or that the system does not give."""
+    """The error for a file that is missing or cannot be read."""
     received = getattr(error, "strerror", None) or str(error)
     remedy = "check the name and the folder"
     return kind(
@@ -142,7 +142,7 @@ def unwritable(
     error: BaseException,
     remedy: str = "choose a folder that exists and is writable",
 ) -> Kind:
-    """The refusal of a file that the system does not let be written."""
+    """The error for a file that cannot be written."""
     received = getattr(error, "strerror", None) or str(error)
     return kind(
         name=f"{path}", expected="a file that can be written", received=received, remedy=remedy
@@ -150,7 +150,7 @@ def unwritable(
 
 
 def not_installed(package: str, purpose: str, install: str = "") -> SettingError:
-    """The refusal where an optional package is missing: what it is for, how to install it."""
+    """The error for a missing optional package, with its purpose and how to install it."""
     return SettingError(
         name=package, expected=f"it installed for {purpose}", received="none",
         remedy=f'pip install "{install or package}"',
@@ -158,6 +158,6 @@ def not_installed(package: str, purpose: str, install: str = "") -> SettingError
 
 
 def printable(name: str) -> str:
-    """A name without control characters: a file must not steer the terminal that it is shown on."""
+    """A name without control characters: a file must not be able to control the terminal."""
     shown = (c.isprintable() or unicodedata.category(c) == "Zs" for c in name)
     return "".join(c if keep else ascii(c)[1:-1] for c, keep in zip(name, shown, strict=True))

@@ -28,9 +28,9 @@ TEXTS: dict[str, str] = {
     "neural_oe": "lagged network output error",
     "neural_ss": "neural state space",
 }
-"""What each kind is, in a few words."""
+"""Short description of each kind."""
 
 
 def spelled(kind: str) -> str:
-    """As the command line spells it: with hyphens."""
+    """A kind as spelled on the command line, with hyphens."""
     return kind.replace("_", "-")

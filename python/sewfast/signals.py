@@ -16,7 +16,7 @@ from .errors import SettingError
 
 #: Sample time of every named signal [s].
 TS = 0.001
-#: Steady gain of the drive's middle range [RPM/V] (paper Eq. 8), by which jumps are planned.
+#: Steady gain of the drive's middle range [RPM/V] (paper Eq. 8), used to plan jumps.
 GAIN = 490.0
 #: Acceleration at the drive's current limit [RPM/s].
 ACCELERATION = 25_000.0
@@ -29,19 +29,19 @@ class Signal:
     Attributes
     ----------
     name
-        As the command line takes it.
+        Name on the command line.
     unit
         ``V`` for an excitation, ``RPM`` for a reference.
     duration_s
         Length [s].
     description
-        What it is and what it is for.
+        Description and purpose.
     low, high
         Limits of the amplitude [unit].
     rate
-        Limit of the rate of change [unit/s]; infinity sets none.
+        Limit of the rate of change [unit/s]; infinity for none.
     shape
-        Draws the signal for a seed, before the limits.
+        Function of the seed that generates the signal before the limits.
     """
 
     name: str
@@ -148,7 +148,7 @@ def _saturating(seed: int) -> FloatArray:
 
 
 def _saturating_2(seed: int) -> FloatArray:
-    # Another stream than `saturating` has for the same seed.
+    # A stream other than that of `saturating` for the same seed.
     return _core.jumps(
         duration=15.0,
         Ts=TS,
@@ -198,7 +198,7 @@ def _trapezoid(
 
 
 def _trapezoids(seed: int) -> FloatArray:
-    # Down to a slow run, not to rest: a crank held by friction shows nothing about the drive.
+    # Down to a low speed, not to rest: a crank held by friction shows nothing about the drive.
     rise = np.linspace(0.0, _SLOW_RPM, round(0.1 / TS))
     return np.concatenate([rise, *(_trapezoid(*shape, low=_SLOW_RPM) for shape in TRAPEZOIDS)])
 
@@ -347,9 +347,9 @@ def available() -> tuple[Signal, ...]:
 
 
 def crest_factor(signal: NDArray[np.floating]) -> float:
-    """Largest deviation from the mean by the root mean square of the deviations, shape (N,).
+    """Largest deviation from the mean over the root mean square of the deviations, shape (N,).
 
-    A sine has 1.414, a binary signal 1; lower puts more power into the same amplitude.
+    It is 1.414 for a sine and 1 for a binary signal; lower means more power at the same amplitude.
 
     Raises
     ------

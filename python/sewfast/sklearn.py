@@ -1,8 +1,8 @@
 """A scikit-learn regressor around `identify`, for its cross-validation, pipelines and searches.
 
-Samples of a dynamic system are not exchangeable: folds that shuffle rows, or that join what lay
-apart, destroy what is to be learned. Cross-validate by whole recordings or by blocks of one, with
-`experiment` and scikit-learn's group splitters (docs/choosing-a-model.md).
+Samples of a dynamic system are not exchangeable: folds that shuffle rows, or join separate pieces,
+destroy the dynamics. Cross-validate by whole recordings or by blocks of one, with `experiment` and
+scikit-learn's group splitters (docs/choosing-a-model.md).
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class FreeRunRegressor(RegressorMixin, BaseEstimator):
     Ts : float
         Sample time [s].
     model : str
-        As of `sewfast.identify`. Linear output error takes a fraction of a second; `auto` searches
+        As for `sewfast.identify`. Linear output error takes a fraction of a second; `auto` searches
         for tens of seconds in each fold.
     na, nb, nk : int or None
-        As of `sewfast.identify`.
+        As for `sewfast.identify`.
     time_budget : float or None
-        Seconds for each fit.
+        Time for each fit [s].
     seed : int
-        Of the starts of a network.
+        Seed of a network's starts.
     init : int
         Samples of each experiment from which `score` estimates the initial state; the score is of
         the others.
@@ -46,7 +46,7 @@ class FreeRunRegressor(RegressorMixin, BaseEstimator):
     Attributes
     ----------
     model_ : sewfast.Model
-        What was identified: `validate`, `check` and `tune` take it.
+        The identified model, for `validate`, `check` and `tune`.
     n_features_in_ : int
         Number of inputs.
 
@@ -90,12 +90,12 @@ class FreeRunRegressor(RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array_like, shape (N, n_inputs)
-            Inputs, one row for each sample, in the order of time.
+            Inputs, one row per sample, in order of time.
         y : array_like, shape (N,)
             Output.
         experiment : array_like, shape (N,), optional
-            Which recording a row belongs to: rows that follow each other with the same value are
-            one experiment with an initial state of its own. By default all rows are one.
+            Label of the recording of each row: consecutive rows with the same value are one
+            experiment, with a separate initial state. By default all rows are one.
 
         Returns
         -------
@@ -107,7 +107,7 @@ class FreeRunRegressor(RegressorMixin, BaseEstimator):
         ValueError
             For shapes that do not agree, too few samples or values that are not finite.
         SettingError, DataError, FitError
-            As from `sewfast.identify`.
+            As for `sewfast.identify`.
         """
         data = self._data(*_checked(self, X, y, reset=True), experiment)
         self.model_: Model = identify(
@@ -117,12 +117,12 @@ class FreeRunRegressor(RegressorMixin, BaseEstimator):
         return self
 
     def predict(self, X: ArrayLike) -> FloatArray:
-        """The free run from rest: from the inputs alone.
+        """The free run from rest, computed from the inputs alone.
 
         Parameters
         ----------
         X : array_like, shape (N, n_inputs)
-            One experiment, in the order of time.
+            One experiment, in order of time.
 
         Returns
         -------
@@ -133,18 +133,18 @@ class FreeRunRegressor(RegressorMixin, BaseEstimator):
         return self.model_.simulate(checked)
 
     def score(self, X: ArrayLike, y: ArrayLike, experiment: ArrayLike | None = None) -> float:
-        """R^2 of the free run, each experiment from an initial state of its own.
+        """R^2 of the free run, with a separate initial state for each experiment.
 
         Parameters
         ----------
         X, y, experiment
-            As of `fit`. The first `init` samples of each experiment set its initial state and are
-            not scored.
+            As for `fit`. The first `init` samples of each experiment determine its initial state
+            and are not scored.
 
         Returns
         -------
         float
-            1 where the run explains everything, 0 where it does as well as the mean.
+            1 if the run explains everything, 0 if it is as good as the mean.
         """
         check_is_fitted(self)
         data = self._data(*_checked(self, X, y, reset=False), experiment)
@@ -176,7 +176,7 @@ class FreeRunRegressor(RegressorMixin, BaseEstimator):
 def _checked(
     regressor: FreeRunRegressor, X: ArrayLike, y: ArrayLike, *, reset: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Inputs (N, n) and output (N,), as scikit-learn checks them."""
+    """Inputs (N, n) and output (N,), checked by scikit-learn."""
     inputs, output = validate_data(
         regressor, X, y, dtype=np.float64, y_numeric=True, reset=reset, ensure_min_samples=2
     )

@@ -38,8 +38,8 @@ def speed_from_counts(
     Parameters
     ----------
     counts
-        Accumulated counts, shape (N,), integers or floats; at least 2, for ``savgol`` ``window``,
-        for ``kalman`` 5.
+        Accumulated counts, shape (N,), integers or floats: at least 2, ``window`` for ``savgol``,
+        5 for ``kalman``.
     Ts
         Sample time [s].
     counts_per_rev
@@ -51,13 +51,13 @@ def speed_from_counts(
     unit
         ``rpm``, ``rev/s``, ``rad/s`` or ``deg/s``.
     window, order
-        Of ``savgol``: odd number of samples, order of the polynomial.
+        For ``savgol``: odd number of samples, order of the polynomial.
     process_noise
-        Of ``kalman``: intensity of the jerk [unit^2/s^3]; None: found by maximum likelihood.
-        Whole counts are taken as exact to 1/12 count^2; for others that variance is found too.
+        For ``kalman``: intensity of the jerk [unit^2/s^3]; None: estimated by maximum likelihood.
+        Whole counts have a rounding variance of 1/12 count^2; for others it is estimated too.
     ripple_orders
-        Of ``kalman``: multiples of the shaft's turn at which the load may repeat, 6 at most, as
-        cranks and torque ripple do [4]_; used if it makes the counts more likely. () disables it.
+        For ``kalman``: multiples of the shaft's turn, at most 6, at which the load can repeat, as
+        with cranks and torque ripple [4]_; used if it makes the counts more likely. () disables it.
     unwrap_bits
         Width of a counter that wraps, for example 16.
 
@@ -112,20 +112,20 @@ def speed_from_counts(
 
 
 SHORTEST = 5
-"""Counts in a row that the Kalman smoother needs."""
+"""Least consecutive counts for the Kalman smoother."""
 
 
 def speed_between_gaps(
     counts: FloatArray, Ts: float, counts_per_rev: float, *, method: Method = "kalman"
 ) -> FloatArray:
-    """As `speed_from_counts`, each piece between gaps (NaN) for itself.
+    """As `speed_from_counts`, separately for each piece between gaps (NaN).
 
-    NaN in gaps and in pieces that are too short for the method; shape (N,).
+    NaN in gaps and in pieces too short for the method; shape (N,).
 
     Raises
     ------
     DataError
-        Where no piece is long enough.
+        If no piece is long enough.
     """
     if not np.isnan(counts).any():
         return speed_from_counts(counts, Ts, counts_per_rev, method=method)
@@ -146,7 +146,7 @@ def speed_between_gaps(
 def speed_or_nan(
     counts: FloatArray, Ts: float, counts_per_rev: float, method: Method
 ) -> FloatArray:
-    """As `speed_between_gaps`, all NaN where too little came for a speed."""
+    """As `speed_between_gaps`, all NaN if there are too few counts for a speed."""
     try:
         return speed_between_gaps(counts, Ts, counts_per_rev, method=method)
     except DataError:
@@ -154,11 +154,10 @@ def speed_or_nan(
 
 
 def floor_of_J(estimate: ArrayLike, truth: ArrayLike, y_scale: float = 1000.0) -> float:
-    """The floor of J that a speed estimate leaves: ``mean((estimate - truth)^2) / 2``, scaled.
+    """The least J possible with a speed estimate: ``mean((estimate - truth)^2) / 2``, scaled.
 
-    A model that gave the true speed exactly would still score this J against the estimate, so no
-    honest J of a free run falls below it. Raw differences of 1,572 counts/rev at 1 ms leave about
-    1.2e-4.
+    A model with the exact true speed would still score this J against the estimate, so no honest J
+    of a free run is lower. For raw differences of 1,572 counts/rev at 1 ms it is about 1.2e-4.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Numbers and tables as a reader likes them: few digits, a unit, a dash where there is none."""
+"""Numbers and tables for readers: few digits, a unit, a dash for a missing value."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _SPACE = "\N{NO-BREAK SPACE}"
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """`digits` significant digits, plain where that is short, else a power of ten."""
+    """`digits` significant digits, plain if that is short, else with a power of ten."""
     if value is None or not math.isfinite(value):
         return NONE
     if value == 0.0:
         return "0"
-    # of the rounded value: 9.996 has two digits before the point
+    # magnitude of the rounded value: 9.996 gives two digits before the point
     size = int(f"{value:.{digits - 1}e}".split("e")[1])
     if not -3 <= size <= 5:
         mantissa = value / 10.0**size
@@ -73,13 +73,13 @@ class Table:
     Attributes
     ----------
     caption : str
-        What it shows.
+        Title of the table.
     header : tuple of str
     rows : tuple of tuple of str
     best : frozenset of (row, column)
         Cells to set in bold.
     words : bool
-        Whether its cells hold words rather than numbers, which begin at the left.
+        Whether its cells hold words, aligned to the left, rather than numbers.
     """
 
     caption: str
@@ -89,7 +89,7 @@ class Table:
     words: bool = False
 
     def to_html(self, notes: Sequence[str] = ()) -> str:
-        """As HTML for a notebook, everything escaped: no style or script of its own.
+        """As HTML for a notebook, with everything escaped, without style or script.
 
         Parameters
         ----------

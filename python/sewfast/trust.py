@@ -24,9 +24,9 @@ from .control.loop import (
 )
 from .dataset import Dataset, FloatArray
 from .errors import FitError, SettingError, SewfastError
-from .evidence.card import Judged, Line
-from .evidence.questions import OUTSIDE
-from .evidence.region import placed
+from .evidence.card import Line, VerdictTable
+from .evidence.region import region_runs
+from .evidence.verdicts import OUTSIDE
 from .gains import real
 from .models import Model
 from .units import revolutions_per_second
@@ -301,7 +301,7 @@ class JudgedRun:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Judgement(Judged):
+class Judgement(VerdictTable):
     """Lines with verdicts, and the runs behind them.
 
     Attributes
@@ -585,7 +585,7 @@ def _outside(found: ClosedLoopRun, model: Model | None) -> tuple[float, float]:
         output_name=model.output_name, output_unit=model.output_unit, name=found.reference,
     )  # fmt: skip
     try:
-        place = placed(model, data, init=0)
+        place = region_runs(model, data, init=0)
     except SewfastError:
         return 1.0, math.inf
     if place is None:

@@ -1,6 +1,6 @@
-"""Units as people and instruments write them: one table of spellings, and units in a column's name.
+"""Units in their usual spellings: one table of spellings, and units in a column's name.
 
-A unit is kept as it was written; only comparing and converting look here.
+A unit is kept as written; this module is only used to compare and convert units.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ REVOLUTIONS_PER_SECOND: dict[str, float] = {
     "rad/s": 1.0 / math.tau,
     "deg/s": 1.0 / 360.0,
 }
-"""Revolutions per second that one of each unit stands for."""
+"""Factor from each unit to revolutions per second."""
 _WRITTEN = {
     "rpm": "r/min rev/min 1/min min-1 min^-1 min⁻¹ u/min upm tr/min",
     "rev/s": "rps 1/s turn/s turns/s",
@@ -30,7 +30,7 @@ _WRITTEN = {
     "s": "sec second seconds",
     "%": "percent pct",
 }
-"""How else a unit is written, in lower case; `u` are German turns, `tr` French."""
+"""Other spellings of a unit, in lower case; `u` is German for turns, `tr` French."""
 _SPELLINGS = {other: unit for unit, others in _WRITTEN.items() for other in others.split()}
 ANGULAR_SPEEDS = frozenset(REVOLUTIONS_PER_SECOND) | frozenset(
     other for other, unit in _SPELLINGS.items() if unit in REVOLUTIONS_PER_SECOND
@@ -39,7 +39,7 @@ SPEEDS = ANGULAR_SPEEDS | frozenset(["m/s", "cm/s", "mm/s", "m/min", "km/h"])
 
 
 def spelled(unit: str) -> str:
-    """A unit in lower case and in the package's own spelling: two that are equal mean the same.
+    """A unit in lower case and in the package's spelling, so that equal units compare equal.
 
     Examples
     --------
@@ -51,12 +51,12 @@ def spelled(unit: str) -> str:
 
 
 def revolutions_per_second(unit: str) -> float | None:
-    """Revolutions per second that one of `unit` stands for; None where it is no angular speed."""
+    """Factor from `unit` to revolutions per second; None if it is no angular speed."""
     return REVOLUTIONS_PER_SECOND.get(spelled(unit))
 
 
 def counts_per_unit(counts_per_rev: float, unit: str = "rpm") -> float:
-    """Encoder counts that pass in one second at a speed of one ``unit``.
+    """Encoder counts per second at a speed of one ``unit``.
 
     A change of ``n`` counts in ``Ts`` seconds is a speed of ``n / (Ts * counts_per_unit)``.
     With 1,572 counts/rev and 1 ms one count is 38.168 RPM.
@@ -107,7 +107,7 @@ _UNITS = SPEEDS | frozenset(
         "rad deg ° nm n m cm mm w hz khz % °c degc counts counts/s",
     )
 )
-"""Units that oscilloscopes, loggers and people write behind or below a name, in lower case."""
+"""Units that are written behind or below a name, in lower case."""
 _BEFORE_UNIT = re.compile(r"\s+in\s+|\s*/\s*|\s*,\s+")
 
 
@@ -119,14 +119,14 @@ def split_unit(header: str) -> tuple[str, str]:
     text = header.strip()
     for between in _BEFORE_UNIT.finditer(text):
         name, unit = text[: between.start()], text[between.end() :]
-        # `speed m/s` is no `speed m` in seconds
+        # `speed m/s` does not mean `speed m` in seconds
         if name and is_unit(unit) and not is_unit(text[len(name.rpartition(" ")[0]) :]):
             return name, unit
     return text, ""
 
 
 def is_unit(text: str) -> bool:
-    """Whether a text is one of the units that measurements have."""
+    """Whether a text is a unit of measurement."""
     return text.strip().lower() in _UNITS
 
 
@@ -142,10 +142,10 @@ _SUFFIXED = re.compile(rf"(.+)[_ ]({'|'.join(sorted(_SUFFIX, key=len, reverse=Tr
 
 
 def unit_in_name(name: str) -> tuple[str, str]:
-    """`speed_rpm` -> `("speed", "RPM")`; a name that ends with no unit gives an empty one.
+    """`speed_rpm` -> `("speed", "RPM")`; a name without a unit at its end gives an empty one.
 
-    Only endings that hardly mean anything else count. A lone `A` is also a phase or a channel, so
-    that it is a unit only behind a word for a current.
+    Only unambiguous endings count. A lone `A` can also be a phase or a channel, so it is a unit
+    only behind a word for a current.
     """
     match = _SUFFIXED.fullmatch(name)
     if match is None or (match[2] == "A" and not _CURRENT.fullmatch(match[1].lower())):

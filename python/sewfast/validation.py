@@ -19,26 +19,26 @@ from .plotting import Drawing, Plotted, fit_panels, stacked
 from .tables import Table, percent, significant
 
 GOOD, FAIR, POOR = 90.0, 70.0, 30.0
-"""Percent of the free run's fit from which a model is good, fair, poor; below it is useless."""
+"""Least fit of the free run [%] for a model to be good, fair, poor; below, it is useless."""
 FEW = 100
-"""Scored samples below which a verdict has little to go by."""
+"""Scored samples below which a verdict has little evidence."""
 AT_THE_NOISE = 1.5
-"""Below this multiple of the measurement noise an error leaves nothing to be explained."""
+"""An error below this multiple of the measurement noise cannot be improved."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Size of an error series.
+    """Scores of an error series.
 
     Attributes
     ----------
     rmse, max_abs : float
         Root mean square and largest magnitude [output unit].
     fit_percent : float
-        100 (1 - |y - yhat| / |y - mean(y)|), Euclidean norms; NaN where y is constant.
+        100 (1 - |y - yhat| / |y - mean(y)|), Euclidean norms; NaN for constant y.
 
-    With weights, mean squares and means are weighted: rmse is sqrt(sum w e^2 / sum w), the norms
-    are of sqrt(w) times their argument. The largest magnitude is not.
+    With weights, mean squares and means are weighted: rmse is sqrt(sum w e^2 / sum w), and norms
+    are of sqrt(w) times their argument. The largest magnitude is not weighted.
     """
 
     rmse: float
@@ -47,7 +47,7 @@ class Scores:
 
     @classmethod
     def of(cls, y: FloatArray, yhat: FloatArray, weights: FloatArray | None = None) -> Scores:
-        """Scores of `yhat` against `y`, both of shape (N,), as the weights, which are not all 0."""
+        """Scores of `yhat` against `y`; all arrays (N,), weights not all 0."""
         root = 1.0 if weights is None else np.sqrt(weights)
         total = len(y) if weights is None else weights.sum()
         mean = y.mean() if weights is None else (weights * y).sum() / total
@@ -67,12 +67,11 @@ class ExperimentErrors:
     Attributes
     ----------
     init : int
-        Samples before the scored ones: those with the measured outputs that set the state.
+        Samples before the scored ones, with the measured outputs that determine the state.
     y, simulated, one_step : array, shape (N,)
-        What is scored against, the free run and the one-step prediction [output unit]. NaN in y
-        is not scored.
+        Reference, free run and one-step prediction [output unit]. NaN in y is not scored.
     weights : array, shape (N,), or None
-        How much each sample counts; None: all alike.
+        Weight of each sample; None: all equal.
     """
 
     name: str
@@ -95,7 +94,7 @@ class ExperimentErrors:
 
     @property
     def unmeasured(self) -> int:
-        """Samples after the initial ones that are not scored, because y is NaN there."""
+        """Number of samples after the initial ones that are not scored because y is NaN."""
         return int(np.isnan(self.y[self.init :]).sum())
 
     @property
@@ -104,12 +103,12 @@ class ExperimentErrors:
         return len(self.y) - self.init - self.unmeasured
 
     def scored(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """y, free run and one-step prediction at the samples that are scored."""
+        """y, free run and one-step prediction at the scored samples."""
         known = self._known()
         return self.y[known], self.simulated[known], self.one_step[known]
 
     def scored_weights(self) -> FloatArray | None:
-        """Weights of the samples that are scored; None where all count alike."""
+        """Weights of the scored samples; None if all are equal."""
         return None if self.weights is None else self.weights[self._known()]
 
     def _known(self) -> NDArray[np.intp]:
@@ -133,19 +132,20 @@ class Validation(Plotted):
     Attributes
     ----------
     simulation, one_step : Scores
-        Over all experiments together; the fit is about their common mean.
+        Scores over all experiments together; the fit is relative to their common mean.
     experiments : tuple of ExperimentErrors
         Series and scores of each.
     n : int
         Samples scored.
     init : int
-        Measured outputs before those in each experiment; they set the initial state. 0: from rest.
+        Measured outputs before the scored ones in each experiment, which determine the initial
+        state. 0: from rest.
     unmeasured : int
-        Samples after those that are not scored, because their output was not measured.
+        Number of later samples without a measured output, which are not scored.
     unit : str
-        Of the errors.
+        Unit of the errors.
     notes : tuple of str
-        What the reader should know, such as inputs beyond the range of the training data.
+        Remarks for the reader, such as inputs beyond the range of the training data.
     Ts : float or None
         Sample time of the data [s].
     without_input : float
@@ -231,7 +231,7 @@ class Validation(Plotted):
         }
 
     def drawing(self) -> Drawing:
-        """The measured output, the free run over it, and both errors below."""
+        """Draw the measured output, the free run over it, and both errors below."""
         s, unit = self.simulation, f" {self.unit}" if self.unit else ""
         fit = f"fit {s.fit_percent:.2f} %, " if math.isfinite(s.fit_percent) else ""
         panels = fit_panels(
@@ -294,25 +294,25 @@ class Validation(Plotted):
 
 
 def noise_of(outputs: Sequence[FloatArray]) -> float:
-    """White measurement noise of outputs (N,), pooled; NaN where unknown."""
+    """White measurement noise of outputs (N,), pooled; NaN if unknown."""
     found = [white_noise(y) for y in outputs]
     known = [n for n in found if math.isfinite(n)]
     return math.sqrt(sum(n * n for n in known) / len(known)) if known else math.nan
 
 
 def grade_of(fit: float, rmse: float, noise: float) -> str:
-    """`good`, `fair`, `poor` or `useless`; empty where the output is constant.
+    """`good`, `fair`, `poor` or `useless`; empty for a constant output.
 
-    An error of the size of the measurement noise is good though the fit is not: no model can do
-    better. Where the output itself is hardly larger than its noise, that shows nothing, so a fit
-    below `POOR` is useless all the same.
+    An error at the level of the measurement noise is good even with a low fit: no model can do
+    better. If the output itself is hardly larger than its noise, that is no evidence, so a fit
+    below `POOR` is useless in any case.
 
     Parameters
     ----------
     fit : float
-        Of the free run [%].
+        Fit of the free run [%].
     rmse, noise : float
-        Its error, and the white measurement noise of the output, in one unit.
+        Error of the free run, and white measurement noise of the output, in one unit.
     """
     if not math.isfinite(fit):
         return ""
@@ -328,10 +328,10 @@ def _beside_a_constant(scores: Scores) -> str:
 
 
 def by_input(error: float, resting: float) -> float:
-    """What the moves of the input bring [%]: 100 (1 - error of the free run / error at rest).
+    """Part explained by the input's motion [%]: 100 (1 - error of the free run / error at rest).
 
-    As large as the fit where only the input moves the output. A ramp, a decay to rest or levels
-    that differ from one recording to the next are followed from the initial state alone.
+    It equals the fit if only the input moves the output. A ramp, a decay to rest or different
+    levels of recordings are explained by the initial state alone.
     """
     if not math.isfinite(error):
         return math.nan
@@ -339,16 +339,16 @@ def by_input(error: float, resting: float) -> float:
 
 
 def judged(fit: float, error: float, noise: float, share: float) -> tuple[str, str]:
-    """The grade, and what is to be said where the input has too small a part in the fit.
+    """The grade, and a remark if the input explains too small a part of the fit.
 
     Parameters
     ----------
     fit : float
-        Of the free run [%].
+        Fit of the free run [%].
     error, noise : float
-        Of the free run, and white measurement noise of the output, in one unit.
+        Error of the free run, and white measurement noise of the output, in one unit.
     share : float
-        What the moves of the input bring [%], by `by_input`.
+        Part explained by the input's motion [%], from `by_input`.
     """
     by_fit, grade = grade_of(fit, error, noise), grade_of(min(fit, share), error, noise)
     if grade == by_fit:
@@ -360,7 +360,7 @@ def judged(fit: float, error: float, noise: float, share: float) -> tuple[str, s
 
 
 def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
-    """`free_run_error` where the inputs rest at their means after the initial samples."""
+    """`free_run_error` with the inputs held at their means after the initial samples."""
     means = np.mean(np.concatenate([e.u for e in data.experiments]), axis=0)
     resting = []
     for e in data.experiments:
@@ -371,10 +371,10 @@ def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
 
 
 def free_run_error(model: DynamicModel, data: Dataset, inputs: Dataset, init: int) -> float:
-    """Root mean square error against the outputs of `data` of the free run of `inputs`.
+    """Root mean square error of the free run on `inputs` against the outputs of `data`.
 
-    Over the known outputs after the initial samples, each as its weight [output unit]; infinite
-    where the free run leaves the finite numbers.
+    Weighted, over the known outputs after the initial samples [output unit]; infinite if the free
+    run diverges.
     """
     try:
         runs = model.simulate(inputs, init=init)
@@ -397,12 +397,12 @@ def validate(
     ----------
     model : Model
     data : Dataset
-        Complete inputs. Samples whose output is NaN are not scored, and counted in `unmeasured`.
-        With weights, errors and fits are weighted (`Scores`), and a sample of weight 0 counts as
-        not measured; the measurement noise ignores them.
+        Inputs must be complete. Samples whose output is NaN are not scored, but counted in
+        `unmeasured`. With weights, errors and fits are weighted (`Scores`), and a sample of weight
+        0 counts as not measured; the measurement noise ignores weights.
     init : int
-        The first `init` measured outputs of each experiment set the initial state; samples up to
-        the last of them are not scored. 0 starts from rest and scores every sample.
+        The first `init` measured outputs of each experiment determine the initial state; samples up
+        to the last of them are not scored. 0 starts from rest and scores every sample.
     against : str or None
         Name of a channel to score against instead of the measured output (a virtual machine's
         true speed).
@@ -410,7 +410,7 @@ def validate(
     Raises
     ------
     DataError
-        If data do not fit the model, an input is NaN, or nothing is left to score.
+        If the data do not match the model, an input is NaN, or nothing is left to score.
     FitError
         If the model is unstable on this input.
     """
@@ -426,9 +426,8 @@ def validate(
     for e in data.experiments:
         if len(e) - e.unmeasured <= init:
             raise DataError(
-                f"{e.name}: expected more than init = {init} samples, received "
-                f"{e.counted}: nothing is left to score; lower init (--init) or give a "
-                "longer range"
+                f"{e.name}: expected more than init = {init} samples, received {e.counted}: "
+                "nothing is left to score; lower init (--init) or give a longer range"
             )
     series = zip(
         given.experiments,
@@ -470,7 +469,7 @@ def validate(
 
 
 def _target(experiment: Experiment, against: str | None, first: int) -> FloatArray:
-    """What is scored against, NaN where it has no weight."""
+    """The reference of the scores, NaN where it has no weight."""
     if against is None:
         return without_weightless(experiment).y
     if against not in experiment.channels:
@@ -497,7 +496,7 @@ def _target(experiment: Experiment, against: str | None, first: int) -> FloatArr
 
 
 def _beyond_training(model: DynamicModel, data: Dataset) -> list[str]:
-    """Inputs that leave the range that the model has seen by more than a hundredth of it."""
+    """Notes on inputs that exceed their training range by more than a hundredth of it."""
     notes = []
     known = model.training.get("input_range", [])
     for name, (low, high), (least, most) in zip(

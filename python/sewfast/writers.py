@@ -1,4 +1,4 @@
-"""Files out: named columns as CSV, `.npz`, `.mat` or Parquet, whole or not at all."""
+"""Writing tables: named columns as CSV, `.npz`, `.mat` or Parquet; a file is complete or absent."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def write_table(
 ) -> None:
     """Write columns of one length to a file, in the format given by its extension.
 
-    Every float is written so that reading returns the same bits. A column `t` comes first.
+    Every float reads back to the same bits. A column `t` comes first.
 
     Parameters
     ----------
@@ -55,12 +55,12 @@ def write_table(
 
 
 def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
-    """Put `content` in place of a file: a temporary name beside it, renamed once it is whole.
+    """Write `content` to a file: under a temporary name beside it, renamed once it is complete.
 
     Raises
     ------
     DataError
-        Where the folder does not exist or cannot be written to.
+        If the folder does not exist or cannot be written to.
     """
     try:
         replace_file(path, content)
@@ -82,7 +82,7 @@ def _csv(columns: _Columns, units: Mapping[str, str]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([labelled(n, units.get(n, "")) for n in columns])
-    # Python's repr of a float is its shortest text that reads back to the same bits
+    # Python's repr of a float is the shortest text that reads back to the same bits
     writer.writerows(zip(*(map(repr, c.tolist()) for c in columns.values()), strict=True))
     return text.getvalue().encode()
 

@@ -25,8 +25,8 @@ from sewfast.evidence import (
     check,
     estimate,
     operating_range,
-    remembered,
     residual_tests,
+    with_training_evidence,
 )
 from sewfast.evidence.correlations import chi2_quantile, chi2_tail, normal_quantile
 from sewfast.evidence.operating import linearise
@@ -58,7 +58,7 @@ def test_a_hidden_unit_that_is_next_to_nothing_leaves_evidence_in_numbers(
     theta[trained.parameter_names.index("w2[0]")] = weight
     model = NeuralOE.core_from(Fields("model", {**trained.parameters(), "theta": theta.tolist()}))
     model = replace(trained, core=model, training={"input_range": [[-5.0, 5.0]]})
-    kept = remembered(model, data)
+    kept = with_training_evidence(model, data)
     kept.save(tmp_path / "m.json")
     assert np.isfinite(kept.bands(data).upper[0]).all()
     # what the unit does to its own weights is nothing: five directions
@@ -212,7 +212,9 @@ def test_an_ensemble_has_a_card_like_any_other() -> None:
     parts = [linear_data(700, seed=s, noise=0.5) for s in (1, 2, 3)]
     members = [sewfast.identify(p, model="oe") for p in parts]
     training = {k: members[0].training[k] for k in ("input_range", "output_range")}
-    ensemble = remembered(Ensemble.of(members, training=training), Dataset.concat(parts))
+    ensemble = with_training_evidence(
+        Ensemble.of(members, training=training), Dataset.concat(parts)
+    )
     card = ensemble.check(linear_data(1500, seed=11, noise=0.5))
     assert card.bands is not None
     assert 0.9 < card.bands.coverage < 0.99

@@ -12,8 +12,8 @@ from plants import linear_data
 from sewfast import Dataset, LinearOE, check, identify
 from sewfast.evidence import Residuals, operating_range
 from sewfast.evidence.card import summary
-from sewfast.evidence.questions import accuracy, correlation, operation
 from sewfast.evidence.residuals import horizon_scores
+from sewfast.evidence.verdicts import accuracy, correlation, operation
 from sewfast.validation import grade_of, validate
 
 

@@ -1,4 +1,4 @@
-"""The table of `rust/core/src/simd/tanh/pieces.rs`; needs mpmath.
+"""The table of `rust/core/src/simd/tanh/tables.rs`; needs mpmath.
 
 `python tests/golden/tanh_pieces.py`: Remez's algorithm for polynomials of tanh around 0, 1/4, 1/2
 ... 15/4 with the least relative error.

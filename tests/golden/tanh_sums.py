@@ -1,4 +1,4 @@
-"""The coefficients of `rust/core/src/simd/tanh/sums.rs`: `python tests/golden/tanh_sums.py`.
+"""The coefficients of `rust/core/src/simd/tanh/tables.rs`: `python tests/golden/tanh_sums.py`.
 
 Needs mpmath. Remez's algorithm for tanh(t) = t (1 + s P(s)), s = t^2, up to an eighth, with the
 least relative error; and tanh of the quarters.

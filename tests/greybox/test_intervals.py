@@ -10,8 +10,7 @@ from test_physics import linear
 
 import sewfast
 from sewfast import physics
-from sewfast.motorfit.intervals import covariance_of
-from sewfast.motorfit.marquardt import minimised
+from sewfast.motorfit.estimation import covariance_of, minimised
 from sewfast.motorfit.records import records_of, spikes_of
 from sewfast.motorfit.task import NOTHING, PLACE, State, Task
 

@@ -15,7 +15,6 @@ from plants import bent_data, linear_data
 from sewfast import Dataset, Ensemble, LinearOE, NeuralOE, NeuralSS, _core, identify, validate
 from sewfast.errors import DataError, FitError, Interrupted, SettingError
 from sewfast.identification import trials
-from sewfast.identification.effort import Clock, Pool, Stopped
 from sewfast.identification.folds import (
     FOLDS,
     RUNAWAY,
@@ -27,7 +26,7 @@ from sewfast.identification.folds import (
 )
 from sewfast.identification.orders import DELAYS, LinearTable, raised
 from sewfast.identification.search import HALVING_ITERATIONS, STILL_NEAR, Search
-from sewfast.identification.task import Task
+from sewfast.identification.task import Clock, Pool, Stopped, Task
 from sewfast.identification.training import Start, Structure
 from sewfast.identification.trials import Candidate, best_of_each_size, counting
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sewfast import ARX, IV, Dataset, Ensemble, LinearOE, Model, NeuralOE, NeuralSS, _core
-from sewfast.evidence import remembered
+from sewfast.evidence import with_training_evidence
 from sewfast.models.grey_box import NAMES, GreyBox
 from sewfast.models.hammerstein import HammersteinWiener
 
@@ -58,7 +58,7 @@ def model_of(name: str) -> Model:
     """The model of a case, with the evidence of its own training record."""
     case = CASES[name]
     model = case.make()
-    return remembered(model, recording(model)) if case.evidence else model
+    return with_training_evidence(model, recording(model)) if case.evidence else model
 
 
 def _wrapped(cls: Any, core: Any, inputs: int, **training: Any) -> Any:

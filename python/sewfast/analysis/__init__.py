@@ -1,8 +1,8 @@
 """Analysis of a controller on models: responses, Bode of L, S, T, gain sensitivity, what-if.
 
-Read in this order: `analysis` (`analyse` and what it gives), `points` (operating points and their
-Bode), `responses` (steps of reference and load), `sensitivity` and `changes` (what other gains or
-another drive would do), `figures`.
+Read in this order: `analysis` (`analyse` and its result), `points` (operating points and their
+Bode), `responses` (steps of reference and load), `sensitivity` and `changes` (other gains, other
+plants), `figures`.
 """
 
 from ..control.systems import LinearLoop

@@ -1,4 +1,4 @@
-"""`analyse`: a controller on models or a virtual machine, looked at from every side."""
+"""`analyse`: responses, margins and sensitivities of a controller on models or a machine."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ FORMAT = "sewfast.analysis"
 VERSION = 1
 REFERENCES = ("trapezoid", "random")
 MOST = 8
-"""Members that gains and plants are varied on; those of an ensemble are sorted, the best first."""
+"""Most members on which gains and plants are varied; an ensemble is sorted, best first."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -92,7 +92,7 @@ class Analysis:
         return max(loop.Ms for loop in self.loops)
 
     def linear(self, point: int | None = None, plant: int = 0) -> LinearLoop:
-        """The linear loop about an operating point (the main one): L, S, T as state space.
+        """The linear loop at an operating point (by default the main one): L, S, T as state space.
 
         `linear().to_control("S")` and `.to_scipy("S")` give the toolboxes' objects.
 
@@ -189,7 +189,7 @@ class Analysis:
         }
 
     def _repr_html_(self) -> str:
-        """A table for a notebook: margins, then the steps and what speaks against the loop."""
+        """A table for a notebook: margins, then the steps and objections to the loop."""
         y, u = self.controller.gains.y_unit, self.controller.gains.u_unit
         table = Table(
             f"Analysis on {_plants(self.plants)}: margins of the worst plant",
@@ -237,8 +237,8 @@ def analyse(
         Output before the steps and size of the reference step [y]; by default the middle of
         `speeds` and a tenth of it.
     disturbance : float, optional
-        Of the disturbance step, at the plant's input [u]; by default one that would move the output
-        by `step` without control. On a virtual machine it is the load torque with the same effect.
+        Disturbance step at the plant's input [u]; by default one that would move the output by
+        `step` without control. On a virtual machine it is the load torque with the same effect.
     seconds : float, optional
         Duration of the steps; by default five times the slowest closed-loop pole's time
         constant.
@@ -263,7 +263,7 @@ def analyse(
     Raises
     ------
     SettingError
-        For plants whose sample time or units are not the controller's, or that cannot rest at any
+        For plants with another sample time or units than the controller, or that cannot rest at any
         of `speeds`; for steps of size 0, or times that are not above 0.
     DataError
         For a reference that cannot be used.
@@ -306,15 +306,14 @@ def analyse(
 
 
 def _main(points: Sequence[Sequence[PlantPoint]], level: float | None) -> int:
-    """The operating point nearest to the level of the steps; the middle one."""
+    """Index of the operating point nearest to the level of the steps; by default the middle one."""
     if level is None:
         return len(points) // 2
     return int(np.argmin([abs(row[0].y - level) for row in points]))
 
 
 def slowest_time(controller: Controller, row: Sequence[PlantPoint]) -> float:
-    """The slowest closed-loop time constant of all plants [s]; of an unstable loop a tenth of a
-    thousand samples."""
+    """The slowest closed-loop time constant of all plants [s]; 100 samples for unstable loops."""
     sizes = [
         abs(LinearLoop.of(controller, p.system, speed=p.y).poles()[0]) for p in row
     ]  # fmt: skip
@@ -343,7 +342,7 @@ def _responses(
 def _judgement(
     controller: Controller, plants: Sequence[Any], references: Any, limits: Limits | None, seed: int
 ) -> Judgement | None:
-    """None where a loop runs away: the score says so."""
+    """Objections to the loops; None if a loop diverges, which the score shows."""
     try:
         return judge(controller, plants, references, limits=limits, seed=seed, refuse=False)
     except FitError:
@@ -395,9 +394,8 @@ def _response_line(r: Responses) -> str:
     if r.kind == "reference":
         return (
             f"reference step of {in_unit(f'{r.size:.4g}', r.y_unit)} at "
-            f"{in_unit(f'{r.level:.4g}', r.y_unit)}: "
-            f"rise {span([m['rise_ms'] for m in found])} ms, overshoot "
-            f"{span([m['overshoot_percent'] for m in found])} %, settled within "
+            f"{in_unit(f'{r.level:.4g}', r.y_unit)}: rise {span([m['rise_ms'] for m in found])} "
+            f"ms, overshoot {span([m['overshoot_percent'] for m in found])} %, settled within "
             f"{span([m['settling_ms'] for m in found])} ms"
         )
     return (
@@ -408,7 +406,7 @@ def _response_line(r: Responses) -> str:
 
 
 def span(values: Sequence[float | None]) -> str:
-    """The smallest and the largest of the plants'."""
+    """The range of the plants' values as text."""
     known = [v for v in values if v is not None]
     if not known:
         return "-"
@@ -426,7 +424,7 @@ def _cells(s: Score) -> list[str]:
 
 
 def rows(cells: Sequence[Sequence[str]]) -> list[str]:
-    """Columns as wide as they need to be; the first to the left, numbers to the right."""
+    """Rows of text in aligned columns: the first to the left, numbers to the right."""
     widths = [max(len(r[i]) for r in cells) for i in range(len(cells[0]))]
     return [
         "  " + r[0].ljust(widths[0]) + "".join(
@@ -441,7 +439,7 @@ def rows(cells: Sequence[Sequence[str]]) -> list[str]:
 
 NUMBERS = "analysis.json"
 FOLDER = "analysis"
-"""Of the figures, within the folder of the numbers."""
+"""Folder of the figures, within that of the numbers."""
 ALT = {
     "responses": "Output and command over time after a step of the reference and after a step of a "
     "disturbance; the band holds all plants",
@@ -452,7 +450,7 @@ ALT = {
 
 
 def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> list[Path]:
-    """Write everything, or without the PNGs, which the report has no use for; what was written.
+    """Write everything, the PNGs optionally (the report does not use them); return the files.
 
     Raises
     ------

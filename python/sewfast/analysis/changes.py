@@ -1,4 +1,4 @@
-"""Plants that are not as identified: other gain, slower, later; a machine with another load."""
+"""Changed plants: other gain, slower, more delay; a machine with other parameters or load."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from ..models.linear import LinearDifference
 
 @dataclass(frozen=True)
 class Change:
-    """What if a plant were different?
+    """A change of a plant, for a what-if.
 
     Attributes
     ----------
     name : str
-        As a reader sees it.
+        Name for the reader.
     apply : callable
-        From a plant to the changed one; a `SettingError` where a plant cannot be changed so.
+        Function from a plant to the changed one; raises a `SettingError` if that is impossible.
     """
 
     name: str
@@ -38,13 +38,13 @@ class Change:
 
 
 def gain(factor: float) -> Change:
-    """The output of a model times a factor."""
+    """Multiply the output of a model by a factor."""
     factor = _positive("factor", factor)
     return Change(f"gain x {factor:g}", lambda plant: with_gain(_model(plant), factor))
 
 
 def time_constants(factor: float) -> Change:
-    """Every time constant of a model times a factor, as more or less inertia would do."""
+    """Multiply every time constant of a model by a factor, as other inertia would."""
     factor = _positive("factor", factor)
     return Change(
         f"time constants x {factor:g}", lambda plant: with_time_constants(_model(plant), factor)
@@ -52,7 +52,7 @@ def time_constants(factor: float) -> Change:
 
 
 def delay(samples: int) -> Change:
-    """The input of a model acts some samples later."""
+    """Delay the input of a model by some samples."""
     samples = whole("samples", samples)
     plural = "s" if samples != 1 else ""
     return Change(
@@ -61,7 +61,7 @@ def delay(samples: int) -> Change:
 
 
 def parameters(name: str, **factors: float) -> Change:
-    """Parameters of a virtual machine, each times its factor."""
+    """Multiply parameters of a virtual machine, each by its factor."""
     known = VirtualMachine().parameters
     for one, factor in factors.items():
         if one not in known:
@@ -91,18 +91,18 @@ def load(torque: float) -> Change:
 
 
 def friction(factor: float) -> Change:
-    """Coulomb, Stribeck and viscous friction of a virtual machine times a factor."""
+    """Multiply Coulomb, Stribeck and viscous friction of a virtual machine by a factor."""
     names = ("coulomb_torque", "stribeck_torque", "viscous_friction")
     return parameters(f"friction x {factor:g}", **dict.fromkeys(names, factor))
 
 
 def inertia(factor: float) -> Change:
-    """The inertia of a virtual machine times a factor."""
+    """Multiply the inertia of a virtual machine by a factor."""
     return parameters(f"inertia x {factor:g}", inertia=factor)
 
 
 def crank_load(factor: float) -> Change:
-    """The load that varies over the turn of a virtual machine times a factor."""
+    """Multiply the load that varies over the turn of a virtual machine by a factor."""
     return parameters(f"crank load x {factor:g}", load_first=factor, load_second=factor)
 
 
@@ -147,25 +147,25 @@ def _changed(model: Model, **parameters: Any) -> Model:
 
 
 def with_gain(model: Model, factor: float) -> Model:
-    """The same model whose output is a factor as large."""
+    """The model with its output multiplied by a factor."""
     if not isinstance(model, SingleModel):
         raise SettingError("gain: expected a single model, received an ensemble; take its members")
     return _changed(model, **model.with_output_scaled(factor))
 
 
 def with_delay(model: Model, samples: int) -> Model:
-    """The same model whose input acts some samples later."""
+    """The model with its input delayed by some samples."""
     if not isinstance(model, SingleModel):
         raise SettingError("delay: expected a single model, received an ensemble; take its members")
     return _changed(model, **model.with_input_delayed(samples))
 
 
 def with_time_constants(model: Model, factor: float) -> Model:
-    """The same steady states, reached a factor more slowly.
+    """The model with the same steady states, reached more slowly by a factor.
 
-    Linear: every pole p becomes p^(1/factor), the steady gain, or an integrator's rate over the
-    factor, stays. State space: every step goes 1/factor of its way. Grey box: inertia and lag
-    are a factor larger. A lagged network has no time constants of its own to change.
+    Linear: every pole p becomes p^(1/factor); the steady gain, or an integrator's rate times the
+    factor, is kept. State space: every step is 1/factor as large. Grey box: inertia and lag are
+    multiplied. A lagged network has no explicit time constants to change.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def with_time_constants(model: Model, factor: float) -> Model:
 def _slower_linear(model: LinearDifference, factor: float) -> Model:
     core: _core.LinearModel = model.core
     poles = np.roots(np.concatenate([[1.0], core.a])).astype(np.complex128)
-    # what is not on its way to rest within some samples has no time constant to speak of
+    # very fast poles have no meaningful time constant
     slow = (poles.real > 0.0) & (np.abs(poles) > 1e-6)
     moved = np.where(slow, np.where(slow, poles, 1.0) ** (1.0 / factor), poles)
     integrates = np.abs(1.0 - poles) < 1e-9

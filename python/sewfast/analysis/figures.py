@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .analysis import Analysis
 
 BLUE, ORANGE, GREY, BLACK = "#0072B2", "#D55E00", "#9a9a9a", "#000000"
-"""Okabe and Ito's, told apart by everyone; the line style tells them apart in grey print."""
+"""Colours of Okabe and Ito, distinct for everyone; line styles distinguish them in grey print."""
 _STYLES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1, 2)))
 LARGE_MS = 2.0
 
@@ -36,13 +36,13 @@ def figures(a: Analysis) -> dict[str, Figure]:
     Raises
     ------
     SettingError
-        Where matplotlib is not installed.
+        If matplotlib is not installed.
     """
     return {name: drawing(a, name).figure() for name in names(a)}
 
 
 def names(a: Analysis) -> list[str]:
-    """The figures that an analysis has numbers for."""
+    """The names of the figures for which an analysis has numbers."""
     there = {
         "responses": bool(a.responses), "bode": True, "sensitivity": bool(a.sensitivity),
         "what_if": bool(a.what_if),
@@ -56,7 +56,7 @@ def drawing(a: Analysis, name: str | None = None) -> Drawing:
     Raises
     ------
     SettingError
-        For a name that is no figure of this analysis.
+        For another name.
     """
     if name is None:
         return overview(a)
@@ -67,7 +67,7 @@ def drawing(a: Analysis, name: str | None = None) -> Drawing:
 
 
 def overview(a: Analysis) -> Drawing:
-    """Steps above, loop transfer and sensitivities below: what a loop does, and how safely."""
+    """Steps above, loop transfer and sensitivities below: performance and margins of a loop."""
     rows = [row for part in (response_drawing(a), bode_drawing(a)) for row in part.rows]
     heights = [h for part in (response_drawing(a), bode_drawing(a)) for h in part.heights]
     if not a.responses:
@@ -159,7 +159,7 @@ def _bode(ax: Axes, a: Analysis, curve: str) -> None:
         look = {
             "color": shade(n, len(a.loops)),
             "ls": _STYLES[n % len(_STYLES)],
-            # what lies on top of another curve leaves it to be seen
+            # thinner lines on top, so that a curve below stays visible
             "lw": 1.4 + 1.8 * (1.0 - (n + 1) / len(a.loops)),
         }
         _curve(ax, loop, values(loop), look, f"about {loop.level:.4g} {unit}")
@@ -183,7 +183,7 @@ def _bode(ax: Axes, a: Analysis, curve: str) -> None:
 
 
 def _sensible_phase(ax: Axes) -> None:
-    """What lies where the loop no longer acts is not what one looks for."""
+    """Limit the phase axis to the range in which the loop acts."""
     low, high = ax.get_ylim()
     low, high = max(low, -540.0), min(max(high, 0.0), 90.0)
     ax.set_ylim(low, high)
@@ -191,7 +191,7 @@ def _sensible_phase(ax: Axes) -> None:
 
 
 def _mark(ax: Axes) -> None:
-    """Where a peak of |S| is large."""
+    """Mark the level above which a peak of |S| is large."""
     ax.axhline(LARGE_MS, color=ORANGE, lw=1.0, ls=(0, (4, 2)))
     ax.annotate(
         f"Ms = {LARGE_MS:g}", (0.0, LARGE_MS), (4, 3), xycoords=("axes fraction", "data"),
@@ -211,7 +211,7 @@ def _curve(ax: Axes, loop: LoopBode, values: Float, look: Any, label: str | None
 
 
 def sensitivity_drawing(a: Analysis) -> Drawing:
-    """Cost over that of the gains as they are, and Ms, over the factor on each setting."""
+    """Cost relative to the unchanged controller, and Ms, over the factor on each setting."""
     cost = partial(_sensitivity, a=a, value=lambda s: s.cost / a.score.cost)
     peak = partial(_sensitivity, a=a, value=lambda s: s.Ms, is_peak=True)
     return Drawing(((cost, peak),), (3.3,), (1.0, 1.0), share_x=False, legend=8)

@@ -1,4 +1,4 @@
-"""`PlantPoint`: a plant about a steady output, and `LoopBode`: L, S and T there."""
+"""`PlantPoint`: a plant linearised at a steady output, and `LoopBode`: L, S and T there."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from ..models.linear import LinearDifference
 
 
 SHARES = (0.1, 0.5, 0.9)
-"""Of the outputs that the training data came near: where plants are linearised."""
+"""Positions within the outputs near the training data at which plants are linearised."""
 _MACHINE_SPEEDS = (300.0, 1000.0, 2000.0)
 
 
 @dataclass(frozen=True, eq=False)
 class PlantPoint:
-    """One plant about one steady output.
+    """One plant linearised at one steady output.
 
     Attributes
     ----------
     plant : str
-        Its title.
+        Title of the plant.
     u, y : float
         Steady input and output [u], [y].
     system : StateSpace
-        Deviations from there, delay included.
+        Model of the deviations, including the delay.
     gain : float
         Steady output over steady input [y/u]; infinite for an integrator.
     known : bool
@@ -55,7 +55,7 @@ class PlantPoint:
     known: bool
     Ts: float
 
-    # what margins take for a plant
+    # the interface of plants for `margins`
     @property
     def A(self) -> FloatArray:
         """State matrix."""
@@ -73,31 +73,31 @@ class PlantPoint:
 
     @property
     def D(self) -> FloatArray:
-        """Direct way through: 0."""
+        """Direct feedthrough: 0."""
         return self.system.D
 
     @property
     def dt(self) -> float:
-        """Sample time [s], by the name that toolboxes have for it."""
+        """Sample time [s], by its name in toolboxes."""
         return self.Ts
 
 
 def plant_points(
     plants: Sequence[Plant], names: Sequence[str], speeds: Sequence[float] | None
 ) -> tuple[tuple[PlantPoint, ...], ...]:
-    """The plants about each of the operating points; a plant that cannot rest at one is not there.
+    """The plants at each of the operating points, without those that cannot rest there.
 
     Parameters
     ----------
     plants : sequence of Model or VirtualMachine
     names : sequence of str
     speeds : sequence of float, optional
-        Steady outputs [y]; by default over what the first model's training data came near.
+        Steady outputs [y]; by default spread over the training data of the first model.
 
     Raises
     ------
     SettingError
-        For a model with several inputs, or where no plant can rest at any of the outputs.
+        For a model with several inputs, or if no plant can rest at any of the outputs.
     """
     for plant in plants:
         if isinstance(plant, Model) and len(plant.input_names) != 1:
@@ -133,7 +133,7 @@ def _speeds(plants: Sequence[Plant]) -> list[float]:
         low, high = first.training["output_range"]
         return [float(f"{0.5 * (low + high):.2g}")]
     low, high = min(p.y for p in known), max(p.y for p in known)
-    # two digits: no more is meant
+    # two digits are enough for a default
     return [float(f"{low + share * (high - low):.2g}") for share in SHARES]
 
 
@@ -170,7 +170,7 @@ def _machine_point(machine: VirtualMachine, name: str, speed: float) -> PlantPoi
 def two_lags(gain: float, T1: float, T2: float, Ts: float) -> StateSpace:
     """`gain/((T1 s + 1)(T2 s + 1))` under a zero-order hold, exactly; T1 and T2 differ."""
     p, q = math.exp(-Ts / T1), math.exp(-Ts / T2)
-    # partial fractions: two lags side by side
+    # partial fractions: two lags in parallel
     a, b = gain * T1 / (T1 - T2), -gain * T2 / (T1 - T2)
     C = np.array([[a * (1.0 - p), b * (1.0 - q)]])
     return StateSpace(np.diag([p, q]), np.ones((2, 1)), C, np.zeros((1, 1)))
@@ -192,12 +192,12 @@ def to_json(point: PlantPoint) -> dict[str, Any]:
 
 FREQUENCIES = 240
 _BELOW = 0.02
-"""The lowest frequency over that of the slowest closed-loop pole."""
+"""Lowest frequency relative to that of the slowest closed-loop pole."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoopBode:
-    """The loop around every plant about one operating point.
+    """The loop around every plant at one operating point.
 
     Attributes
     ----------
@@ -205,7 +205,7 @@ class LoopBode:
         One per plant.
     hertz : array, shape (F,)
     L : array of complex, shape (plants, F)
-        Broken at the plant's input.
+        Loop gain, broken at the plant's input.
     margins : tuple of Margins
         One per plant.
     """
@@ -227,12 +227,12 @@ class LoopBode:
 
     @property
     def level(self) -> float:
-        """The steady output [y], that of the first plant."""
+        """The steady output [y] of the first plant."""
         return self.points[0].y
 
     @property
     def Ms(self) -> float:
-        """The largest of all plants; infinite where one is unstable."""
+        """The largest Ms of all plants; infinite if one loop is unstable."""
         return max(m.Ms for m in self.margins)
 
     @property
@@ -250,7 +250,7 @@ class LoopBode:
 
 
 def margins_json(found: Margins) -> dict[str, Any]:
-    """As JSON values; what is not finite becomes None."""
+    """Margins as JSON values; numbers that are not finite become None."""
     names = (
         "Ms", "Mt", "gain_margin", "phase_margin_deg", "delay_margin_s", "noise_gain"
     )  # fmt: skip
@@ -264,7 +264,7 @@ def margins_json(found: Margins) -> dict[str, Any]:
 def loop_bodes(
     controller: Controller, points: Sequence[Sequence[PlantPoint]], slowest: float
 ) -> tuple[LoopBode, ...]:
-    """The loop about every operating point.
+    """The loop at every operating point.
 
     Parameters
     ----------

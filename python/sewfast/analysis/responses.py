@@ -1,4 +1,4 @@
-"""`Responses`: steps of reference and disturbance on every plant; loads on the machine."""
+"""`Responses`: steps of reference and disturbance on every plant; runs under load."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def finite(name: str, value: Any) -> float:
 
 
 def finite_each(name: str, values: Any) -> list[float]:
-    """The values as finite floats, one at least.
+    """The values as finite floats, at least one.
 
     Raises
     ------
     SettingError
-        For what is no sequence of numbers, or an empty one.
+        For anything but a sequence of numbers, and for an empty one.
     """
     try:
         given = [] if isinstance(values, str) else list(values)
@@ -57,7 +57,7 @@ def finite_each(name: str, values: Any) -> list[float]:
 
 
 def required(name: str, value: Any, kind: type[T]) -> T:
-    """The value, which is of that kind; the kind's defaults where it is None.
+    """The value if it is of that kind; the kind's defaults for None.
 
     Raises
     ------
@@ -73,12 +73,12 @@ def required(name: str, value: Any, kind: type[T]) -> T:
 
 
 def each_change(changes: Any) -> Sequence[Change] | None:
-    """The changes, or None for the usual ones.
+    """The changes, or None for the default ones.
 
     Raises
     ------
     SettingError
-        For what is no sequence of changes.
+        For anything but a sequence of changes.
     """
     if changes is None:
         return None
@@ -108,25 +108,25 @@ def run_under_load(
     seed: int = 0,
     name: str | None = None,
 ) -> ClosedLoopRun:
-    """Run a controller on a virtual machine whose shaft is loaded, from rest.
+    """Run a controller on a virtual machine with a load on its shaft, from rest.
 
     Parameters
     ----------
     controller : Controller
     machine : VirtualMachine
-        Is not changed.
+        The machine, which is not changed.
     reference : str or array, shape (N,)
         As for `sewfast.run`.
     load : array, shape (N,)
-        Load torque during each sample [N m], beside the machine's own; it brakes where it has the
-        sign of the speed.
+        Load torque during each sample [N m], in addition to the machine's own; it brakes if it has
+        the sign of the speed.
     feedforward : array, shape (N,), optional
         Added to the command before its limits [u].
 
     Raises
     ------
     SettingError, DataError
-        As `sewfast.run`, and for a load that is not as long as the reference.
+        As `sewfast.run`, and for a load of another length than the reference.
     """
     check_fits(controller, machine)
     r = reference_samples(reference, controller, seed)
@@ -170,7 +170,7 @@ def _columns(
 
 
 def torque_of(machine: VirtualMachine, volt: float) -> float:
-    """The load torque that costs the machine a command of `volt` when it is steady [N m]."""
+    """The load torque that takes a steady command of `volt` to balance [N m]."""
     p = machine.parameters
     return volt * p["amplifier_gain"] * p["motor_constant"] / p["resistance"]
 
@@ -179,15 +179,15 @@ def torque_of(machine: VirtualMachine, volt: float) -> float:
 
 
 SETTLED = 0.02
-"""Of the step: where a response counts as settled, unless the output swings by more of itself."""
+"""Part of the step within which a response is settled, unless the output itself varies more."""
 RECOVERED = 0.01
-"""Of what the disturbance would do without control: where it counts as rejected, likewise."""
+"""Part of the disturbance's effect without control within which it is rejected, likewise."""
 RISE = (0.1, 0.9)
 
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """One kind of step on every plant, about one operating point.
+    """One kind of step on every plant, at one operating point.
 
     Attributes
     ----------
@@ -203,9 +203,9 @@ class Responses:
     level : float
         The output before the step [y].
     size : float
-        Of the reference step [y]; of a disturbance what it would do to the output without control.
+        Size of the reference step, or effect of the disturbance without control [y].
     disturbance : float
-        Of the step at the plant's input [u]; 0 for a reference step.
+        Step at the plant's input [u]; 0 for a reference step.
     y_unit, u_unit : str
     """
 
@@ -227,22 +227,21 @@ class Responses:
         return self.y.min(axis=0), self.y.max(axis=0)
 
     def metrics(self) -> tuple[dict[str, float | None], ...]:
-        """Per plant.
+        """Metrics of each plant.
 
         Returns
         -------
         tuple of dict
-            Of a reference step `rise_ms` (10 to 90 %), `overshoot_percent`, `settling_ms` (within
-            `SETTLED` of the step from then on); of a disturbance `peak` [y], `peak_ms`,
-            `recovery_ms` (within `RECOVERED` of `size` from then on). None where it does not. What
-            the output strayed by before the step, as a load over the turn makes it, is allowed
-            for.
+            For a reference step `rise_ms` (10 to 90 %), `overshoot_percent`, `settling_ms` (within
+            `SETTLED` of the step from then on); for a disturbance `peak` [y], `peak_ms`,
+            `recovery_ms` (within `RECOVERED` of `size` from then on). None if that never happens.
+            Variations before the step, such as those of a load over the turn, are allowed for.
         """
         of = _reference_metrics if self.kind == "reference" else _disturbance_metrics
         return tuple(of(self, y) for y in self.y)
 
     def to_json(self) -> dict[str, Any]:
-        """What the responses amount to, as JSON values; the curves are in the figures."""
+        """The metrics as JSON values; the curves are in the figures."""
         return {
             "kind": self.kind,
             "level": self.level,
@@ -278,7 +277,7 @@ def _disturbance_metrics(of: Responses, y: FloatArray) -> dict[str, float | None
 
 
 def _own(of: Responses, y: FloatArray) -> float:
-    """How far the output strays from its mean while nothing happens, and a quarter more."""
+    """Largest deviation of the output from its mean before the step, plus a quarter."""
     before = y[of.t < 0.0]
     return 1.25 * float(np.abs(before - before.mean()).max(initial=0.0))
 
@@ -288,7 +287,7 @@ def _first(t: FloatArray, holds: Any) -> float | None:
 
 
 def _since(t: FloatArray, holds: Any) -> float | None:
-    """When it begins to hold for good [ms]; None where it does not at the end."""
+    """Time from which on a condition holds [ms]; None if it does not hold at the end."""
     outside = np.flatnonzero(~holds)
     if len(outside) == 0:
         return 0.0
@@ -301,16 +300,16 @@ def _since(t: FloatArray, holds: Any) -> float | None:
 
 @dataclass(frozen=True)
 class Steps:
-    """What the responses are to: an operating point, the size of the steps, how long to look.
+    """The steps: their operating point, sizes and duration.
 
     Attributes
     ----------
     level, step : float
         The output before the step, and the reference's step [y].
     disturbance : float
-        At the plant's input [u].
+        Disturbance at the plant's input [u].
     samples : int
-        After the step; as many lead to the operating point, and half as many are shown before.
+        Samples after the step; as many lead to the operating point, half of which are shown.
     """
 
     level: float
@@ -338,7 +337,7 @@ def responses(
 
 
 def _disturbed(controller: Controller, plant: Plant, r: FloatArray, d: FloatArray) -> ClosedLoopRun:
-    """A load takes what a negative disturbance at the input takes."""
+    """Run with a disturbance; on a machine it is a load torque of opposite sign."""
     if isinstance(plant, VirtualMachine):
         load = torque_of(plant, 1.0) * -d
         return run_under_load(controller, plant, r, load, name="disturbance step")
@@ -368,13 +367,13 @@ def default_steps(
     disturbance: float | None,
     seconds: float | None,
 ) -> Steps:
-    """Steps that fit a plant: a tenth of its level, a disturbance that would do the same.
+    """Default steps for a plant: a tenth of its level, and a disturbance of the same effect.
 
     Parameters
     ----------
     controller : Controller
     points : sequence of PlantPoint
-        The plants about the operating point.
+        The plants at the operating point.
     slowest : float
         Time constant of the slowest closed-loop pole [s].
     level, step, disturbance, seconds : float or None
@@ -383,7 +382,7 @@ def default_steps(
     Raises
     ------
     SettingError
-        For what is not finite, a step of 0, or seconds that are not above 0.
+        For numbers that are not finite, a step of 0, or seconds not above 0.
     """
     given = {"level": level, "step": step, "disturbance": disturbance, "seconds": seconds}
     checked = {name: finite(name, v) for name, v in given.items() if v is not None}

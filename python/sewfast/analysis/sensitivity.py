@@ -1,4 +1,4 @@
-"""What changes cost: gains that are off, and plants that are not as identified."""
+"""Sensitivity of the cost to changed gains, and to changed plants."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class Score:
     Attributes
     ----------
     cost : float
-        Mean over plants and references [y]; infinite where a loop runs away.
+        Mean over plants and references [y]; infinite if a loop diverges.
     tracking : float
         The worst rms of r - y [y].
     overshoot_percent : float
-        The worst.
+        The worst overshoot.
     chatter : float
         The worst rms of the command's change from sample to sample [u].
     Ms : float
-        The worst; infinite where a linear loop is unstable, NaN where there is none.
+        The worst Ms; infinite if a linear loop is unstable, NaN if there is none.
     """
 
     cost: float
@@ -54,20 +54,20 @@ class Score:
     Ms: float
 
     def to_json(self) -> dict[str, float | None]:
-        """As JSON values; what is not finite becomes None."""
+        """As JSON values; numbers that are not finite become None."""
         return {k: v if math.isfinite(v) else None for k, v in vars(self).items()}
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What a controller is scored on.
+    """The plants, references and cost that score a controller.
 
     Attributes
     ----------
     plants : tuple of Model or VirtualMachine
     names : tuple of str
     points : tuple of PlantPoint
-        The plants about the operating point at which Ms is taken.
+        The plants at the operating point for Ms.
     references : tuple of str or array
     cost : Cost
     seed : int
@@ -81,7 +81,7 @@ class Task:
     seed: int
 
     def on(self, plants: Sequence[Plant], names: Sequence[str]) -> Task:
-        """The same on other plants, linearised at the same output."""
+        """The task on other plants, linearised at the same output."""
         points: tuple[PlantPoint, ...] = ()
         with contextlib.suppress(SettingError):
             points = plant_points(plants, names, [self.points[0].y])[0]
@@ -106,7 +106,7 @@ class Task:
 
 
 def each(function: Callable[[J], R], jobs: Sequence[J], threads: int | None) -> list[R]:
-    """In the order of the jobs, on threads: the compiled runs release the interpreter."""
+    """Results in the order of the jobs, computed on threads (compiled runs release the GIL)."""
     with ThreadPoolExecutor(threads or available()) as pool:
         return list(pool.map(function, jobs))
 
@@ -120,14 +120,14 @@ NAMES = ("Kp", "Ti", "Td", "alpha", "beta", "N", "filter_time", "observer_time")
 
 @dataclass(frozen=True)
 class GainSensitivity:
-    """One setting, moved.
+    """Scores for changes of one setting.
 
     Attributes
     ----------
     name : str
         `Kp`, `Ti`, `Td` (of the schedule as well), `alpha`, `beta`, `N`, ...
     value : float
-        As it is.
+        Value of the unchanged setting.
     factors : tuple of float
     scores : tuple of Score
         One per factor.
@@ -151,7 +151,7 @@ class GainSensitivity:
 def gain_sensitivity(
     controller: Controller, task: Task, *, threads: int | None = None
 ) -> tuple[GainSensitivity, ...]:
-    """Every setting that is neither 0 nor infinite, by each of `FACTORS`.
+    """Vary every setting that is neither 0 nor infinite by each of `FACTORS`.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def _value(controller: Controller, name: str) -> float:
 
 
 def scaled(controller: Controller, name: str, factor: float) -> Controller:
-    """The controller with one setting times a factor, gains in standard form."""
+    """The controller with one setting multiplied by a factor, gains in standard form."""
     if name not in ("Kp", "Ti", "Td"):
         return replace(controller, **{name: factor * getattr(controller, name)})
     changes: dict[str, Any] = {"gains": _scaled(controller.gains, name, factor)}
@@ -199,14 +199,14 @@ def _scaled(gains: Gains, name: str, factor: float) -> Gains:
 
 @dataclass(frozen=True)
 class WhatIf:
-    """One change of the plants.
+    """The score after one change of the plants.
 
     Attributes
     ----------
     name : str
-        What is different.
+        Name of the change.
     score : Score
-        Of the same controller.
+        Score of the same controller.
     """
 
     name: str
@@ -232,8 +232,8 @@ def what_if(
     task : Task
         Plants, references and cost.
     changes : sequence of Change, optional
-        By default `ON_MODELS` and, for virtual machines, `ON_MACHINES`. One that no plant can be
-        changed by is left out.
+        By default `ON_MODELS` and, for virtual machines, `ON_MACHINES`. A change that applies to no
+        plant is left out.
     threads : int, optional
         All processors by default; the result is the same at any number.
     """
@@ -249,7 +249,7 @@ def what_if(
 
 
 def _with_changes(task: Task, change: Change) -> Task | None:
-    """The task on those plants that can be changed so; None where none can."""
+    """The task on the plants to which the change applies; None if there are none."""
     plants, names = [], []
     for plant, name in zip(task.plants, task.names, strict=True):
         try:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..dataset import Dataset, Experiment
 from ..errors import FitError
-from ..evidence import ReportCard, check, remembered
+from ..evidence import ReportCard, check, with_training_evidence
 from ..identification import seeded
 from ..identification.folds import folds, thinned
 from ..identification.task import wrap
@@ -148,7 +148,7 @@ def _members(
             progress(len(done), len(seeds))
         trained = [m for m in done if m is not None]
         trained.sort(key=lambda m: validate_member(m, data)[0])
-        kept = list(pool.map(lambda m: remembered(m, data), trained[: demands.members]))
+        kept = list(pool.map(lambda m: with_training_evidence(m, data), trained[: demands.members]))
     except FitError:
         kept = []
     except BaseException:

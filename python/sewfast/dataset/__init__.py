@@ -1,8 +1,8 @@
 """Data sets: experiments, their parts, what they must fulfil.
 
 Read in this order: `experiment` and `dataset` (the values, immutable), `pieces` (parts, gaps, what
-a data set must fulfil); preparation: `trends` (offsets, remembered), `rates` (sample times, the
-speed of a position), `outliers`; what is in them: `summary`, `diagnosis` and `feedback`
+a data set must fulfil); preparation: `trends` (offsets, kept for restoring), `rates` (sample times,
+the speed of a position), `outliers`; properties: `summary`, `diagnosis` and `feedback`
 (integrators, closed loops, repetitions), `frames` (as tables of other packages).
 """
 

@@ -1,4 +1,4 @@
-"""`diagnose`: what a record is, where that decides what can be identified from it."""
+"""`diagnose`: properties of a record that decide what can be identified from it."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ if TYPE_CHECKING:
     from .experiment import Experiment
 
 SHORT = 3.0
-"""Time constants of the slowest pole that a record should be long, at least."""
+"""Shortest length of a record, in time constants of its slowest pole."""
 SURE = 5.0
 """Standard errors by which that pole must be known before a record is called short."""
 RESTING = 0.2
-"""Part of a record that may be at rest at its ends."""
+"""Part of a record that can be at rest at its ends without a finding."""
 REPEATED = 0.95
-"""Correlation of the inputs with themselves one period later that makes a record repeat."""
+"""Correlation of the inputs with themselves one period later above which a record repeats."""
 REPEATED_LOOSELY, OUTPUT_REPEATED = 0.3, 0.98
-"""The same in a closed loop, where noise comes back in the input: inputs, and output with them."""
+"""The same in a closed loop, where noise returns in the input: inputs alone, inputs with output."""
 CLUSTERED = 0.95
 """Part of the samples that must be at one of two levels."""
 COARSE = 10.0
 """Steps of the sensor in a standard deviation of the output, below which it counts as coarse."""
 LIMITED, VISITS = 0.02, 3
-"""Part of the samples, and separate stretches, from which on an input counts as limited."""
+"""Least part of the samples and least number of stretches for an input to count as limited."""
 _MOST = 65_536
-"""Values that a period is looked for in; longer records are averaged in blocks."""
+"""Most values searched for a period; longer records are averaged in blocks."""
 _REFERENCE = re.compile(
     r"((y_?)?(r|ref|reference|set_?point|sp|target|soll|sollwert|demand)"
-    # a `voltage_ref` may be the plant's input, a `speed_ref` is not
+    # a `voltage_ref` can be the plant's input, a `speed_ref` cannot
     r"|(motor[_ ]?)?(n|speed|rpm|velocity|vel|omega|drehzahl|position|pos|angle|theta|winkel)"
     r"[_ .-]?(ref|reference|set_?point|sp|target|soll|sollwert|demand|cmd|command))"
     # a `setpoint voltage` is what an amplifier is given
@@ -52,7 +52,7 @@ _REFERENCE = re.compile(
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a record is.
+    """One property of a record.
 
     Attributes
     ----------
@@ -60,11 +60,11 @@ class Finding:
         `integrator`, `wraps`, `closed_loop`, `repeats`, `two_level_input`, `rests`,
         `short_record`, `limited_input` or `coarse_output`.
     text : str
-        What was found and what it means, one sentence without a full stop.
+        The finding and its meaning, one sentence without a full stop.
     remedy : str
-        What to do about it, the same way.
+        What to do about it, in the same form.
     evidence : mapping of str to number or str
-        What it was found by, in SI units and the columns' own.
+        The figures behind it, in SI units and those of the columns.
     """
 
     kind: str
@@ -86,7 +86,7 @@ class Finding:
 
 @dataclass(frozen=True, repr=False)
 class Diagnosis:
-    """What `diagnose` finds; `str` is a page of text.
+    """The findings of `diagnose`; `str` is a page of text.
 
     Attributes
     ----------
@@ -133,11 +133,11 @@ def diagnose(data: Dataset) -> Diagnosis:
     `rests`             the ends, a fifth of the record or more, at rest
     `short_record`      shorter than three of its slowest time constants
     `limited_input`     an input that often stays at its limit
-    `coarse_output`     a sensor with few steps in what the output does
+    `coarse_output`     a sensor with few steps within the output's motion
     ==================  ======================================================================
 
-    Nothing is changed, and no finding forbids anything. Long records take some tenths of a second:
-    at most 20,000 samples are looked at for feedback, and means of blocks for most of the rest.
+    The data are not changed, and no finding forbids anything. Long records take some tenths of a
+    second: the test for feedback uses at most 20,000 samples, most others means of blocks.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ def _wraps(data: Dataset) -> Iterator[Finding]:
     back, other, sizes = 0, 0, []
     for y in columns:
         change = np.diff(y)
-        # between the moves of an angle and its jumps there is nothing; between those of noise, all
+        # changes of an angle are either small or jumps; noise has changes of all sizes between
         other += int(np.sum((np.abs(change) > 0.35 * span) & (np.abs(change) <= 0.7 * span)))
         jumps = np.where(np.abs(change) > 0.7 * span, np.sign(change), 0.0)
         for k in np.flatnonzero(jumps):
@@ -313,14 +313,14 @@ def _two_levels(data: Dataset) -> Iterator[Finding]:
 
 
 def two_levels(values: FloatArray) -> tuple[float, float] | None:
-    """The two levels that all values are at but for noise and few on their way; else None."""
+    """The two levels of an input, apart from noise and few values in transit; else None."""
     if len(values) == 0 or values.min() == values.max():
         return None
     low, high = float(values.min()), float(values.max())
     if bool(((values == low) | (values == high)).all()):
         return low, high
     sample = values[:: max(1, len(values) // 20_000)]
-    # one outlier would take the middle with it
+    # quantiles, because one outlier would shift the middle
     middle = float(np.mean(np.quantile(sample, [0.02, 0.98])))
     groups = sample[sample < middle], sample[sample >= middle]
     if min(map(len, groups)) < 0.02 * len(sample):
@@ -341,7 +341,7 @@ def _limited(data: Dataset) -> Iterator[Finding]:
     for j in range(data.n_inputs):
         columns = [e.u[:, j] for e in data.experiments]
         known = _known(np.concatenate(columns))
-        # a staircase has its highest level too
+        # a staircase also stays at its highest level
         if len(known) == 0 or len(np.unique(known[:200_000])) < 50:
             continue
         for value in (float(known.min()), float(known.max())):
@@ -394,12 +394,12 @@ def _closed_loop(data: Dataset) -> Iterator[Finding]:
 
 
 def is_reference(name: str) -> bool:
-    """Whether a column is named as the reference of a loop: r, setpoint, speed_ref."""
+    """Whether a column has a name for a loop's reference: r, setpoint, speed_ref."""
     return _REFERENCE.fullmatch(name) is not None
 
 
 def _reference(data: Dataset) -> tuple[str, float] | None:
-    """A channel that is named as a reference and that the output follows, with its correlation."""
+    """A channel with a reference's name that the output follows, and their correlation."""
     for name in data.experiments[0].channels:
         if not is_reference(name) or any(name not in e.channels for e in data.experiments):
             continue
@@ -435,7 +435,7 @@ def _repeats(data: Dataset) -> Iterator[Finding]:
 
 
 def _period(e: Experiment) -> tuple[float, float] | None:
-    """Samples after which the inputs come again, two times or more, and their correlation then."""
+    """Period [samples] of inputs that repeat at least twice, and their correlation at it."""
     size = max(1, len(e) // _MOST)
     columns = [_averaged(c, size) for c in (*e.u.T, e.y)]
     *inputs, output = [None if c is None else _autocorrelation(c) for c in columns]
@@ -443,7 +443,7 @@ def _period(e: Experiment) -> tuple[float, float] | None:
     if not moving or len(moving[0]) < 20:
         return None
     r = np.min(moving, axis=0)
-    # next to lag 0 every signal is like itself
+    # at lags near 0 every signal resembles itself
     again = (r >= REPEATED) & np.maximum.accumulate(r < 0.5)
     if output is not None:
         loosely = (r >= REPEATED_LOOSELY) & (output >= OUTPUT_REPEATED)
@@ -457,7 +457,7 @@ def _period(e: Experiment) -> tuple[float, float] | None:
 
 
 def _averaged(column: FloatArray, size: int) -> FloatArray | None:
-    """Means of blocks without their mean, 0 where nothing is known; None where nothing moves."""
+    """Block means minus their mean, 0 where nothing is known; None if the column is constant."""
     count = len(column) // size
     cut = column[: count * size].reshape(count, size)
     known = np.abs(cut) < LARGEST
@@ -491,7 +491,7 @@ def _rests(data: Dataset) -> Iterator[Finding]:
     if share < RESTING:
         return
     e, before, after = max(ends, key=lambda end: end[1] + end[2])
-    # some rest shows the level, and lets the initial state be estimated
+    # a short rest is useful: it shows the level and helps to estimate the initial state
     keep = max(20, len(e) // 50)
     first, last = max(0, before - keep), len(e) - max(0, after - keep)
     one = len(data.experiments) == 1
@@ -510,7 +510,7 @@ def _rests(data: Dataset) -> Iterator[Finding]:
 
 
 def _resting(e: Experiment, *, backwards: bool = False) -> int:
-    """Samples at one end in which every column stays at its level there."""
+    """Number of samples at one end during which every column stays at its level."""
     still: NDArray[np.bool_] = np.ones(len(e), dtype=np.bool_)
     end = max(5, min(50, len(e) // 20))
     for i, column in enumerate((*e.u.T, e.y)):
@@ -521,7 +521,7 @@ def _resting(e: Experiment, *, backwards: bool = False) -> int:
         level = float(np.median(known[:end]))
         spread = MAD * float(np.median(np.abs(known[:end] - level)))
         span = float(np.ptp(known))
-        # noise may be seen, but an input that is noise does not rest
+        # noise on a level is allowed, but an input that is noise does not rest
         most = 0.05 if i < e.u.shape[1] else 0.1
         tolerance = min(max(0.01 * span, 5.0 * spread), most * span)
         still &= ~(np.abs(ordered - level) > tolerance)

@@ -60,17 +60,17 @@ def mean_square(squares: FloatArray, weights: FloatArray) -> float:
 
 
 def without_weightless(e: Experiment) -> Experiment:
-    """The experiment with samples of weight 0 as ones that were not measured."""
+    """The experiment with samples of weight 0 marked as not measured."""
     if e.weights is None or e.weights.all():
         return e
     return replace(e, y=frozen(np.where(e.weights == 0.0, np.nan, e.y)))
 
 
 def in_effect(data: Dataset) -> Dataset:
-    """The data as fits and scores take them.
+    """The data as fits and scores use them.
 
-    Samples of weight 0 are as if they had not been measured. The other weights say something only
-    beside each other: they are left out where they are all alike, and their largest is made 1.
+    Samples of weight 0 count as not measured. Only ratios of the other weights matter: equal
+    weights are dropped, others are scaled to a largest one of 1.
     """
     if all(e.weights is None for e in data.experiments):
         return data
@@ -112,11 +112,11 @@ class Experiment:
     channels : mapping of name to array of shape (N,)
         Further columns for plots and scores (the true speed of a virtual machine, say).
     name : str
-        Where it comes from, for messages.
+        Its origin, for messages.
     start : int
-        Index of its first sample in the recording that it was cut from.
+        Index of its first sample in the recording from which it was cut.
     removed : Trend or None
-        What `Dataset.detrend` has removed; `Dataset.restore` adds it again.
+        The trend removed by `Dataset.detrend`; `Dataset.restore` adds it again.
     weights : array, shape (N,), or None
         How much the squared error of each sample counts in `identify` and `validate`: finite, 0 or
         more, not all 0. A sample of weight 0 counts as not measured wherever a model is fitted,
@@ -202,8 +202,7 @@ class Experiment:
         if len(known) < init:
             raise DataError(
                 f"{self.name}: expected at least init = {init} samples to start from, received "
-                f"{self.counted}; lower init (--init), 0 to start from rest, or give a "
-                "longer range"
+                f"{self.counted}; lower init (--init), 0 to start from rest, or give a longer range"
             )
         return int(known[init - 1]) + 1 if init else 0
 

@@ -1,4 +1,4 @@
-"""Where a record comes from: an integrator, a closed loop."""
+"""Statistical tests of a record: does the output integrate, was it made in a closed loop."""
 
 from __future__ import annotations
 
@@ -19,37 +19,37 @@ if TYPE_CHECKING:
 
 
 SCALES = ((60, 1), (200, 2), (1000, 4))
-"""Blocks that the longest experiment is cut into, and past changes in the regression on them."""
+"""Numbers of blocks for the longest experiment, and past changes in the regression on them."""
 LEAST_DIFFERENCES = 300
-"""Samples of the longest experiment below which nothing is said."""
+"""Least samples of the longest experiment for a test."""
 NEGLIGIBLE = 0.5
-"""Lengths of the record in time constants up to which a pole is at 1 for all that it can show."""
+"""Length of the record in time constants below which a pole cannot be told from 1."""
 RESTORED = (3.0, 3.0, 6.0)
-"""Standard errors by which a pole must lie inside, at each of the scales, to count as inside.
+"""Standard errors by which a pole must lie inside the unit circle, at each of the scales.
 
-More on the finest blocks, where sensor noise on the level looks like a force that brings it back.
+More on the finest blocks, where sensor noise on the level looks like a restoring force.
 """
 RESTORED_SHORT = 2.5
 """The same at every scale where the record is too short for the finest blocks."""
 DRIVEN = 4.5
 """Standard errors by which the input must drive the change of the output."""
 BALANCE, MOST_BALANCE = 0.2, 0.5
-"""Restoring over driving part of the change: less in the median of the scales, and where the input
-drives most clearly."""
+"""Largest ratio of restoring to driving part of the change: in the median of the scales, and at the
+scale where the input drives most clearly."""
 EXPLAINED = 0.35
-"""Part of the output without its line that the integral of the input must reach."""
+"""Least part of the output, without its trend, that the integral of the input must explain."""
 MOST_EXPERIMENTS = 50
 TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True)
 class Integration:
-    """How an output that is driven by the inputs comes back, seen over the whole record.
+    """How an output that inputs drive returns to its level, over the whole record.
 
     Attributes
     ----------
     is_integral : bool
-        The output integrates an input: nothing that the record shows brings it back.
+        The output integrates an input: the record shows no restoring force.
     input : int
         The input that drives it most clearly.
     lengths : float
@@ -82,20 +82,20 @@ def integration(data: Dataset) -> Integration | None:
               + \sum_i b_i u_{k-i} + f\,\mathrm{sign}(\Delta y_{k-1}) + \sum_i q_i u_{k-i}^2
 
     The slowest time constant is `(1 - sum a) / epsilon` blocks, and `sum b / (1 - sum a)` the
-    gain into it. A constant holds offsets of both, a line holds drift, the sign holds dry friction
-    and the squares an uneven input. Means over blocks of three lengths make sensor noise and what
-    is fast small. The output is an integral where
+    gain into it. The constant models offsets, the line drift, the sign dry friction and the squares
+    an asymmetric input. Means over blocks of three lengths reduce sensor noise and fast motion. The
+    output is an integral if
 
-    - at no length the pole lies significantly inside (`RESTORED`), where a time constant of more
-      than two records counts as infinite (`NEGLIGIBLE`): a slow drive that was recorded for one
-      time constant or more does come back;
-    - the input drives the change at some length (`DRIVEN`): drift of a sensor has a pole at 1 as
-      well, but no input reaches it;
+    - at no length the pole lies significantly inside (`RESTORED`); a time constant of more than two
+      records counts as infinite (`NEGLIGIBLE`), since a slow drive that was recorded for a time
+      constant or more visibly returns;
+    - the input drives the change at some length (`DRIVEN`): drift of a sensor also has a pole at 1,
+      but no input drives it;
     - the restoring part is small beside the driving part (`BALANCE`): at rest both are equal;
     - the integral of the input is a large part of the output (`EXPLAINED`).
 
     Source: D. Dickey, W. Fuller, J. American Statistical Association 74 (1979) 427-431. The bounds
-    are those at which some 50 simulated families could be kept apart.
+    separate some 50 simulated families.
     """
     experiments = sorted(data.experiments, key=len, reverse=True)[:MOST_EXPERIMENTS]
     longest = len(experiments[0])
@@ -179,7 +179,7 @@ def _scale(means: list[FloatArray], past: int, record: float, seconds: float) ->
     inputs = np.flatnonzero(moving[:-1])
     with np.errstate(over="ignore"):
         scaled = [(m - middle)[:, moving] / size[moving] for m in means]
-    # an input where the output is missing had no part in the scale: its square could overflow
+    # inputs at missing outputs are not scaled: their squares could overflow
     scaled = [np.where(np.abs(m) < LARGEST, m, np.nan) for m in scaled]
     changes = np.concatenate([np.diff(m[:, -1]) for m in scaled])
     spread = _deviation(changes)
@@ -234,7 +234,7 @@ def _rows(scaled: FloatArray, past: int, record: float, spread: float) -> FloatA
 
 
 def _least_squares(X: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Parameters and their covariance; what the columns do not fix is 0."""
+    """Parameters and their covariance; parameters that the columns do not determine are 0."""
     length = np.linalg.norm(X, axis=0)
     scale = 1.0 / np.where(length > 0.0, length, 1.0)
     left, values, right = np.linalg.svd(X * scale, full_matrices=False)
@@ -269,24 +269,24 @@ def _without_line(column: FloatArray) -> FloatArray:
 
 
 PAST = 20
-"""Past outputs and inputs of the regressions that leave innovations; fewer with many inputs."""
+"""Past outputs and inputs in the regressions for the innovations; fewer with many inputs."""
 LEADS = 10
-"""Samples after an innovation of the output up to which an input is looked at."""
+"""Largest lead: samples after an innovation of the output within which an input is tested."""
 AT_ONCE = 0.2
-"""Part of the plant's response that a controller can feign within a sample, at most."""
+"""Largest part of the plant's response that a controller can mimic within a sample."""
 SPANS = (1, 3, 10)
-"""Samples over which that input is summed up: a filter in the loop spreads what it feeds back."""
+"""Samples over which that input is summed: a filter in the loop spreads the feedback."""
 SIGNIFICANT = 4.2
-"""Standard errors from which on a correlation is one; chance reaches it in one of 1,000 records."""
+"""Least significance of a correlation [standard errors]; chance reaches it in .1 % of records."""
 OVER_MISFIT = 2.0
-"""Times the largest correlation with the past, which only a misfit of the regression leaves."""
+"""Least ratio to the largest correlation with the past, which only a misfit can cause."""
 HELD = 0.5
-"""Part of the samples in which a fed back input can keep its value to the last bit."""
+"""Largest part of the samples in which a fed back input keeps its value to the last bit."""
 MOST_SAMPLES = 20_000
 LEAST = 300
 _CLIP = 5.0
 _EXACT = 1e-9
-"""Innovation over standard deviation below which a signal is known from its past: rounding."""
+"""Innovation over standard deviation below which only rounding is left of a signal."""
 _SMOOTH = 12
 
 
@@ -300,9 +300,9 @@ class Feedback:
     lead : int
         Samples after which the input follows.
     correlation : float
-        Of the innovations at this lead.
+        Correlation of the innovations at this lead.
     significance : float
-        The same in standard errors.
+        That correlation in standard errors.
     misfit : float
         The largest correlation with the input's past beyond the regression, in standard errors.
     """
@@ -315,27 +315,27 @@ class Feedback:
 
 
 def feedback(data: Dataset) -> Feedback | None:
-    """The input that noise of the output reaches most clearly; None where none is seen.
+    """The input with the clearest response to noise of the output; None if no input responds.
 
-    Both are made white first: the output by a regression on the past of itself and of all inputs
-    (and the sign of its motion, for dry friction), each input by one on its own past. What is left,
-    e of the output and w of the input, correlates at positive leads, e(k) with w(k + 1) and later,
-    only where the input was computed from the output (Granger 1969; Box, Jenkins, Reinsel 2008,
-    section 12.1). Standard errors are those of a product that is neither normal nor white (Newey,
-    West 1987), and both are clipped at 5 robust standard deviations, so that steps of a reference
-    do not hide the noise.
+    Both are whitened first: the output by a regression on its own past and that of all inputs (and
+    the sign of its motion, for dry friction), each input by a regression on its own past. The
+    residuals, e of the output and w of the input, correlate at positive leads, e(k) with w(k + 1)
+    and later, only if the input was computed from the output (Granger 1969; Box, Jenkins, Reinsel
+    2008, section 12.1). Standard errors allow for products that are neither normal nor white
+    (Newey, West 1987), and both residuals are clipped at 5 robust standard deviations, so that
+    steps of a reference do not hide the noise.
 
-    At lead 0 a controller that answers within the sample looks like a plant that does. The signs
-    tell them apart: a controller opposes what it sees, so there e(k) w(k) has the sign against the
-    plant's own response, and is small beside it.
+    At lead 0, a controller that responds within the sample looks like a plant that does. Their
+    signs differ: a controller opposes the output, so that e(k) w(k) has the opposite sign to the
+    plant's response, and is small beside it.
 
-    A plant that is not linear leaves something of the input in e. That correlates with the
-    input's past beyond the regression as well, where feedback does not: a lead counts only where it
-    is twice as significant as anything there.
+    A nonlinear plant leaves a part of the input in e. That part also correlates with the input's
+    past beyond the regression, while feedback does not: a lead counts only if it is twice as
+    significant as any such correlation.
 
-    An input that keeps its value for most samples while the output is noisy is fed back by nobody;
-    where it changes every so many samples, those samples are looked at. An output that a smoother
-    computed with later samples anticipates the input, which looks like feedback, and is not asked
+    An input that keeps its value for most samples while the output is noisy is not fed back; where
+    it changes at regular intervals, only those samples are used. An output computed by a smoother
+    from later samples anticipates the input, which looks like feedback; it is not tested
     (`Dataset.looks_ahead`).
     """
     pieces = [] if data.looks_ahead else _pieces(data)
@@ -353,7 +353,7 @@ def feedback(data: Dataset) -> Feedback | None:
 
 
 def _pieces(data: Dataset) -> list[FloatArray]:
-    """The longest runs in which everything is known, columns in deviations."""
+    """The longest runs without missing values, columns minus their means."""
     pieces: list[FloatArray] = []
     for e in sorted(data.experiments, key=len, reverse=True):
         columns = np.column_stack([e.u, e.y])
@@ -373,11 +373,11 @@ def _pieces(data: Dataset) -> list[FloatArray]:
 
 
 def _sampling(column: list[FloatArray]) -> tuple[int, list[int]] | None:
-    """Samples between changes of a held input, and where they begin; None: it is not fed back."""
+    """Interval between changes of a held input and its offsets; None if it is not fed back."""
     if not column:
         return None
     low, high = min(float(p.min()) for p in column), max(float(p.max()) for p in column)
-    # an input that stays at its limit was held by the limit
+    # samples at a limit do not count as held
     free = [(piece[:-1] > low) & (piece[:-1] < high) for piece in column]
     changes = [np.diff(piece) != 0.0 for piece in column]
     count = sum(int((c & f).sum()) for c, f in zip(changes, free, strict=True))
@@ -437,7 +437,7 @@ def _lagged(piece: FloatArray, past: int) -> FloatArray:
 
 
 def _motion(y: FloatArray, past: int) -> FloatArray:
-    """Sign of the last two changes of the output, rounded off where it hardly moves."""
+    """Smoothed sign of the last two changes of the output."""
     change = np.diff(y)
     sign = change / np.sqrt(change**2 + 0.01 * change.var() + np.finfo(np.float64).tiny)
     k = np.arange(past, len(y))
@@ -445,9 +445,9 @@ def _motion(y: FloatArray, past: int) -> FloatArray:
 
 
 def _innovation(X: FloatArray, u: FloatArray, y: FloatArray) -> tuple[FloatArray | None, Any]:
-    """What the columns leave of y, clipped, and the coefficients with u as one column more.
+    """Clipped residual of y, and the coefficients with u as an additional column.
 
-    The first is None where the columns leave rounding only.
+    The residual is None if it is only rounding.
     """
     X = np.column_stack([X, np.ones(len(X))])
     length = np.linalg.norm(X, axis=0)
@@ -479,7 +479,7 @@ def _impulse(theta: FloatArray, past: int, width: int, j: int) -> FloatArray:
 def _correlation(
     parts: list[tuple[FloatArray, FloatArray]], lag: int, span: int
 ) -> tuple[float, float]:
-    """Of e(k) with w(k + lag) + .. + w(k + lag + span - 1): its size, and in standard errors."""
+    """Correlation of e(k) with w(k + lag) + .. + w(k + lag + span - 1), also in standard errors."""
     total, variance, e2, w2, n = 0.0, 0.0, 0.0, 0.0, 0
     for e, w in parts:
         sums = np.concatenate([[0.0], np.cumsum(w)])
@@ -495,7 +495,7 @@ def _correlation(
         between = sum(
             2.0 * (1.0 - i / (_SMOOTH + 1.0)) * float(z[i:] @ z[:-i]) for i in range(1, _SMOOTH + 1)
         )
-        # never less than without memory: a negative sum is chance
+        # at least the value without memory: a negative sum is chance
         variance += max(own + between, own)
         e2, w2 = e2 + float(one @ one), w2 + float(other @ other)
     if not (variance > 0.0 and e2 > 0.0 and w2 > 0.0):

@@ -133,7 +133,7 @@ def _columns(data: Dataset) -> tuple[dict[str, Any], dict[str, str]]:
 
 
 def _free(name: str, taken: dict[str, Any]) -> str:
-    """The name, or another one where a column has it already."""
+    """The name, changed if another column has it already."""
     while name in taken:
         name += "_"
     return name

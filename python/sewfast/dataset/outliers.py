@@ -1,4 +1,4 @@
-"""The noise of a column, and outliers: marks of outputs that a separate step may take out."""
+"""The noise of a column, and outliers: outputs that are marked, to be masked in a separate step."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _SAME = 1e-9
 
 
 def white_noise(column: FloatArray) -> float:
-    """Standard deviation of what changes from sample to sample without memory; NaN where unknown.
+    """Standard deviation of the white noise of a column; NaN if unknown.
 
-    From third differences, in which what is smooth over a few samples is small: their variance is
-    20 times that of white noise. The median makes single jumps harmless.
+    From third differences: they suppress smooth motion, and their variance is 20 times that of
+    white noise. The median makes single jumps harmless.
     """
     changes = np.diff(column, 3)
     changes = changes[np.isfinite(changes)]
@@ -44,7 +44,7 @@ def white_noise(column: FloatArray) -> float:
 def quantum(column: FloatArray) -> float | None:
     """The step of a grid on which all values lie; None if there is none.
 
-    Only where at least three values occur twice or more on average: a few values of any kind lie on
+    Requires at least three values that occur twice or more on average: a few values always lie on
     some grid.
     """
     values = np.unique(column[np.isfinite(column)])
@@ -79,13 +79,13 @@ LONGEST = 4096
 """Samples of a segment at most (Welch 1967)."""
 SHORTEST = 32
 LOW, HIGH, TOP = 0.05, 0.95, 0.999
-"""Parts of the power below the band, below its upper end, and below the top of what is there."""
+"""Parts of the power below the band's lower end, its upper end, and the top frequency."""
 
 
 def power_spectrum(columns: Iterable[FloatArray], Ts: float) -> tuple[FloatArray, FloatArray]:
     """Power density of one signal over pieces without gaps, by Welch's method.
 
-    Segments of one length overlap by half, lose their mean and stand under a Hann window.
+    Segments of one length overlap by half; their mean is removed and a Hann window applied.
 
     Returns
     -------
@@ -109,7 +109,7 @@ def power_spectrum(columns: Iterable[FloatArray], Ts: float) -> tuple[FloatArray
 
 
 def band(frequency: FloatArray, power: FloatArray) -> tuple[float, float] | None:
-    """Frequencies [Hz] about the middle 90 % of the power; None where there is no power."""
+    """Frequencies [Hz] that bound the middle 90 % of the power; None if there is no power."""
     if len(power) == 0 or not power.sum() > 0.0:
         return None
     below = np.cumsum(power) / power.sum()
@@ -129,7 +129,7 @@ def top(frequency: FloatArray, power: FloatArray) -> float | None:
 
 
 class Simulates(Protocol):
-    """A model, as far as outliers need one: its free run on a data set."""
+    """The part of a model that outliers need: its free run on a data set."""
 
     @property
     def input_names(self) -> tuple[str, ...]: ...
@@ -254,8 +254,8 @@ def mark_outliers(
 def usual_threshold(data: Dataset) -> float:
     """Robust standard deviations that mark an output: 6 up to 20,000 samples, then slowly more.
 
-    Of white noise alone 6 would do for a hundred million samples; in 2,000,000 samples of a plant
-    that moves, chance reaches 7.3.
+    For white noise alone, 6 would suffice for a hundred million samples; in 2,000,000 samples of a
+    moving plant, chance reaches 7.3.
     """
     return THRESHOLD + 0.75 * max(0.0, math.log10(len(data) / 20_000))
 
@@ -273,11 +273,10 @@ def _series(data: Dataset, model: Simulates | None) -> list[FloatArray]:
 
 
 def distances(y: FloatArray, window: int = 7) -> FloatArray:
-    """How far each value stands out from its window, in robust standard deviations.
+    """Distance of each value from its window, in robust standard deviations.
 
-    The smaller of two: the distance to the window's median over the record's deviation, which a
-    steep but steady window does not raise; the same without the window's slope, over the larger of
-    the window's and the record's deviation, which a spike on a slope does not hide in.
+    The smaller of two distances to the window's median: over the record's deviation, and, after
+    removing the window's slope, over the larger of the window's and the record's deviation.
     """
     known = y[np.isfinite(y)]
     if len(known) == 0:
@@ -300,7 +299,7 @@ def distances(y: FloatArray, window: int = 7) -> FloatArray:
 
 
 def _levelled(rows: FloatArray, level: float) -> FloatArray:
-    """Windows without their slope, where it is clearly more than noise."""
+    """Windows minus their slope, if it clearly exceeds the noise."""
     slope = _medians(np.diff(rows, axis=1))
     slope = np.where(np.abs(slope) > 2.0 * level, slope, 0.0)
     width = rows.shape[1]

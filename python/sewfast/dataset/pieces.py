@@ -1,4 +1,4 @@
-"""What a data set must fulfil before it is used, and parts of it."""
+"""Checks of a data set before it is used, and parts of it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ OUTPUT_REMEDY = (
 
 
 def require_dataset(data: object, what: str) -> None:
-    """A `Dataset`, or a `DataError` that says how to make one."""
+    """Raise a `DataError` that says how to make a `Dataset` if `data` is none."""
     from .dataset import Dataset
 
     if not isinstance(data, Dataset):
@@ -44,7 +44,7 @@ def require_dataset(data: object, what: str) -> None:
 
 
 def require_alike(data: Dataset, other: Dataset) -> None:
-    """Raise `DataError` where two data sets cannot be one: inputs, units, sample time (1 %)."""
+    """Raise `DataError` if two data sets cannot be joined: inputs, units, sample time (1 %)."""
     if data.n_inputs != other.n_inputs:
         raise DataError(
             f"expected {data.n_inputs} inputs, as in {data.source}, received {other.n_inputs} "
@@ -102,13 +102,13 @@ def require_complete(data: Dataset) -> None:
 
 
 LARGEST = 1e150
-"""Magnitude from which on squares leave the numbers: no measured quantity."""
+"""Magnitude from which on squares overflow; no measured quantity is as large."""
 LARGEST_FITTED, SMALLEST_FITTED = 1e60, 1e-60
-"""Magnitude and range between which covariances and their inverses stay within the numbers."""
+"""Magnitude and range between which covariances and their inverses do not overflow."""
 
 
 def require_sane(data: Dataset, largest: float = LARGEST) -> None:
-    """Raise `DataError` where a value is infinite or beyond any measured quantity; NaN is none."""
+    """Raise `DataError` if a value is infinite or beyond any measured quantity; NaN is allowed."""
     for e in data.experiments:
         columns = zip((*data.input_names, data.output_name), (*e.u.T, e.y), strict=True)
         for name, column in columns:
@@ -127,9 +127,8 @@ def require_excited(data: Dataset) -> None:
     for i, name in enumerate(data.input_names):
         if all(np.min(e.u[:, i]) == np.max(e.u[:, i]) for e in data.experiments):
             raise DataError(
-                f"{data.source}: input {name!r} is constant at "
-                f"{data.experiments[0].u[0, i]:g}; expected an input that moves; "
-                "record with an excitation (`sewfast signals`)"
+                f"{data.source}: input {name!r} is constant at {data.experiments[0].u[0, i]:g}; "
+                "expected an input that moves; record with an excitation (`sewfast signals`)"
             )
     ranges = [range_of(e.y) for e in data.experiments]
     if not any(low < high for low, high in ranges):
@@ -140,9 +139,9 @@ def require_excited(data: Dataset) -> None:
 
 
 def require_fittable(data: Dataset) -> None:
-    """Raise `DataError` where values are so large, or move so little, that no fit can square them.
+    """Raise `DataError` if values are so large, or move so little, that their squares overflow.
 
-    To be asked after `require_measured`: infinite values are named there.
+    Call it after `require_measured`, which reports infinite values.
     """
     require_sane(data, LARGEST_FITTED)
     columns = [*np.concatenate([e.u for e in data.experiments]).T]
@@ -174,7 +173,7 @@ def require_finite(column: FloatArray, what: str, start: int, remedy: str) -> No
 
 
 SHORTEST_PIECE = 100
-"""Samples between two gaps that `Dataset.split_at_gaps` keeps at least."""
+"""Shortest piece between two gaps that `Dataset.split_at_gaps` keeps, in samples."""
 
 
 def take(data: Dataset, text: str) -> Dataset:
@@ -306,7 +305,7 @@ def split_at_gaps(
         Samples that a piece must have; shorter ones are left out, which `notes` says. The
         initial state alone takes 20.
     of : {"any", "inputs"}
-        Whether a gap in the output parts an experiment, or only one in an input.
+        Whether a gap in the output splits an experiment, or only one in an input.
 
     Raises
     ------
@@ -359,7 +358,7 @@ def mask(data: Dataset, where: Where, *, why: str = "masked") -> Dataset:
         experiment if there are several, True where the output is to be ignored; or a function from
         an experiment to its mask.
     why : str
-        What the note says.
+        Reason given in the note.
 
     Raises
     ------

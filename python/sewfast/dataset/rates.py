@@ -105,7 +105,7 @@ def resample(
 
 
 def _rounded(ratio: float) -> float:
-    """A whole ratio where the sample times say it but for rounding."""
+    """The ratio, made whole if only rounding separates it from a whole number."""
     for whole in (round(ratio), 1.0 / max(round(1.0 / ratio), 1)):
         if whole > 0 and abs(ratio / whole - 1.0) < 1e-9:
             return float(whole)
@@ -149,7 +149,7 @@ def _resampled(e: Experiment, ratio: float, inputs: str, antialias: bool) -> Exp
 
 
 def _rescaled(e: Experiment, ratio: float, start: int, inputs: str) -> Trend | None:
-    """The line that was taken off, over the new samples."""
+    """The removed line, per new sample."""
     if e.removed is None:
         return None
     at = np.full(len(e.removed.level), float(e.start))
@@ -214,7 +214,7 @@ def _low_passed(column: FloatArray, times: FloatArray, scale: float) -> FloatArr
     for first in range(0, len(times), rows):
         t = times[first : first + rows]
         whole = np.floor(t).astype(np.int64)
-        # few different ones where the ratio is rational
+        # few distinct fractions if the ratio is rational
         phases, which = np.unique(np.round(t - whole, 12), return_inverse=True)
         weights = _weights((phases[:, None] - offsets) / scale)
         values = padded[whole[:, None] + offsets + reach + 1]
@@ -244,7 +244,7 @@ def _extended(column: FloatArray, reach: int) -> FloatArray:
 SHORTEST = {"kalman": 5, "savgol": 41, "difference": 2}
 """Samples in a row that each method needs."""
 BRIDGED = 5
-"""Samples without a value that a smoother is led across."""
+"""Most missing samples that the smoother bridges."""
 _HOW = {
     "kalman": "by a Kalman smoother, without delay",
     "savgol": "by the slope of a cubic over 41 samples, without delay",
@@ -256,24 +256,24 @@ def differentiate(data: Dataset, *, method: Method = "kalman") -> Dataset:
     """The data with the output's derivative per second in its place: of a position, its speed.
 
     A model of a position has to integrate, and small errors of its speed add up; a model of the
-    speed has a steady state, and a controller of the position needs no more. The unit follows: deg
-    becomes deg/s, m/s becomes m/s^2, an unknown unit stays unknown. Inputs and channels stay.
+    speed has a steady state, which is enough for a controller of the position. The unit follows:
+    deg becomes deg/s, m/s becomes m/s^2, an unknown unit stays unknown. Inputs and channels stay.
 
     Parameters
     ----------
     method : {"kalman", "savgol", "difference"}
         As for `sewfast.speed_from_counts`. `kalman`: a smoother for motion with white jerk, whose
-        noise and jerk are found by maximum likelihood: sensor noise and rounding are smoothed as
-        much as each record asks for, whole counts are taken as exact to their rounding. `savgol`:
-        slope of a cubic through 41 samples. Neither delays; both look ahead, so the result begins
-        to move some samples before the input does. `difference`: to the sample before, half a
-        sample late, with all of the noise; the only one that a controller has too.
+        noise and jerk are estimated by maximum likelihood: smoothing adapts to the sensor noise and
+        rounding of each record, and whole counts are exact to their rounding. `savgol`: slope of a
+        cubic through 41 samples. Neither delays; both look ahead, so the result begins to move some
+        samples before the input does. `difference`: to the previous sample, half a sample late,
+        with all of the noise; the only method that a controller can use as well.
 
     Returns
     -------
     Dataset
         NaN where the output was not measured, or has weight 0. Up to 5 missing samples are bridged
-        by a straight line for the smoother; longer gaps part the record, and pieces shorter than
+        by a straight line for the smoother; longer gaps split the record, and pieces shorter than
         the method needs (5, 41 or 2 samples) become NaN.
 
     Raises
@@ -370,11 +370,11 @@ def _rate(y: FloatArray, Ts: float, method: Method) -> FloatArray:
 
 
 def _in_steps(y: FloatArray) -> tuple[float, FloatArray]:
-    """A step of the sensor and the position in such steps, as the smoother expects counts.
+    """The sensor's step and the position in such steps: the smoother expects counts.
 
-    On a grid the step is the grid's, and the position a whole number, which the smoother takes as
-    exact to its rounding. Otherwise it is the white part of the position: the smoother looks for
-    noise and jerk over many decades around 1.
+    For values on a grid the step is the grid's, and the positions are whole numbers, which the
+    smoother takes as exact to their rounding. Otherwise it is the white noise of the position: the
+    smoother searches noise and jerk over many decades around 1.
     """
     if bool((y == np.round(y)).all()):
         return 1.0, y
@@ -387,7 +387,7 @@ def _in_steps(y: FloatArray) -> tuple[float, FloatArray]:
 
 
 def _removed(e: Experiment, Ts: float) -> Trend | None:
-    """The line that was taken off the output has its slope as a derivative, and no drift."""
+    """The derivative of the removed line: its slope as a level, without drift."""
     if e.removed is None:
         return None
     level, slope = e.removed.level.copy(), e.removed.slope.copy()

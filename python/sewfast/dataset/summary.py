@@ -1,4 +1,4 @@
-"""What to know of data before anything is identified from them."""
+"""`summary`: the properties of data to look at before identifying anything from them."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ class ColumnSummary:
     low, high, mean, std : float
         Of the known values [unit].
     trend : float
-        Change of a straight line through an experiment, from its first to its last sample; that of
-        the experiment where it is largest [unit].
+        Change of a straight line through an experiment, from its first to its last sample, in the
+        experiment where it is largest [unit].
     quantum : float or None
-        Step of the grid that all values lie on [unit].
+        Step of the grid on which all values lie [unit].
     at_low, at_high : float
         Parts of the known samples that stay at the smallest and at the largest value for three
         samples or more, 0 to 1.
@@ -88,7 +88,7 @@ class ColumnSummary:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Summary:
-    """What `Dataset.summary` finds; `str` is a page of text, `to_json` its numbers.
+    """The result of `Dataset.summary`; `str` is a page of text, `to_json` its numbers.
 
     Attributes
     ----------
@@ -98,9 +98,9 @@ class Summary:
         Experiment and sample (0-based, of its file) of outputs that stand out from their neighbours
         (`Dataset.mark_outliers`).
     diagnosis : Diagnosis
-        What the data are (`sewfast.diagnose`).
+        Properties of the data (`sewfast.diagnose`).
     advice : tuple of str
-        What to do about the numbers, in the order of their weight.
+        What to do about the numbers, most important first.
     """
 
     Ts: float
@@ -148,7 +148,7 @@ class Summary:
         return self.data.plot(ax, file=file)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook, what helps below it."""
+        """A table for a notebook, with the advice below it."""
         (_, header), *rows = _rows(self.columns)
         cells = tuple((label, *cells) for label, cells in rows)
         hints = [*map(str, self.diagnosis.findings), *self.advice]
@@ -326,23 +326,23 @@ def _plain(value: Any) -> Any:
 
 
 LIMITED = 0.02
-"""Part of the samples at one limit from which on the output counts as limited."""
+"""Least part of the samples at one limit for the output to count as limited."""
 NOISY = 0.2
-"""White noise over standard deviation from which on the output counts as noisy."""
+"""Least ratio of white noise to standard deviation for the output to count as noisy."""
 FINE = 50.0
-"""Samples in a period of the highest frequency from which on the sample time is very short."""
+"""Samples per period of the highest frequency above which the sample time is very short."""
 ENOUGH = 10.0
-"""Samples that such a period needs."""
+"""Samples per such period that are enough."""
 NYQUIST = 0.25
-"""Upper end of the band, in parts of the sampling rate, from which on it is close to the limit."""
+"""Upper end of the band, as a part of the sampling rate, that is close to the limit."""
 SHOWN = 8
 """Outliers whose places are named."""
 FEW = 500
-"""Samples below which an identification has little to go by."""
+"""Samples below which an identification has little evidence."""
 
 
 def advice(found: Summary) -> Iterator[str]:
-    """One sentence per finding: what it is, what it does, what helps."""
+    """One sentence per finding: the fact, its effect and the remedy."""
     output = found.columns[-1]
     for c in found.columns:
         yield from _values(c)
@@ -350,7 +350,7 @@ def advice(found: Summary) -> Iterator[str]:
         yield _outliers(found, output.name)
     yield from _limits(output)
     yield from _noise_advice(output)
-    # of a position nearly all power is slow, whatever the speed does
+    # nearly all power of a position is slow, however fast its speed changes
     if found.diagnosis.find("integrator") is None and found.diagnosis.find("wraps") is None:
         yield from _rate(output, found.Ts)
     if found.n < FEW:
@@ -456,7 +456,7 @@ INPUT, OUTPUT, MISSING, OUTLIER = "#333333", "#0072B2", "#D55E00", "#CC0000"
 MOST_PANELS = 8
 _BUCKETS = 1200
 _MOST_GAPS = 1000
-"""That are shaded, the longest first; of more a figure would only be slow."""
+"""Most gaps that are shaded, the longest first; more would only slow the figure down."""
 
 
 def plot(data: Dataset, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
@@ -510,8 +510,8 @@ def _over_time(
             places = [((offset + start - 0.5) * Ts, length * Ts) for start, length in gaps]
             missing: dict[str, Any] = {"color": MISSING, "alpha": 0.25, "lw": 0, "snap": False}
             missing |= {"label": "" if has_gaps else "missing"}
-            # over the whole height, as one collection: a link can lose thousands of samples; a gap
-            # that is thinner than a pixel has a mark at the bottom
+            # one collection over the whole height: a link can lose thousands of samples; marks at
+            # the bottom show gaps thinner than a pixel
             height = ax.get_xaxis_transform()
             ax.broken_barh(places, (0.0, 1.0), transform=height, **missing)
             middles = [left + 0.5 * width for left, width in places]

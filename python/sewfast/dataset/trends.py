@@ -1,4 +1,4 @@
-"""Offsets and drift: taken off, remembered, and put back on what a model says."""
+"""Offsets and drift: removed from data, kept, and added again to a model's outputs."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from .experiment import Experiment
 
 LEAST_REST = 20
-"""Samples at rest that `steady` needs at the beginning."""
+"""Least samples at rest at the beginning for `steady`."""
 MOVED = 0.02
-"""Part of its range that an input may leave its first value by and still count as at rest."""
+"""Part of its range by which an input at rest can differ from its first value."""
 SETTLED = 0.05
-"""Part of its range that the output may drift by over the second half of the rest."""
+"""Part of its range by which the output can drift over the second half of the rest."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """What was taken off an experiment: a straight line per column, inputs first, output last.
+    """The lines removed from an experiment: one per column, inputs first, output last.
 
     Attributes
     ----------
@@ -39,13 +39,13 @@ class Trend:
     slope: FloatArray
 
     def lines(self, e: Experiment) -> FloatArray:
-        """What was taken off each sample, shape (N, n_inputs + 1)."""
+        """The removed values of each sample, shape (N, n_inputs + 1)."""
         index = np.arange(e.start, e.start + len(e), dtype=np.float64)
         lines: FloatArray = self.level + self.slope * index[:, None]
         return lines
 
     def is_offset(self, level: FloatArray) -> bool:
-        """Whether this is that constant."""
+        """Whether the trend is this constant, without slope."""
         return not self.slope.any() and np.array_equal(self.level, level)
 
     def plus(self, other: Trend | None) -> Trend:
@@ -67,8 +67,8 @@ def detrend(
         through each column of each experiment, by least squares. "steady": in each experiment the
         level at rest, before an input first moves.
     like : Dataset or None
-        A data set that `detrend` made with one and the same offset for all its experiments: remove
-        what was removed there, as for validation data. `order` is then ignored.
+        A result of `detrend` with one and the same offset for all its experiments: remove that
+        offset, as for validation data. `order` is then ignored.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def detrend(
     else:
         raise SettingError(f"detrend: expected order 0, 1 or 'steady', received {order!r}")
     pairs = list(zip(data.experiments, trends, strict=True))
-    notes = [f"{e.name} [{e.range_text}]: {how} taken off, {_told(e, t, data)}" for e, t in pairs]
+    notes = [f"{e.name} [{e.range_text}]: {how} taken off, {_shown(e, t, data)}" for e, t in pairs]
     experiments = tuple(_without(e, t) for e, t in pairs)
     return replace(data, experiments=experiments, notes=(*data.notes, *notes))
 
@@ -231,7 +231,7 @@ def _offset_of(like: Dataset, data: Dataset) -> Trend:
     return first
 
 
-def _told(e: Experiment, trend: Trend, data: Dataset) -> str:
+def _shown(e: Experiment, trend: Trend, data: Dataset) -> str:
     def one(name: str, level: float, slope: float) -> str:
         first = level + slope * e.start
         if slope == 0.0:

@@ -1,12 +1,13 @@
 """Evidence that a model can be trusted: tests, covariance, bands, region, linearisation.
 
-Read in this order: `checking` (`check`), `card` and `questions` (the report card and its verdicts);
-what they rest on: `residuals`, `correlations` and `portmanteau` (tests), `parameters` (covariance),
-`simulation_bands`, `region` (what was trained on), `operating` (linearisation), `figures`.
+Read in this order: `checking` (`check`), `card` and `verdicts` (the report card and its lines), and
+the evidence behind them: `residuals`, `correlations` and `portmanteau` (tests), `parameters`
+(covariance), `simulation_bands`, `region` (the training region), `operating` (linearisation),
+`figures`.
 """
 
 from .card import Line, ReportCard
-from .checking import check, remembered, training_evidence
+from .checking import check, training_evidence, with_training_evidence
 from .correlations import ResidualTest
 from .operating import OperatingPoint, OperatingRange, operating_range
 from .parameters import Parameters, estimate
@@ -30,8 +31,8 @@ __all__ = [
     "check",
     "estimate",
     "operating_range",
-    "remembered",
     "residual_tests",
     "training_evidence",
     "training_region",
+    "with_training_evidence",
 ]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["Line", "ReportCard", "Verdict"]
 
 
-# --- Line and Judged: questions with value, limit and verdict, and what shows them together -------
+# --- Line and VerdictTable ------------------------------------------------------------------------
 
 
 Verdict: TypeAlias = Literal["ok", "warn", "fail", "info"]
@@ -31,21 +31,21 @@ _WIDTH = 100
 
 @dataclass(frozen=True)
 class Line:
-    """One question.
+    """One line of a report card: a figure with its limit and verdict.
 
     Attributes
     ----------
     name : str
-        What was looked at.
+        The tested quantity.
     value : float
-        The number; NaN where there is none.
+        Its value; NaN if there is none.
     shown : str
-        The number as text, with its unit.
+        The value as text, with its unit.
     limit : str
-        What it is held against; empty for information alone.
+        The limit as text; empty for information only.
     verdict : "ok", "warn", "fail" or "info"
     meaning : str
-        What it says and what to do.
+        The meaning and what to do.
     """
 
     name: str
@@ -68,8 +68,8 @@ class Line:
         }
 
 
-class Judged:
-    """What consists of lines: its verdict is the worst of theirs."""
+class VerdictTable:
+    """A table of lines; its verdict is their worst one."""
 
     lines: tuple[Line, ...]
     heading = "Report card"
@@ -78,17 +78,17 @@ class Judged:
 
     @property
     def title(self) -> str:
-        """What was judged."""
+        """The title: what was judged."""
         raise NotImplementedError
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of the lines."""
+        """The worst verdict of the lines."""
         return max((line.verdict for line in self.lines), key=_ORDER.__getitem__, default="info")
 
     @property
     def summary(self) -> str:
-        """What the lines amount to and what to do, in a sentence; empty where they stand alone."""
+        """Conclusion from the lines and what to do, in a sentence; empty if there is none."""
         return ""
 
     def line(self, name: str) -> Line:
@@ -97,7 +97,7 @@ class Judged:
         Raises
         ------
         KeyError
-            Where there is none.
+            If there is no such line.
         """
         for line in self.lines:
             if line.name == name:
@@ -105,7 +105,7 @@ class Judged:
         raise KeyError(f"no line {name!r}; there are {', '.join(x.name for x in self.lines)}")
 
     def to_html(self) -> str:
-        """A table for a page: no script, no style of its own, verdicts as classes of the cells."""
+        """A table for a page, without script and style; the verdicts are classes of the cells."""
         rows = "\n".join(
             f'<tr><th scope="row">{escape(x.name)}</th><td>{escape(x.shown)}</td>'
             f"<td>{escape(x.limit)}</td>"
@@ -154,9 +154,9 @@ class Judged:
 
 
 _NAMED = 3
-"""Lines that are named; of more there is only the number."""
+"""Most lines listed by name; of the others only the number is given."""
 _STEPS = (
-    # by weight: a model that fails an early one is not helped by mending a later one
+    # most important first: mending a later line does not help a model that fails an earlier one
     ("free run", "check the columns, the delay and the orders, or record with a larger excitation"),
     ("largest pole", "record at the operating points that are unstable, and train on them as well"),
     (
@@ -183,11 +183,11 @@ _STEPS = (
     ("samples per parameter", "record longer, or take a smaller model"),
     ("inside", "read the bands with care: noise or operation differ from the training data"),
 )
-"""How a line's name begins, and what to do where it warns or fails."""
+"""Beginning of a line's name, and what to do if it warns or fails."""
 
 
 def summary(lines: Sequence[Line]) -> str:
-    """Of the lines of a report card."""
+    """Conclusion from the lines of a report card."""
     failed = [x for x in lines if x.verdict == "fail"]
     warned = [x for x in lines if x.verdict == "warn"]
     free = next((x for x in lines if x.name == "free run"), None)
@@ -236,7 +236,7 @@ VERSION = 1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ReportCard(Judged):
+class ReportCard(VerdictTable):
     """Lines with verdicts, and the evidence behind them.
 
     Attributes
@@ -245,7 +245,7 @@ class ReportCard(Judged):
     model, data : str
         The names of the model and the data.
     on_training : bool
-        Whether the data are those that the model was identified from.
+        Whether the data are the model's training data.
     scores : HorizonScores
         Errors at every horizon, per experiment and pooled.
     tests : tuple of ResidualTest
@@ -253,11 +253,11 @@ class ReportCard(Judged):
     operating : OperatingRange or None
     parameters : Parameters or None
     criteria : Criteria or None
-        Where the training data are known.
+        Only if the training data are known.
     outside : float
         Share of the samples outside the training region; NaN if it is not known.
     distances : tuple of array, shape (N,)
-        Distance to the nearest known point over the region's radius, per experiment.
+        Distances from the training region over its bounds, per experiment: above 1 is outside.
     runs : tuple of Run
         Free runs: outputs, measured and computed.
     """
@@ -324,7 +324,7 @@ class ReportCard(Judged):
         ax, file
             As for `Drawing.plot`; one gets the figure's first panel.
         figure : str, optional
-            `bands`, `residuals`, `bode`, `poles` or `region`: whichever the card has data for.
+            `bands`, `residuals`, `bode`, `poles` or `region`, if the card has data for it.
 
         Raises
         ------

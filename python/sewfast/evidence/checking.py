@@ -13,12 +13,12 @@ from ..dataset.experiment import in_effect
 from ..dynamic_model import INIT, DynamicModel
 from ..errors import FitError, SewfastError
 from ..validation import Scores, by_input, noise_of, without_input
-from . import questions
+from . import verdicts
 from .card import Line, ReportCard
 from .operating import OperatingRange, operating_range
-from .parameters import Criteria, Knowledge, Parameters, estimate
+from .parameters import Criteria, Parameters, StoredInformation, estimate
 from .portmanteau import LAGS, parameter_test, residual_tests
-from .region import Place, placed, training_region
+from .region import RegionRuns, region_runs, training_region
 from .residuals import Residuals, horizon_scores, representative
 from .simulation_bands import (
     LEVEL,
@@ -48,15 +48,15 @@ def check(
     ----------
     model : Model
     data : Dataset
-        Best not the training data. Outputs after the first `init` samples may be NaN; those of
-        weight 0 count as such, other weights are ignored.
+        Preferably not the training data. Outputs after the first `init` samples can be NaN; those
+        of weight 0 count as NaN, other weights are ignored.
     training : Dataset or None
-        What the model was identified from: adds information criteria and the comparison of errors,
-        and replaces what `identify` stored with the model (bands, region).
+        The training data of the model: adds information criteria and the comparison of errors,
+        and replaces the evidence stored by `identify` (bands, region).
     init : int
-        Samples of each experiment that set the initial state and are not judged.
+        Samples of each experiment that determine the initial state and are not judged.
     level : float
-        Of the bands, .5 to .999.
+        Level of the bands, .5 to .999.
 
     Returns
     -------
@@ -65,9 +65,9 @@ def check(
     Raises
     ------
     DataError
-        If the data do not fit the model or leave nothing to judge.
+        If the data do not match the model or leave nothing to judge.
     FitError
-        If the model runs away on these inputs.
+        If the model diverges on these inputs.
     SettingError
         For a level out of range.
     """
@@ -86,34 +86,34 @@ def check(
     noise = noise_of([r.y[r.counts] for r in free.runs])
     rmse = scores.pooled["free run"].rmse
     share = by_input(rmse, without_input(model, data, init))
-    lines = questions.accuracy(scores, unit, noise, share)
+    lines = verdicts.accuracy(scores, unit, noise, share)
     if training is not None and training is not data:
         lines.append(
-            questions.generalisation(
+            verdicts.generalisation(
                 scores.pooled["free run"], _training_scores(model, training, init)
             )
         )
-    lines.append(questions.bias(free))
-    tests = residual_tests(tested, memory(model, data, init))
-    lines += [questions.correlation(t) for t in tests]
+    lines.append(verdicts.bias(free))
+    tests = residual_tests(tested, fading_samples(model, data, init))
+    lines += [verdicts.correlation(t) for t in tests]
     if not on_training and not model.members:
         held = parameter_test(tested, int(model.training.get("samples") or 0))
-        lines += [questions.correlation(held)] if held is not None else []
+        lines += [verdicts.correlation(held)] if held is not None else []
     found = _parameters(model, data, training, on_training, init)
     lines += found[2]
-    place = placed(model, data, training, init)
+    place = region_runs(model, data, training, init)
     far = place.distances if place is not None else []
     covered = _bands(model, data, free, training, level, place)
     if covered is not None:
-        lines.append(questions.coverage(covered))
+        lines.append(verdicts.coverage(covered))
     outside = farthest = math.nan
     if far:
         judged = np.concatenate([d[init:] for d in far])
         outside, farthest = float(np.mean(judged > 1.0)), float(judged.max())
-    lines.append(questions.region(outside, farthest))
+    lines.append(verdicts.region(outside, farthest))
     operating = _operating(model)
     if operating is not None:
-        lines += questions.operation(operating)
+        lines += verdicts.operation(operating)
     return ReportCard(
         tuple(lines), model.title, _named(data), on_training, scores, tests, covered, operating,
         found[0], found[1], outside, tuple(far), free.runs, data.Ts, data.output_name, unit,
@@ -121,14 +121,14 @@ def check(
 
 
 def is_training_data(model: DynamicModel, data: Dataset) -> bool:
-    """Whether names, ranges and lengths are those that the model was identified from."""
+    """Whether names, ranges and lengths are those of the model's training data."""
     known = model.training.get("data")
     mine = [{"name": e.name, "range": e.range_text, "samples": len(e)} for e in data.experiments]
     return known == mine
 
 
-def memory(model: DynamicModel, data: Dataset, init: int = INIT) -> int:
-    """Samples after which a model has forgotten all but a twentieth of its initial state."""
+def fading_samples(model: DynamicModel, data: Dataset, init: int = INIT) -> int:
+    """Samples after which the effect of the initial state has decayed to a twentieth."""
     single = representative(model)
     e = max(data.experiments, key=len)
     state = single.initial_state(e, init)
@@ -143,24 +143,24 @@ def memory(model: DynamicModel, data: Dataset, init: int = INIT) -> int:
     return int(kept[-1]) + 1 if len(kept) else LAGS
 
 
-def remembered(model: _M, data: Dataset) -> _M:
-    """The model with what `training_evidence` finds in its `training`."""
+def with_training_evidence(model: _M, data: Dataset) -> _M:
+    """The model with the result of `training_evidence` added to its `training`."""
     return replace(model, training={**model.training, **training_evidence(model, data)})
 
 
 def training_evidence(model: DynamicModel, data: Dataset) -> dict[str, Any]:
-    """What a model should store: `region`, `uncertainty`, `information`, JSON values.
+    """Evidence for a model to store: `region`, `uncertainty`, `information`, as JSON values.
 
     Parameters
     ----------
     model : Model
     data : Dataset
-        What it was identified from.
+        Its training data.
 
     Returns
     -------
     dict
-        For `model.training`; without a part that these data do not give.
+        Entries for `model.training`; parts that these data cannot provide are missing.
     """
     found: dict[str, Any] = {}
     try:
@@ -172,7 +172,7 @@ def training_evidence(model: DynamicModel, data: Dataset) -> dict[str, Any]:
             residuals = Residuals.of(model, data)
             known = estimate(model, residuals)
         if known is not None:
-            found["information"] = Knowledge.of(known, residuals.n).to_json()
+            found["information"] = StoredInformation.of(known, residuals.n).to_json()
     except (SewfastError, np.linalg.LinAlgError):
         return found
     return found
@@ -195,21 +195,21 @@ def _training_scores(model: DynamicModel, training: Dataset, init: int) -> Score
 def _parameters(
     model: DynamicModel, data: Dataset, training: Dataset | None, on_training: bool, init: int
 ) -> tuple[Parameters | None, Criteria | None, list[Line]]:
-    """Parameters and criteria from the training data if at hand, else what is stored."""
+    """Parameters and criteria from the training data if given, else the stored ones."""
     source = training if training is not None else data if on_training else None
     if model.members:
         return None, None, []
     if source is None:
-        known = Knowledge.stored(model)
-        return None, None, questions.parameters(known) if known is not None else []
+        known = StoredInformation.stored(model)
+        return None, None, verdicts.parameters(known) if known is not None else []
     residuals = Residuals.of(model, source, init)
     found = estimate(model, residuals)
     if found is None:
         return None, None, []
-    squares = questions.residuals_power(residuals) * residuals.n
+    squares = verdicts.residuals_power(residuals) * residuals.n
     criteria = Criteria.of(squares, residuals.n, found.effective)
-    lines = questions.parameters(Knowledge.of(found, residuals.n))
-    lines += [questions.looseness(found), questions.information(criteria, residuals.unit)]
+    lines = verdicts.parameters(StoredInformation.of(found, residuals.n))
+    lines += [verdicts.looseness(found), verdicts.information(criteria, residuals.unit)]
     return found, criteria, lines
 
 
@@ -219,7 +219,7 @@ def _bands(
     free: Residuals,
     training: Dataset | None,
     level: float,
-    place: Place | None,
+    place: RegionRuns | None,
 ) -> Bands | None:
     known = stored_uncertainty(model) if training is None else uncertainty(model, training)
     if known is None:

@@ -1,13 +1,13 @@
 """`ResidualTest`: a set of correlations under one verdict.
 
 The statistic is r'(Z'RZ)^+ r with r = Z'e, one column of Z per lag, R the covariance matrix of e.
-Z is first freed of what a change of the parameters could have done to e: then it is chi-square
-whether the parameters were estimated on these data or on others (Ljung 1999, sections 16.5 and
-16.6; Breusch and Godfrey 1978). R is Bartlett's: the residual as it is, coloured, with an
-autoregression for R. A strongly coloured residual knows its own R too badly for 25 sums at once,
-and the form acquits too often; whitened by the same autoregression it is exact, but then accuses
-for the curvature of the model, which is large compared with the innovation. The statistic of a test
-is the mean of both.
+The directions in which a change of the parameters moves e are first projected out of Z: the
+statistic is then chi-square whether the parameters were estimated on these data or on others (Ljung
+1999, sections 16.5 and 16.6; Breusch and Godfrey 1978). R is Bartlett's, from an autoregression of
+the coloured residual. For a strongly coloured residual R is too uncertain for 25 sums at once, and
+the test accepts too often. Whitened by the same autoregression the test is exact, but rejects for
+the curvature of the model, which is large compared with the innovation. The statistic of a test is
+the mean of both.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def chi2_quantile(tail: float, freedom: int) -> float:
 
     Notes
     -----
-    Bisection of `chi2_tail`, which falls everywhere; the start is Wilson and Hilferty's.
+    Bisection of `chi2_tail`, which decreases everywhere; the start is Wilson and Hilferty's.
     """
     if not 0.0 < tail < 1.0:
         raise ValueError(f"expected a probability between 0 and 1, received {tail}")
@@ -128,7 +128,7 @@ def normal_quantile(tail: float) -> float:
 
 LEVEL = 0.01
 _INDEPENDENT = 1e-7
-"""Eigenvalue, relative to the largest, from which a combination of the sums counts."""
+"""Least eigenvalue, relative to the largest, for a combination of the sums to count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,22 +141,22 @@ class ResidualTest:
     lags : array of int, shape (m,)
         Samples by which the second series is earlier.
     series : tuple of str
-        What the residual is correlated with.
+        The series with which the residual is correlated.
     correlations : array, shape (len(series), m)
         Between -1 and 1.
     limits : array, shape (len(series), m)
-        99 % of single correlations lie within plus or minus this; for the eye, not for the verdict.
+        99 % of single correlations lie within plus or minus this; for plots, not for the verdict.
     statistic, p_value : float
-        Chi-square of all of them together, and the chance of a larger one; NaN where nothing can be
-        tested.
+        Chi-square of all correlations together, and the probability of a larger one; NaN if
+        nothing can be tested.
     freedom : int
         Its degrees of freedom.
     threshold : float
-        What the statistic exceeds by chance in one of a hundred good models.
+        Value that the statistic exceeds by chance for one good model in a hundred.
     explained : float
-        Share of the residual's power behind the correlations, over what chance gives; 0 to 1.
+        Share of the residual's power explained by the correlations, beyond chance; 0 to 1.
     judges : bool
-        Whether a good model of this kind promises that the test passes.
+        Whether a good model of this kind should pass the test.
     """
 
     name: str
@@ -174,7 +174,7 @@ class ResidualTest:
 
     @property
     def passed(self) -> bool:
-        """Whether the statistic is one that a good model gives, or nothing can be tested."""
+        """Whether the statistic is within that of good models, or nothing can be tested."""
         return not self.p_value < LEVEL
 
     def __str__(self) -> str:
@@ -183,19 +183,19 @@ class ResidualTest:
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Sums over all samples, their covariance, and what makes correlations of them.
+    """Sums over all samples, their covariance, and the scales of the correlations.
 
     Attributes
     ----------
     values : array, shape (n,)
     covariance : array, shape (n, n)
     scales : array, shape (n,)
-        The values over these are correlations.
+        The values divided by these are correlations.
     reference : array, shape (n,)
-        Variances that the values would have without any correction.
+        Variances of the values without any correction.
     explained : float
     room : float
-        Samples less the parameters that were estimated on them.
+        Samples minus the parameters estimated on them.
     """
 
     values: FloatArray
@@ -213,7 +213,7 @@ class Sums:
         noise: Noise,
         directions: Sequence[FloatArray],
     ) -> Sums:
-        """Z'e, where Z is freed of the directions.
+        """Z'e, where the directions are projected out of Z.
 
         Parameters
         ----------
@@ -222,7 +222,7 @@ class Sums:
         target : arrays, shape (N,)
             e.
         noise : Noise
-            Of the target.
+            Noise of the target.
         directions : arrays, shape (N, p)
             Orthonormal over all experiments together.
         """
@@ -255,7 +255,7 @@ def verdict(
     judges: bool,
     white: Sums | None = None,
 ) -> ResidualTest:
-    """The test that the sums make; they are in the order of the series, then of the lags.
+    """The test of the sums, which are ordered by series, then by lag.
 
     With `white`, the same sums of the whitened series, the statistic is the mean of both.
     """
@@ -282,9 +282,9 @@ def verdict(
 
 
 def _likelihood_ratio(statistic: float, freedom: int, room: float) -> float:
-    """Nearer to chi-square than the quadratic form, whose variance holds the effect that is tested.
+    """-(n - (m + 2)/2) ln(1 - S/n), Bartlett's correction for a regression with m regressors.
 
-    -(n - (m + 2)/2) ln(1 - S/n), Bartlett's correction for a regression with m regressors.
+    It is closer to chi-square than the quadratic form, whose variance includes the tested effect.
     """
     share = statistic / max(room, 1.0)
     if share >= 1.0:
@@ -295,7 +295,7 @@ def _likelihood_ratio(statistic: float, freedom: int, room: float) -> float:
 def quadratic(
     values: FloatArray, covariance: FloatArray, reference: FloatArray
 ) -> tuple[float, int]:
-    """r' C^+ r over the combinations that C determines, and their number."""
+    """r' C^+ r over the combinations determined by C, and their number."""
     if not (np.isfinite(covariance).all() and np.isfinite(values).all()):
         return np.nan, 0
     scale = np.sqrt(reference)
@@ -314,7 +314,7 @@ def quadratic(
 def _explained(
     values: FloatArray, gram: FloatArray, covariance: FloatArray, squares: FloatArray, power: float
 ) -> float:
-    """What a regression of e on Z takes of its power, less what it takes by chance."""
+    """Share of e's power that a regression on Z explains, minus the share by chance."""
     scale = np.sqrt(squares)
     used = scale > 0.0
     if power <= 0.0 or not used.any():
@@ -331,9 +331,9 @@ def _explained(
 def independent_directions(
     columns: Sequence[FloatArray], determined: float = 1e-10
 ) -> list[FloatArray]:
-    """An orthonormal basis, over all experiments together, of what the columns (N, p) span.
+    """An orthonormal basis, over all experiments together, of the span of the columns (N, p).
 
-    Directions whose information is below `determined` times the largest are left out.
+    Directions with information below `determined` times the largest are left out.
     """
     scale = np.sqrt(np.sum([np.square(c).sum(axis=0) for c in columns], axis=0))
     used = (scale > 0.0) & np.isfinite(scale)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-"""Okabe and Ito's: distinct for readers with a colour deficiency, too."""
+"""Colours of Okabe and Ito, distinct for readers with a colour deficiency, too."""
 _STYLES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1, 2)))
 _MARKERS = "osD^vP"
 _MOST_PANELS = 6
@@ -30,7 +30,7 @@ _FARTHEST = 20.0
 
 
 def figures(card: ReportCard) -> dict[str, Figure]:
-    """All figures of a card by name; only those that it has evidence for.
+    """All figures of a card by name, as far as it has the evidence.
 
     Returns
     -------
@@ -46,7 +46,7 @@ def figures(card: ReportCard) -> dict[str, Figure]:
 
 
 def names(card: ReportCard) -> list[str]:
-    """The figures that a card has evidence for."""
+    """The names of the figures for which a card has evidence."""
     evidence = {
         "residuals": bool(card.tests), "bands": card.bands is not None,
         "bode": card.operating is not None, "poles": card.operating is not None,
@@ -56,12 +56,12 @@ def names(card: ReportCard) -> list[str]:
 
 
 def drawing(card: ReportCard, name: str | None = None) -> Drawing:
-    """One figure of a card; by default `bands`, else the first that it has evidence for.
+    """One figure of a card; by default `bands`, else the first for which it has evidence.
 
     Raises
     ------
     SettingError
-        For a name that is no figure, or one that the card has no evidence for.
+        For an unknown figure, or one for which the card has no evidence.
     """
     there = names(card)
     if name is None and there:
@@ -74,7 +74,7 @@ def drawing(card: ReportCard, name: str | None = None) -> Drawing:
 
 
 def save(card: ReportCard, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write every figure as a PNG into a folder, which is made where it does not exist.
+    """Write every figure as a PNG into a folder, which is created if needed.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def bode_drawing(card: ReportCard) -> Drawing:
 
 
 def _bode(ax: Axes, card: ReportCard, i: int, phase: bool) -> None:
-    """Gain or phase from input i, about constant inputs from low to high."""
+    """Gain or phase from input i, at constant inputs from low to high."""
     assert card.operating is not None
     o = card.operating
     hertz = o.frequencies
@@ -238,7 +238,7 @@ def pole_drawing(card: ReportCard) -> Drawing:
 
 
 def _along_first_input(card: ReportCard) -> list[int]:
-    """Operating points at which the first input alone differs."""
+    """Operating points at which only the first input differs."""
     assert card.operating is not None
     return [k for k, j in enumerate(card.operating.varied) if j == 0]
 

@@ -20,7 +20,7 @@ from .residuals import representative
 
 
 _RUN = 2000
-"""Samples of a constant input that bring a model near its equilibrium."""
+"""Samples of constant input to bring a model near its equilibrium."""
 _NEWTON = 30
 
 
@@ -35,9 +35,9 @@ class Linearised:
     Attributes
     ----------
     state : array
-        Where it is linearised, as the compiled model's `simulate` takes it.
+        State of the linearisation, as for the compiled model's `simulate`.
     drift : float
-        What the output of an integrator changes by at every sample there; 0 for other models.
+        Change of an integrator's output per sample at this state; 0 for other models.
     """
 
     y: float
@@ -55,7 +55,7 @@ class Linearised:
 def linearise(
     core: Any, u: FloatArray, state: FloatArray | None = None, level: float | None = None
 ) -> Linearised:
-    """About the equilibrium at a constant input, sought from `state` on (None: rest).
+    """Linearise about the equilibrium at a constant input, searched from `state` (None: rest).
 
     Parameters
     ----------
@@ -63,13 +63,12 @@ def linearise(
     u : array, shape (nu,)
     state : array, optional
     level : float, optional
-        Where the output of an integrator is to be, which rests at any level or at none.
+        Output level for an integrator, which rests at any level or at none.
 
     Raises
     ------
     SettingError
-        For a kind of model that is none of the linear difference equation, the network and the
-        neural state-space model.
+        For a model of another package.
     """
     u = np.ascontiguousarray(u, dtype=np.float64)
     if hasattr(core, "a") and hasattr(core, "offset"):
@@ -83,9 +82,9 @@ def linearise(
 
 
 def integrating_pole(model: DynamicModel) -> float | None:
-    """The pole at 1, or so near that no step within reach settles; None where there is none.
+    """The pole at 1, or so close that no practical step settles; None if there is none.
 
-    A record of a position gives it to within its noise and its friction.
+    A record of a position determines it up to noise and friction.
     """
     try:
         small = linearise(representative(model).core, np.zeros(len(model.input_names)))
@@ -127,7 +126,7 @@ def _network(core: Any, s: dict[str, Any], u: FloatArray, state: FloatArray | No
         return value, C[0, :na], np.hstack([D.T, C[0, na:].reshape(len(u), nb - 1)])
 
     y = _steady(core, u, np.zeros(na) if state is None else state)
-    # of a model without scales, the size of the output there
+    # for a model without scales, the magnitude of the output there
     scale = s.get("y_scale", max(abs(y), 1e-6))
     settled = False
     for _ in range(_NEWTON):
@@ -145,7 +144,7 @@ def _network(core: Any, s: dict[str, Any], u: FloatArray, state: FloatArray | No
 
 
 def _steady(core: Any, u: FloatArray, state: FloatArray) -> float:
-    """The output after a long constant input; where that runs away, the state's own."""
+    """The output after a long constant input; if that diverges, the output of the state."""
     try:
         return float(core.simulate(np.tile(u, (_RUN, 1)), state)[-1])
     except SewfastError:
@@ -175,7 +174,7 @@ def _state_space(
     core: Any, s: dict[str, Any], u: FloatArray, state: FloatArray | None, level: float | None
 ) -> Linearised:
     x = _last_state(core, u, core.rest_state() if state is None else state)
-    # an integrator's last state drifts, and nothing but itself depends on it
+    # an integrator's last state drifts, and no other state depends on it
     free = len(x) - 1 if s["integrator"] else len(x)
     held = np.tile(u, (2, 1))
     settled = False
@@ -201,7 +200,7 @@ def _state_space(
 def _moved_to(core: Any, u: FloatArray, x: FloatArray, level: float) -> FloatArray:
     """The integrator's state, the last one, at which the output is `level`, by Newton's method.
 
-    Where the output function does not reach that level, the state stays as it is.
+    If the output function does not reach that level, the state is returned unchanged.
     """
     moved = x.copy()
     for _ in range(_NEWTON):
@@ -231,7 +230,7 @@ def _last_state(core: Any, u: FloatArray, state: FloatArray) -> FloatArray:
 POINTS = 9
 FREQUENCIES = 120
 _CLOSING = 3
-"""Rounds in which the range of an input closes in on what the training data came near."""
+"""Rounds that narrow the range of an input to the values near the training data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,19 +243,19 @@ class OperatingPoint:
     y : float
         Steady output.
     A, B, C, D : array, shapes (n, n), (n, nu), (1, n), (1, nu)
-        Small signals in the data's units; the inputs act `delay` samples later.
+        Small-signal model in the data's units; the inputs act `delay` samples later.
     delay : int
     settled : bool
-        Whether this is an equilibrium; where it is not, the linear model holds at the last state
-        of a long run (an integrator's drifts).
+        Whether this is an equilibrium. If not, the linear model holds at the last state of a long
+        run (an integrator drifts).
     saturated : bool
-        Whether the output is on a limit: nothing passes through there.
+        Whether the output is on a limit, where no signal passes.
     known : bool
-        Whether the training data came near it; so too where the model does not store its region.
+        Whether the training data came near it; also True if the model does not store its region.
     Ts : float
         Sample time [s].
     drift : float
-        What the output of an integrator changes by at every sample; 0 for other models.
+        Change of an integrator's output per sample; 0 for other models.
     """
 
     u: FloatArray
@@ -274,7 +273,7 @@ class OperatingPoint:
 
     @property
     def poles(self) -> NDArray[np.complex128]:
-        """In the z plane, the slowest first; those of the delay (at 0) are left out."""
+        """Poles in the z plane, the slowest first, without those of the delay (at 0)."""
         found = np.linalg.eigvals(self.A).astype(np.complex128)
         return found[np.argsort(-np.abs(found), kind="stable")]
 
@@ -293,7 +292,7 @@ class OperatingPoint:
 
     @property
     def time_constants(self) -> FloatArray:
-        """-Ts/ln|pole| [s], the slowest first; infinite where a pole does not decay."""
+        """-Ts/ln|pole| [s], the slowest first; infinite for a pole that does not decay."""
         size = np.abs(self.poles)
         size = np.clip(size, 1e-300, None)
         return np.where(size < 1.0, -self.Ts / np.log(np.minimum(size, 1.0 - 1e-16)), np.inf)
@@ -328,7 +327,7 @@ class OperatingPoint:
         return float(pair[0] * (pair[1] / pair[0]) ** share)
 
     def to_control(self) -> Any:
-        """As a `control.StateSpace` with its delay.
+        """The linear model with its delay as a `control.StateSpace`.
 
         Raises
         ------
@@ -343,7 +342,7 @@ class OperatingPoint:
         return control.ss(A, B, C, D, self.Ts)
 
     def delayed(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """A, B, C, D with the delay as states of their own."""
+        """A, B, C, D with the delay as additional states."""
         A, B, C, D = self.A, self.B, self.C, self.D
         for _ in range(self.delay):
             n, m = B.shape
@@ -354,7 +353,7 @@ class OperatingPoint:
         return A, B, C, D
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values; what is not finite becomes None."""
+        """As JSON values; numbers that are not finite become None."""
         return {
             "u": self.u.tolist(),
             "y": self.y if math.isfinite(self.y) else None,
@@ -375,11 +374,11 @@ class OperatingRange:
     Attributes
     ----------
     points : tuple of OperatingPoint
-        Every input over its range while the others are at their middles, input by input.
+        Every input over its range while the others are at mid-range, input by input.
     varied : tuple of int
-        Which input is varied at each point.
+        Index of the varied input at each point.
     members : tuple of tuple of OperatingPoint
-        The same of every member of an ensemble; `points` are then those of the first.
+        The points of every member of an ensemble; `points` are then those of the first.
     """
 
     points: tuple[OperatingPoint, ...]
@@ -392,13 +391,13 @@ class OperatingRange:
     Ts: float
 
     def gain_unit(self, i: int = 0) -> str:
-        """Unit of the gain from input i; empty where either unit is unknown."""
+        """Unit of the gain from input i; empty if either unit is unknown."""
         known = self.output_unit and self.input_units[i]
         return f"{self.output_unit}/{self.input_units[i]}" if known else ""
 
     @property
     def frequencies(self) -> FloatArray:
-        """For the Bode plot [Hz]: from well below the slowest corner to half the sample rate."""
+        """Frequencies for a Bode plot [Hz]: from well below the slowest corner to half the rate."""
         slowest = [
             max((t for t in p.time_constants if math.isfinite(t)), default=self.Ts)
             for p in self.points
@@ -435,7 +434,7 @@ def operating_range(
     Raises
     ------
     DataError
-        Where the model does not store the range of its training inputs and none are given.
+        If the model does not store the range of its training inputs and none are given.
     """
     region = stored_region(model)
     first = representative(model)
@@ -452,7 +451,7 @@ def operating_range(
 
 
 def _input_range(model: DynamicModel, first: DynamicModel) -> FloatArray:
-    """Of the training inputs, (nu, 2): an ensemble stores it itself, or its members do."""
+    """Range of the training inputs, (nu, 2), stored with an ensemble or with its members."""
     ranges = model.training.get("input_range") or first.training.get("input_range")
     if not ranges:
         raise DataError(
@@ -475,7 +474,7 @@ def _grid(
 def _closed_in(
     model: DynamicModel, limits: FloatArray, i: int, points: int, region: TrainingRegion | None
 ) -> list[FloatArray]:
-    """Values of input i over what the data came near: a pulse's height was never held for long."""
+    """Values of input i near the training data: the height of a pulse, say, was never held."""
     low, high = limits[i]
     for _ in range(_CLOSING):
         line = _line(limits, i, low, high, points)
@@ -488,7 +487,7 @@ def _closed_in(
 
 
 def _line(limits: FloatArray, i: int, low: float, high: float, points: int) -> list[FloatArray]:
-    """Input i from low to high, the others at their middles."""
+    """Input i from low to high, the others at mid-range."""
     grid = np.tile(limits.mean(axis=1), (points, 1))
     grid[:, i] = np.linspace(low, high, points)
     return list(grid)
@@ -529,7 +528,7 @@ def _point(
 
 
 def point_at_level(model: DynamicModel, u: FloatArray, level: float) -> OperatingPoint:
-    """The point of an integrator at an input at which it keeps its output, at that output."""
+    """The operating point of an integrator at an input that holds its output, at that output."""
     small = linearise(model.core, u, level=level)
     reached = abs(small.y - level) <= 1e-6 * max(abs(level), 1.0)
     return _point(model, u, replace(small, settled=reached), stored_region(model))
@@ -541,7 +540,7 @@ def _row(p: OperatingPoint, i: int) -> list[str]:
     note = "saturated" if p.saturated else note
     note = note if p.is_stable else "unstable"
     numbers = [p.dc_gain[i], float(p.time_constants.max(initial=0.0)), p.bandwidth(i)]
-    # an integrator rests at any output, and has no gain
+    # an integrator rests at any output and has no steady gain
     return [*("-" if math.isnan(v) else f"{v:.4g}" for v in [*p.u, p.y, *numbers]), note]
 
 

@@ -1,4 +1,4 @@
-"""Parameters: covariance, conditioning, how many count, and criteria with that number."""
+"""Parameters: covariance, conditioning, effective number, and information criteria."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from .residuals import Noise, Residuals, representative
 
 @dataclass(frozen=True)
 class Criteria:
-    """Criteria of a model on the data that it was fitted to; smaller is better, differences matter.
+    """Criteria of a model on its training data; smaller is better, only differences matter.
 
     Attributes
     ----------
     parameters : float
-        Effective number.
+        Effective number of parameters.
     n : int
         Samples.
     aic, aicc, bic : float
@@ -33,7 +33,7 @@ class Criteria:
     Notes
     -----
     Akaike (1974), Hurvich and Tsai (1989), Schwarz (1978), Akaike (1969); Ljung 1999, section 16.4.
-    They take the residual for white: with a coloured one they are too willing to add parameters.
+    They assume a white residual; with a coloured one they favour too many parameters.
     """
 
     parameters: float
@@ -66,14 +66,14 @@ class Criteria:
 
 
 DETERMINED = 1e-10
-"""Share of the largest information from which a direction counts; double precision ends there."""
+"""Least information of a direction, relative to the largest; double precision ends there."""
 NOTHING = 1e-60
-"""Length of a sensitivity's column, as a share of the longest, below which it says nothing."""
+"""Least length of a sensitivity's column, relative to the longest, to carry information."""
 
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """What the data say of the parameters.
+    """Estimates of the parameters and their uncertainty.
 
     Attributes
     ----------
@@ -81,13 +81,14 @@ class Parameters:
     covariance : array, shape (p, p)
         (H + L)^-1 Psi'R Psi (H + L)^-1 with H = Psi'Psi, L the weight decay, R the residual's
         covariance matrix, coloured (Ljung 1999, eq. 9.42; Newey and West 1987); undetermined
-        directions count as held.
+        directions count as fixed.
     effective : float
-        trace (H + L)^-1 H: parameters that the data and not the weight decay determine.
+        trace (H + L)^-1 H: number of parameters determined by the data, not the weight decay.
     condition : float
-        Of the sensitivity with columns of unit length; infinity where a direction has no effect.
+        Condition of the sensitivity with columns of unit length; infinity if a direction has no
+        effect.
     undetermined : int
-        Directions that the data say nothing about.
+        Number of directions without information in the data.
     names : tuple of str
     """
 
@@ -104,14 +105,14 @@ class Parameters:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     def loose(self, share: float = 1.0) -> list[str]:
-        """Names of the parameters whose standard error exceeds that share of their size."""
+        """Names of the parameters whose standard error exceeds that share of their magnitude."""
         bound = share * np.abs(self.values)
         return [n for n, s, b in zip(self.names, self.standard_errors, bound, strict=True) if s > b]
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """The normal matrix of a residual, with its inverse over what is determined.
+    """The normal matrix of a residual, with its inverse over the determined directions.
 
     Attributes
     ----------
@@ -129,7 +130,7 @@ class Information:
 
     @property
     def scale(self) -> FloatArray:
-        """Square roots of the diagonal, the largest one where it is nothing."""
+        """Square roots of the diagonal; the largest one in place of 0."""
         return _unit_scale(np.diag(self.gram) + self.penalty)
 
     def inverse(self, less: FloatArray | None = None, determined: float = DETERMINED) -> FloatArray:
@@ -145,7 +146,7 @@ class Information:
         return found
 
     def conditioning(self) -> tuple[float, int]:
-        """Condition number of the sensitivity, and the directions without information."""
+        """Condition number of the sensitivity, and number of directions without information."""
         scale = _unit_scale(np.diag(self.gram))
         sizes = np.linalg.eigvalsh(self.gram / np.outer(scale, scale))
         if len(sizes) == 0 or sizes[-1] <= 0.0:
@@ -156,10 +157,10 @@ class Information:
 
 
 def _unit_scale(squares: FloatArray) -> FloatArray:
-    """What makes columns of these squared lengths unit ones; a column that is nothing stays so.
+    """Factors that normalise columns of these squared lengths; columns of zeros stay so.
 
-    Weight decay can shrink what a hidden unit does to the output to 1e-160: the inverse of its
-    information is no number any more, whatever the units are.
+    Weight decay can shrink the effect of a hidden unit to 1e-160, so that the inverse of its
+    information overflows in any units.
     """
     lengths = np.sqrt(squares)
     largest = lengths.max(initial=0.0) or 1.0
@@ -167,8 +168,8 @@ def _unit_scale(squares: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Knowledge:
-    """What stays with a model of how well its training data determine it.
+class StoredInformation:
+    """Stored with a model: how well its training data determine the parameters.
 
     Attributes
     ----------
@@ -186,16 +187,16 @@ class Knowledge:
     undetermined: int
 
     @classmethod
-    def of(cls, p: Parameters, samples: int) -> Knowledge:
+    def of(cls, p: Parameters, samples: int) -> StoredInformation:
         return cls(len(p.values), samples, p.effective, p.condition, p.undetermined)
 
     def to_json(self) -> dict[str, float | None]:
-        """As JSON values: None for a condition that is infinite."""
+        """As JSON values: None for an infinite condition."""
         return {k: v if np.isfinite(v) else None for k, v in asdict(self).items()}
 
     @classmethod
-    def stored(cls, model: DynamicModel) -> Knowledge | None:
-        """What the model stores; None where there is nothing that can be read."""
+    def stored(cls, model: DynamicModel) -> StoredInformation | None:
+        """The values stored with the model; None if there are none, or they are unreadable."""
         values = model.training.get("information")
         if not isinstance(values, Mapping):
             return None
@@ -216,7 +217,7 @@ class Knowledge:
 
 
 def estimate(model: DynamicModel, residuals: Residuals) -> Parameters | None:
-    """What the data say of a model's parameters; None for an ensemble, which has no one set."""
+    """Parameters of a model and their uncertainty; None for an ensemble, which has several sets."""
     if residuals.width == 0 or model.members:
         return None
     information = Information.of(model, residuals)
@@ -230,7 +231,7 @@ def estimate(model: DynamicModel, residuals: Residuals) -> Parameters | None:
 
 
 def penalty(model: DynamicModel, residuals: Residuals) -> FloatArray:
-    """The weight decay as a diagonal added to Psi'Psi, in the data's units; zero without one.
+    """The weight decay as a diagonal added to Psi'Psi, in the data's units; zero without decay.
 
     The training cost is 1/(2N) sum (e/y_scale)^2 + decay/2 |w|^2 (docs/CONVENTIONS.md).
     """
@@ -268,7 +269,7 @@ _DECAYED = {"neural_oe": _network_decay, "neural_ss": _state_space_decay}
 
 
 def _meat(residuals: Residuals, noise: Noise) -> FloatArray:
-    """Psi'R Psi over all experiments."""
+    """Psi'R Psi over all experiments: the middle factor of the sandwich covariance."""
     total = np.zeros((residuals.width, residuals.width))
     for run in residuals.runs:
         shaped = noise.shaped(run.sensitivity)
@@ -279,7 +280,7 @@ def _meat(residuals: Residuals, noise: Noise) -> FloatArray:
 def _values(model: DynamicModel, residuals: Residuals) -> tuple[FloatArray, tuple[str, ...]]:
     values, names = model.theta, model.parameter_names
     if residuals.horizon == "one step":
-        # regressors are past outputs themselves, a_i their negative factors
+        # regressors are the past outputs, a_i their negative coefficients
         na = model.orders["na"]
         values = np.concatenate([-values[:na], values[na:]])
         names = (*(f"-{n}" for n in names[:na]), *names[na:])

@@ -18,9 +18,9 @@ LAGS = 25
 LEAST_SAMPLES = 50
 _FOLLOWED = 1e-4
 _MODERATE = 60
-"""Binary exponent up to which the tests take values as they are."""
+"""Binary exponent up to which the tests use values without rescaling."""
 LARGEST_SET = 50
-"""Sums in one test: with several inputs there are fewer lags of each."""
+"""Most sums in one test: several inputs have fewer lags each."""
 
 _Lags: TypeAlias = NDArray[np.int64]
 _Columns: TypeAlias = list[FloatArray]
@@ -33,7 +33,7 @@ def residual_tests(residuals: Residuals, memory: int = LAGS) -> tuple[ResidualTe
     ----------
     residuals : Residuals
     memory : int
-        Samples that the model remembers; the lags reach that far, at least to 24.
+        Samples over which the initial state fades; the lags reach that far, at least to 24.
 
     Returns
     -------
@@ -41,13 +41,13 @@ def residual_tests(residuals: Residuals, memory: int = LAGS) -> tuple[ResidualTe
         `autocorrelation` of e (judges one-step residuals only); `input`: e(k) with u(k - lag);
         `squared_input`, `cubed_input`: e with u^2, u^3; `output`: e with powers of the computed
         output (Ramsey 1969); `squares`: e^2 with u^2; `product`: e(k) with
-        e(k - 1 - lag) u(k - 1 - lag); `feedback`: u(k) with e(k - lag). None where there are fewer
-        than 50 samples, or nothing but rounding is left.
+        e(k - 1 - lag) u(k - 1 - lag); `feedback`: u(k) with e(k - lag). Empty if there are fewer
+        than 50 samples, or the residuals are only rounding.
 
     Notes
     -----
-    Billings and Voon, *Int. J. Control* 38 (1983) 193 and 44 (1986) 235. Inputs and their squares
-    and products are taken about their means.
+    Billings and Voon, *Int. J. Control* 38 (1983) 193 and 44 (1986) 235. The means of inputs and of
+    their squares and products are removed.
     """
     if residuals.is_nothing or residuals.n < LEAST_SAMPLES:
         return ()
@@ -56,9 +56,9 @@ def residual_tests(residuals: Residuals, memory: int = LAGS) -> tuple[ResidualTe
 
 
 def _within_reach(residuals: Residuals) -> Residuals:
-    """In other units where values are so large or small that their sixth powers leave the numbers.
+    """Residuals rescaled if their sixth powers would overflow or underflow.
 
-    The tests have no unit, and powers of two change no digit.
+    The tests are independent of units, and powers of two change no digit.
     """
     u = np.concatenate([r.u for r in residuals.runs])
     y = np.concatenate([r.yhat[r.counts] for r in residuals.runs])
@@ -81,10 +81,10 @@ def _exponents(sizes: FloatArray) -> NDArray[np.int32]:
 
 
 def parameter_test(residuals: Residuals, trained: int) -> ResidualTest | None:
-    """Whether other parameters would do better on data that the model was not fitted to.
+    """Whether other parameters would do better on data not trained on.
 
-    The residual with its sensitivities, those that matter; their sums also hold what `trained`
-    samples left open. None where there are no sensitivities or too few samples.
+    Tests the residual against its significant sensitivities, allowing for the uncertainty that
+    `trained` samples leave. None without sensitivities or with too few samples.
     """
     if residuals.is_nothing or residuals.n < LEAST_SAMPLES or residuals.width == 0:
         return None
@@ -98,7 +98,7 @@ def parameter_test(residuals: Residuals, trained: int) -> ResidualTest | None:
 
 
 def lags_over(memory: int, samples: int, count: int = LAGS) -> _Lags:
-    """Lags from 0 on: i where the memory is short, else memory (i/(count-1))^2, close at first."""
+    """Lags from 0 on: i for a short memory, else memory (i/(count-1))^2, dense at first."""
     reach = max(count - 1, min(memory, samples // 10))
     i = np.arange(count)
     wide = np.rint(reach * (i / max(count - 1, 1)) ** 2).astype(np.int64)
@@ -106,7 +106,7 @@ def lags_over(memory: int, samples: int, count: int = LAGS) -> _Lags:
 
 
 def lagged(columns: FloatArray, lags: _Lags, counts: NDArray[np.bool_]) -> FloatArray:
-    """Columns (N, c) delayed by every lag, (N, c m), series by series; zero where none is known."""
+    """Columns (N, c) delayed by every lag, (N, c m), series by series; zero where unknown."""
     n, width = columns.shape
     found = np.zeros((n, width, len(lags)))
     for i, lag in enumerate(lags):
@@ -117,13 +117,13 @@ def lagged(columns: FloatArray, lags: _Lags, counts: NDArray[np.bool_]) -> Float
 
 
 def leading(columns: FloatArray, lags: _Lags, counts: NDArray[np.bool_]) -> FloatArray:
-    """Columns ahead by every lag, else as `lagged`."""
+    """Columns advanced by every lag, otherwise as `lagged`."""
     return lagged(columns[::-1], lags, counts[::-1])[::-1]
 
 
 @dataclass(frozen=True, eq=False)
 class _Setting:
-    """What the tests share."""
+    """Quantities shared by the tests."""
 
     residuals: Residuals
     errors: _Columns
@@ -155,7 +155,7 @@ class _Setting:
         return self.residuals.input_names
 
     def lags(self, series: int = 1) -> _Lags:
-        """As many as the record's length and the number of series allow."""
+        """As many lags as the record's length and the number of series allow."""
         n = self.residuals.n
         count = min(LAGS, max(5, LARGEST_SET // series), max(2, n // (8 * series)))
         return lags_over(self.memory, n, count)
@@ -167,7 +167,7 @@ class _Setting:
         return [make(x, lags, r.counts) for x, r in zip(series, self.runs, strict=True)]
 
     def centred(self, of: Callable[[FloatArray], FloatArray]) -> _Columns:
-        """Columns made of the inputs, about their common means."""
+        """Columns computed from the inputs, minus their common means."""
         return _about_mean_of_columns([of(r.u) for r in self.runs])
 
 
@@ -181,9 +181,9 @@ def _whitened_basis(columns: _Columns, known: list[NDArray[np.bool_]], noise: No
 def _innovations(
     errors: _Columns, basis: _Columns, known: list[NDArray[np.bool_]], noise: Noise
 ) -> _Columns:
-    """Whitened residuals, less what better parameters would take of them.
+    """Whitened residuals, with the sensitivities to the parameters projected out.
 
-    A change of the parameters too small to see in the residual can be large against its innovation.
+    A parameter change too small to see in the residual can be large compared with its innovation.
     """
     white = [
         np.where(k, noise.whitened(e[:, None])[:, 0], 0.0)
@@ -203,7 +203,7 @@ def _linear(
     directions: _Columns | None = None,
     judges: bool = True,
 ) -> ResidualTest:
-    """The residual with columns that hold no noise, as it is and whitened."""
+    """Test of the residual, plain and whitened, against columns without noise."""
     basis = s.white_directions
     if directions is not None:
         basis = _whitened_basis(directions, s.known, s.noise)
@@ -217,12 +217,12 @@ def _linear(
 
 
 def _products(u: FloatArray) -> FloatArray:
-    """Squares and products of the inputs, each about its own mean first: u_i u_j for i <= j."""
+    """Squares and products of the inputs after removing their means: u_i u_j for i <= j."""
     return np.column_stack([u[:, i] * u[:, j] for i, j in _pairs(u.shape[1])])
 
 
 def _pairs(n: int) -> list[tuple[int, int]]:
-    """With many inputs squares alone: their products would leave too few lags."""
+    """Pairs of inputs; for many inputs only squares, as products would leave too few lags."""
     if n > 3:
         return [(i, i) for i in range(n)]
     return list(combinations_with_replacement(range(n), 2))
@@ -238,7 +238,7 @@ def _autocorrelation(s: _Setting) -> ResidualTest:
     judges = s.residuals.horizon == "one step"
     white = Noise(np.zeros(0), s.noise.variance, s.noise.variance)
     past = s.spread(lagged, [e[:, None] for e in s.errors], lags)
-    # the sensitivities of a free run hold no noise: only a mean is to be taken out
+    # the sensitivities of a free run are free of noise: only the mean is projected out
     sums = Sums.of(
         past, s.errors, white, s.directions if judges else _constant([r.counts for r in s.runs])
     )
@@ -261,7 +261,7 @@ def _squared_input(s: _Setting) -> ResidualTest:
 
 
 def _cubed_input(s: _Setting) -> ResidualTest:
-    """Saturation and dead zone are odd: squares do not see them."""
+    """Saturation and dead zone are odd functions, which squares do not detect."""
     names = tuple(f"{name}³" for name in s.names)
     lags = s.lags(len(names))
     mean = np.concatenate([r.u for r in s.runs]).mean(axis=0)
@@ -271,7 +271,7 @@ def _cubed_input(s: _Setting) -> ResidualTest:
 
 
 def _output(s: _Setting) -> ResidualTest:
-    """Ramsey's test: powers of what the model computes, which hold the input's whole past."""
+    """Ramsey's test: powers of the computed output, which depends on the input's whole past."""
     lags = s.lags(2)
     values = np.concatenate([r.yhat for r in s.runs])
     mean, spread = values.mean(), max(float(values.std()), 1e-300)
@@ -293,7 +293,7 @@ def _squares(s: _Setting) -> ResidualTest:
     squares = _squares_about_mean(s)
     past = [lagged(q, lags, known) for q, known in zip(squares, s.known, strict=True)]
     bound = 3.0 * np.sqrt(s.noise.innovation)
-    # a single outlier's square would outweigh all the rest
+    # the square of a single outlier would dominate
     power = _about_mean([np.minimum(np.abs(w), bound) ** 2 for w in s.white], s.known)
     noise = Noise.fit(list(zip(power, s.known, strict=True)), sparing=True)
     sums = Sums.of(past, power, noise, _constant(s.known))
@@ -307,7 +307,7 @@ def _feedback(s: _Setting) -> ResidualTest:
     past = s.spread(lagged, s.centred(lambda u: u), lags - 1)
     known = [np.hstack(pair) for pair in zip(s.directions, past, strict=True)]
     title = "inputs with past residuals"
-    # what the past input says of the coming one is no answer to the residual
+    # predictability of the input from its own past is no response to the residual
     return _linear(s, "feedback", title, lags, s.names, ahead, known, judges=False)
 
 

@@ -1,31 +1,31 @@
-"""The training region: where a model has been on its training data, and what lies outside.
+"""The training region: the signals of a model's free run on its training data.
 
-A model is judged by what goes in and comes out of its free run, so that one measure serves every
-kind, ensembles included. A sample lies outside where any of three distances exceeds 1:
+A model is judged by the input and output of its free run, so that one measure serves every kind,
+including ensembles. A sample lies outside if any of three distances exceeds 1:
 
-- *nearest*: from the point (inputs, output, change of the output over a lag) to the nearest
-  training point, over the radius. The lag is the one over which the output changes visibly, so
-  that a short sample time does not shrink the change to nothing. The radius is what a tenth of the
-  training record keeps from the other nine tenths, the worst tenth of ten: a new stretch of the
-  same excitation is to the record what each tenth is to the others.
-- *level*: the rms of each signal about its training mean over a window, over the largest that the
-  training data reach. A signal of twice the size still crosses zero, and a Gaussian one is seldom
-  where the training data have never been; its rms over some time gives it away. The window is the
-  shortest one over which most of the training record itself, at twice its size, would be outside.
-- *peak*: the largest deviation within the last few lags, the time that a sample stays in the
-  model's memory.
+- *nearest*: distance of the point (inputs, output, change of the output over a lag) to the nearest
+  training point, over the radius. The output changes visibly over the lag, so that a short sample
+  time does not make the change vanish. The radius is the distance that a tenth of the training
+  record keeps from the other nine tenths, for the worst tenth of ten: a new stretch of the same
+  excitation relates to the record as each tenth does to the others.
+- *level*: the rms of each signal about its training mean over a window, over its largest value in
+  the training data. A signal of twice the amplitude still crosses zero, and a Gaussian one is
+  rarely where the training data have never been; its rms over some time reveals it. The window is
+  the shortest one over which most of the training record, doubled in amplitude, would be outside.
+- *peak*: the largest deviation within the last few lags, the time over which a sample affects the
+  model.
 
-Where a model integrates, as that of a position does, the output is no part of the point: at rest
-an axis is the same everywhere, and a record that goes there and back never rests at its ends. Level
-and peak bound its output as any other's.
+For a model that integrates, such as that of a position, the point has no output: at rest an axis
+is the same everywhere, and a record that goes back and forth never rests at its ends. Level and
+peak bound its output like any other.
 
 A two-level input makes the regressor's points degenerate (they lie on a few planes), and any
 ellipsoid or whitening of them turns rounding into distance. Here nothing is whitened: every
 coordinate is divided by half its own range.
 
-What a new stretch exceeds by depends on how many independent pieces the record holds; the margins
-below were set on PRBS, steps, multisines and chirps into lags of first and second order, and are
-measured on others by tests/evidence/test_region.py.
+How far a new stretch exceeds the bounds depends on the number of independent pieces in the record;
+the margins below were set on PRBS, steps, multisines and chirps into lags of first and second
+order, and are measured on others by tests/evidence/test_region.py.
 """
 
 from __future__ import annotations
@@ -44,34 +44,34 @@ Signals: TypeAlias = tuple[FloatArray, FloatArray]
 """Inputs (N, nu) and output (N,) of one run."""
 
 FORM = 2
-"""Of the stored values; the first form whitened the model's own regressor or state."""
+"""Version of the stored values; version 1 whitened the model's own regressor or state."""
 CENTRES = 300
 _SUBSAMPLE = 4000
 _BLOCK = 4096
 _TENTHS = 10
 _FARTHEST = 1000.0
-"""Larger distances say no more, and their squares would drown what follows in rounding."""
+"""Largest distance; squares of larger ones would swamp later values by rounding."""
 
 _LEAST_RADIUS = 0.1
-"""Of half a range: a twentieth of the range is no new region."""
+"""Least radius, as a part of half a range: a twentieth of the range is no new region."""
 _LEFT_OUT = 0.98
-"""Share of a tenth of the record that lies within its distance from the others."""
+"""Share of the points of a tenth that lie within its distance from the other tenths."""
 _MOVED = 0.5
-"""Mean square change over a lag, over the variance: samples correlate by three quarters."""
+"""Mean square change over the lag, relative to the variance: a correlation of three quarters."""
 
 _INPUT_LEVEL, _FEW_WINDOWS = 1.2, 0.2
-"""Factor on the largest training level of an input, and what is added where windows are few."""
+"""Factor on the largest training level of an input, and an addition for few windows."""
 _WHOLE_LEVEL = 1.4
-"""Factor on the level of the whole record, where that is more: half way to the double, in dB."""
+"""Factor on the level of the whole record, if that gives more: half way to the double, in dB."""
 _INPUT_PEAK, _OUTPUT = 1.3, 1.7
-"""Factors on the largest peak of an input, on largest level and peak of the output."""
+"""Factors on the largest peak of an input, and on the largest level and peak of the output."""
 _SEEN = 0.85
-"""Share of the training record at twice its size that the window has to find outside."""
+"""Share of the training record, doubled in amplitude, that must lie outside with the window."""
 _LARGEST_WINDOW = 6
-"""Windows that the record holds at least."""
+"""Least number of windows in the record."""
 _PEAK_LAGS = 3
 _SMALLEST = 1e-6
-"""Of a signal's own size: an input that never moved is outside as soon as it moves."""
+"""Least level, relative to the signal: an input that never moved is outside once it moves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class Region:
     Attributes
     ----------
     mean, scale : array, shape (d,)
-        (point - mean) / scale is what the centres are given in.
+        The centres are in coordinates (point - mean) / scale.
     centres : array, shape (c, d)
     radius : float
     """
@@ -117,7 +117,7 @@ class Region:
         return _nearest((points - self.mean) / self.scale, self.centres)
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values with the digits that matter."""
+        """As JSON values, rounded to significant digits."""
         return {
             "mean": _short(self.mean, 7),
             "scale": _short(self.scale, 7),
@@ -146,13 +146,13 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class TrainingRegion:
-    """Where a model has been on its training data.
+    """The region of a model's training data.
 
     Attributes
     ----------
     nearest : Region
-        Of the points (inputs, output, change of the output over `lag`), of one that integrates
-        without the output.
+        Region of the points (inputs, output, change of the output over `lag`); without the output
+        for a model that integrates.
     centre, level, peak : array, shape (nu + 1,)
         Means of the inputs and the output; the bounds of rms and peak about them.
     lag, window : int
@@ -168,21 +168,21 @@ class TrainingRegion:
 
     @classmethod
     def of(cls, runs: Sequence[Signals], *, integrates: bool = False) -> TrainingRegion:
-        """Of runs on training data.
+        """The region of runs on training data.
 
         Parameters
         ----------
         runs : sequence of (u, y)
             Inputs, shape (N, nu), and output, shape (N,), of each experiment.
         integrates : bool
-            Whether the output is as good as any other where it rests.
+            Whether the model integrates, so that all rest positions are equivalent.
         """
         lag = max(1, int(np.median([_lag(y) for _, y in runs])))
         points = np.concatenate([_points(u, y, lag, integrates) for u, y in runs])
         signals = [np.column_stack(run) for run in runs]
         together = np.concatenate(signals)
         centre = together.mean(axis=0)
-        # a change of the output that is small compared with the output itself is no new region
+        # a change that is small compared with the output itself is no new region
         floor = np.zeros(points.shape[1])
         floor[-1] = 0.1 * 0.5 * float(np.ptp(together[:, -1]))
         largest = np.maximum(
@@ -196,7 +196,7 @@ class TrainingRegion:
         return cls(Region.of(points, floor), centre, level, peak, lag, window)
 
     def distances(self, u: FloatArray, y: FloatArray) -> FloatArray:
-        """How far every sample of a run lies, in units of the bound: above 1 is outside.
+        """Distance of every sample of a run, relative to the bounds: above 1 is outside.
 
         Parameters
         ----------
@@ -216,7 +216,7 @@ class TrainingRegion:
         return np.minimum(np.maximum(near, size), _FARTHEST)
 
     def holds(self, u: FloatArray, y: float) -> bool:
-        """Whether the training data came near a steady state: inputs (nu,) and output at rest."""
+        """Whether a steady state with inputs (nu,) and output is near the training data."""
         if not (np.isfinite(u).all() and np.isfinite(y)):
             return False
         point = np.concatenate([u, [0.0] if self.integrates else [y, 0.0]])
@@ -224,7 +224,7 @@ class TrainingRegion:
 
     @property
     def integrates(self) -> bool:
-        """Whether the points are without the output."""
+        """Whether the points have no output coordinate."""
         return len(self.nearest.mean) == len(self.centre)
 
     @property
@@ -268,7 +268,7 @@ class TrainingRegion:
 
 
 def training_region(model: DynamicModel, data: Dataset) -> dict[str, Any]:
-    """The region that a model passes through on its training data, for its `training["region"]`."""
+    """The region of a model on its training data, for its `training["region"]`."""
     return _region(model, data).to_json()
 
 
@@ -280,7 +280,7 @@ def _region(model: DynamicModel, data: Dataset) -> TrainingRegion:
 
 
 def stored_region(model: DynamicModel) -> TrainingRegion | None:
-    """The region stored with the model; None where there is none that can be read."""
+    """The region stored with the model; None if there is none, or it is unreadable."""
     values = model.training.get("region")
     if not isinstance(values, Mapping):
         return None
@@ -292,15 +292,15 @@ def stored_region(model: DynamicModel) -> TrainingRegion | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """Where free runs go, seen from the training region.
+class RegionRuns:
+    """Free runs and their distances from the training region.
 
     Attributes
     ----------
     runs : list of (u, y)
         Inputs, shape (N, nu), and simulated output, shape (N,), of each experiment.
     distances : list of array, shape (N,)
-        Over the region's bounds: above 1 is outside.
+        Distances relative to the region's bounds: above 1 is outside.
     """
 
     region: TrainingRegion
@@ -311,18 +311,18 @@ class Place:
         return [self.region.distances(u, y) for u, y in self.runs]
 
 
-def placed(
+def region_runs(
     model: DynamicModel, data: Dataset, training: Dataset | None = None, init: int = INIT
-) -> Place | None:
-    """In the region stored with the model, or that of the training data where they are given.
+) -> RegionRuns | None:
+    """Free runs in the region of the training data if given, else in the stored one.
 
-    None where there is neither.
+    None if there is neither.
     """
     if training is not None:
         known: TrainingRegion | None = _region(model, training)
     else:
         known = stored_region(model)
-    return None if known is None else Place(known, _runs(model, data, init))
+    return None if known is None else RegionRuns(known, _runs(model, data, init))
 
 
 def _runs(model: DynamicModel, data: Dataset, init: int) -> list[Signals]:
@@ -334,7 +334,7 @@ def _runs(model: DynamicModel, data: Dataset, init: int) -> list[Signals]:
 
 
 def _points(u: FloatArray, y: FloatArray, lag: int, integrates: bool) -> FloatArray:
-    """Inputs, output and its change over the lag, (N, nu + 2); or without the output."""
+    """Inputs, output (unless the model integrates) and its change over the lag, (N, nu + 2)."""
     change = np.zeros(len(y))
     if len(y) > 1:
         lag = min(lag, len(y) - 1)
@@ -355,7 +355,7 @@ def _lag(y: FloatArray) -> int:
 
 
 def _spread_out(points: FloatArray) -> tuple[FloatArray, float]:
-    """Up to `CENTRES` points, each the farthest from those before, and what they leave uncovered.
+    """Up to `CENTRES` points, each farthest from those before, and the largest distance left.
 
     The greedy k-centre of Gonzalez (1985): extremes are among the first.
     """
@@ -371,7 +371,7 @@ def _spread_out(points: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _between_tenths(points: FloatArray) -> float:
-    """What 98 % of a tenth of the points keep from the other nine, the worst tenth of ten."""
+    """Distance of 98 % of a tenth of the points from the other nine, for the worst tenth."""
     if len(points) < 2 * _TENTHS:
         return 0.0
     tenth = np.arange(len(points)) * _TENTHS // len(points)
@@ -397,9 +397,9 @@ def _nearest(points: FloatArray, centres: FloatArray) -> FloatArray:
 def _window(
     signals: Sequence[FloatArray], centre: FloatArray, peak: FloatArray, lag: int
 ) -> tuple[int, FloatArray]:
-    """The window and the bounds of the level: the shortest that finds twice the inputs outside.
+    """The window and the bounds of the level: the shortest with the doubled inputs outside.
 
-    Twice about their mean as well as about zero. Where none does, the one that finds most.
+    Inputs are doubled about their mean and about zero. If no window suffices, the best one.
     """
     n = sum(map(len, signals))
     whole = np.sqrt(sum(np.square(x - centre).sum(axis=0) for x in signals) / n)
@@ -430,7 +430,7 @@ def _window(
 def _size(
     signals: FloatArray, level: FloatArray, peak: FloatArray, lag: int, window: int
 ) -> FloatArray:
-    """Rms and peak of deviations (N, m) over their bounds, the largest of all, (N,)."""
+    """Largest of rms and peak of the deviations (N, m), relative to their bounds, (N,)."""
     bound = _FARTHEST * np.minimum(level, peak)
     signals = np.clip(signals, -bound, bound)
     rms = (_rms(signals, window) / level).max(axis=1)
@@ -440,7 +440,7 @@ def _size(
 
 
 def _rms(signals: FloatArray, window: int) -> FloatArray:
-    """Over the last samples of each column; the first ones as the first whole window."""
+    """Moving rms of each column; the first samples have the value of the first whole window."""
     window = min(window, len(signals))
     sums = np.cumsum(np.square(signals), axis=0)
     sums[window:] -= sums[:-window].copy()
@@ -450,7 +450,7 @@ def _rms(signals: FloatArray, window: int) -> FloatArray:
 
 
 def _largest(values: FloatArray, window: int) -> FloatArray:
-    """Largest of the last values, (N,), by doubling spans; the first ones as the first window."""
+    """Moving maximum, (N,), by doubling spans; the first samples as in the first window."""
     window = min(window, len(values))
     found: FloatArray = values.copy()
     span = 1
@@ -466,7 +466,7 @@ def _largest(values: FloatArray, window: int) -> FloatArray:
 
 
 def _short(values: FloatArray, digits: int) -> Any:
-    """The region is a judgement, its last bits are not."""
+    """Values rounded to so many digits: the region is not known to the last bit."""
     rounded = [float(f"{v:.{digits - 1}e}") for v in values.ravel()]
     return np.array(rounded).reshape(values.shape).tolist()
 

@@ -1,4 +1,4 @@
-"""What a model leaves of the data: the noise in it, residuals, scores over the horizon."""
+"""Residuals of a model, a model of their noise, and scores over the horizon."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ class Noise:
         series : pairs of values (N,) and whether each of them counts (N,)
             One pair per experiment.
         spent : float
-            Parameters that were estimated on these samples: they take as many degrees of freedom.
+            Parameters estimated on these samples, each of which costs a degree of freedom.
         sparing : bool
-            By Schwarz's criterion, for a series that is white unless much speaks against it.
+            Use Schwarz's criterion, for a series that is white unless there is strong evidence.
         """
         n = sum(int(known.sum()) for _, known in series)
         squares = sum(float(e[known] @ e[known]) for e, known in series)
@@ -82,7 +82,7 @@ class Noise:
         return found
 
     def whole(self, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Where w(k) follows from values that are all known, shape (N,)."""
+        """Where w(k) depends only on known values, shape (N,)."""
         p = len(self.ar)
         found: NDArray[np.bool_] = np.convolve(known, np.ones(p + 1))[: len(known)] > p + 0.5
         return found
@@ -121,7 +121,7 @@ class Noise:
 
 
 def fast_length(n: int) -> int:
-    """The smallest 2^a, 3 2^a or 5 2^a that is at least `n`: quick to transform."""
+    """The smallest 2^a, 3 2^a or 5 2^a that is at least `n`, for a fast transform."""
     return min(f << max(0, (-(-n // f) - 1).bit_length()) for f in (1, 3, 5))
 
 
@@ -183,11 +183,11 @@ class Run:
     y, yhat : array, shape (N,)
         Measured (NaN where it is not) and computed output [output unit].
     counts : array of bool, shape (N,)
-        Samples that are measured and come after the initial ones.
+        Measured samples after the initial ones.
     psi : array, shape (N, p)
         Sensitivity of yhat to the parameters.
     state : array, shape (N, s)
-        Orthonormal: what a change of the initial state could do to yhat, zero where a sample does
+        Orthonormal basis of the changes of yhat due to the initial state, zero where a sample does
         not count.
     """
 
@@ -207,7 +207,7 @@ class Run:
 
     @cached_property
     def sensitivity(self) -> FloatArray:
-        """`psi` where samples count, less what a change of the initial state could do as well."""
+        """`psi` where samples count, with the effect of the initial state projected out."""
         return self.without_state(np.where(self.counts[:, None], self.psi, 0.0))
 
     @property
@@ -216,7 +216,7 @@ class Run:
         return np.where(self.counts, self.y - self.yhat, 0.0)
 
     def without_state(self, columns: FloatArray) -> FloatArray:
-        """Columns (N,) or (N, m) less what a change of the initial state could explain."""
+        """Columns (N,) or (N, m) with the effect of the initial state projected out."""
         left: FloatArray = columns - self.state @ (self.state.T @ columns)
         return left
 
@@ -228,10 +228,10 @@ class Residuals:
     Attributes
     ----------
     horizon : "free run" or "one step"
-        What they come from: an ARX model promises white one-step residuals, every other kind a
-        free run that leaves nothing of the input.
+        Their origin: an ARX model should have white one-step residuals, every other kind a free
+        run whose residuals are independent of the input.
     spent : int
-        Parameters, those that matter (rank of the sensitivity).
+        Number of effective parameters (rank of the sensitivity).
     """
 
     horizon: Horizon
@@ -245,12 +245,12 @@ class Residuals:
     def of(
         cls, model: DynamicModel, data: Dataset, init: int = INIT, horizon: Horizon | None = None
     ) -> Residuals:
-        """Residuals of a model, at the horizon that it was made for unless stated otherwise.
+        """Residuals of a model, by default at the horizon for which it was fitted.
 
         Raises
         ------
         DataError
-            Where the data do not fit the model or leave nothing to judge.
+            Where the data do not match the model or leave nothing to judge.
         FitError
             Where the model is unstable on this input.
         """
@@ -272,7 +272,7 @@ class Residuals:
 
     @property
     def n(self) -> int:
-        """Samples that count."""
+        """Number of samples that count."""
         return sum(int(r.counts.sum()) for r in self.runs)
 
     @property
@@ -290,12 +290,12 @@ class Residuals:
 
     @property
     def constants(self) -> list[FloatArray]:
-        """A constant less what the initial state could do of it, one array (N,) per experiment."""
+        """A constant with the initial state's effect projected out, one array (N,) per run."""
         return [r.without_state(r.counts.astype(np.float64)) for r in self.runs]
 
     @property
     def mean(self) -> float:
-        """Of the residuals, without what the initial state explains; 0 where it explains all."""
+        """Mean residual without the initial state's effect; 0 if that explains a constant."""
         ones = self.constants
         length = float(sum(one @ one for one in ones))
         total = float(sum(one @ r.error for one, r in zip(ones, self.runs, strict=True)))
@@ -303,19 +303,19 @@ class Residuals:
 
     @property
     def is_nothing(self) -> bool:
-        """Whether all that is left is rounding."""
+        """Whether the residuals are only rounding."""
         power = sum(float(e @ e) for e in self.errors)
         size = sum(float(np.sum(np.square(r.y[r.counts]))) for r in self.runs)
         return power <= 1e-20 * size
 
     def noise(self, values: Sequence[FloatArray] | None = None, spent: float = 0.0) -> Noise:
-        """The colour of the residuals, or of other series of the same samples."""
+        """Noise model of the residuals, or of other series of the same samples."""
         series = self.errors if values is None else values
         return Noise.fit([(v, r.counts) for v, r in zip(series, self.runs, strict=True)], spent)
 
 
 def representative(model: DynamicModel) -> DynamicModel:
-    """The model itself, or an ensemble's first member: the one that did best in training."""
+    """The model itself, or an ensemble's first member, the best one in training."""
     return model.members[0] if model.members else model
 
 
@@ -331,7 +331,7 @@ def _free_runs(model: DynamicModel, data: Dataset, init: int) -> list[Run]:
 def _sensitivities(
     model: DynamicModel, data: Dataset, init: int, simulated: Sequence[FloatArray]
 ) -> list[FreeRunJacobian]:
-    """Of the model; of an ensemble, of the member whose free runs are nearest to its own."""
+    """Sensitivities of the model, or of the member with free runs nearest to the ensemble's."""
     nearest, least = model, np.inf
     for member in model.members:
         with suppress(FitError):
@@ -371,7 +371,7 @@ def _run(e: Experiment, yhat: FloatArray, first: int, psi: FloatArray, state: Fl
 
 
 def _orthonormal(columns: FloatArray) -> FloatArray:
-    """An orthonormal basis of the columns' span, of its numerical rank."""
+    """An orthonormal basis of the columns' span, with its numerical rank."""
     scale = np.abs(columns).max(axis=0, initial=0.0)
     columns = columns[:, scale > 0.0] / scale[scale > 0.0]
     if columns.shape[1] == 0 or len(columns) == 0:
@@ -396,9 +396,9 @@ class HorizonScores:
     pooled : mapping of horizon to Scores
         Horizons are `free run` and `1 step`, `5 steps`, ..
     experiments : mapping of horizon to tuple of Scores
-        None where an experiment has no sample to score.
+        None if an experiment has no sample to score.
     names : tuple of str
-        Of the experiments, with their ranges.
+        Names of the experiments, with their ranges.
     """
 
     pooled: dict[str, Scores]
@@ -422,13 +422,13 @@ class HorizonScores:
 def horizon_scores(
     model: DynamicModel, data: Dataset, residuals: Residuals, steps: tuple[int, ...] = STEPS
 ) -> HorizonScores:
-    """Errors at every horizon; those of some steps ahead only where the outputs are complete.
+    """Errors at every horizon; those some steps ahead only if the outputs are complete.
 
     Parameters
     ----------
     model, data
     residuals : Residuals
-        Their free run.
+        Residuals of the free run.
     steps : tuple of int
     """
     series: dict[str, list[FloatArray]] = {"free run": [r.yhat for r in residuals.runs]}

@@ -1,13 +1,13 @@
-"""Simulation bands: where a measured sample is to be expected about a free run.
+"""Simulation bands: the range about a free run in which a measured sample is expected.
 
 The half width at sample k is a quantile of e/s times s(k), s(k)^2 = sigma^2 + |Psi(k) F|^2: the
-spread of the residual and what the parameters' uncertainty adds to it (delta method, P = FF' the
-sandwich covariance, so the residual's colour counts). An ensemble puts the spread of its members in
-place of the second part. The quantiles are those of residuals that the model was not fitted to:
-every tenth of the training data is left out in turn, to first order (Cook and Weisberg 1982), so
-that neither normality nor a perfect model is assumed (CV+ and normalised conformal bands: Barber et
-al. 2021, Lei et al. 2018). Outside the training region s grows in proportion to the distance, up
-to ten times.
+spread of the residual plus the contribution of the parameters' uncertainty (delta method, with the
+sandwich covariance P = FF', which allows for coloured residuals). For an ensemble the spread of its
+members replaces the second part. The quantiles are those of residuals on left-out data: every tenth
+of the training data is left out in turn, to first order (Cook and Weisberg 1982), so that neither
+normality nor a perfect model is assumed (CV+ and normalised conformal bands: Barber et al. 2021,
+Lei et al. 2018). Outside the training region s grows in proportion to the distance, up to ten
+times.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ..dynamic_model import INIT, DynamicModel
 from ..errors import FitError, SettingError
 from .correlations import normal_quantile
 from .parameters import Information, Parameters, estimate
-from .region import Place, placed
+from .region import RegionRuns, region_runs
 from .residuals import Residuals
 
 LEVEL = 0.95
@@ -35,27 +35,27 @@ BLOCKS = 10
 _TAILS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.35, 0.5)
 _KEPT_VARIANCE = 0.999
 _FOLLOWED = 1e-4
-"""Information of a direction in which parameters follow when a block is left out, over the largest.
+"""Least relative information of a direction in which parameters move when a block is left out.
 
-In weaker ones a network bends long before it has gone as far as the first order says.
+In weaker directions a network is nonlinear long before the first-order step is reached.
 """
 _WIDEST = 10.0
 _LARGEST_GROWTH = 3.0
-"""A residual is not trusted to grow further when its block is left out: first order ends there."""
+"""Largest growth of a residual when its block is left out: the limit of the first order."""
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How far measured samples lie from a model's free run.
+    """Distribution of the distance of measured samples from a model's free run.
 
     Attributes
     ----------
     spread : float
         Standard deviation of the residual [output unit].
     factor : array, shape (p, r)
-        F with FF' the part of the parameters' covariance that matters; r = 0 for an ensemble.
+        F, where FF' is the significant part of the parameters' covariance; r = 0 for an ensemble.
     probabilities, quantiles : array, shape (q,)
-        Of e/s.
+        Distribution of e/s.
     samples : int
     """
 
@@ -66,7 +66,7 @@ class Uncertainty:
     samples: int
 
     def quantile(self, probability: float) -> float:
-        """Quantile of e/s, between the stored ones on the scale of a normal variable."""
+        """Quantile of e/s, interpolated on the scale of a normal variable."""
         at = [-normal_quantile(float(p)) for p in self.probabilities]
         return float(np.interp(-normal_quantile(probability), at, self.quantiles))
 
@@ -104,20 +104,20 @@ class Uncertainty:
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Bands about the free run of every experiment, and what lay inside.
+    """Bands about the free run of every experiment, and their measured coverage.
 
     Attributes
     ----------
     level : float
-        Share of measured samples that the band is made for.
+        Share of measured samples that the band should contain.
     lower, simulated, upper : tuple of array, shape (N,)
     inside : tuple of float
-        Measured share of each experiment's samples after the initial ones; NaN where none is
-        measured.
+        Share of each experiment's measured samples after the initial ones that lie inside; NaN if
+        none is measured.
     coverage : float
-        Of all experiments together.
+        Share for all experiments together.
     n : int
-        Samples measured.
+        Number of measured samples.
     """
 
     level: float
@@ -129,7 +129,7 @@ class Bands:
     n: int
 
     def to_json(self) -> dict[str, Any]:
-        """The shares as JSON values; the series are not among them."""
+        """The shares as JSON values, without the series."""
         return {
             "level": self.level,
             "coverage": _number(self.coverage),
@@ -139,7 +139,7 @@ class Bands:
 
 
 def require_level(level: float) -> None:
-    """A share that bands can be made for, or a `SettingError`."""
+    """Raise a `SettingError` for a level for which no band can be made."""
     is_number = isinstance(level, Real) and not isinstance(level, bool)
     if not is_number or not 0.5 <= level <= 0.999:
         raise SettingError(f"level: expected a share from 0.5 to 0.999, received {level!r}")
@@ -159,18 +159,18 @@ def bands(
     ----------
     model : Model
     data : Dataset
-        Outputs after the first `init` samples may be NaN; those measured are counted.
+        Outputs after the first `init` samples can be NaN; measured ones are counted.
     level : float
         Share of measured samples to expect inside, .5 to .999.
     init : int
         As for `simulate`.
     training : Dataset or None
-        What the model was identified from; None takes what `identify` stored with it.
+        The model's training data; None: the evidence stored by `identify`.
 
     Raises
     ------
     SettingError
-        For a level out of range, or a model that knows nothing of its uncertainty.
+        For a level out of range, or a model without stored uncertainty.
     DataError, FitError
         As for `simulate`.
     """
@@ -178,12 +178,11 @@ def bands(
     known = uncertainty(model, training) if training is not None else stored_uncertainty(model)
     if known is None:
         raise SettingError(
-            "bands: expected a model that stores its uncertainty, received one without; "
-            "identify it "
-            "again, or give its training data (training=...)"
+            "bands: expected a model that stores its uncertainty, received one without; identify "
+            "it again, or give its training data (training=...)"
         )
     residuals = Residuals.of(model, data, init, "free run")
-    return bands_of(model, data, residuals, known, level, placed(model, data, training, init))
+    return bands_of(model, data, residuals, known, level, region_runs(model, data, training, init))
 
 
 def bands_of(
@@ -192,9 +191,9 @@ def bands_of(
     residuals: Residuals,
     known: Uncertainty,
     level: float,
-    place: Place | None = None,
+    place: RegionRuns | None = None,
 ) -> Bands:
-    """Bands about free runs that have been computed, with their place in the training region."""
+    """Bands about computed free runs, widened by their distances from the training region."""
     tail = 0.5 * (1.0 - level)
     low, high = known.quantile(tail), known.quantile(1.0 - tail)
     spreads = _spreads(model, data, residuals, known)
@@ -221,7 +220,7 @@ def bands_of(
 
 
 def uncertainty(model: DynamicModel, data: Dataset, init: int = INIT) -> Uncertainty:
-    """From the data that a model was identified from."""
+    """Uncertainty of a model from its training data."""
     residuals = Residuals.of(model, data, init, "free run")
     found = None if model.members else estimate(model, residuals)
     return uncertainty_of(model, data, residuals, found)
@@ -230,7 +229,7 @@ def uncertainty(model: DynamicModel, data: Dataset, init: int = INIT) -> Uncerta
 def uncertainty_of(
     model: DynamicModel, data: Dataset, residuals: Residuals, found: Parameters | None
 ) -> Uncertainty:
-    """From free runs on the training data, and what they say of the parameters."""
+    """Uncertainty from free runs on the training data and the estimated parameters."""
     factor = np.zeros((0, 0)) if found is None else _factor(found, residuals)
     errors = _left_out(model, residuals)
     power = sum(
@@ -252,7 +251,7 @@ def uncertainty_of(
 
 
 def stored_uncertainty(model: DynamicModel) -> Uncertainty | None:
-    """What the model stores; None where there is nothing that can be read."""
+    """The uncertainty stored with the model; None if there is none, or it is unreadable."""
     values = model.training.get("uncertainty")
     if not isinstance(values, Mapping):
         return None
@@ -263,11 +262,11 @@ def stored_uncertainty(model: DynamicModel) -> Uncertainty | None:
 
 
 def _factor(found: Parameters, residuals: Residuals) -> FloatArray:
-    """F with FF' about P, by the directions that move the free run most."""
+    """F with FF' close to P, from the directions that move the free run most."""
     gram = np.sum([r.sensitivity.T @ r.sensitivity for r in residuals.runs], axis=0)
     sizes, vectors = np.linalg.eigh(found.covariance)
     root = vectors * np.sqrt(np.maximum(sizes, 0.0))
-    # directions of P^(1/2), sorted by the variance that they give the free run
+    # directions of P^(1/2), sorted by their contribution to the free run's variance
     moved, turn = np.linalg.eigh(root.T @ gram @ root)
     order = np.argsort(moved)[::-1]
     share = np.cumsum(moved[order]) / max(moved.sum(), 1e-300)
@@ -277,9 +276,9 @@ def _factor(found: Parameters, residuals: Residuals) -> FloatArray:
 
 
 def _left_out(model: DynamicModel, residuals: Residuals) -> list[FloatArray]:
-    """Residuals of every block with the parameters that the other blocks alone would give.
+    """Residuals of every block for parameters fitted to the other blocks only.
 
-    To first order e_b + Psi_b (H - H_b + L)^-1 Psi_b' e_b.
+    To first order, e_b + Psi_b (H - H_b + L)^-1 Psi_b' e_b.
     """
     errors = [r.error for r in residuals.runs]
     if residuals.width == 0:
@@ -296,7 +295,7 @@ def _left_out(model: DynamicModel, residuals: Residuals) -> list[FloatArray]:
 
 
 def _blocks(length: int, total: int) -> list[tuple[int, int]]:
-    """Blocks of one run, so that all runs together have about `BLOCKS`."""
+    """Blocks of one run, such that all runs together have about `BLOCKS`."""
     count = max(1, round(BLOCKS * length / max(total, 1)))
     if count == 1 and length >= total:
         count = 2
@@ -331,7 +330,7 @@ def _spreads(
 def _member_runs(
     members: Sequence[DynamicModel], data: Dataset, init: int
 ) -> list[list[FloatArray]]:
-    """Free runs of the members that stand the input, as those count in the ensemble's own."""
+    """Free runs of the members that do not diverge, as counted in the ensemble's own run."""
     found = []
     for member in members:
         with suppress(FitError):
@@ -340,7 +339,7 @@ def _member_runs(
 
 
 def _member_variance(runs: FloatArray) -> FloatArray:
-    """Across members (M, N) by the median absolute deviation: one that runs away does not count."""
+    """Variance across members (M, N) from the median absolute deviation, robust to outliers."""
     middle = np.median(runs, axis=0)
     found: FloatArray = (1.4826 * np.median(np.abs(runs - middle), axis=0)) ** 2
     return found

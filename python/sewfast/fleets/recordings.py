@@ -1,4 +1,4 @@
-"""One recording of a fleet: where it is listed, how it is read, and the row it becomes."""
+"""One recording of a fleet: how it is listed, read, and turned into a row."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ READABLE = (
     ".csv", ".mat", ".npz", ".parquet", ".mcap",
     ".mf4", ".mdf", ".tdms", ".ulg", ".wpilog", ".bag", ".bbl", ".bfl",
 )  # fmt: skip
-"""Endings by which recordings and logs in a folder are known; a manifest may name any file."""
+"""Endings of recordings and logs in a folder; a manifest can list any file."""
 TRAINED = 0.7
-"""Share of a recording that is identified from; the rest is what the figures are of."""
+"""Share of a recording for identification; the figures are computed on the rest."""
 
 
 # --- What there is to do --------------------------------------------------------------------------
@@ -47,7 +47,7 @@ class Job:
     Ts: float | None = None
 
     def fingerprint(self) -> list[Any]:
-        """What changes where the file does."""
+        """Values that change if the file changes."""
         try:
             stat = os.stat(self.path)
         except (OSError, ValueError):  # a name with the character 0 is a ValueError
@@ -62,7 +62,7 @@ def jobs_of(
     Ts: float | None,
     tables: Sequence[Path] = (),
 ) -> list[Job]:
-    """What is to be done; `tables` are results of a fleet and no recordings."""
+    """The jobs of a fleet; `tables` are results of a fleet, not recordings."""
     names = (inputs,) if isinstance(inputs, str) else tuple(inputs or ())
     if isinstance(recordings, str | os.PathLike):
         root = Path(recordings)
@@ -71,7 +71,7 @@ def jobs_of(
             files = sorted(
                 p
                 for p in root.rglob("*")
-                # hidden ones are those of an editor or of another system
+                # hidden files belong to an editor or the operating system
                 if p.suffix.lower() in READABLE
                 and not p.name.startswith(".")
                 and p.resolve() not in results
@@ -170,12 +170,12 @@ def _listed(
 
 
 def row_of(job: Job, settings: Mapping[str, Any], controller: Controller | None) -> Row:
-    """All that is done with one recording; what it cannot do is its message."""
+    """The row of one recording; an error becomes its message."""
     try:
         return _identified(job, settings, controller)
     except SewfastError as error:
         return Row(job.file, "failed", str(error))
-    except Exception as error:  # one recording is not to end the work on thousands of others
+    except Exception as error:  # one recording must not end the work on thousands of others
         return Row(job.file, "failed", f"{type(error).__name__}: {error}")
 
 
@@ -225,8 +225,9 @@ def _read(job: Job) -> Dataset:
 def _physical(model: Model, data: Dataset) -> dict[str, float]:
     """Gain and average residence time of a linear model, with their standard errors.
 
-    Ts (B'(1)/B(1) - A'(1)/A(1)) for G = B/A in the delay operator; it does not move where a pole
-    and a zero nearly cancel. The errors follow from the parameters' covariance by their slopes.
+    The residence time is Ts (B'(1)/B(1) - A'(1)/A(1)) for G = B/A in the delay operator; a pole and
+    a zero that nearly cancel do not affect it. The errors follow from the parameters' covariance by
+    linear propagation.
     """
     found = estimate(model, Residuals.of(model, data))
     theta, na, nk = model.theta, model.orders["na"], model.orders["nk"]

@@ -1,4 +1,4 @@
-"""`fleet`: every recording on its worker, and the journal from which the same call goes on."""
+"""`fleet`: recordings distributed to workers, and the journal from which a call continues."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from .recordings import Job, jobs_of, row_of
 from .table import COLUMNS, FORMAT, Fleet, Row, drifts, earlier_rows, require_ending
 
 _IN_FLIGHT = 4
-"""Tasks handed out at once for each worker: no more lie in the scheduler's memory."""
+"""Tasks submitted at once per worker, to bound the scheduler's memory."""
 _TASK_SECONDS, _TASK_RECORDINGS = 1.0, 16
-"""How long a task takes, and its most recordings: handing one out costs 20 ms of processor."""
+"""Target duration of a task [s], and its most recordings: submitting one costs 20 ms."""
 _RETRIES = 50
-"""Workers that may die over one recording before it is taken for the cause."""
+"""Deaths of workers over one recording before it counts as the cause."""
 _PATIENCE, _LOOK = 120.0, 5.0
-"""How long no worker may be there at all, and how often that is looked at [s]."""
+"""Longest time without any worker, and interval of checking it [s]."""
 _STARTING = 5.0
-"""Times as long where processes of workers are there and not ready yet, as on a busy computer."""
+"""Factor on that time while workers' processes exist but are not ready, as on a busy computer."""
 
 
 @shown_in_notebooks("fleet", "share failed")
@@ -66,36 +66,36 @@ def fleet(
         A folder (with its subfolders), a manifest (CSV with a column `file` and, if they differ,
         `inputs` (several apart by `;`), `output`, `Ts`), or files.
     inputs, output : str, or sequence of str, or None
-        Columns, as of `sewfast.read`. None: recognised in each recording by their names and units,
+        Columns, as for `sewfast.read`. None: recognised in each recording by their names and units,
         `u` and `y` first, as on the command line.
     Ts : float, optional
-        As of `sewfast.read`.
+        As for `sewfast.read`.
     model : str
-        As of `identify`. Linear output error by default: its gain and residence time can be
+        As for `identify`. Linear output error by default: its gain and residence time can be
         compared from run to run, and it takes a fraction of a second.
     controller : Controller, optional
         Tuned anew for every model, from these settings.
     before : path or Fleet, optional
-        An earlier result (`.csv`, `.json`, `.parquet`): `drifts` lists what has moved beyond its
-        bands.
+        An earlier result (`.csv`, `.json`, `.parquet`): `drifts` lists the quantities that have
+        moved beyond their bands.
     out : path, optional
         Where to write the table (`.csv`, `.json`, `.parquet`). A journal is kept next to it until
         everything is done; the same call continues from it and processes only what is new or
         changed.
     client : dask.distributed.Client, optional
-        Your own cluster.
+        Client of your own cluster.
     scheduler : str, optional
-        Address of one, such as `tcp://host:8786`.
+        Address of a cluster, such as `tcp://host:8786`.
     workers : int, optional
         Processes on this computer if there is neither; by default as many as cores. 0 works in this
         process, without Dask.
     memory : str
         Limit for each worker on this computer; a worker that uses more is restarted.
     seed : int
-        As of `identify`; the same seed gives the same bits on any number of workers.
+        As for `identify`; the same seed gives the same bits on any number of workers.
     progress : callable, optional
-        Called with recordings done, recordings in all and the share that failed.
-        In a notebook a bar is shown where this is left out; None shows none.
+        Called with recordings done, recordings in all and the share that failed. If left out, a
+        notebook shows a progress bar; None shows nothing.
 
     Returns
     -------
@@ -193,7 +193,7 @@ def _worked(
     workers: int | None,
     memory: str,
 ) -> Iterator[tuple[Job, Row]]:
-    """Rows as they are finished, in any order."""
+    """Yield rows as they are finished, in any order."""
     if workers == 0 and client is None and scheduler is None:
         for job in recordings:
             yield job, row_of(job, settings, controller)
@@ -219,7 +219,7 @@ def _worked(
             if not waiting:
                 return []
             fit = int(_TASK_SECONDS * done / took) if done else 1
-            # towards the end in smaller portions, so that all workers end at about the same time
+            # smaller portions towards the end, so that all workers finish at about the same time
             count = max(1, min(fit, _TASK_RECORDINGS, math.ceil(len(waiting) / flying)))
             return [[waiting.popleft() for _ in range(count)]]
 
@@ -233,7 +233,7 @@ def _worked(
                 rows, seconds = future.result()
                 done, took = done + len(rows), took + seconds
             except Exception as error:
-                if len(together) > 1:  # whichever is the cause, it costs its own row only
+                if len(together) > 1:  # separately, so that the cause affects only its own row
                     rows, alone = [], [[job] for job in together]
                 else:
                     message = f"{type(error).__name__}: {error}"
@@ -250,7 +250,7 @@ def _worked(
 
 
 def _ended(running: Collection[Any], connected: Any) -> Any:
-    """One of the tasks that have ended, waited for as long as there are workers."""
+    """Wait for one of the tasks to end, as long as there are workers."""
     distributed = import_module("distributed")
     without, missed = math.inf, ""
     while not missed:
@@ -258,7 +258,7 @@ def _ended(running: Collection[Any], connected: Any) -> Any:
             found = distributed.wait(running, _LOOK, return_when="FIRST_COMPLETED")
             return next(iter(found.done))
         except distributed.TimeoutError:
-            # since when none has been seen: on a busy computer a look itself takes its time
+            # start of the time without workers: on a busy computer the check itself is slow
             none = not connected.scheduler_info(n_workers=-1)["workers"]
             without = min(without, time.monotonic()) if none else math.inf
             starting = _replaced(connected) if none else False
@@ -276,11 +276,11 @@ def _ended(running: Collection[Any], connected: Any) -> Any:
 
 
 def _replaced(connected: Any) -> bool:
-    """Have the client's own cluster start the workers that it is to have; whether any is starting.
+    """Let the client's own cluster start its missing workers; return whether any is starting.
 
-    A LocalCluster gives a worker up that has been away for 15 s (`lost-worker-timeout`), on a busy
-    computer one that is merely starting again, and one whose start has failed; it looks for what is
-    missing only where it is scaled.
+    A LocalCluster gives up a worker that has been away for 15 s (`lost-worker-timeout`), which on a
+    busy computer can be merely restarting, and one that failed to start; it replaces missing
+    workers only when it is scaled.
     """
     cluster: Any = getattr(connected, "cluster", None)
     if not (hasattr(cluster, "worker_spec") and hasattr(cluster, "scale")):
@@ -300,7 +300,7 @@ def _replaced(connected: Any) -> bool:
 def _rows_of(
     jobs: Sequence[Job], settings: Mapping[str, Any], controller: Controller | None
 ) -> tuple[list[Row], float]:
-    """Rows of a task, and the seconds that they took."""
+    """Rows of a task, and the time that they took [s]."""
     began = time.perf_counter()
     return [row_of(job, settings, controller) for job in jobs], time.perf_counter() - began
 
@@ -337,9 +337,9 @@ def _connected(
             f"memory: expected a size such as '500MB', got {memory!r}; state its unit"
         ) from error
     kept = {
-        # a worker that was killed is no fault of the recording it was at
+        # a killed worker is not the fault of its recording
         "distributed.scheduler.allowed-failures": _RETRIES,
-        # and is started again, however long that takes on a busy computer
+        # and is restarted, however long that takes on a busy computer
         "distributed.deploy.lost-worker-timeout": "1 day",
     }
     with dask.config.set(kept):
@@ -348,7 +348,7 @@ def _connected(
             "threads_per_worker": 1,
             "memory_limit": memory,
             "dashboard_address": None,
-            # what its processes say of each other while they end is nobody's business here
+            # messages of its processes about each other while they end are irrelevant
             "silence_logs": logging.CRITICAL,
         }
         with _workers_without_ctrl_c():
@@ -359,7 +359,7 @@ def _connected(
 
 @contextmanager
 def _workers_without_ctrl_c() -> Iterator[None]:
-    """Processes that begin here leave Ctrl-C to this one, which ends them."""
+    """Processes started in this block ignore Ctrl-C; this process handles it and ends them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -375,10 +375,10 @@ def _workers_without_ctrl_c() -> Iterator[None]:
 
 @dataclass
 class Journal:
-    """A line for each row that is done, in the folder of the table that is to be written.
+    """A line for each finished row, next to the table to be written.
 
-    The first line says for which settings; a journal of others is begun anew. A last line that was
-    cut off is left out.
+    The first line has the settings; a journal with other settings is started afresh. A truncated
+    last line is ignored.
     """
 
     out: Path | None
@@ -410,7 +410,7 @@ class Journal:
         return {"format": FORMAT, "version": 1, "settings": json.loads(json.dumps(self.settings))}
 
     def known(self, job: Job) -> Row | None:
-        """The row of a recording that has not changed since."""
+        """The stored row of a recording, if that has not changed since."""
         fingerprint, row = self._rows.get(job.file, (None, None))
         return row if fingerprint == job.fingerprint() else None
 
@@ -448,7 +448,7 @@ def _parsed(line: str) -> dict[str, Any] | None:
 
 
 def _row(entry: Mapping[str, Any]) -> Row | None:
-    """The row of a journal's line; None for one that is damaged or of another version."""
+    """The row of a journal's line; None if it is damaged or of another version."""
     values = entry.get("row")
     if not isinstance(values, dict) or set(values) != set(COLUMNS) or "of" not in entry:
         return None

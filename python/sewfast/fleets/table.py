@@ -1,4 +1,4 @@
-"""The table of a fleet: a row for each recording, its files, and what has drifted since another."""
+"""The table of a fleet: a row for each recording, its files, and drift since an earlier run."""
 
 from __future__ import annotations
 
@@ -26,45 +26,45 @@ if TYPE_CHECKING:
 FORMAT = "sewfast.fleet"
 SIGMAS = 4.0
 LEAST_CHANGE = 0.02
-"""Of a gain or a residence time: less is no drift, however certain it is."""
+"""Least relative change of a gain or a residence time to count as drift, however certain."""
 SHOWN = 50
-"""Rows of a table in a notebook."""
+"""Most rows of a table in a notebook."""
 NOISE_RATIO = 1.5
-"""Between the residuals of two recordings, either way, from which on it is drift."""
+"""Ratio of the residuals of two recordings, in either direction, that counts as drift."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What was found from one recording.
+    """The result of one recording.
 
     Attributes
     ----------
     file : str
-        Relative to the folder, or as the manifest has it.
+        Path relative to the folder, or as in the manifest.
     status : str
-        `ok`, or `failed` where there is a message instead of a model.
+        `ok`, or `failed` with a message instead of a model.
     message : str
     samples : int
     Ts : float
         [s]
     kind : str
-        Of the model.
+        Kind of the model.
     fit_percent, rmse : float
-        In free run on the last 30 % of the recording, from which nothing was learned.
+        Free run on the last 30 % of the recording, which were not used for training.
     noise : float
         Standard deviation of the residual there.
     gain, gain_error : float
         Steady gain from the first input and its standard error; NaN for networks.
     residence_time, residence_time_error : float
-        Average residence time [s] and its standard error: of a first-order lag its time constant
-        and dead time together, of others the area between step response and final value over the
+        Average residence time [s] and its standard error: for a first-order lag the sum of time
+        constant and dead time, in general the area between step response and final value over the
         gain (Astrom and Hagglund 2006, chapter 2); NaN for networks and integrators.
     verdict : str
-        Of `identify`, in words.
+        Verdict of `identify`, in words.
     parameters : str
         Start of the hash of all parameters: equal for equal bits.
     Kp, Ti, Td : float
-        Gains of the controller tuned for it, in standard form; NaN where there is no controller.
+        Gains of the controller tuned for it, in standard form; NaN without a controller.
     """
 
     file: str
@@ -89,12 +89,12 @@ class Row:
 
 COLUMNS = tuple(Row.__dataclass_fields__)
 LABELS = {"gain": "gain", "residence_time": "residence time [s]", "noise": "noise"}
-"""What is drawn, in the model's own units."""
+"""Drawn quantities, in the model's units."""
 
 
 @dataclass(frozen=True)
 class Drift:
-    """A machine that is not what it was.
+    """A change of a machine since an earlier run.
 
     Attributes
     ----------
@@ -137,18 +137,18 @@ class Fleet(Plotted):
         return tuple(row for row in self.rows if row.status != "ok")
 
     def columns(self) -> dict[str, list[Any]]:
-        """The rows by column, as `pandas.DataFrame` and others take them."""
+        """The rows by column, for `pandas.DataFrame` and others."""
         return {name: [getattr(row, name) for row in self.rows] for name in COLUMNS}
 
     def drawing(self) -> Drawing:
         """Gain, residence time and noise of every machine, with bands of 4 standard errors.
 
-        A machine that has drifted is named, its earlier value grey.
+        Machines that have drifted are labelled, their earlier values grey.
 
         Raises
         ------
         SettingError
-            Where no recording was identified.
+            If no recording was identified.
         """
         done = [row for row in self.rows if row.status == "ok"]
         if not done:
@@ -179,7 +179,7 @@ class Fleet(Plotted):
             ax.xaxis.set_major_locator(MaxNLocator(integer=True))
 
     def _repr_html_(self) -> str:
-        """A table for a notebook; those that failed are below it."""
+        """A table for a notebook, with the failed recordings below."""
         done = [row for row in self.rows if row.status == "ok"]
         rows = tuple(
             (
@@ -273,12 +273,12 @@ def _arrow() -> tuple[Any, Any]:
 
 
 def load_fleet(path: str | os.PathLike[str]) -> Fleet:
-    """Read a table that `Fleet.save` wrote.
+    """Read a table written by `Fleet.save`.
 
     Raises
     ------
     SettingError
-        Where there is none, or it lacks columns.
+        If there is none, or it lacks columns.
     """
     place = Path(path)
     require_ending(place)

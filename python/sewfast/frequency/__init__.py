@@ -1,9 +1,9 @@
-"""Frequency response: what a machine does to a sine, with error bars, and the shaft behind it.
+"""Frequency response of a machine with error bars, and the shaft behind it.
 
-`response` holds the result and what is asked of it (bands, loop, margins, files, pictures),
-`estimate` makes it from periods and by averaged spectra, `local` from any record, `shaft` fits a
-rigid machine or two masses to it, `speeds` holds those about several speeds, `proposal` finds gains
-and a notch.
+`response` has the result and its uses (bands, loop, margins, files, pictures), `estimate` computes
+it from periods and by averaged spectra, `local` from any record, `shaft` fits a rigid machine or
+masses on shafts to it, `speeds` has the responses at several speeds, `proposal` finds gains and
+filters.
 """
 
 from .estimate import periodic, spectral

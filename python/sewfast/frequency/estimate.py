@@ -1,8 +1,8 @@
-"""Frequency responses from signals: periodic ones line by line, any others by averaged spectra.
+"""Frequency responses from signals: periodic ones line by line, others by averaged spectra.
 
-Both are unbiased under feedback where a reference is given that the noise does not know: output and
-input are each related to it, and their quotient is the plant (joint input-output method;
-Pintelon and Schoukens 2012, System Identification, sections 2.6 and 7.3).
+Both are unbiased under feedback if a reference independent of the noise is given: output and input
+are each related to it, and their quotient is the plant (joint input-output method; Pintelon and
+Schoukens 2012, System Identification, sections 2.6 and 7.3).
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from ..errors import DataError, SettingError
 from .response import Complex, FrequencyResponse
 
 SEGMENTS = 16
-"""Into as many halves of segments a record is cut unless told: bands of a fifth of the gain where
-the coherence is a half."""
+"""Default number of half segments of a record: gives bands of a fifth of the gain at a coherence of
+one half."""
 LEAST = 16
-"""Samples of a segment or period, at the least."""
+"""Least samples of a segment or period."""
 LARGEST = 1e150
-"""Of a signal: sums of its squares do not overflow."""
+"""Largest magnitude of a signal, so that sums of squares do not overflow."""
 
 
 def periodic(
@@ -34,9 +34,9 @@ def periodic(
 ) -> FrequencyResponse:
     """The robust best linear approximation from repeated periods of different random excitations.
 
-    Noise is what differs from period to period of one realisation; what differs more than that from
-    one realisation to another is nonlinear distortion (robust method; Pintelon and Schoukens 2012,
-    section 4.3.1). Leakage there is none.
+    Differences between periods of one realisation are noise; larger differences between
+    realisations are nonlinear distortion (robust method; Pintelon and Schoukens 2012, section
+    4.3.1). There is no leakage.
 
     Parameters
     ----------
@@ -45,17 +45,17 @@ def periodic(
     Ts : float
         Sample time [s].
     lines : array of int, shape (n,)
-        Lines that are excited, rising: frequencies k / (N Ts), up to N / 2.
+        Excited lines in rising order: frequencies k / (N Ts), up to N / 2.
     r : array, shape (M, P, N), optional
-        Reference of a loop that is closed around the plant.
+        Reference of a closed loop around the plant.
     labels
         `u_unit`, `y_unit`, `from_counts`, `provenance` of the result.
 
     Raises
     ------
     DataError
-        For other shapes, values that are not finite, fewer than two periods in all, lines that are
-        no lines or that u does not have.
+        For other shapes, values that are not finite, fewer than two periods in all, invalid lines
+        or lines without power in u.
     """
     u, y = _blocks("u", u), _blocks("y", y)
     if u.shape != y.shape:
@@ -82,7 +82,7 @@ def periodic(
         U, Y = U * turn, Y * turn
     _require_excited(U, "u")
     if r is None and realisations > 1:
-        # the same phase for all, so that they can be averaged
+        # relative to the reference's phase, so that realisations can be averaged
         turn = np.conj(U) / np.abs(U)
         U, Y = U * turn, Y * turn
     Um, Ym = U.mean(axis=1), Y.mean(axis=1)
@@ -120,12 +120,12 @@ def spectral(
     segment: int | None = None,
     **labels: object,
 ) -> FrequencyResponse:
-    """From any record: cross spectra over auto spectra, averaged over overlapping segments.
+    """Response from any record: cross spectra over auto spectra, averaged over segments.
 
-    Welch's method with a Hann window and half of a segment as overlap; each segment without its
-    mean. Without a reference it is `scipy.signal.csd(u, y) / scipy.signal.welch(u)` (H1); its
-    variance follows from the coherence (Bendat and Piersol 2010, table 9.6). A window widens what
-    is narrow: a resonance has to be several times as wide as 1 / (segment Ts).
+    Welch's method with a Hann window and an overlap of half a segment; means of the segments are
+    removed. Without a reference it is `scipy.signal.csd(u, y) / scipy.signal.welch(u)` (H1); its
+    variance follows from the coherence (Bendat and Piersol 2010, table 9.6). The window smooths
+    narrow features: a resonance has to be several times as wide as 1 / (segment Ts).
 
     Parameters
     ----------
@@ -134,11 +134,11 @@ def spectral(
     Ts : float
         Sample time [s].
     r : array, shape (N,), optional
-        Reference of a loop that is closed around the plant, or whatever else moves u and is not
-        moved by the noise. Without it the response under feedback is that of the plant where
-        there is no noise and of minus one over the controller where there is nothing else.
+        Reference of a closed loop around the plant, or any signal that moves u and is independent
+        of the noise. Without it, the response under feedback is that of the plant if there is no
+        noise, and minus one over the controller if there is only noise.
     segment : int, optional
-        Samples; a sixteenth of the record with the overlap unless told.
+        Samples of a segment; by default 16 overlapping half segments make up the record.
     labels
         `u_unit`, `y_unit`, `from_counts`, `provenance` of the result.
 
@@ -146,7 +146,7 @@ def spectral(
     ------
     DataError
         For other shapes, values that are not finite, fewer than three segments, a constant input,
-        or a reference that has nothing to do with it.
+        or a reference that is unrelated to the input.
     """
     signals = record_of(u, y, r)
     n = len(signals[0])

@@ -1,21 +1,21 @@
-"""Frequency responses of any record by local polynomials: no window, no periods, bands that hold.
+"""Frequency responses of any record by local polynomials, without window or periods.
 
 The spectra of a finite record are related, at the line k of its transform, by
 
     Y(k) = G(k) U(k) + T(k) + V(k)
 
-T is leakage: what the machine was still doing when the record began, less what it was still doing
-at its end. It is as smooth over the frequency as G, so over a few lines both are parabolas, found
-by least squares; what these leave is noise, which tells the variance (Pintelon and Schoukens 2012,
-section 7.2). A window only makes the leakage smaller, and smears a resonance for it. How large the
-leakage can be in an interval, all the others show.
+T is leakage: the transient at the beginning of the record minus the one at its end. It is as smooth
+over the frequency as G, so over a few lines both are parabolas, found by least squares; the
+residuals are noise, and give the variance (Pintelon and Schoukens 2012, section 7.2). A window only
+reduces the leakage, and smears resonances. The leakage expected in an interval is learned from all
+the others.
 
-How many lines are few is the question that is left. The lines are divided into intervals: from wide
-ones, an interval is halved, and its halves again, where Akaike's criterion, corrected for few
-lines, says that two parabolas predict better than one (Hurvich and Tsai, Biometrika 76, 1989).
-Around a resonance the intervals come out narrow; where the response is smooth they stay wide, and
-average the more. Each is read at the three Gauss points: there a parabola's error from a smooth
-curve is least, and under even power the three errors are independent.
+The remaining question is the number of lines. The lines are divided into intervals: starting from
+wide ones, an interval is halved, and its halves again, if Akaike's criterion, corrected for few
+lines, prefers two parabolas to one (Hurvich and Tsai, Biometrika 76, 1989). Around a resonance the
+intervals become narrow; where the response is smooth they stay wide, and average more. Each is read
+at the three Gauss points, where a parabola's error from a smooth curve is least; under even power
+the three errors are independent.
 """
 
 from __future__ import annotations
@@ -35,52 +35,51 @@ from .estimate import record_of
 from .response import LEVEL, Complex, FrequencyResponse
 
 LINES = 13
-"""Of an interval, at the least: seven more than the two parabolas have coefficients."""
+"""Least lines of an interval: seven more than the coefficients of the two parabolas."""
 WIDEST = 0.25
-"""Of an interval's first frequency: so wide it is at the most."""
+"""Largest width of an interval, relative to its first frequency."""
 NARROWEST = 0.006
-"""Of its frequency, below which an interval is not halved: a damping of .003 is seen with it, and
-the time for long records is that of their transform."""
+"""Width, relative to its frequency, below which an interval is not halved: fine enough for a
+damping of .003, while the time for long records stays that of their transform."""
 SAMPLES = 4 * LINES
 RANK = 1e-9
-"""Of the largest diagonal element of R, below which a column adds nothing."""
+"""Diagonal element of R, relative to the largest, below which a column adds nothing."""
 ROUNDING = 1e-13
-"""Of the largest line, below which others are none."""
+"""Magnitude, relative to the largest line, below which a line counts as empty."""
 FLOOR = 1e-24
-"""Mean square of what is left, that is not told from rounding."""
+"""Mean square of the residual that cannot be distinguished from rounding."""
 GAUSS = np.array([-math.sqrt(0.6), 0.0, math.sqrt(0.6)])
 CHANCE = 3.0
-"""Standard deviations above what chance brings, by which a reference must be seen in the input."""
+"""Standard deviations above chance by which a reference must be visible in the input."""
 
 
 def local_polynomial(
     u: ArrayLike, y: ArrayLike, *, Ts: float, r: ArrayLike | None = None, **labels: Any
 ) -> FrequencyResponse:
-    """From any record, without the leakage of its beginning and end.
+    """Response from any record, without the leakage of its beginning and end.
 
     Parameters
     ----------
     u, y : array, shape (N,)
-        Input and output; the machine may be in motion at the start and at the end.
+        Input and output; the machine can be in motion at the start and at the end.
     Ts : float
         Sample time [s].
     r : array, shape (N,), optional
-        Reference of a loop that is closed around the plant, or whatever else moves u and is not
-        moved by the noise. Output and input are each related to it, and their quotient is the
-        plant.
+        Reference of a closed loop around the plant, or any signal that moves u and is independent
+        of the noise. Output and input are each related to it, and their quotient is the plant.
     labels
         `u_unit`, `y_unit`, `from_counts`, `provenance` of the result.
 
     Returns
     -------
     FrequencyResponse
-        At frequencies that lie closer where the response bends more; `blocks` has a value for each.
+        Frequencies are denser where the response changes faster; `blocks` has a value for each.
 
     Raises
     ------
     DataError
         For other shapes, values that are not finite, fewer than 52 samples, an input that does not
-        move, or a reference that has nothing to do with it.
+        move, or a reference that is unrelated to it.
     """
     signals = record_of(u, y, r)
     n = len(signals[0])
@@ -96,7 +95,7 @@ def local_polynomial(
             for s, top in zip(signals, largest, strict=True)
         ]
     )
-    # what rounding leaves of a line is no power
+    # lines at the level of rounding have no power
     size = np.abs(spectra)
     spectra[size < ROUNDING * size.max(axis=1, keepdims=True)] = 0.0
     by = 0 if r is None else 2
@@ -131,11 +130,11 @@ class _Piece:
     Attributes
     ----------
     solution : array of complex, shape (6, m)
-        Coefficients, of the response first, of its input over `scale`, for each of m outputs.
+        Coefficients for each of m outputs: first the response, then the leakage.
     inverse : array of complex, shape (6, 6)
-        Of the triangle R of the regressors.
+        Inverse of the triangular factor R of the regressors.
     products : array of complex, shape (m, m)
-        Of what is left of the outputs: the sums of conj(e_i) e_j.
+        Sums of conj(e_i) e_j over the residuals of the outputs.
     power : float
         Mean squared magnitude of u.
     output : array, shape (m,)
@@ -153,20 +152,20 @@ class _Piece:
 
     @property
     def freedom(self) -> int:
-        """Complex degrees of freedom that are left beside two parabolas."""
+        """Complex degrees of freedom left after fitting two parabolas."""
         return self.stop - self.start - 6
 
     @property
     def ratio(self) -> FloatArray:
-        """Variance of the noise over the power, of each output."""
+        """Variance of the noise over the power, for each output."""
         found: FloatArray = np.diag(self.products).real / self.freedom / self.output
         return found
 
     @cached_property
     def criterion(self) -> float:
-        """Akaike's, corrected; real and imaginary part of a line are two observations.
+        """Akaike's corrected criterion; real and imaginary part of a line are two observations.
 
-        Outputs are taken as independent: of a loop they have one noise, and a determinant of 0.
+        Outputs count as independent: in a loop they share one noise, with a determinant of 0.
         """
         n, k = 2 * (self.stop - self.start), 2 * len(self.solution)
         size = 2.0 * np.diag(self.products).real / n + FLOOR
@@ -174,11 +173,11 @@ class _Piece:
 
     @property
     def places(self) -> FloatArray:
-        """Numbers of the lines at its Gauss points, between two of them where it comes so."""
+        """Line numbers at its Gauss points, in general between two lines."""
         return 1.0 + self.start + 0.5 * (1.0 + GAUSS) * (self.stop - self.start - 1)
 
     def gains(self) -> tuple[Complex, FloatArray]:
-        """Of each output, shape (3, m), and what a noise of variance 1 does to each, shape (3,)."""
+        """Gains of the outputs, shape (3, m), and their variance under unit noise, shape (3,)."""
         powers = GAUSS[:, None] ** np.arange(3)
         spread = (np.abs(powers @ self.inverse[:3]) ** 2).sum(axis=1)
         return powers @ self.solution[:3] / self.scale, spread / self.scale**2
@@ -191,18 +190,18 @@ class _Piece:
             value, per = gains[:, 0], np.ones(len(gains))
             noise = np.full(len(gains), C[0, 0].real)
         else:
-            # of the output less the response times the input, which is what the noise makes of both
+            # residual of the output minus the response times that of the input: the loop's noise
             value, per = gains[:, 0] / gains[:, 1], np.abs(gains[:, 1]) ** 2
             noise = C[0, 0].real - 2.0 * (value * C[0, 1]).real + np.abs(value) ** 2 * C[1, 1].real
             noise = np.maximum(noise, 0.0)
-        # a response that is not known is not large: what its error adds is taken off
+        # an uncertain response must not appear large: subtract the contribution of its error
         explained = np.maximum(np.abs(value) ** 2 - noise * spread / per, 0.0) * self.power
         share = explained / np.maximum(explained + noise, 1e-300)
         return value, self.places, noise * spread / per, share
 
 
 def _divided(source: Complex, outputs: Complex) -> Iterator[_Piece]:
-    """The intervals, from the lowest line on."""
+    """The intervals, from the lowest line upwards."""
     start, lines = 0, len(source)
     while lines - start >= LINES:
         width = max(LINES, int(WIDEST * (start + 1)))
@@ -219,7 +218,7 @@ def _divided(source: Complex, outputs: Complex) -> Iterator[_Piece]:
 
 
 def _best(source: Complex, outputs: Complex, piece: _Piece) -> tuple[float, list[_Piece]]:
-    """The piece itself, or the best of its halves where these have the lower criterion."""
+    """The piece itself, or the best of its halves if these have the lower criterion."""
     length = piece.stop - piece.start
     if length < max(2 * LINES, NARROWEST * piece.start):
         return piece.criterion, [piece]
@@ -238,7 +237,7 @@ def _best(source: Complex, outputs: Complex, piece: _Piece) -> tuple[float, list
 
 
 def _piece(source: Complex, outputs: Complex, start: int, stop: int) -> _Piece | None:
-    """None where the input has too little in it to tell a response."""
+    """Fit one interval; None if the input has too little power there."""
     part, seen = source[start:stop], outputs[start:stop]
     scale = float(np.abs(part).max())
     if scale == 0.0:
@@ -268,7 +267,7 @@ def _regressors(source: Complex) -> Complex:
 def _leakage(pieces: list[_Piece]) -> FloatArray:
     """Mean squares of the leakage's three coefficients over the outputs' power, shape (3,).
 
-    From the half of the intervals that show them best.
+    From the half of the intervals that determine them best.
     """
     full = [piece for piece in pieces if len(piece.solution) == 6]
     if not full:
@@ -282,11 +281,10 @@ def _leakage(pieces: list[_Piece]) -> FloatArray:
 
 
 def _shrunk(piece: _Piece, source: Complex, outputs: Complex, leakage: FloatArray) -> _Piece:
-    """The piece, with its leakage expected to be as large as elsewhere.
+    """The piece refitted with a prior on its leakage, from its size in other intervals.
 
-    Its coefficients are three observations more, of 0 with the variance that the others show. Where
-    the command's own spectrum is smooth, as of a chirp near its start, response and leakage cannot
-    be told apart otherwise.
+    The prior adds three observations of 0 with that variance. If the command's own spectrum is
+    smooth, as that of a chirp near its start, response and leakage cannot be separated otherwise.
     """
     kept = leakage > 0.0
     columns = np.flatnonzero(np.append([True] * 3, kept))
@@ -301,7 +299,7 @@ def _shrunk(piece: _Piece, source: Complex, outputs: Complex, leakage: FloatArra
 
 
 def _require_related(pieces: list[_Piece]) -> None:
-    """Refuse a reference that is seen in the input no more often than chance has it."""
+    """Refuse a reference that is visible in the input no more than by chance."""
     seen = []
     for piece in pieces:
         gains, spread = piece.gains()

@@ -1,12 +1,12 @@
-"""`propose`: gains, and filters where a shaft swings, for a machine that was shaken.
+"""`propose`: gains, and filters for a resonant shaft, from a measured frequency response.
 
-The loop is to fight disturbances down to as high a frequency as a largest sensitivity allows:
-maximised is the bandwidth of the sensitivity, the frequency at which |S| comes to 1/sqrt(2), over
-gain, integral and derivative time, lag of the feedback and the filters' frequencies and dampings.
-Ms is held to on the fitted machine, which says whether the loop is stable, and on the measured
-lines with their 95 % circles, which know what the fit does not. Above the measured lines nobody
-knows the machine, and the loop's gain is kept low there. No filter, a notch, a biquad whose zeros
-and poles are free, and two of them are tried in turn: what is not worth it is left out.
+The loop should suppress disturbances up to as high a frequency as a largest sensitivity Ms allows.
+The search maximises the bandwidth of the sensitivity, the frequency at which |S| reaches 1/sqrt(2),
+over gain, integral and derivative time, lag of the feedback and the filters' frequencies and
+dampings. Ms is limited on the fitted machine, which shows whether the loop is stable, and on the
+measured lines with their 95 % circles, which include what the fit misses. Above the measured lines
+the machine is unknown, and the loop's gain is kept low. No filter, a notch, a biquad with free
+zeros and poles, and two of these are tried in turn; a filter that does not pay is left out.
 """
 
 from __future__ import annotations
@@ -30,51 +30,51 @@ from .response import Complex, FrequencyResponse
 from .shaft import ShaftFit
 
 MS = 1.7
-"""Largest sensitivity unless another is asked for."""
+"""Default largest sensitivity."""
 WORTH = 1.05
-"""Times the bandwidth without it, that a filter has to bring."""
+"""Least bandwidth with a filter, relative to the one without it."""
 BLIND = 1.25
-"""Times its gain on the fit, that a loop may have above the lines that were measured."""
+"""Safety factor on the loop's gain, from the fit, above the measured lines."""
 BESIDE = (0.6, 1.5)
-"""Of the first filter's frequency: where a second one begins, which does nothing yet."""
+"""Start of a second filter, relative to the first one's frequency; it begins without effect."""
 GRID = 400
-"""Frequencies at which the bandwidth is looked for."""
+"""Number of frequencies at which the bandwidth is searched."""
 SPREADS = (0.4, 0.2, 0.1)
-"""Sizes of the simplex in a round of the search, each from the best of the one before."""
+"""Sizes of the simplex in a round of the search, each started from the previous best."""
 ROUNDS, FURTHER = 2, 1.01
-"""At most, and what a round has to gain in bandwidth for another one."""
+"""Most rounds, and least gain in bandwidth of a round for another one."""
 STEPS = 50
-"""Of one round, for each number that is searched."""
+"""Evaluations of one round per searched number."""
 SAME = 1e-4
-"""Between the best and the worst point of a simplex, in the logarithm of the bandwidth: its end."""
+"""Difference of best and worst point of a simplex, in log bandwidth, at which it ends."""
 OUTSIDE = 30.0
 """Weight of an Ms above the limit, relative to it, against the logarithm of the bandwidth."""
 SLOWEST = 8.0
-"""Integral time, in radians of the bandwidth: without an integral that is fast enough a disturbance
-that stays is not fought down, whatever the bandwidth."""
+"""Largest integral time, in radians of the bandwidth: a slow integral would not remove a lasting
+disturbance, however large the bandwidth."""
 QUIET = 0.05
-"""Of the command's limit, that the encoder's rounding may move it by (rms)."""
+"""Largest motion of the command due to the encoder's rounding (rms), relative to its limit."""
 DERIVATIVE_FILTER = 10.0
 DEPTH, WIDTH, DAMPING = (0.005, 1.0), (0.02, 5.0), (1e-3, 3.0)
 """Least and largest numbers of filters."""
 INVERSE = 0.3
-"""Damping that the inverse of a shaft gives to the poles on its antiresonance, at the start."""
+"""Initial damping of the poles that the inverse of a shaft puts on its antiresonance."""
 HALF = 1.0 / math.sqrt(2.0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Proposal:
-    """A controller for a machine that was shaken, and what it does on the fit.
+    """A controller from a frequency response, and its performance on the fit.
 
     Attributes
     ----------
     controller : Controller
     bandwidth_hertz : float
-        To which the loop weakens disturbances by 3 dB and more [Hz].
+        Frequency up to which the loop weakens disturbances by 3 dB or more [Hz].
     margins : Margins
-        On the fitted machine.
+        Margins on the fitted machine.
     without : Proposal or None
-        The best without filters, where there are some.
+        The best proposal without filters, if this one has any.
     """
 
     controller: Controller
@@ -110,16 +110,16 @@ def propose(
     Parameters
     ----------
     fit : ShaftFit
-        Of the machine, rigid or with a shaft.
+        Fit of the machine, rigid or with shafts.
     Ms : float
         Largest sensitivity, on the fit and on the measured lines with their bands.
     notch : bool
-        Whether filters may be used: a notch, or one or two biquads of free zeros and poles.
+        Whether to try filters: a notch, or one or two biquads with free zeros and poles.
     like : Controller, optional
-        Limits, moving average, encoder and units of this one; by default a mean of 4 samples.
+        Source of limits, moving average, encoder and units; by default a mean of 4 samples.
     counts_per_rev, u_max : float, optional
-        Encoder and limit of the command, without `like`; the encoder by default that of the machine
-        that was shaken.
+        Encoder and limit of the command, without `like`; by default the encoder of the measured
+        machine.
 
     Returns
     -------
@@ -130,7 +130,7 @@ def propose(
     SettingError
         For an Ms not above 1, or a controller at another sample time.
     FitError
-        Where no gains are stable within Ms.
+        If no gains are stable within Ms.
     """
     Ms = real("Ms", Ms)
     if not 1.0 < Ms < math.inf:
@@ -160,7 +160,7 @@ def propose(
 
 
 def _filtered(task: _Task, plain: Point) -> Point:
-    """The best with as few filters as pay."""
+    """The best controller with as few filters as pay."""
     p = {name: found.value for name, found in task.fit.parameters.items()}
     levelled = np.log(task.fit.notch().numbers)
     starts = [plain[1], *task.starts(1)]
@@ -184,7 +184,7 @@ def _filtered(task: _Task, plain: Point) -> Point:
 
 
 def _freed(frequency: float, depth: float, width: float) -> FloatArray:
-    """A notch as a biquad of free zeros and poles, in logarithms."""
+    """A notch as a biquad with free zeros and poles, in logarithms."""
     found: FloatArray = np.log([frequency, 0.5 * depth * width, frequency, 0.5 * width])
     return found
 
@@ -198,7 +198,7 @@ def _proposal(task: _Task, x: FloatArray) -> Proposal:
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """The fit on a dense grid, and what a point of the search stands for."""
+    """The fit on a dense grid, and the controller and merit of a search point."""
 
     fit: ShaftFit
     like: Controller
@@ -206,10 +206,10 @@ class _Task:
     hertz: FloatArray
     plant: Complex
     everywhere: FrequencyResponse
-    """Ones on the grid, and then at the measured lines that show the command: for feedback."""
+    """Ones on the grid and at the measured lines with enough coherence, to compute feedback."""
     lines: Complex
     circles: FloatArray
-    """What was measured at these lines, and the radius of its 95 % circles."""
+    """Measured response at these lines, and the radius of its 95 % circles."""
     model: tuple[FloatArray, FloatArray]
     quiet: float
 
@@ -217,7 +217,7 @@ class _Task:
     def of(cls, fit: ShaftFit, like: Controller, Ms: float) -> _Task:
         of = fit.response
         hertz = np.geomspace(0.05 * of.hertz[0], 0.499 / of.Ts, GRID)
-        of.loop(like)  # refuses another sample time and other units
+        of.loop(like)  # raises for another sample time or other units
         model = sampled(fit.to_model(), of.Ts)
         per_unit, reach = like.counts_per_unit, 0.5 * (like.u_max - like.u_min)
         known = per_unit > 0.0 and math.isfinite(reach)
@@ -232,10 +232,10 @@ class _Task:
         )  # fmt: skip
 
     def controller(self, x: FloatArray) -> Controller:
-        """From logarithms of Kp, Ti, Td, the lag, and of filters.
+        """The controller of logarithms of Kp, Ti, Td, the lag, and the filters.
 
-        Of a notch frequency, depth, width; of one or two biquads frequency and damping of the
-        zeros, frequency and damping of the poles.
+        A notch has frequency, depth and width; each of one or two biquads has frequency and damping
+        of the zeros, then of the poles.
         """
         Kp, Ti, Td, lag, *filters = np.exp(np.clip(x, -40.0, 40.0))
         g = self.like.gains
@@ -269,9 +269,7 @@ class _Task:
         )  # fmt: skip
 
     def starts(self, count: int) -> list[FloatArray]:
-        """Gains for the lag that the machine shows below its first swing, each a tenth of those
-        before.
-        """
+        """Gains for the machine's lag below its first resonance, each a tenth of the previous."""
         p = {name: found.value for name, found in self.fit.parameters.items()}
         K, T = p["gain"], p.get("lag_1", 0.05)
         late = p["delay"] + p.get("lag_2", 0.0) + 3.0 * self.like.Ts
@@ -289,7 +287,7 @@ class _Task:
         ]
 
     def bandwidth(self, controller: Controller) -> float:
-        """Where |S| first comes to 1/sqrt(2) [Hz]."""
+        """Frequency at which |S| first reaches 1/sqrt(2) [Hz]."""
         return self._bandwidth(self._feedback(controller)[0])
 
     def _bandwidth(self, feedback: Complex) -> float:
@@ -302,12 +300,12 @@ class _Task:
         return float(self.hertz[k - 1] * (self.hertz[k] / self.hertz[k - 1]) ** share)
 
     def _feedback(self, controller: Controller) -> tuple[Complex, Complex]:
-        """On the grid, and at the measured lines that show the command."""
+        """Feedback on the grid, and at the measured lines with enough coherence."""
         found = self.everywhere.loop(controller)
         return found[: len(self.hertz)], found[len(self.hertz) :]
 
     def merit(self, x: FloatArray) -> float:
-        """Logarithm of the bandwidth, less what an Ms beyond the limit costs; -inf if unstable."""
+        """Logarithm of the bandwidth, minus a penalty for exceeding Ms; -inf if unstable."""
         try:
             controller = self.controller(x)
         except SettingError:
@@ -327,12 +325,12 @@ class _Task:
         )  # fmt: skip
 
     def _measured(self, feedback: Complex) -> float:
-        """The largest sensitivity that the measured lines allow, their 95 % circles included."""
+        """Largest sensitivity at the measured lines, including their 95 % circles."""
         distance = np.abs(1.0 + self.lines * feedback) - self.circles * np.abs(feedback)
         return float(1.0 / np.maximum(distance, 1e-6).min())
 
     def _unmeasured(self, feedback: Complex) -> float:
-        """The largest sensitivity above the measured lines, by the loop's gain alone."""
+        """Largest sensitivity above the measured lines, from the loop's gain alone."""
         above = self.hertz > self.everywhere.hertz[-1]
         if not above.any():
             return 1.0
@@ -345,16 +343,16 @@ def _within(value: float, low: float, high: float) -> float:
 
 
 def _or_none(time: float, Ts: float) -> float:
-    """A time of less than a tenth of a sample is none."""
+    """The time, or 0 if it is less than a tenth of a sample."""
     return 0.0 if time < 0.1 * Ts else float(min(time, 100.0 * Ts))
 
 
 Point: TypeAlias = tuple[float, FloatArray]
-"""Of the search: merit and logarithms of the numbers."""
+"""Point of the search: merit and logarithms of the numbers."""
 
 
 def _best(task: _Task, starts: list[FloatArray]) -> Point:
-    """The best of a simplex search from each start, begun again at its end."""
+    """The best of simplex searches from each start, restarted at their end."""
     found = (-math.inf, starts[0])
     for start in starts:
         x, merit = start, -math.inf
@@ -375,7 +373,7 @@ def _best(task: _Task, starts: list[FloatArray]) -> Point:
 def simplex(
     merit: Callable[[FloatArray], float], start: FloatArray, spread: float, steps: int
 ) -> tuple[float, FloatArray]:
-    """The largest merit by the simplex of Nelder and Mead (Computer Journal 7, 1965)."""
+    """Maximise the merit by the simplex of Nelder and Mead (Computer Journal 7, 1965)."""
     n = len(start)
     points = [start, *(start + spread * row for row in np.eye(n))]
     values = [merit(x) for x in points]

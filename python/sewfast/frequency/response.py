@@ -1,4 +1,4 @@
-"""`FrequencyResponse`: gain and phase, how sure they are, and the loop around them."""
+"""`FrequencyResponse`: gain and phase with their uncertainty, and the loop around them."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ Complex = NDArray[np.complex128]
 
 FORMAT = "sewfast-frequency-response"
 VERSION, VERSIONS = 2, (1, 2)
-"""Before 2, `blocks` was one number always."""
+"""Before version 2, `blocks` was always one number."""
 
 LEVEL = 0.95
-"""Of the bands."""
+"""Confidence level of the bands."""
 LEAST_LINES = 3
 """For margins."""
 BETWEEN = 4
-"""Places for each measured line at which a search looks at the sensitivity."""
+"""Points per measured line at which a search evaluates the sensitivity."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -49,21 +49,21 @@ class FrequencyResponse:
     value : array of complex, shape (n,)
         Output over input [y/u].
     variance : array, shape (n,)
-        Of `value`: the expected square of its error's magnitude, from noise and, if different
-        excitations were averaged, from nonlinear distortion.
+        Expected squared magnitude of the error of `value`, from noise and, if different excitations
+        were averaged, from nonlinear distortion.
     noise : array, shape (n,), or None
-        The part of it seen when the same excitation is repeated: noise alone.
+        The part of it due to noise alone, from repetitions of the same excitation.
     coherence : array, shape (n,)
         Share of the output's power that the response explains, 0 to 1.
     blocks : float or array, shape (n,)
-        Independent blocks that were averaged; the variance is known from one fewer.
+        Number of averaged independent blocks; the variance has one degree of freedom fewer.
     Ts : float
         Sample time [s].
     u_unit, y_unit : str
     from_counts : bool
         Whether the output is a difference of encoder counts: the mean speed over the sample before.
     provenance : mapping
-        Machine, speed, method; `cautions` on a record, `incomplete` where the run broke off.
+        Machine, speed, method; `cautions` on a record, `incomplete` if the run broke off.
     """
 
     hertz: FloatArray
@@ -85,7 +85,7 @@ class FrequencyResponse:
 
     @property
     def phase_deg(self) -> FloatArray:
-        """Unwrapped, shape (n,) [deg]; between -180 and 180 at the lowest frequency."""
+        """Unwrapped phase, shape (n,) [deg]; between -180 and 180 at the lowest frequency."""
         return np.rad2deg(np.unwrap(np.angle(self.value)))
 
     @property
@@ -135,7 +135,7 @@ class FrequencyResponse:
     # --- The loop that a controller closes around it ----------------------------------------------
 
     def loop(self, controller: Controller, *, speed: float | None = None) -> Complex:
-        """L, broken at the plant's input, at each frequency, shape (n,).
+        """Loop gain L, broken at the plant's input, at each frequency, shape (n,).
 
         Raises
         ------
@@ -145,7 +145,7 @@ class FrequencyResponse:
         return self.value * self._feedback(controller, speed)
 
     def _feedback(self, controller: Controller, speed: float | None) -> Complex:
-        """From the measured output to the command, with its sign turned."""
+        """Response from the measured output to the command, with reversed sign."""
         if not math.isclose(controller.Ts, self.Ts, rel_tol=1e-9):
             raise SettingError(
                 name="controller", expected=f"the response's sample time, {self.Ts:g} s",
@@ -163,20 +163,20 @@ class FrequencyResponse:
                 )  # fmt: skip
         path = loop_path(controller, speed=speed)
         omega = 2.0 * np.pi * self.hertz
-        # the plant is a delay of one sample, which is taken out again
+        # the plant here is a delay of one sample, which is removed again
         one, delay = np.array([1.0]), np.array([0.0, 1.0])
         found = _core.loop_response(path, delay, one, omega) * np.exp(1j * omega * self.Ts)
         if self.from_counts and controller.counts_per_rev is not None:
-            # the mean over a sample is in the response already
+            # the response already includes the mean over a sample
             found = found / (0.5 * (1.0 + np.exp(-1j * omega * self.Ts)))
         feedback: Complex = found
         return feedback
 
     def lines(self, controller: Controller) -> tuple[FloatArray, Complex, FloatArray, bool]:
-        """Frequencies [rad/s], response and radius where the coherence is above a half, and whether
-        the controller's encoder is in it: what `sewfast.tune` takes Ms on.
+        """Lines with a coherence above a half, on which `sewfast.tune` limits Ms.
 
-        Between two measured lines the response is interpolated, as for `margins`.
+        Frequencies [rad/s], response and radius, and whether the response includes the controller's
+        encoder. Between two measured lines the response is interpolated, as for `margins`.
         """
         self._feedback(controller, controller.schedule[0][0] if controller.schedule else None)
         seen = self.coherence > 0.5
@@ -206,7 +206,7 @@ class FrequencyResponse:
     # --- Files, other tools, pictures -------------------------------------------------------------
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write it as JSON; `load_response` reads it."""
+        """Write the response as JSON; `load_response` reads it."""
         storage.write(path, FORMAT, VERSION, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
@@ -227,7 +227,7 @@ class FrequencyResponse:
         }
 
     def to_control(self) -> Any:
-        """As `control.FrequencyResponseData` (python-control)."""
+        """The response as `control.FrequencyResponseData` (python-control)."""
         from ..models.conversion import require_control
 
         return require_control().FrequencyResponseData(self.value, 2.0 * np.pi * self.hertz)
@@ -239,10 +239,10 @@ class FrequencyResponse:
         fit: ShaftFit | None = None,
         file: str | os.PathLike[str] | None = None,
     ) -> Any:
-        """Gain and phase with their 95 % bands, and coherence; with the curve of a fit, if given.
+        """Draw gain and phase with their 95 % bands, coherence, and the curve of a fit if given.
 
-        Frequencies at which less than half of the output is explained are drawn pale. Other
-        arguments and result are those of `Dataset.plot`.
+        Frequencies with a coherence below a half are drawn pale. Other arguments and result are
+        those of `Dataset.plot`.
         """
         return self.drawing(fit).plot(ax, file)
 
@@ -329,7 +329,7 @@ def _band(
 
 
 def load_response(path: str | os.PathLike[str]) -> FrequencyResponse:
-    """Read what `FrequencyResponse.save` wrote.
+    """Read a file of `FrequencyResponse.save`.
 
     Raises
     ------
@@ -340,7 +340,7 @@ def load_response(path: str | os.PathLike[str]) -> FrequencyResponse:
 
 
 def response_of(fields: storage.Fields) -> FrequencyResponse:
-    """From what `FrequencyResponse.to_dict` gave.
+    """The response of the values of `FrequencyResponse.to_dict`.
 
     Raises
     ------
@@ -376,20 +376,20 @@ def response_of(fields: storage.Fields) -> FrequencyResponse:
 
 @dataclass(frozen=True)
 class LoopMargins:
-    """Margins of a loop that is known at frequencies only.
+    """Margins of a loop known only at some frequencies.
 
     Attributes
     ----------
     Ms, Ms_hertz : float
-        Largest |S|, and where [Hz].
+        Largest |S|, and its frequency [Hz].
     Ms_band : tuple of (float, float)
-        In which it lies at 95 %, as the response is uncertain.
+        Its 95 % band due to the uncertain response.
     phase_margin_deg : float
-        Least turn of L to -1 where |L| is 1 [deg]; inf where it is nowhere 1.
+        Least rotation of L to -1 where |L| is 1 [deg]; inf if |L| is nowhere 1.
     gain_margin : float
-        Least factor above 1 that leads through -1; inf where none does.
+        Least factor above 1 that takes L through -1; inf if there is none.
     crossovers : tuple of float
-        Where |L| is 1 [Hz].
+        Frequencies at which |L| is 1 [Hz].
     """
 
     Ms: float
@@ -401,13 +401,13 @@ class LoopMargins:
 
     @classmethod
     def of(cls, hertz: FloatArray, L: Complex, radius: FloatArray) -> LoopMargins:
-        """From L at rising frequencies and the radius of its uncertainty, all of shape (n,)."""
+        """Margins from L at rising frequencies and its radius of uncertainty, all shape (n,)."""
         if len(hertz) < LEAST_LINES:
             raise DataError(
                 name="response", expected=f"at least {LEAST_LINES} frequencies for margins",
                 received=str(len(hertz)),
             )  # fmt: skip
-        # between two lines L is a straight line in log magnitude and phase
+        # between two lines log magnitude and phase of L are straight lines
         fine = np.interp(np.arange(0, len(hertz) - 1 + 1e-9, 0.1), np.arange(len(hertz)), hertz)
         size = np.interp(fine, hertz, np.log(np.maximum(np.abs(L), 1e-300)))
         turn = np.interp(fine, hertz, np.unwrap(np.angle(L)))
@@ -441,7 +441,7 @@ class LoopMargins:
 def _crossings(
     x: FloatArray, zero: FloatArray, value: FloatArray, holds: NDArray[np.bool_] | None = None
 ) -> list[tuple[float, float]]:
-    """Where `zero` changes its sign (and `holds`): the place and the value there."""
+    """Sign changes of `zero` (where `holds`): the position and the value there."""
     at = np.flatnonzero(np.signbit(zero[:-1]) != np.signbit(zero[1:]))
     if holds is not None:
         at = at[holds[at] & holds[at + 1]]

@@ -1,14 +1,15 @@
-"""Two masses and the shaft between them, or one rigid machine, fitted to a frequency response.
+"""A rigid machine, or two or three masses on shafts, fitted to a frequency response.
 
 With the electrical and mechanical lag `1 + a1 s + a2 s^2`, the motor's speed under a command is
 
     G(s) = K e^(-s tau) / (1 + a1 s + a2 s^2)  x  (w_r / w_a)^2 A(s) / R(s),
     A(s) = s^2 + 2 z_a w_a s + w_a^2,   R(s) = s^2 + 2 z_r w_r s + w_r^2
 
-The motor stands still at the antiresonance w_a, where the load swings on the shaft alone, and both
-swing against each other at the resonance w_r; their ratio tells the inertias' (Ellis 2012, Control
-System Design Guide, chapter 16). What is sampled is not G but its response to a held command, as
-the encoder counts it; the fit compares that, exactly, by partial fractions.
+The motor stands still at the antiresonance w_a, where the load oscillates on the shaft alone, and
+both oscillate against each other at the resonance w_r; the ratio of the two frequencies gives that
+of the inertias (Ellis 2012, Control System Design Guide, chapter 16). The measured quantity is not
+G but its response to a held command, as counted by the encoder; the fit computes that exactly, by
+partial fractions.
 """
 
 from __future__ import annotations
@@ -31,35 +32,35 @@ from ..tables import html_of
 from .response import Complex, FrequencyResponse
 
 RIGID, SHAFT = 4, 4
-"""Parameters of a rigid machine, and of each shaft."""
+"""Number of parameters of a rigid machine, and of each shaft."""
 LEAST = 20
-"""Frequencies for a fit."""
+"""Least frequencies for a fit."""
 CLEAR = 100.0
-"""Times the mean squared error of a frequency, that a resonance has to explain to be believed."""
+"""Error that a resonance has to explain to be accepted, in mean squared errors of a frequency."""
 NEIGHBOURS = 10
-"""Lines to either side over which the uncertainty is smoothed: a few blocks do not know it well."""
+"""Lines to either side over which the uncertainty is smoothed: few blocks estimate it poorly."""
 FLOOR = 0.005
-"""Of the gain, that no fit has to explain: friction and dead time bend every response a little,
-which would else outweigh a resonance that is seen less well."""
+"""Part of the gain that no fit has to explain: friction and dead time distort every response a
+little, which could otherwise outweigh a less visible resonance."""
 STARTS = 6
-"""Frequencies, evenly in their logarithm, at which a resonance is looked for beside the peaks."""
+"""Number of log-spaced frequencies, besides the peaks, at which a resonance is searched."""
 LIFTED = 50.0
-"""Squared errors over their mean, in as many lines as a shaft needs, from which a second one is
-looked for there; noise makes 16 of it, give or take 6."""
+"""Squared errors over their mean, summed over as many lines as a shaft needs, above which a second
+shaft is searched; noise gives 16 with a standard deviation of 6."""
 DAMPED = 0.5
-"""Damping ratio from which two poles are no resonance."""
+"""Damping ratio from which two poles do not count as a resonance."""
 RATIOS = (0.03, 30.0)
-"""Of load to motor inertia; beyond them the pair of zeros and poles is something else."""
+"""Limits of the ratio of load to motor inertia of a shaft."""
 NEAR, SHOWN = 1.4, 8
-"""Frequencies within this factor of antiresonance and resonance, and how many must be usable: two
-for each of the shaft's parameters, and so half of them about either. Fewer can be explained by many
-a shaft that is not there."""
+"""Factor around antiresonance and resonance, and least number of usable frequencies within it: two
+for each of the shaft's parameters, half of them around either. Fewer can be explained by many
+spurious shafts."""
 BEYOND, FARTHEST = (1.05, 1.3, 1.8), 1.0
-"""Of the highest measured frequency, where a resonance beyond it is looked for; the farthest that
-is believed, of the sample rate."""
+"""Starts for a resonance beyond the measured range, relative to the highest frequency; and the
+largest one accepted, relative to the sample rate."""
 CONFIDENCE = 1.96
 DEPTHS, WIDTHS = (0.02, 0.7), (0.1, 2.0)
-"""Of a proposed notch."""
+"""Limits of the depth of a proposed notch."""
 
 
 @dataclass(frozen=True)
@@ -88,11 +89,11 @@ class ShaftFit:
         `antiresonance_damping`, `inertia_ratio` (all loads over the motor), with a second shaft
         `resonance_2_hertz` and so on.
     misfit : float
-        Root of the mean squared error over its standard deviation: 1 if noise explains everything.
+        Root mean square of error over standard deviation: 1 if noise explains everything.
     response : FrequencyResponse
-        What was fitted.
+        The fitted response.
     beyond_hertz : float or None
-        Where a resonance seems to lie that is above all measured frequencies, by its flank [Hz].
+        Frequency of a resonance above the measured range, estimated from its flank [Hz].
     """
 
     parameters: Mapping[str, Parameter]
@@ -103,12 +104,12 @@ class ShaftFit:
 
     @property
     def has_resonance(self) -> bool:
-        """Whether a shaft between two masses was found."""
+        """Whether a shaft was found."""
         return self.resonances > 0
 
     @property
     def resonances(self) -> int:
-        """Shafts that were found: 0 of a rigid machine, 1 of two masses, 2 of three."""
+        """Number of shafts: 0 for a rigid machine, 1 for two masses, 2 for three."""
         return (len(self._theta) - RIGID) // SHAFT
 
     def at(self, hertz: Any) -> Complex:
@@ -124,15 +125,14 @@ class ShaftFit:
     def notch(self, number: int = 1) -> Biquad:
         """The notch that cancels a resonance, by default the lowest.
 
-        Its zeros are the poles of the oscillation.
-        At w_r the shaft lifts the gain by g = (w_r/w_a)^2 |A/R|; a depth of 1/g takes that back,
-        and with a width of 2 z_r g the notch's zeros are damped as the resonance is.
+        Its zeros are the poles of the oscillation. At w_r the shaft raises the gain by
+        g = (w_r/w_a)^2 |A/R|; a depth of 1/g cancels that, and with a width of 2 z_r g the notch's
+        zeros have the damping of the resonance.
 
         Raises
         ------
         FitError
-            For a resonance that the machine does not have, as a rigid one has none, or one beyond
-            half the sample rate.
+            For a resonance that the machine does not have, or one beyond half the sample rate.
         """
         if not 1 <= number <= self.resonances:
             kind = f"one of {self.resonances}" if self.resonances else "a rigid one"
@@ -190,9 +190,9 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
         From command to speed, as `sewfast.bode` measures it; lines with a coherence below a half
         are omitted.
     resonance : bool, optional
-        Whether there is a shaft. None finds out: a shaft is accepted if it explains 100 times the
-        mean squared error of a frequency, is damped below .5 and lies within what was measured. A
-        second shaft is looked for where there is one, and has to do the same.
+        Whether there is a shaft. None: a shaft is accepted if it explains 100 times the mean
+        squared error of a frequency, is damped below .5 and lies within the measured range. If
+        there is one, a second shaft is searched under the same conditions.
 
     Raises
     ------
@@ -243,7 +243,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
 
 
 def _polynomials(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Numerator and denominator of G without its delay; theta: logarithms, but for the delay."""
+    """Numerator and denominator of G without its delay; theta: logarithms, except the delay."""
     K, a1, a2 = np.exp(theta[:3])
     num, den = np.array([K]), np.array([a2, a1, 1.0])
     for wr, zr, wa, za in _shafts(theta):
@@ -253,13 +253,13 @@ def _polynomials(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _shafts(theta: FloatArray) -> FloatArray:
-    """Of each shaft frequency [rad/s] and damping of resonance and antiresonance, (shafts, 4)."""
+    """Frequency [rad/s] and damping of each shaft's resonance and antiresonance, (shafts, 4)."""
     found: FloatArray = np.exp(theta[RIGID:]).reshape(-1, SHAFT)
     return found
 
 
 def _in_order(theta: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """With the lowest resonance first."""
+    """Parameters and covariance reordered, with the lowest resonance first."""
     order = np.argsort(theta[RIGID::SHAFT], kind="stable")
     places = [RIGID + SHAFT * k + j for k in order for j in range(SHAFT)]
     at = np.array([*range(RIGID), *places])
@@ -267,16 +267,16 @@ def _in_order(theta: FloatArray, covariance: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _mark(number: int) -> str:
-    """In the names of a shaft's parameters."""
+    """The mark of a shaft in the names of its parameters."""
     return "" if number == 1 else f"_{number}"
 
 
 def _terms(
     theta: FloatArray, Ts: float, *, counted: bool
 ) -> tuple[int, float, list[tuple[complex, complex]]]:
-    """Whole samples of delay, the rest of it as a share, and poles with their residues.
+    """Whole samples of delay, its fraction, and poles with their residues.
 
-    Of the speed, or where it is counted of its integral.
+    For the speed, or for its integral if it is counted.
     """
     num, den = _polynomials(theta)
     if counted:
@@ -290,7 +290,7 @@ def _terms(
 
 
 def _held(p: complex, part: float, Ts: float) -> tuple[complex, complex]:
-    """What a pole has made at a sample's end of this sample's command and of the one before."""
+    """Contributions of this and the previous command to a pole's state at the sample's end."""
     if p == 0.0:
         return (1.0 - part) * Ts, part * Ts
     now = np.exp(p * (1.0 - part) * Ts)
@@ -298,7 +298,7 @@ def _held(p: complex, part: float, Ts: float) -> tuple[complex, complex]:
 
 
 def _sampled(theta: FloatArray, hertz: FloatArray, Ts: float, counted: bool) -> Complex:
-    """The response of what is seen: speed at the samples, or its mean over the sample before."""
+    """Response of the measured quantity: speed at the samples, or its mean between them."""
     whole, part, terms = _terms(theta, Ts, counted=counted)
     step = np.exp(-2j * np.pi * hertz * Ts)
     total: Complex = np.zeros(len(hertz), dtype=np.complex128)
@@ -310,7 +310,7 @@ def _sampled(theta: FloatArray, hertz: FloatArray, Ts: float, counted: bool) -> 
 
 
 def sampled_model(theta: FloatArray, Ts: float, u_unit: str, y_unit: str) -> LinearOE:
-    """G under a held command, at the samples; theta: logarithms, but for the delay in samples."""
+    """G under a held command, at the samples; theta: logarithms, except the delay in samples."""
     whole, part, terms = _terms(theta, Ts, counted=False)
     poles = [np.exp(p * Ts) for p, _ in terms]
     num: Any = np.zeros(len(poles) + 2, dtype=np.complex128)
@@ -365,7 +365,7 @@ def _solved(task: _Task, start: FloatArray) -> tuple[float, FloatArray, FloatArr
 
 
 def _rigid_starts(task: _Task) -> list[FloatArray]:
-    """The corner where the gain has fallen to .7, and lags beyond it."""
+    """Starts with a corner where the gain has fallen to .7, and lags beyond it."""
     size = np.abs(task.value)
     K = float(size[: max(3, len(size) // 50)].max())
     below = np.flatnonzero(size < K / math.sqrt(2.0))
@@ -379,7 +379,7 @@ def _rigid_starts(task: _Task) -> list[FloatArray]:
 
 
 def _shaft_starts(task: _Task, rigid: FloatArray) -> list[FloatArray]:
-    """Where the response rises most above the rigid machine's, and a few places more."""
+    """Starts where the response is most above the rigid machine's, and at a few more places."""
     f = task.hertz
     ratio = np.abs(task.value) / np.abs(_sampled(rigid, f, task.Ts, task.counted))
     places = [
@@ -390,7 +390,7 @@ def _shaft_starts(task: _Task, rigid: FloatArray) -> list[FloatArray]:
 
 
 def _second_starts(task: _Task, shaft: tuple[float, FloatArray, FloatArray]) -> list[FloatArray]:
-    """Where the response rises above that of one shaft, over as many lines as a shaft needs."""
+    """Starts where the response is above that of one shaft, over as many lines as needed."""
     cost, theta, _ = shaft
     f, fit = task.hertz, _sampled(theta, task.hertz, task.Ts, task.counted)
     usual = cost / max(2 * len(f) - len(theta), 1)
@@ -402,7 +402,7 @@ def _second_starts(task: _Task, shaft: tuple[float, FloatArray, FloatArray]) -> 
 
 
 def _peaks(ratio: FloatArray) -> NDArray[np.intp]:
-    """Places of the local maxima, the largest first."""
+    """Indices of the local maxima, the largest first."""
     inner = np.flatnonzero((ratio[1:-1] >= ratio[:-2]) & (ratio[1:-1] >= ratio[2:])) + 1
     found: NDArray[np.intp] = inner[np.argsort(-ratio[inner])]
     return found
@@ -411,7 +411,7 @@ def _peaks(ratio: FloatArray) -> NDArray[np.intp]:
 def _starts_at(
     task: _Task, fit: FloatArray, ratio: FloatArray, places: Iterable[float]
 ) -> list[FloatArray]:
-    """The fit and a shaft at each place, its antiresonance at the valley before and beside it."""
+    """The fit with a shaft at each place, its antiresonance at the valley before it or close by."""
     f, starts = task.hertz, []
     for place in places:
         left = (f > 0.3 * place) & (f < 0.98 * place)
@@ -423,9 +423,9 @@ def _starts_at(
 
 
 def _beyond(task: _Task, rigid: tuple[float, FloatArray, FloatArray]) -> float | None:
-    """The frequency of a resonance above all that were measured [Hz]; None where none is told.
+    """Frequency of a resonance above the measured range [Hz]; None if there is no evidence.
 
-    Its flank has to explain as much as a resonance among them would have to.
+    Its flank has to explain as much as a resonance within the range.
     """
     found = []
     for factor, ratio in product(BEYOND, (0.6, 0.85)):
@@ -443,13 +443,13 @@ def _beyond(task: _Task, rigid: tuple[float, FloatArray, FloatArray]) -> float |
 def _best_shaft(
     task: _Task, starts: list[FloatArray]
 ) -> tuple[float, FloatArray, FloatArray] | None:
-    """The best fit from these starts that can be of shafts; None where there is none."""
+    """The best fit from these starts with plausible shafts; None if there is none."""
     found = [s for s in (_solved(task, x) for x in starts) if _is_shaft(s[1], task.hertz)]
     return min(found, key=lambda s: s[0], default=None)
 
 
 def _is_shaft(theta: FloatArray, f: FloatArray) -> bool:
-    """Whether each pair of zeros and poles can be a shaft, and was measured."""
+    """Whether each pair of zeros and poles is a plausible shaft within the measured range."""
     return all(_is_one(shaft, f) for shaft in _shafts(theta))
 
 
@@ -465,7 +465,7 @@ def _is_one(shaft: FloatArray, f: FloatArray) -> bool:
 
 
 def _is_better(task: _Task, shaft: float, rigid: float) -> bool:
-    """Whether the shaft explains clearly more, measured by what it leaves itself."""
+    """Whether the shaft explains clearly more, relative to its own remaining error."""
     freedom = max(2 * len(task.hertz) - RIGID - SHAFT, 1)
     return (rigid - shaft) > CLEAR * shaft / freedom
 
@@ -508,7 +508,7 @@ def _parameters(
         found[f"resonance{mark}_damping"] = positive(at + 1, "")
         found[f"antiresonance{mark}_hertz"] = positive(at + 2, "Hz", turn)
         found[f"antiresonance{mark}_damping"] = positive(at + 3, "")
-    if shafts:  # far below all shafts the motor carries everything, far above itself alone
+    if shafts:  # far below all resonances the motor moves all loads, far above only itself
         found["inertia_ratio"] = derived(
             lambda x: math.exp(2.0 * float(np.sum(x[RIGID::SHAFT] - x[RIGID + 2 :: SHAFT]))) - 1.0,
             "",

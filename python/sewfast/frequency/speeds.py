@@ -1,4 +1,4 @@
-"""`ResponsesOverSpeed`: the frequency responses of one machine about several speeds."""
+"""`ResponsesOverSpeed`: the frequency responses of one machine at several speeds."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ VERSION = 1
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ResponsesOverSpeed:
-    """Frequency responses about several working speeds; iterating gives the responses.
+    """Frequency responses at several working speeds; iterating gives the responses.
 
     Attributes
     ----------
     responses : mapping from float to FrequencyResponse
-        By working speed [RPM], rising.
+        Responses by working speed [RPM], rising.
     refused : mapping from float to str
-        Speeds that gave none, and why.
+        Speeds without a response, and why.
     """
 
     responses: Mapping[float, FrequencyResponse]
@@ -43,7 +43,7 @@ class ResponsesOverSpeed:
 
     @property
     def speeds(self) -> tuple[float, ...]:
-        """At which there is a response [RPM]."""
+        """Speeds with a response [RPM]."""
         return tuple(self.responses)
 
     def __len__(self) -> int:
@@ -64,7 +64,7 @@ class ResponsesOverSpeed:
 
     @cached_property
     def fits(self) -> Mapping[float, ShaftFit]:
-        """What `fit_shaft` makes of each, without those that it refuses."""
+        """Results of `fit_shaft`, without the responses that it refuses."""
         found = {}
         for speed, response in self.responses.items():
             try:
@@ -74,13 +74,13 @@ class ResponsesOverSpeed:
         return found
 
     def margins(self, controller: Controller) -> Mapping[float, LoopMargins]:
-        """Margins of the loop at each speed, with the gains that its schedule has there."""
+        """Margins of the loop at each speed, with the controller's scheduled gains there."""
         return {s: r.margins(controller, speed=s) for s, r in self.responses.items()}
 
     # --- Files, pictures --------------------------------------------------------------------------
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write them as JSON; `load_responses` reads it."""
+        """Write the responses as JSON; `load_responses` reads them."""
         storage.write(path, FORMAT, VERSION, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
@@ -92,10 +92,10 @@ class ResponsesOverSpeed:
         }
 
     def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
-        """Gain and phase at each speed, over each other, and the coherence.
+        """Draw gain and phase at all speeds in one panel each, and the coherence.
 
-        Frequencies at which less than half of the output is explained are left out; the phase is
-        drawn between -270 and 90 degrees. Other arguments and result are those of `Dataset.plot`.
+        Frequencies with a coherence below a half are left out; the phase is drawn between -270 and
+        90 degrees. Other arguments and result are those of `Dataset.plot`.
         """
         return self.drawing().plot(ax, file)
 
@@ -122,7 +122,7 @@ class ResponsesOverSpeed:
             ax.set_xlabel("frequency [Hz]")
 
         def turned(r: FrequencyResponse) -> FloatArray:
-            # unwrapped over lines that say nothing it would turn by chance
+            # unwrapping over incoherent lines would add random turns
             return 90.0 - np.mod(90.0 - np.rad2deg(np.angle(r.value)), 360.0)
 
         panels = (
@@ -160,7 +160,7 @@ class ResponsesOverSpeed:
 
 
 def load_responses(path: str | os.PathLike[str]) -> ResponsesOverSpeed:
-    """Read what `ResponsesOverSpeed.save` wrote.
+    """Read a file of `ResponsesOverSpeed.save`.
 
     Raises
     ------

@@ -1,7 +1,8 @@
-"""What a motor is, from its record: friction, inertia, resistance, with error bars.
+"""Physical parameters of a motor from its record: friction, inertia, resistance, with error bars.
 
-Read `fit` first: `physics` makes a `motor` of what `sewfast.motorfit` finds; `equations` fits a
-function of your own. `tracking` follows a motor while it runs.
+Read `fit` first: `physics` turns the result of `sewfast.motorfit` into a `motor`; `equations` fits
+a function of your own; `exports` writes settings of other tools; `tracking` follows a running
+motor.
 """
 
 from .equations import EquationFit, load_equations

@@ -1,8 +1,8 @@
 """`physics` with equations of your own: a Python function of state, command and parameters.
 
-The function is called four times a step (Runge and Kutta's method), so that this is slow: seconds
-to minutes where the built-in motor takes one. It is tried with a column per set of parameters
-first; a function that takes arrays is called once for all derivatives of a step.
+The function is called four times a step (Runge-Kutta), which is slow: seconds to minutes, where the
+built-in motor takes one second. It is first tried with one column per set of parameters; a function
+that accepts arrays is called once for all derivatives of a step.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ..arrays import FloatArray, as_column
 from ..errors import DataError, FitError, SettingError
 from ..frequency.shaft import Parameter
 from ..identification.least_squares import least_squares
-from ..motorfit.intervals import CONFIDENCE, covariance_of, filtered, whitener
+from ..motorfit.estimation import CONFIDENCE, covariance_of, filtered, whitener
 from ..motorfit.records import Piece, Records, rad_per_second
 from ..tables import html_of
 from .motor import findings
@@ -32,17 +32,17 @@ Equations: TypeAlias = Callable[[Any, Any, Mapping[str, Any]], Any]
 FORMAT, VERSION = "sewfast-equations", 1
 EVALUATIONS = 60
 DIFFERENCE = 1e-4
-"""Of a parameter: half the step of its central difference."""
+"""Half the step of a central difference, relative to the parameter."""
 VAGUE = 1.0
-"""Of its value: the half-width of an interval from which a parameter is not determined."""
+"""Half-width of an interval, relative to the value, above which a parameter is not determined."""
 NOTHING = 1e-9
-"""Of the speed's spread: a parameter that moves the free run by less has no effect on it."""
+"""Least effect of a parameter on the free run, relative to the speed's spread."""
 BLIND = 1e-9
-"""Of the largest eigenvalue of the scaled matrix: a direction in which the free run stays."""
+"""Eigenvalue, relative to the largest of the scaled matrix, of a direction without effect."""
 MIXED = 0.02
-"""Share of such a direction from which a parameter takes part in it."""
+"""Least share of a parameter in such a direction to belong to it."""
 WHITE = 12
-"""Order of the autoregression that says how what is left over hangs together."""
+"""Order of the autoregression that models the residual's colour."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,17 +52,17 @@ class EquationFit:
     Attributes
     ----------
     parameters : mapping of Parameter by name
-        Value and 95 % interval, in the units in which the function takes them.
+        Value and 95 % interval, in the function's units.
     undetermined : mapping of str by name
-        Parameters that the record does not determine, and why; `values` has what was fitted.
+        Parameters that the record does not determine, and why; `values` has their fitted values.
     values : mapping of float by name
-        All parameters, as they were at the least squares.
+        All parameters at the least-squares solution.
     equations_name : str
         Module and name of the function.
     states : int
         Number of states; the first is the speed [rad/s].
     fit_percent, rmse : float
-        Of the free run on the record, after its start; rmse in `speed_unit`.
+        Fit of the free run on the record, after its start; rmse in `speed_unit`.
     converged : bool
         Whether the least-squares minimum was confirmed.
     """
@@ -81,7 +81,7 @@ class EquationFit:
     u_unit: str
     speed_unit: str
     equations: Equations | None = field(default=None)
-    """The function; None in a fit that was read from a file, which holds no code."""
+    """The function; None in a fit read from a file, which holds no code."""
 
     def value(self, name: str) -> float:
         """A parameter's value.
@@ -101,19 +101,18 @@ class EquationFit:
         )  # fmt: skip
 
     def with_equations(self, equations: Equations) -> EquationFit:
-        """The same fit with the function that a file does not hold."""
+        """The same fit with its function, which a file does not hold."""
         if not callable(equations):
             raise _not_callable(equations)
         return replace(self, equations=equations)
 
     def simulate(self, u: ArrayLike, *, Ts: float | None = None, speed: float = 0.0) -> FloatArray:
-        """Speed [speed_unit] under commands, (N,), from a speed on, other states from zero.
+        """Speed [speed_unit] under commands, (N,), from an initial speed, other states from zero.
 
         Raises
         ------
         SettingError
-            Without the function, as after reading a file, or where it does not take what it is
-            given.
+            Without the function, as after reading a file, or if it does not accept its arguments.
         DataError
             If the commands are not finite, one-dimensional numbers.
         """
@@ -141,7 +140,7 @@ class EquationFit:
         storage.write(path, FORMAT, VERSION, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
-        """All but the function, as JSON values."""
+        """Everything except the function, as JSON values."""
         return {
             "parameters": {n: vars(p) for n, p in self.parameters.items()},
             "undetermined": dict(self.undetermined),
@@ -173,7 +172,7 @@ _KEPT = (*_TEXTS, "states", "substeps", "fit_percent", "rmse", "converged", "sam
 
 
 def load_equations(path: str | os.PathLike[str]) -> EquationFit:
-    """Read what `EquationFit.save` wrote; nothing is executed or imported.
+    """Read a file of `EquationFit.save`; nothing is executed or imported.
 
     Raises
     ------
@@ -226,14 +225,14 @@ class Simulation:
     """Whether the function takes all columns at once."""
 
     def derivative(self, x: FloatArray, u: float, p: Mapping[str, Any]) -> FloatArray:
-        """Of the state (n,) or (n, columns), checked for its shape.
+        """Derivative of the state (n,) or (n, columns), with its shape checked.
 
         Raises
         ------
         FitError
-            Where the function raises.
+            If the function raises.
         SettingError
-            Where it returns another shape, or no numbers.
+            If it returns another shape, or no numbers.
         """
         try:
             found = self.equations(x, u, p)
@@ -257,12 +256,12 @@ class Simulation:
         return array.reshape(x.shape)
 
     def settle(self, theta: FloatArray, u: float, speed: float) -> None:
-        """Look whether all columns can be had at once: where the results are those of one by one.
+        """Test whether the function accepts all columns at once, with the same results.
 
         Raises
         ------
         FitError, SettingError
-            As `derivative`, at the start; also where it gives no finite number there.
+            As `derivative`, at the start; also if it returns no finite number there.
         """
         x = np.zeros(self.states)
         x[0] = speed
@@ -304,7 +303,7 @@ class Simulation:
         *,
         mean: bool,
     ) -> FloatArray:
-        """Speed at the samples, or its mean over the one before, (N, columns)."""
+        """Speed at the samples, or its mean over the previous sample, (N, columns)."""
         columns = theta.shape[1]
         x = np.zeros((self.states, columns))
         x[0] = speed
@@ -389,7 +388,7 @@ def fit_equations(
         [np.where(p.used, e, 0.0) for p, e in zip(records.pieces, over, strict=True)], WHITE
     )
     found = least_squares(residuals, found.x, jacobian, bounds=(low, high), max_nfev=EVALUATIONS)
-    return _told(records, simulation, found, (start, low, high), runs(found.x[:, None]))
+    return _result(records, simulation, found, (start, low, high), runs(found.x[:, None]))
 
 
 def _starts(
@@ -424,7 +423,7 @@ def _starts(
 
 
 def _restarted(records: Records, simulation: Simulation, theta: FloatArray) -> Records:
-    """Speeds at the pieces' first samples by least squares, where they do not stand still there."""
+    """Initial speeds of the pieces by least squares, unless they start at standstill."""
     pieces = []
     for p in records.pieces:
         if p.speed == 0.0:
@@ -445,7 +444,7 @@ def _restarted(records: Records, simulation: Simulation, theta: FloatArray) -> R
 def _stacked(
     pieces: Sequence[Piece], runs: Sequence[FloatArray], taps: FloatArray, *, off: bool = True
 ) -> FloatArray:
-    """Runs, less what was measured, through the filter; one piece below the other."""
+    """Runs minus measured speeds, filtered; one piece below the other."""
     parts = [
         filtered((y - p.y[:, None] if off else y).T, p.used, taps).T
         for p, y in zip(pieces, runs, strict=True)
@@ -454,7 +453,7 @@ def _stacked(
 
 
 def _merged(jacobian: FloatArray, names: Sequence[str]) -> dict[str, list[str]]:
-    """Parameters that others can stand for, and which: directions in which nothing changes."""
+    """Parameters that others can replace, and which: directions without effect on the run."""
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0.0] = 1.0
     size, along = np.linalg.eigh(jacobian.T @ jacobian / np.outer(scale, scale))
@@ -468,14 +467,14 @@ def _merged(jacobian: FloatArray, names: Sequence[str]) -> dict[str, list[str]]:
     return found
 
 
-def _told(
+def _result(
     records: Records,
     simulation: Simulation,
     found: Any,
     ranges: tuple[FloatArray, FloatArray, FloatArray],
     runs: Sequence[FloatArray],
 ) -> EquationFit:
-    """What is printed, and what is named instead."""
+    """The fit: parameters with intervals, and the undetermined ones with their reasons."""
     _, low, high = ranges
     for name, x, least, most in zip(simulation.names, found.x, low, high, strict=True):
         if x in (least, most):

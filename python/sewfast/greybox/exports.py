@@ -1,10 +1,10 @@
 """A motor's parameters as settings of other tools: feed-forward gains, simulators, boards.
 
-The fit knows a DC motor: volts and amperes whose product is power, and `torque = K i`. Boards for
-three phases compute in the amplitudes of phase to neutral, `v = R i + lambda w` along q, of which
-`3/2 v i` is power, so that `torque = 3/2 lambda i`. Two terminals of such a motor, one phase behind
-the other, have twice its resistance and inductance, and between them the amplitude
-`sqrt(3) lambda w`, by whose reciprocal [rpm/V] boards know the motor (KV): `torque = 8.27/KV i`.
+The fit is that of a DC motor: the product of volts and amperes is power, and `torque = K i`. Boards
+for three phases compute with amplitudes of phase to neutral, `v = R i + lambda w` along q, with
+power `3/2 v i`, so that `torque = 3/2 lambda i`. Between two terminals of such a motor, two phases
+in series, there is twice the resistance and inductance, and the amplitude of the back-EMF is
+`sqrt(3) lambda w`; its reciprocal [rpm/V] is the KV of boards: `torque = 8.27/KV i`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Target: TypeAlias = Literal["wpilib", "mujoco", "urdf", "odrive", "moteus", "simplefoc"]
 Winding: TypeAlias = Literal["line", "q"]
 AMPLITUDES = 1.5
-"""Power over volts times amperes, where both are amplitudes of the q axis."""
+"""Power over volts times amperes, for amplitudes along the q axis."""
 
 
 def export(motor: Motor, target: Target, winding: Winding | None, gear: float) -> str:
@@ -68,13 +68,13 @@ def _wpilib(motor: Motor, factor: float, gear: float) -> str:
 
 
 def _torque(motor: Motor, name: str) -> float:
-    """A term in N m, nothing where it is not shown."""
+    """A term in N m; 0 if the record does not show it."""
     K, R = motor.value("motor_constant"), motor.value("resistance_ohm")
     return motor.of[name] * K * motor.value("volts") / R
 
 
 def _at_joint(motor: Motor, factor: float, gear: float) -> tuple[float, float]:
-    """Viscous [N m s/rad] and dry friction [N m] of the motor, as its joint feels them."""
+    """Viscous [N m s/rad] and dry friction [N m] of the motor, reflected to its joint."""
     viscous, dry = (factor * _torque(motor, name) for name in ("k_b", "k_s"))
     return gear**2 * viscous, gear * dry
 
@@ -97,12 +97,12 @@ def _mujoco(motor: Motor, factor: float, gear: float) -> str:
 
 
 class Phase:
-    """A motor as boards see it: amplitudes of phase to neutral.
+    """A motor in the quantities of boards: amplitudes of phase to neutral.
 
     Attributes
     ----------
     resistance, inductance : float
-        Of a phase [ohm], [H]; the inductance is None where the record does not show the lag.
+        Of a phase [ohm], [H]; the inductance is None if the record does not show the lag.
     flux : float
         Amplitude of a phase's back-EMF per speed [V s/rad].
     torque_constant : float
@@ -110,7 +110,7 @@ class Phase:
     KV : float
         Speed [rpm] per amplitude of the back-EMF between two terminals [V].
     inertia, inertia_of_turns : float
-        [kg m^2], and per turn in place of radian.
+        Inertia [kg m^2], and the same per turn instead of radian.
     """
 
     def __init__(self, motor: Motor, is_q: bool) -> None:
@@ -160,7 +160,7 @@ BOARDS = {
         "sensor, voltage_limit, current_limit, gains",
     ),
 }
-"""Lines of each board's settings; that of an inductance is left out where there is none."""
+"""Lines of each board's settings; an unknown inductance is left out."""
 
 
 def _board(target: str, phase: Phase) -> str:

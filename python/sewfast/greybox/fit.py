@@ -1,4 +1,4 @@
-"""`physics`: a motor's parameters by output error, and which of them the record shows."""
+"""`physics`: parameters of a motor by output error, as far as the record shows them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STRUCTURES = {
     "dcmotor": tuple(t for t in TERMS if t not in OPTIONAL),
     "cogging": WAVES[:3],
 }
-"""Names that stand for several terms."""
+"""Names for groups of terms."""
 
 
 @overload
@@ -75,34 +75,33 @@ def physics(
         One input; of a `Recording` the counts are fitted. Random steps in both directions for 10 s
         show most; several experiments are fitted together.
     structure : "dcmotor" or sequence of str
-        Terms that may be in it, of `lag`, `delay`, `coulomb`, `offset`, `drop`, `stribeck`,
-        `load_1`, `load_2`, `inertia_2` (varying once, twice per turn), `cogging` and
-        `torque_ripple` (of orders per turn that are found), `limit`, `stribeck_difference` (by
-        direction), `sag` (of the supply) and `eccentricity` (of the encoder). "dcmotor" stands for
-        all of them, the last three only where they stand out clearly; ``["dcmotor", "sag"]`` looks
-        for one of them in any case. A term that the record does not show is omitted.
+        Possible terms, of `lag`, `delay`, `coulomb`, `offset`, `drop`, `stribeck`, `load_1`,
+        `load_2`, `inertia_2` (varying once, twice per turn), `cogging` and `torque_ripple` (whose
+        orders per turn are searched), `limit`, `stribeck_difference` (by direction), `sag` (of the
+        supply) and `eccentricity` (of the encoder). "dcmotor" means all of them, the last three
+        only if they stand out clearly; ``["dcmotor", "sag"]`` tries one of these in any case. A
+        term that the record does not show is omitted.
     current : str or array, shape (N,), optional
         Motor current [A]: a channel of the data set, or its samples.
     volts : float, optional
         Volts on the winding per unit of command; 1 if the command is that voltage.
     speed_unit : str, optional
-        rpm, rad/s, rev/s or deg/s, if the data set does not say.
+        rpm, rad/s, rev/s or deg/s, if the data set has no unit.
     intervals : "curvature" or "profile"
-        How the 95 % intervals are found: by the curvature of the cost, or as profile likelihood,
-        which follows a cost that is no parabola: ends of their own to either side, for some
-        seconds.
+        Method for the 95 % intervals: curvature of the cost, or profile likelihood, which also
+        follows a cost that is not parabolic: asymmetric intervals, at the cost of some seconds.
     equations : callable, optional
-        Your own equations in place of the motor's: ``f(x, u, p)`` returns the derivatives of the
+        Your own equations instead of the motor's: ``f(x, u, p)`` returns the derivatives of the
         state ``x``, shape (states,), under the command ``u``; ``p`` has the parameters by name. The
         first state is the speed [rad/s], others start at zero. Slow, since Python is called four
         times a sample (for each set of parameters, unless the function takes arrays as well as
         numbers).
     parameters : mapping, optional
-        For `equations`: by name a start, or (start, least, largest).
+        For `equations`: a start by name, or (start, least, largest).
     states : int
         For `equations`: number of states.
     substeps : int
-        For `equations`: steps of the integration (Runge and Kutta's) per sample.
+        For `equations`: steps of the Runge-Kutta integration per sample.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""`Motor`: what a record says of a motor, what it does not, and what can be made of it."""
+"""`Motor`: the parameters that a record determines, the others, and what to derive from them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from ..frequency.shaft import Parameter, sampled_model
 from ..machine import VirtualMachine
 from ..models import LinearOE
 from ..motorfit import WAVES, Estimated, rad_per_second
-from ..motorfit.intervals import CONFIDENCE
-from ..motorfit.profiles import Values, profiled, slope_of, values_of
+from ..motorfit.estimation import CONFIDENCE
 from ..motorfit.task import State
+from ..motorfit.terms import Values, profiled, slope_of, values_of
 from ..plotting import LOOKS, Drawing
 from ..tables import html_of
 from .exports import Target, Winding, export
@@ -33,12 +33,12 @@ VERSION = 3
 """Version 1 has `untold` for `undetermined`, version 2 no `orders`; both are read."""
 NAMES = tuple(_core.GREYBOX_PARAMETERS)
 OLDER = NAMES.index("limit") + 1
-"""From here on, parameters that files before version 3 lack."""
+"""First of the parameters that files before version 3 lack."""
 VAGUE = 1.0
-"""Of its value: the half-width of an interval from which a parameter is not printed."""
+"""Half-width of an interval, relative to the value, above which a parameter is not printed."""
 
 APART = 10.0
-"""Of its value: the half-width from which others can stand for it."""
+"""Half-width, relative to the value, above which other parameters can replace it."""
 
 _SI = ("resistance", "motor_constant", "inertia", "viscous_friction", "coulomb_torque")
 _NO_CURRENT = (
@@ -69,10 +69,9 @@ class Motor:
     terms : tuple of str
         Terms that the record shows besides back-EMF and inertia.
     fit_percent, rmse : float
-        Of the free run on the record, after its start; rmse in `speed_unit`.
+        Fit of the free run on the record, after its start; rmse in `speed_unit`.
     converged : bool
-        Whether the least-squares minimum was confirmed, or any further gain is below what noise
-        would give.
+        Whether the least-squares minimum was confirmed, or any further gain is within the noise.
     """
 
     parameters: Mapping[str, Parameter]
@@ -92,9 +91,9 @@ class Motor:
     resistance: float | None
     theta: FloatArray
     orders: tuple[int, ...] = (0,) * len(WAVES)
-    """How often per turn cogging, three of them, and the torque ripple repeat; 0 for none."""
+    """Orders per turn of three cogging terms and of the torque ripple; 0 for none."""
     shown: tuple[FloatArray, FloatArray] | None = field(default=None)
-    """Speed, measured and in the free run [rad/s], for the picture; not in a file."""
+    """Speed, measured and in the free run [rad/s], for plots; not stored in files."""
 
     def value(self, name: str) -> float:
         """A parameter's value.
@@ -114,7 +113,7 @@ class Motor:
         )
 
     def simulate(self, u: ArrayLike, *, Ts: float | None = None, speed: float = 0.0) -> FloatArray:
-        """Speed [speed_unit] under commands, (N,), from a speed on; the angle starts at zero.
+        """Speed [speed_unit] under commands, (N,), from an initial speed; the angle starts at zero.
 
         Raises
         ------
@@ -148,15 +147,15 @@ class Motor:
         """A virtual machine with this behaviour: a twin to tune and rehearse on.
 
         If R, Ke and J are not known individually, it has values that give the same speed; its
-        current then has no unit. It has no dead time beyond the hold, no cogging of an order above
-        2, no sag of its supply, an encoder that runs true, and friction that falls off alike in
-        both directions; a torque ripple is in it if it repeats four times per turn.
+        current then has no unit. It lacks dead time beyond the hold, cogging of orders above 2, sag
+        of the supply, eccentricity of the encoder, and Stribeck friction that differs by direction;
+        it includes a torque ripple of four times per turn.
 
         Parameters
         ----------
         u_limit : float, optional
-            The command at which the drive clips, which a record does not show; the default is so
-            large that it hardly clips.
+            The command at which the drive clips, which a record does not show; by default so large
+            that it hardly ever clips.
 
         Raises
         ------
@@ -222,18 +221,18 @@ class Motor:
         Parameters
         ----------
         target : "wpilib", "mujoco", "urdf", "odrive", "moteus" or "simplefoc"
-            `wpilib`: kS, kV, kA as JSON, kV and kA per rad/s and per rad/s^2, kG of a constant load
-            and, of an arm on the shaft, kG_cos and the angle where it is horizontal. `mujoco`:
-            joint and actuator elements; `urdf`: the joint's dynamics. Boards: resistance and
-            inductance of a phase, KV or torque constant per amplitude along q, inertia; what the
-            record cannot tell is named in the text. All but `wpilib` take SI units.
+            `wpilib`: kS, kV, kA as JSON, kV and kA per rad/s and per rad/s^2, kG for a constant
+            load and, for an arm on the shaft, kG_cos and the angle at which it is horizontal.
+            `mujoco`: joint and actuator elements; `urdf`: the joint's dynamics. Boards: resistance
+            and inductance of a phase, KV or torque constant per amplitude along q, inertia; the
+            text lists settings that the record cannot determine. All but `wpilib` use SI units.
         winding : "line" or "q"
-            What the record's volts and amperes are: those between two terminals, as of a DC motor,
-            or amplitudes along the q axis, as boards log them. Boards need it; without it, a
+            Meaning of the record's volts and amperes: between two terminals, as for a DC motor, or
+            amplitudes along the q axis, as boards log them. Required for boards; without it, a
             simulator gets a DC motor. With "q", torques and inertia are 3/2 of those printed.
         gear : float
-            Turns of the motor per turn of the joint or mechanism whose settings these are; the
-            record has the speed of the motor. Not for boards.
+            Turns of the motor per turn of the joint or mechanism of the settings; the record has
+            the motor's speed. Not for boards.
 
         Raises
         ------
@@ -245,11 +244,11 @@ class Motor:
         return export(self, target, winding, gear)
 
     def turn_load(self, angle: ArrayLike) -> FloatArray:
-        """Command that holds the shaft against what varies over the turn, at angles [rad], (N,).
+        """Command that balances the loads which vary over the turn, at angles [rad], (N,).
 
-        Loads once, twice and, of cogging, more often per turn, without the constant load: as a
-        feed-forward it takes them out of the speed. The angle is that of the record: of a
-        `Recording` its counts.
+        Loads once and twice per turn and cogging, without the constant load: as a feed-forward it
+        removes their effect on the speed. Angles are those of the record; for a `Recording` those
+        of its counts.
 
         Raises
         ------
@@ -263,11 +262,11 @@ class Motor:
 
     @property
     def of(self) -> dict[str, float]:
-        """What the fit has, by the names of the equations; nothing where a term is not shown."""
+        """Fitted values by their names in the equations; 0 for a term that is not shown."""
         return dict(zip(NAMES, self.theta.tolist(), strict=True))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write it as JSON, whole or not at all.
+        """Write the motor as JSON; the file is complete or absent.
 
         Raises
         ------
@@ -277,7 +276,7 @@ class Motor:
         storage.write(path, FORMAT, VERSION, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
-        """All but the picture, as JSON values."""
+        """Everything except the plotted runs, as JSON values."""
         limit = NAMES.index("limit")
         theta = [None if j == limit and math.isinf(v) else v for j, v in enumerate(self.theta)]
         return {
@@ -292,7 +291,7 @@ class Motor:
         }
 
     def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
-        """Measured speed and free run, the command needed to hold a speed, and cogging if there is.
+        """Draw measured speed and free run, the command to hold a speed, and any cogging.
 
         Arguments and result are those of `Dataset.plot`.
         """
@@ -385,7 +384,7 @@ _NUMBERS = (
 
 
 def findings(fields: storage.Fields) -> tuple[dict[str, Parameter], dict[str, str], str]:
-    """Of a file: parameters, reasons of those that are not determined, unit of the speed."""
+    """From a file: parameters, reasons for undetermined ones, unit of the speed."""
     stored, undetermined = fields.object("parameters"), fields.object("undetermined")
     parameters = {}
     for name in stored.values:
@@ -402,7 +401,7 @@ def findings(fields: storage.Fields) -> tuple[dict[str, Parameter], dict[str, st
 
 
 def load_motor(path: str | os.PathLike[str]) -> Motor:
-    """Read what `Motor.save` wrote; nothing in it is executed.
+    """Read a file of `Motor.save`; nothing in it is executed.
 
     Raises
     ------
@@ -412,7 +411,7 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
     document = storage.read(path, FORMAT, (1, 2, VERSION))
     if document["version"] == 1 and "untold" in document:
         document["undetermined"] = document.pop("untold")
-    if document["version"] < VERSION:  # terms that it did not know
+    if document["version"] < VERSION:  # terms added later
         document.setdefault("orders", [0] * len(WAVES))
         if isinstance(document.get("theta"), dict):
             document["theta"] = dict.fromkeys(NAMES[OLDER:], 0.0) | document["theta"]
@@ -467,7 +466,7 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
 
 
 def motor_of(found: Estimated, volts: float | None, *, profile: bool) -> Motor:
-    """What the estimate says, each parameter with its interval or the reason why it has none."""
+    """The motor of an estimate: each parameter with its interval, or the reason for having none."""
     estimate, records, reasons = found.state, found.records, found.reasons
     known, names = values_of(estimate), estimate.names()
     spreads = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
@@ -484,7 +483,7 @@ def motor_of(found: Estimated, volts: float | None, *, profile: bool) -> Motor:
         slope = slope_of(known, of, names, spreads)
         half = CONFIDENCE * math.sqrt(max(float(slope @ found.covariance @ slope), 0.0))
         vague = half >= VAGUE * abs(value)
-        if name == "delay":  # that there is none is an answer
+        if name == "delay":  # a delay of zero is a valid result
             vague = half >= APART * max(value, records.Ts)
         if not math.isfinite(half) or vague:
             undetermined[name] = (
@@ -559,12 +558,12 @@ Quantity: TypeAlias = tuple[str, str, Callable[[Values], float]]
 
 
 def _amplitude(wave: str) -> Callable[[Values], float]:
-    """Of cosine and sine together."""
+    """Amplitude of a wave from its cosine and sine."""
     return lambda p: math.hypot(p[wave + "c"], p[wave + "s"])
 
 
 def _quantities(estimate: State, u: str, volts: float | None) -> list[Quantity]:
-    """Name, unit and value of everything that may be printed."""
+    """Name, unit and value of every quantity that can be printed."""
     u = u or "command"
     found: list[Quantity] = [
         ("k_v", f"{u}/(rad/s)", lambda p: p["k_e"] + p["k_b"]),

@@ -1,4 +1,4 @@
-"""`Tracker`: a motor's parameters while it runs, and an alarm where one of them drifts."""
+"""`Tracker`: a motor's parameters while it runs, and an alarm if one of them drifts."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from ..errors import SettingError
 
 NAMES = ("k_v", "k_a", "k_s", "offset")
 TOLERANCE = {"k_v": 0.05, "k_a": 0.02, "k_s": 0.4}
-"""Shares of the reference that a parameter may move by without an alarm."""
+"""Parts of the reference by which a parameter can move without an alarm."""
 SURE = 0.6
-"""Of the tolerance: the standard deviation from which an estimate is a reference. After 5 s the k_a
-of one machine was still off by 3.7 %, and raised eight alarms in two minutes."""
+"""Standard deviation, relative to the tolerance, below which an estimate can be a reference. After
+5 s the k_a of one machine was still off by 3.7 %, and raised eight alarms in two minutes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """What a tracker followed.
+    """History of a tracker.
 
     Attributes
     ----------
     estimates : mapping of array, shape (N,)
-        By name after each sample, in the tracker's units.
+        Estimates by name after each sample, in the tracker's units.
     moved : mapping of array of bool, shape (N,)
-        By name whether it lies clearly outside its tolerance.
+        By name, whether the estimate is clearly outside its tolerance.
     """
 
     estimates: Mapping[str, FloatArray]
@@ -38,23 +38,23 @@ class Track:
 
 
 class Tracker:
-    """`u = k_v w + k_a dw/dt + k_s sign(w) + offset`, followed by least squares with forgetting.
+    """`u = k_v w + k_a dw/dt + k_s sign(w) + offset` by recursive least squares with forgetting.
 
-    The same arithmetic is in the `no_std` crate for firmware (`sewfast_control::Tracker`); signals
-    pass two lags before they are compared, the covariance is kept as `U D U'` [1]_.
+    The same arithmetic is in the `no_std` crate for firmware (`sewfast_control::Tracker`). Signals
+    pass two lags before they are compared; the covariance is stored as `U D U'` [1]_.
 
     Parameters
     ----------
     Ts : float
         Sample time [s].
     speed : float
-        The largest speed, in the unit in which speeds come: a scale, no limit.
+        The largest speed, in the unit of the speeds: a scale, not a limit.
     lag : float
-        Electrical lag [s], as `Motor` tells it; 0 where it is not known biases `k_a`.
+        Electrical lag [s], as given by `Motor`; 0 for an unknown lag biases `k_a`.
     smoothing : float
-        Of each lag [s]; some 20 samples, well below the motor's time constant.
+        Time constant of each lag [s]: some 20 samples, well below the motor's time constant.
     memory : float
-        Over which the past fades [s].
+        Time constant of forgetting [s].
 
     Raises
     ------
@@ -93,33 +93,33 @@ class Tracker:
             speed=float(speed),
         )  # fmt: skip
         self._shares: dict[str, float] | None = None
-        # an estimate changes once in so many samples
+        # the estimate is updated once in so many samples
         self._every = max(1, int(smoothing / Ts))
 
     def reset(self) -> None:
-        """Forget the past; what is watched stays."""
+        """Forget the past, but keep the watched references."""
         self._core.reset()
 
     @property
     def waits(self) -> bool:
-        """Whether `watch` still waits for an estimate that is sure enough."""
+        """Whether `watch` is still waiting for a sufficiently certain estimate."""
         return self._shares is not None
 
     def step(self, u: float, y: float) -> None:
-        """Take the mean speed over the sample before, and the command that acts from now on.
+        """Update with the mean speed over the previous sample and the command from now on.
 
-        A sample that is not finite is passed over.
+        A sample that is not finite is skipped.
         """
         self._core.step(u, y)
         self._watch_if_sure()
 
     def run(self, u: ArrayLike, y: ArrayLike) -> Track:
-        """Take many samples, shape (N,).
+        """Update with many samples, shape (N,).
 
         Raises
         ------
         DataError
-            Where the two differ in length or are no columns of numbers.
+            If the two differ in length or are not columns of numbers.
         """
         command = as_column(u, "u")
         speed, parts, k = as_column(y, "y", len(command)), [], 0
@@ -136,17 +136,17 @@ class Tracker:
 
     @property
     def estimate(self) -> dict[str, float]:
-        """`k_v`, `k_a`, `k_s`, `offset`: command per speed, per speed a second, and commands."""
+        """`k_v`, `k_a`, `k_s`, `offset`: command per speed, per acceleration, and commands."""
         return dict(zip(NAMES, self._core.estimate, strict=True))
 
     @property
     def deviation(self) -> dict[str, float]:
-        """Their standard deviations; inf until something is known."""
+        """Standard deviations of the estimates; inf before there is any information."""
         return {n: math.sqrt(v) for n, v in zip(NAMES, self._core.variance, strict=True)}
 
     @property
     def moved(self) -> tuple[str, ...]:
-        """Parameters beyond their tolerance by three standard deviations, ten updates in a row."""
+        """Parameters beyond tolerance by three standard deviations, ten updates in a row."""
         return tuple(n for n, moved in zip(NAMES, self._core.moved, strict=True) if moved)
 
     def watch(
@@ -155,22 +155,22 @@ class Tracker:
         *,
         tolerance: Mapping[str, float] | None = None,
     ) -> None:
-        """Raise an alarm (`moved`) from now on where a parameter leaves its reference.
+        """From now on, raise an alarm (`moved`) if a parameter leaves its reference.
 
         Parameters
         ----------
         reference : mapping of float by name, optional
-            What it is compared with; None is the estimate of now, which has the same small biases
-            as those to come, or the first that is sure enough: until its standard deviations are
-            below .6 of the tolerances, `waits` is true and nothing is watched.
+            Reference values. None: the present estimate, which has the same small biases as later
+            ones, or the first sufficiently certain one: until its standard deviations are below .6
+            of the tolerances, `waits` is true and nothing is watched.
         tolerance : mapping of float by name, optional
-            Shares of the reference, `{"k_v": .05, "k_a": .02, "k_s": .4}` by default; a parameter
-            without one is not watched.
+            Parts of the reference, `{"k_v": .05, "k_a": .02, "k_s": .4}` by default; a parameter
+            without tolerance is not watched.
 
         Raises
         ------
         SettingError
-            For a name that is none, or numbers out of range.
+            For an unknown name, or numbers out of range.
         """
         shares = dict(TOLERANCE if tolerance is None else tolerance)
         for name in (*(reference or ()), *shares):

@@ -1,10 +1,12 @@
 """`identify`: from a data set to a model.
 
-In the order in which to read it: `entry` (the public function and its refusals), `task` (one
-identification with its settings), `linear` and `lagged` (models of given orders), `folds` (what is
-held out, and how models are compared on it), `training` (starts of one structure, on any number of
-threads), `search` (which structures are tried), `choice` (which of them becomes the model).
-Beside them: `delays` and `order_table` (`delay`, `orders`), `least_squares`.
+Read in this order: `entry` (the public function and its checks), `task` (one identification with
+its settings, clock and threads), `linear`, `grey_box` and `lagged` (models of a given kind),
+`folds` (held-out data, and comparisons on them), `training` (starts of one structure, on any number
+of threads), `orders`, `outputs`, `trials` and `search` (the structures that are tried), `finals`
+and `choice` (which of them becomes the model), `verdict` (whether it is good enough), `further`
+(training a model further). Beside them: `delays` and `order_table` (`delay`, `orders`),
+`least_squares`.
 """
 
 from .entry import identify, seeded

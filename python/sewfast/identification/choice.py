@@ -1,7 +1,7 @@
-"""Which candidate becomes the model: against linear ones, trained to the end, guarded, refitted.
+"""Which candidate becomes the model: compared with linear ones, trained fully, guarded, refitted.
 
-A candidate that fails a question makes room for the next one; the linear model is returned only
-where no network is credibly better. What was second stays with the model, in `alternatives`.
+A candidate that fails a test makes room for the next one; the linear model is returned only if no
+network is credibly better. The second best are kept with the model, in `alternatives`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from ..errors import FitError, Interrupted
 from ..models import Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from ..models.grey_box import GreyBox
 from . import grey_box
-from .effort import Look, Pool, Stopped
 from .finals import (
     ALONE,
     ENOUGH_TO_CHOOSE_BY,
@@ -32,11 +31,21 @@ from .finals import (
     Finals,
 )
 from .folds import LEAST_HELD_OUT, SHARE, compared, errors_of, folds, free_runs
-from .linear import linear_model
+from .linear import linear_model, short
 from .orders import HELD_OUT, LEAST_GAIN, LinearCandidate, LinearTable
 from .search import CLIMB_ITERATIONS, Search
-from .short import short
-from .task import Provenance, Task, arrays, documented, finite, with_provenance, wrap
+from .task import (
+    Look,
+    Pool,
+    Provenance,
+    Stopped,
+    Task,
+    arrays,
+    documented,
+    finite,
+    with_provenance,
+    wrap,
+)
 from .training import Network, Request, Structure, train
 from .trials import (
     STILL_WORTH_A_FEEDTHROUGH,
@@ -48,23 +57,23 @@ from .verdict import verdict
 
 WORTH_AN_INTEGRATOR = 0.7
 ABOUT_EQUAL = 0.02
-"""Up to this larger an error on little data counts as none: fewer parameters are the safer bet."""
+"""On little data, an error larger by this factor counts as equal: fewer parameters are safer."""
 MOST_MEMBERS = 15
-"""Of an ensemble: a controller is tuned on every one, and a median of more is hardly better."""
+"""Members of an ensemble: a controller is tuned on each, and a median of more is hardly better."""
 MOST_ALTERNATIVES = 2
 LIKELY = 1.5
-"""Linear models whose error on the newest part is within this factor are asked on earlier ones."""
+"""Linear models with an error on the newest part within this factor are tested on earlier ones."""
 TOGETHER = 1.25
-"""On little data, or in little time, the median goes over all finalists with errors within this."""
+"""On little data, or in little time, the median includes all finalists within this factor."""
 
 
 def auto(task: Task) -> Model:
-    """The network where it is credibly better, else linear output error."""
+    """The network if it is credibly better, else linear output error."""
     return _identified(task, wants_network=False)
 
 
 def neural_ss(task: Task) -> Model:
-    """The state-space network, whether it is better or not."""
+    """The state-space network, even if it is not better."""
     return _identified(task, wants_network=True)
 
 
@@ -80,7 +89,7 @@ def _identified(task: Task, wants_network: bool) -> Model:
         search.run()
         return choice.model()
     except (Stopped, KeyboardInterrupt) as stopped:
-        # Ctrl-C also comes between two pieces of compiled work
+        # Ctrl-C can also arrive between two compiled calls
         raise Interrupted(choice.best_so_far(stopped)) from None
 
 
@@ -106,7 +115,7 @@ class Choice(Finals):
                 others = [c for c in finished if c.is_sound and c not in chosen]
                 return self._network(chosen, others)
             asked = [c for c in asked if c.structure not in {f.structure for f in finalists}]
-            # where the best do not beat a motor the next ones do not
+            # if the best candidates do not beat a motor, the next ones do not either
             if not self._beats_motor(finished[0]) or self.clock.over(SHARE_OF_FINAL):
                 break
         if self.wants_network:
@@ -117,7 +126,7 @@ class Choice(Finals):
     # --- the choice -----------------------------------------------------------------------------
 
     def _sound_and_settled(self, finished: Sequence[Candidate]) -> list[Candidate]:
-        """The chosen candidate and those that join its median; empty where none may be taken."""
+        """The chosen candidate and those that join its median; empty if none qualifies."""
         able = [c for c in finished if c.is_sound and math.isfinite(c.error)]
         linear = self.linear
         if linear is not None and not self.wants_network:
@@ -141,21 +150,21 @@ class Choice(Finals):
         return [best, *self._joining(best, able)]
 
     def _beats_motor(self, c: Candidate) -> bool:
-        """Whether it is better by a tenth than a motor's equations, where these are a candidate."""
+        """Whether it is better by a tenth than a motor's equations, if these are a candidate."""
         motor = self.search.motor
         return motor is None or c.error < WORTH_IT * motor.rmse
 
     def _joining(self, best: Candidate, able: Sequence[Candidate]) -> list[Candidate]:
-        """Others whose runs bring the median's error down, on little data all about as good.
+        """Others that reduce the median's error; on little data all that are about as good.
 
-        Where little is held out, a structure that leads there by a hair may do far worse elsewhere,
-        and others do their worst at other places: any gain will do.
+        On few held-out samples, a structure that leads narrowly can do far worse elsewhere, and
+        other structures fail at other places: any gain is accepted.
         """
         group = [best]
         worth = 1.0 if self.split.scored < ENOUGH_TO_CHOOSE_BY else ALONE
         is_unsure = self.search.is_small or (self.is_hurried and not self.search.is_large)
         if best.structure.integrator and self.search.repeats:
-            # what is held out repeats what was learned and cannot tell them: all that are small
+            # the held-out data repeat the training data and cannot rank them: take all small ones
             return [c for c in able if c is not best and c.structure.integrator]
         for c in able:
             if c is best or c.structure.integrator != best.structure.integrator:
@@ -171,11 +180,11 @@ class Choice(Finals):
         return errors_of(free_runs(median_of(models), self.split), self.split).rmse
 
     def _any_network(self) -> list[Candidate]:
-        """The best network although it is not sound, or one that is trained in the time left."""
+        """The best network even if it is not sound, or one that is trained in the time left."""
         found = self._state_space_networks()
         asked = [s for s in self.search.candidates if s.kind == "neural_ss"]
         if asked and not found and not self.clock.over(SHARE_OF_FINAL):
-            # slow linear fits have taken the search's share of a time budget
+            # slow linear fits have used up the search's share of a time budget
             self.search.share = SHARE_OF_FINAL
             self.search.tried([(asked[0], CLIMB_ITERATIONS, 1)])
             found = self._state_space_networks()
@@ -200,10 +209,10 @@ class Choice(Finals):
     # --- the model ------------------------------------------------------------------------------
 
     def _refitted(self, c: Candidate, most: int) -> list[Network]:
-        """A few iterations on everything, the held-out part included, where that stays sound.
+        """A few iterations on all data, including the held-out part, if the model stays sound.
 
-        None where a budget has cut the training short, but on little data: models that are still
-        on their way to one minimum do worse after some steps towards another.
+        None if a budget has cut the training short, except on little data: models that have not
+        reached their minimum do worse after some steps towards another one.
         """
         search, models = self.search, c.models[:most]
         is_early = self.is_hurried and not search.is_small
@@ -249,7 +258,7 @@ class Choice(Finals):
         return self._closed(model, error, [*runners_up, *self._linear_alternative()])
 
     def _of(self, models: Sequence[Network], s: Structure) -> Model:
-        """One model as it is, several as an ensemble, in the data's names and units."""
+        """One model unchanged, several as an ensemble, in the data's names and units."""
         known: Provenance = {"weight_decay": s.decay, "samples_fitted": len(self.task.data)}
         members = [
             with_provenance(
@@ -271,12 +280,12 @@ class Choice(Finals):
         return documented(model, self.task, self.began, extra)
 
     def _network_alternative(self) -> list[Model]:
-        """The best network that passed the guard, where none was chosen."""
+        """The best network that passed the guard, if none was chosen."""
         sound = [c for c in self.search.eligible if c.is_sound]
         return [self._alternative(c) for c in sorted(sound, key=lambda c: c.error)[:1]]
 
     def _linear_alternative(self) -> list[Model]:
-        """The linear model that the network was compared with."""
+        """The linear model with which the network was compared."""
         if not self.search.linear.eligible:
             return []
         chosen = self.search.linear.choice
@@ -341,7 +350,7 @@ class Choice(Finals):
         until = self.clock.until(SHARE_OF_REFIT)
         (fit,) = self.search.pool.map(self._linear_fit, [chosen], until=until, share=1.0)
         if fit is None:
-            # no time for all samples: the excerpt's model
+            # no time to fit all samples: keep the model of the excerpt
             extra = {"initial_state": "estimated", "termination": "time budget", **provenance}
             model = documented(wrap(LinearOE, core, task.data), task, self.began, extra)
         else:
@@ -358,12 +367,12 @@ class Choice(Finals):
         wanted = [(c.order, c.nk) for c in likely]
         everywhere.add(wanted, self.clock.until(SHARE_OF_FINAL))
         first = table.choice
-        # a budget that ended before it was asked again must not leave its place to another
+        # a candidate that the budget left untested on earlier parts must not lose for that
         is_asked = (first.order, first.nk) in everywhere.candidates
         return everywhere.choice if is_asked else first
 
     def _least_squares(self) -> Model:
-        """What there is when no output-error fit has come to an end: least squares, in free run."""
+        """The fallback if no output-error fit has finished: least squares, judged in free run."""
         task = self.task
         core = _core.fit_arx(arrays(task.data), **task.orders, offset=True)
         if not core.is_stable:
@@ -418,7 +427,7 @@ class Choice(Finals):
         }
 
     def best_so_far(self, stopped: BaseException) -> Model:
-        """What there is when Ctrl-C comes: the best candidate, else the linear model."""
+        """The result on Ctrl-C: the best candidate, else the linear model."""
         best, linear, motor = self.search.best, self.linear, self.search.motor
         bound = math.inf if linear is None else linear.rmse
         is_motor = motor is not None and motor.rmse < WORTH_IT * bound
@@ -434,7 +443,7 @@ class Choice(Finals):
             self.reasons, self.is_interrupted = ["interrupted: the equations of a motor"], True
             return with_provenance(self._motor(), {"termination": "interrupted"})
         if self.wants_network or linear is None or linear.models[0] is None:
-            # a kind that was asked for by name is not replaced by another
+            # a kind requested by name is not replaced by another
             raise KeyboardInterrupt from stopped
         model = wrap(LinearOE, linear.models[0], self.task.data)
         provenance = {"termination": "interrupted", "initial_state": "estimated"}
@@ -442,7 +451,7 @@ class Choice(Finals):
 
 
 def _without_held_out(task: Task, began: float, wants_network: bool) -> Model:
-    """A record too short to choose by, or still until its end: no network."""
+    """The model of a record too short for held-out data, or still until its end: no network."""
     reason = (
         f"the record is too short to hold out {100 * SHARE:.0f} % of every experiment, at least "
         f"{LEAST_HELD_OUT} samples, to compare on; or nothing moves before"

@@ -1,4 +1,4 @@
-"""Dead time: `delay`, by regressions on lags from one triangle."""
+"""Dead time: `delay`, by regressions on lags that share one triangular factor."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..tables import html_of
 
 CHUNK = 4096
 DEPENDENT = 1e-10
-"""Singular values below this part of the largest one, columns of length one, carry no parameter."""
+"""Singular values below this part of the largest (for columns of length 1) count as zero."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Solution:
     squares : float
         Sum of squared residuals.
     rank : int
-        Parameters that the data fix: the effective number, for least squares.
+        Number of parameters that the data determine.
     """
 
     columns: tuple[int, ...]
@@ -46,14 +46,15 @@ class Solution:
 class LaggedRegression:
     """The triangle R of [y(k), y(k-1) .., u_1(k) u_1(k-1) .., u_2(k) .., 1] over all whole rows.
 
-    Any regression on some of these columns has the sums of squares of the same one on R, which has
-    as many rows as there are columns: hundreds of structures cost less than reading the data once.
-    R'R is the Gram matrix, but its condition is the square of R's, so it is never formed.
+    A regression on some of these columns has the same sums of squares as the regression on those
+    columns of R, which has only as many rows as columns: hundreds of structures cost less than
+    reading the data once. The Gram matrix R'R is never formed, since its condition number is the
+    square of R's.
 
     Parameters
     ----------
     data : Dataset
-        Rows that touch a sample which is not finite are left out.
+        Rows with a sample that is not finite are left out.
     na : int
         Past outputs.
     lags : int
@@ -91,7 +92,7 @@ class LaggedRegression:
         return Solution(columns, theta, float(np.sum((y - chosen @ theta) ** 2)), int(rank))
 
     def squares(self, solution: Solution) -> float:
-        """Sum of squared one-step errors of a solution that came from other data."""
+        """Sum of squared one-step errors of a solution found on other data."""
         error = self.triangle[:, 0] - self.triangle[:, solution.columns] @ solution.theta
         return float(np.sum(error**2))
 
@@ -110,21 +111,21 @@ def _chunks(e: Experiment, na: int, lags: int) -> Iterator[FloatArray]:
 
 
 LONGEST = 30
-"""Delays looked at, unless told otherwise [samples]."""
+"""Largest delay tried by default [samples]."""
 ORDER = 4
 """Past outputs and inputs of the ARX models."""
 REFINED = 2
-"""Past outputs and inputs of the models whose free runs are compared; more could feign a delay."""
+"""Past outputs and inputs of the models whose free runs are compared; more could mimic a delay."""
 ITERATIONS = 6
 SMOOTH = 2000
-"""Lags over which a residual may correlate with itself."""
+"""Lags over which the residual's autocorrelations are summed."""
 WHITENING = 20
 """Order of the autoregression that makes an input white."""
 
 
 @dataclass(frozen=True, eq=False)
 class InputDelay:
-    """What the data say of one input's delay.
+    """Estimate of one input's delay.
 
     Attributes
     ----------
@@ -132,21 +133,21 @@ class InputDelay:
     nk : int
         Delay of the model with the lowest cost in free run [samples].
     low, high : int
-        The plausible delays lie between: their likelihood is at least `1 - confidence` of the best
-        one's, where as many samples count as the residual has independent ones.
+        Range of the plausible delays: their likelihood is at least `1 - confidence` of the best
+        one's, counting only the independent samples of the residual.
     first_correlated : int or None
         First lag at which input and output, both filtered to make the input white, correlate beyond
-        chance; None: at none.
+        chance; None if there is no such lag.
     lags : array, shape (L,)
     cost : array, shape (L,)
-        Mean square free-run error of a model with each delay [output unit squared]; inf where there
-        is none.
+        Mean square free-run error of a model with each delay [output unit squared]; inf if there is
+        no such model.
     one_step_cost : array, shape (L,)
         Mean square one-step error of an ARX model with each delay.
     correlation : array, shape (L,)
         Prewhitened cross-correlation at each lag.
     bound : float
-        Of |correlation| where input and output are independent, for all lags together.
+        Bound of |correlation| for independent input and output, for all lags together.
     """
 
     name: str
@@ -206,20 +207,8 @@ class DelayEstimate:
 
         Parameters
         ----------
-        ax : Axes or sequence of Axes, optional
-            One shows the errors of the first input; several take as many panels.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the panels of a new figure.
-
-        Raises
-        ------
-        SettingError
-            If matplotlib is not installed, or the file cannot be written.
+        ax, file
+            As for `Drawing.plot`; one panel shows the errors of the first input.
         """
         panels: list[Any] = []
         for found in self.inputs:
@@ -238,7 +227,7 @@ class DelayEstimate:
 
 
 def _draw_costs(ax: Any, found: InputDelay) -> None:
-    """The rms error of a model with each delay; those that are plausible are shaded."""
+    """The rms error of a model with each delay; plausible delays are shaded."""
     known = np.isfinite(found.cost)
     ax.axvspan(found.low - 0.4, found.high + 0.4, color=SHADE)
     ax.plot(found.lags[known], np.sqrt(found.cost[known]), marker="o", markersize=3)
@@ -248,7 +237,7 @@ def _draw_costs(ax: Any, found: InputDelay) -> None:
 
 
 def _draw_correlation(ax: Any, found: InputDelay) -> None:
-    """The correlation at each lag, and how large chance makes it."""
+    """The correlation at each lag, with the bound of chance."""
     ax.axhspan(-found.bound, found.bound, color=SHADE)
     ax.vlines(found.lags, 0.0, found.correlation)
     ax.plot(found.lags, found.correlation, linestyle="none", marker="o", markersize=3)
@@ -267,8 +256,8 @@ def delay(
     samples over the sum of the squared residual autocorrelations: a nonlinear drive leaves a smooth
     residual, which carries less information than its length suggests.
 
-    One step: the same for ARX models of order 4, which cost next to nothing; at a high sampling
-    rate noise makes them late, so they are only the start.
+    One step: the same for ARX models of order 4, which cost next to nothing. At a high sampling
+    rate noise makes their estimates late, so they only provide the start.
 
     Correlation: an autoregression of order 20 is fitted to the input, and input and output are
     filtered by it; the input is then white, and independent series correlate within `z / sqrt(N)`
@@ -281,9 +270,10 @@ def delay(
     longest : int
         Largest delay considered [samples].
     least : int
-        Smallest one; 0 admits inputs that act at once, which feedback in the recording can mimic.
+        Smallest delay considered; 0 admits inputs that act at once, which feedback in the recording
+        can mimic.
     confidence : float
-        Of the range of plausible delays, and of the bound on the correlations together.
+        Confidence level of the range of plausible delays, and of the bound on all correlations.
 
     Returns
     -------
@@ -298,7 +288,7 @@ def delay(
 
     Notes
     -----
-    A drive responds through its inertia: the first coefficients can be too small to be seen, so the
+    A drive responds through its inertia: the first coefficients can be too small to detect, so the
     estimate can be late by a sample or two. The model can then still start at 1.
     """
     _require(data, longest, least, confidence)
@@ -328,7 +318,7 @@ def delay(
 
 
 def reach(data: Dataset) -> int:
-    """Delays that short records leave room for."""
+    """Largest delay that the length of the records allows."""
     shortest = min(len(e) for e in data.experiments)
     return max(1, min(LONGEST, shortest // 10))
 
@@ -347,7 +337,7 @@ def _require(data: Dataset, longest: int, least: int, confidence: float) -> None
 
 
 def _one_step_costs(regression: LaggedRegression, j: int, lags: range) -> FloatArray:
-    """Mean square errors of ARX models, in which the other inputs have every lag."""
+    """Mean square errors of ARX models in which the other inputs have all lags."""
     everything = [(0, regression.lags)] * regression.n_inputs
     costs = []
     for nk in lags:
@@ -357,7 +347,7 @@ def _one_step_costs(regression: LaggedRegression, j: int, lags: range) -> FloatA
 
 
 def _free_run_costs(data: Dataset, j: int, lags: range, best: list[int]) -> FloatArray:
-    """Mean square free-run errors with input `j` delayed by each lag, the others by their best."""
+    """Mean square free-run errors with input `j` delayed by each lag, others by their best."""
     costs = []
     for nk in lags:
         delays = [*best[:j], nk, *best[j + 1 :]]
@@ -402,13 +392,13 @@ def _independent_samples(data: Dataset, delays: list[int]) -> float:
     if products[0] <= 0.0:
         return float(samples)
     squares = (products[1:] / products[0]) ** 2
-    # those of a white residual have the mean 1/N
+    # squared autocorrelations of a white residual have the mean 1/N
     excess = float(squares.sum()) - len(squares) / samples
     return samples / (1.0 + 2.0 * max(excess, 0.0))
 
 
 def _sum(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Of two series that start together and need not end together."""
+    """Sum of two series with a common start, over the longer of both."""
     total = np.zeros(max(len(one), len(other)))
     total[: len(one)] += one
     total[: len(other)] += other
@@ -432,12 +422,12 @@ def _of_input(
     one_step_cost: FloatArray,
 ) -> InputDelay:
     measured = np.concatenate([e.y[np.isfinite(e.y)] for e in data.experiments])
-    # rounding: a clean record has costs of nearly zero, whose ratios mean nothing
+    # floor of rounding: a clean record has costs of nearly zero, whose ratios mean nothing
     floor = 1e-16 * float(np.var(measured))
     deviance = independent * np.log((cost + floor) / (cost.min() + floor))
     plausible = np.flatnonzero(deviance <= -2.0 * math.log(1.0 - confidence))
     correlation, samples = _prewhitened_correlation(data, j, lags)
-    # each of L lags is judged at the level that all together keep (Sidak)
+    # significance of each of L lags such that all together keep the level (Sidak)
     each = 1.0 - (1.0 - confidence ** (1.0 / len(lags))) / 2.0
     bound = _normal_quantile(each) / math.sqrt(samples)
     beyond = np.flatnonzero(np.abs(correlation) > bound)
@@ -476,7 +466,7 @@ def _autoregression(series: list[FloatArray]) -> FloatArray:
     mean = np.mean(np.concatenate(series))
     rows = [np.lib.stride_tricks.sliding_window_view(s - mean, order + 1)[:, ::-1] for s in series]
     gram = np.sum([r.T @ r for r in rows], axis=0)
-    # a ridge keeps a filter for inputs that a few numbers describe (steps, sines) from exploding
+    # the ridge bounds the filter for inputs that few parameters describe (steps, sines)
     ridge = 1e-8 * gram[0, 0] * np.eye(order)
     return np.concatenate([[1.0], -np.linalg.solve(gram[1:, 1:] + ridge, gram[1:, 0])])
 

@@ -13,17 +13,16 @@ from ..dataset.experiment import in_effect
 from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted, SettingError
-from ..evidence import remembered
+from ..evidence import with_training_evidence
 from ..kinds import KINDS, Kind, spelled
 from ..models import Model
 from ..models.files import STRUCTURED
 from ..progress import shown_in_notebooks
 from ..threads import Workers, available, require_workers
-from . import choice, further, grey_box, lagged, linear, structured
-from .effort import Clock, Progress
+from . import choice, further, grey_box, lagged, linear
 from .folds import thinned
 from .outputs import OUTPUTS
-from .task import Task, with_provenance
+from .task import Clock, Progress, Task, with_provenance
 from .training import Structure
 from .verdict import verdict_by_name
 
@@ -36,16 +35,16 @@ _KINDS: dict[str, Callable[[Task], Model]] = {
     "neural_oe": lagged.neural_oe,
     "neural_ss": choice.neural_ss,
     "paper": lagged.paper,
-    **{cls.kind: structured.identified_as(cls) for cls in STRUCTURED},
+    **{cls.kind: linear.identified_as(cls) for cls in STRUCTURED},
 }
 SHARE_OF_FIT = 0.9
-"""Of a time budget; the rest is for the evidence that is kept with the model."""
+"""Share of a time budget for the fits; the rest is for the evidence stored with the model."""
 NETWORKS = ("neural_oe", "neural_ss")
 LINEAR_WIDTH = 10
 EVIDENCE_RATE, LEAST_EVIDENCE = 2.5e5, 2_000
-"""Samples times parameters for which evidence is found in a second, on a slow machine."""
+"""Samples times parameters whose evidence takes a second on a slow machine."""
 _SEARCHED = ("auto", "neural_ss")
-"""Kinds that find their own structure; the others have lags."""
+"""Kinds without given lags: their structure is searched."""
 _LAGS = 2
 _PAPER = {"na": 2, "nb": 2, "nk": 1, "hidden": 8}
 _PAPER_STARTS = 8
@@ -90,26 +89,25 @@ def identify(
     model : {"auto", "arx", "iv", "oe", "grey_box", "neural_oe", "neural_ss"} or Model
         `arx`: least squares of the one-step error. `iv`: refined instrumental variables, which
         measurement noise does not bias. `oe`: linear output error. `grey_box`: the equations of a
-        motor from its command to its speed, with a network of `hidden` units beside them; None:
-        with 4 where these are credibly better on held-out data. `neural_oe`: the
-        lagged network, trained in free run from the linear output-error model. `neural_ss`: the
-        state-space network. `auto`: one of `oe`, `neural_ss` and `neural_oe`, and of speeds
-        `grey_box`, by the free-run error on held-out data; on little data the median of several
-        networks, an `Ensemble`. A kind
-        requested by name is always returned. A model is trained further on these data, in its own
-        structure.
+        motor from its command to its speed, with a network of `hidden` units beside them (None: 4
+        units if they are credibly better on held-out data). `neural_oe`: the lagged network,
+        trained in free run from the linear output-error model. `neural_ss`: the state-space
+        network. `auto`: one of `oe`, `neural_ss`, `neural_oe` and, for speeds, `grey_box`, by the
+        free-run error on held-out data; on little data the median of several networks, an
+        `Ensemble`. A kind requested by name is always returned. A model is trained further on
+        these data, in its own structure.
     preset : "paper" or None
         The paper's network (docs/CONVENTIONS.md): no linear start, fixed scaling and orders.
     na, nb : int or None
-        Past outputs and past inputs in the regressor of a lagged model; None: 2, for `na` of a
-        Hammerstein-Wiener model 1 where that does about as well.
+        Past outputs and past inputs in the regressor of a lagged model; None: 2, but `na` = 1 for a
+        Hammerstein-Wiener model if that does about as well.
     nk : int or None
-        Delay [samples]. None: 1 for a lagged model; a searched one takes 1 unless the data say
-        otherwise. A plant of a control loop needs 1 or more.
+        Delay [samples]. None: 1 for a lagged model; a search uses 1 unless the data suggest another
+        delay. A plant of a control loop needs 1 or more.
     nx : int or None
-        States of `neural_ss`; None: found.
+        States of `neural_ss`; None: searched.
     hidden : int or None
-        Hidden units of a network; None: found, 8 for `neural_oe`.
+        Hidden units of a network; None: searched, 8 for `neural_oe`.
     output : {"linear", "saturation", "abs"} or None
         Output function of `neural_ss`; None: `linear`, or another if the data suggest it and it is
         better.
@@ -117,7 +115,7 @@ def identify(
         Random starts of a network's training. None: by the amount of data; 4 for `neural_oe`, 8
         for the preset `paper`, which has no linear model to start from.
     seed : int
-        Of the starts. A seed gives the same model at any number of threads and with any workers,
+        Seed of the starts. It gives the same model at any number of threads and with any workers,
         unless a time budget ends the work.
     iterations : int or None
         At most this many per start; None: by the amount of data, 100 for a lagged model.
@@ -130,19 +128,19 @@ def identify(
         Where the starts of `auto` and `neural_ss` are trained: a `concurrent.futures.Executor`, a
         Dask client, or anything with `map(function, jobs)`. None: threads of this process.
     time_budget : float or None
-        Seconds for everything, linear fits and evidence included; the best so far is returned, and
-        the model says what the budget has cut short.
+        Time for everything, including linear fits and evidence [s]; the best model so far is
+        returned, with a note on what was cut short.
     select : bool
         Whether data are held out to stop the training of `neural_oe` and to choose its weight
         decay. False trains on all data to the last iteration, for comparisons of methods.
     progress : callable(done, total, best_cost) or None
         Called from the calling thread from time to time, counting each stage from its start.
-        In a notebook a bar is shown where this is left out; None shows none.
+        If left out, a notebook shows a progress bar; None shows nothing.
 
     Returns
     -------
     Model
-        With its provenance in `training`.
+        Its provenance is in `training`.
 
     Raises
     ------
@@ -211,7 +209,7 @@ def identify(
     if isinstance(model, Model):
         found = _within_budget(lambda t: further.trained(t, model), task)
         if found.core is model.core:
-            # stopped before its first step: the evidence that it has is that of its own data
+            # stopped before its first step: it keeps the evidence from its own data
             return found
     else:
         found = _within_budget(_KINDS[kind], task)
@@ -219,7 +217,7 @@ def identify(
         if "verdict" not in found.training:
             own = verdict_by_name(found, task.data, task.validation)
             found = with_provenance(found, {"verdict": own})
-        return remembered(found, _excerpt(found, task))
+        return with_training_evidence(found, _excerpt(found, task))
     except KeyboardInterrupt:
         raise Interrupted(found) from None
 
@@ -227,19 +225,19 @@ def identify(
 def seeded(
     data: Dataset, *, iterations: int | None = None, progress: Progress | None = None
 ) -> Callable[[int, Progress | None], Model]:
-    """What trains networks that differ in their seeds alone, called with a seed and a progress.
+    """A function of a seed and a progress callback that trains one network.
 
-    Each is what `identify(data, model="neural_oe", starts=1, select=False)` returns, bit by bit,
-    without the evidence and the verdict that are kept with it. The linear model that all of them
-    begin at is fitted here, once: it takes longer than three networks.
+    Each network equals that of `identify(data, model="neural_oe", starts=1, select=False)` bit by
+    bit, without evidence and verdict. The linear model at which all of them start is fitted here,
+    once: it takes longer than three networks.
 
     Parameters
     ----------
     data : Dataset
     iterations : int, optional
-        At most this many, of the linear fits as of each network.
+        At most this many, for the linear fits and for each network.
     progress : callable, optional
-        Of the linear fits.
+        Progress of the linear fits.
 
     Raises
     ------
@@ -267,7 +265,7 @@ def _in_effect(data: Dataset, what: str) -> Dataset:
 
 
 def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
-    """What is reached when the time is up, with a note; a Ctrl-C goes on to the caller."""
+    """The model, or with a note the best one when the time is up; Ctrl-C goes on to the caller."""
     too_short = FitError(
         f"time_budget: expected time for at least one iteration, received "
         f"{task.clock.budget} s; give more, fewer data, or leave the budget out"
@@ -277,7 +275,7 @@ def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
     except Interrupted as e:
         if not task.clock.over(SHARE_OF_FIT):
             raise
-        # without a step these are still the linear model they began at
+        # without a step these are still their linear start
         begins_linear = e.best.kind in (*NETWORKS, *(cls.kind for cls in STRUCTURED))
         if begins_linear and e.best.training.get("iterations") == 0:
             raise too_short from None
@@ -290,7 +288,7 @@ def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
 
 
 def _excerpt(model: Model, task: Task) -> Dataset:
-    """The data for the evidence that is kept with a model; less of them where time is short."""
+    """The data for the evidence stored with a model; fewer of them if time is short."""
     clock = task.clock
     if clock.budget is None:
         return task.data
@@ -319,7 +317,7 @@ def _preset(preset: str, kind: str, orders: Mapping[str, int | None]) -> str:
 
 
 def _require_alone(**settings: object) -> None:
-    """A model that is trained further has its structure already."""
+    """Refuse settings of the structure for a model that is trained further."""
     for name, value in settings.items():
         if value is not None:
             raise SettingError(
@@ -351,7 +349,7 @@ def _require_meaning(
     output: str | None,
     time_budget: float | None,
 ) -> None:
-    """Settings that another kind of model has are a misunderstanding."""
+    """Refuse settings that this kind of model does not have."""
     searched = kind in _SEARCHED
     of_the_other = {"na": na, "nb": nb} if searched else {"nx": nx, "output": output}
     if kind == "grey_box":
@@ -396,7 +394,7 @@ def _require_longer(data: Dataset, least: int) -> None:
 
 
 def _require_enough(task: Task, kind: str) -> None:
-    """Every experiment holds whole regressors; all together more samples than parameters."""
+    """Require whole regressors in every experiment, and more samples than parameters in all."""
     lag, parameters = _sizes(task, kind)
     _require_longer(task.data, lag + INIT)
     usable = sum(len(e) - e.unmeasured - lag for e in task.data.experiments)
@@ -408,7 +406,7 @@ def _require_enough(task: Task, kind: str) -> None:
 
 
 def _sizes(task: Task, kind: str) -> tuple[int, int]:
-    """Samples that the first regressor reaches back, and the number of parameters."""
+    """Samples before the first whole regressor, and the number of parameters."""
     inputs = task.data.n_inputs
     if kind == "neural_ss":
         smallest = Structure(task.nx or 1, 1, task.hidden or 2, 0.0)

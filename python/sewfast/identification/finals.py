@@ -1,4 +1,4 @@
-"""Finalists: candidates that are credibly better than linear models, trained to the end."""
+"""Finalists: candidates that are credibly better than linear models, trained fully."""
 
 from __future__ import annotations
 
@@ -22,47 +22,47 @@ from .trials import (
 WORTH_IT = 0.9
 """A network must bring the error below this part of the best linear model's, and of a motor's."""
 WORTH_LOOKING = 0.97
-"""Where the median of the starts does not even reach this, nothing is asked."""
+"""If the median of the starts does not even reach this ratio, no further tests are made."""
 VERIFIED = 4
-"""Structures that are learned again on the earlier fold."""
+"""Number of structures trained again on the earlier fold."""
 FINALISTS = 3
 RELEASED = 0.01
-"""Weight decay makes the search surer, and biases what it finds: one finalist is trained with this
-part of it as well, and what is held out decides."""
+"""Weight decay makes the search more reliable but biases its result: one finalist is also trained
+with this part of it, and the held-out data decide."""
 WITHIN, WITHIN_LARGE = 2.0, 1.3
-"""How much larger than the best one's a finalist's error may be."""
+"""Largest ratio of a finalist's error to the best one's."""
 ENOUGH_TO_CHOOSE_BY = 1_500
-"""Held-out samples from which on a single start, or structure, may be taken instead of a median."""
+"""Held-out samples needed to choose a single start, or structure, instead of a median."""
 MOST_STARTS_LARGE = 2
-"""Starts of a finalist that are trained to the end on much data."""
+"""Starts of a finalist that are trained fully on much data."""
 ALONE = 0.98
-"""A single start must bring the error of the median below this part: a median errs less often."""
+"""A single start must reduce the median's error to below this part: medians err less often."""
 FINAL_OPERATIONS, FINAL_OPERATIONS_LARGE = 1.5e11, 1.25e12
 LEGS = 3
 LEG_ITERATIONS = 80
 BEHIND = 1.15
-"""A finalist that is behind by more after a leg is not trained on."""
+"""A finalist that is behind by more than this factor after a leg is not trained further."""
 BEHIND_LARGE = 1.01
-"""The same on much data, where held-out errors are sure and iterations dear."""
+"""The same on much data, where held-out errors are reliable and iterations expensive."""
 FINISHED = 0.995
-"""A leg that does not bring the error below this part ends the training."""
+"""A leg that does not reduce the error to below this part ends the training."""
 SHARE_OF_VERIFYING, SHARE_OF_FINAL, SHARE_OF_REFIT = 0.64, 0.89, 0.94
-"""Parts of a time budget at which each stage has to be done."""
+"""Parts of a time budget by which each stage must be finished."""
 
 
 @dataclass
 class Finals:
-    """What may be chosen from a search, and why.
+    """The candidates that can be chosen from a search, with the reasons.
 
     Attributes
     ----------
     search : Search
     began : float
-        When the identification began, on `time.perf_counter`.
+        Start of the identification, on `time.perf_counter`.
     reasons : list of str
-        What has decided so far, for the model's file.
+        Reasons for the decisions so far, for the model's file.
     is_hurried : bool
-        Whether a time budget cuts the training to the end short.
+        Whether a time budget cuts the full training short.
     """
 
     search: Search
@@ -78,13 +78,13 @@ class Finals:
 
     @property
     def linear(self) -> LinearCandidate | None:
-        """The linear model with the lowest held-out error: what a network has to beat."""
+        """The linear model with the lowest held-out error, which a network has to beat."""
         return self.search.linear.best if self.search.linear.eligible else None
 
     # --- against the linear model ---------------------------------------------------------------
 
     def worth_asking(self) -> list[Candidate]:
-        """Candidates credibly better than linear, the best first."""
+        """Candidates that are credibly better than linear models, best first."""
         found = self.search.eligible
         ranked = sorted([c for c in found if c.is_sound], key=lambda c: c.error)
         linear = self.linear
@@ -122,10 +122,10 @@ class Finals:
         return "no network could be trained: too few samples, or no start had a finite free run"
 
     def _verified(self, ranked: Sequence[Candidate], linear: LinearCandidate) -> list[Candidate]:
-        """Those that beat linear models on two later parts, most starts alone as well.
+        """Those that beat linear models on two later parts, most starts also on their own.
 
-        Forward chaining: the best structure of each size is learned again from what is before an
-        earlier fifth, so that a win by luck, of the start or of the part, is none.
+        Forward chaining: the best structure of each size is trained again on the data before an
+        earlier fifth, so that a start or part with luck does not decide.
         """
         search = self.search
         asked = best_of_each_size(ranked)[:VERIFIED]
@@ -137,13 +137,13 @@ class Finals:
             search.share = SHARE_OF_VERIFYING
             earlier = LinearTable(self.task, [search.folds[1]], search.pool)
             nk = linear.nk
-            # another part may ask for another order, and the network has to beat that one, too
+            # another part can need another order, which the network has to beat as well
             orders = {1, 2, 3, search.linear.choice.order, linear.order}
             earlier.add([(o, nk) for o in sorted(orders)], search.until)
             bound = earlier.best.rmse if earlier.candidates else math.inf
             able = [c for c in winning if search.is_affordable(c.structure, 1)]
             again = self._learned_again(able)
-            # what the time budget has left unasked has not failed; where it is all, one part counts
+            # untested for lack of time is not failed; if that holds for all, one part counts
             if again or not able:
                 learned = [c for c, _ in again]
                 for c in able:
@@ -156,7 +156,7 @@ class Finals:
                 if ratio < WORTH_IT:
                     passed.append((math.sqrt(c.error * other.error), c))
         passed.sort(key=lambda p: p[0])
-        # one or two of four sizes win by luck now and then; what the data show, most sizes can see
+        # one or two of four sizes can win by luck; most sizes win only if the data show it
         middle = float(np.median(list(ratios.values())))
         self.reasons.append(
             f"{len(passed)} of {len(ratios)} network sizes beat it, most starts alone as well, on "
@@ -174,10 +174,10 @@ class Finals:
         return sorted(kept, key=lambda c: order.index(id(c)) if id(c) in order else len(order))
 
     def _learned_again(self, able: Sequence[Candidate]) -> list[tuple[Candidate, Candidate]]:
-        """Those that could be learned afresh from what is before the earlier fifth, and how.
+        """Those that could be trained afresh on the data before the earlier fifth, with the result.
 
-        With a time budget in as many starts as there is time for; if not even two of each, then the
-        best structures alone.
+        A time budget limits the number of starts; if there is no time for two of each, only the
+        best structures are trained.
         """
         search = self.search
         starts, least = 3 if search.is_large else 6, 2
@@ -191,9 +191,9 @@ class Finals:
         return [(c, other) for c, other in zip(some, found, strict=True) if other.starts]
 
     def _usual(self, c: Candidate, held: Split) -> float:
-        """The error of the median of the starts, or of the median start where that is larger.
+        """The error of the median of the starts, or of the median start if that is larger.
 
-        One start of six that is stuck says nothing of the others.
+        One start of six that is stuck does not count against the others.
         """
         each = [errors_of(free_runs(m, held), held).rmse for m in c.models]
         return max(c.error, float(np.median(each)))
@@ -201,9 +201,9 @@ class Finals:
     # --- training to the end --------------------------------------------------------------------
 
     def finalists(self, ranked: Sequence[Candidate]) -> list[Candidate]:
-        """Up to three of different structure, about as good as the best; of different size first.
+        """Up to three different structures about as good as the best, different sizes first.
 
-        A search that has led to the wrong size has led there with all its neighbours.
+        A search that ends at a wrong size ends there with all its neighbours.
         """
         within = WITHIN_LARGE if len(self.task.data) >= 20_000 else WITHIN
         first = ranked[0]
@@ -214,7 +214,7 @@ class Finals:
             s = c.structure
             key = (s.kind, s.nx, s.hidden, s.nk, s.integrator, s.output.name)
             close = c.error <= within * first.error or (
-                # held-out data that repeat what was learned do not tell small networks apart
+                # held-out data that repeat the training data cannot rank small networks
                 s.integrator and first.structure.integrator and self.search.repeats
             )
             if close and key not in seen and len(found) < FINALISTS:
@@ -226,7 +226,7 @@ class Finals:
                 found[FINALISTS - 1 :] = [plain]
         self.search.share = SHARE_OF_FINAL
         self.is_hurried = self.search.able(self._operations) < 1.0
-        # the same starts twice are no use where there is hardly time to train them once
+        # no second weight decay if there is hardly time to train the starts once
         if self.search.is_released and not (self.is_hurried or first.structure.integrator):
             leading = found[0]
             released = replace(leading, structure=decayed(leading.structure, RELEASED))
@@ -235,16 +235,16 @@ class Finals:
 
     @property
     def _operations(self) -> float:
-        """Multiplications of the training to the end."""
+        """Multiplications of the full training."""
         return FINAL_OPERATIONS_LARGE if self.search.is_large else FINAL_OPERATIONS
 
     def _simplest_of_size(self, c: Candidate, ranked: Sequence[Candidate]) -> Candidate:
-        """The network of the same states with the fewest hidden units that does about as well."""
+        """The network with the same states and the fewest hidden units that does about as well."""
         same = [o for o in ranked if replace(o.structure, hidden=c.structure.hidden) == c.structure]
         return self.search.simplest([c, *same])
 
     def finish(self, finalists: Sequence[Candidate]) -> list[Candidate]:
-        """More starts, then all fitted data, until nothing is gained any more."""
+        """More starts, then all fitted data, until the error no longer improves."""
         search, until = self.search, self.search.until
         budget = self._operations * search.able(self._operations)
         alive = self._with_more_starts(finalists, budget / 3.0)
@@ -294,7 +294,7 @@ class Finals:
         ]
 
     def _leg(self, alive: Sequence[Candidate], budget: float) -> list[Request]:
-        """One leg for the starts that count: as many iterations as the budget allows."""
+        """One leg of the starts that count, with as many iterations as the budget allows."""
         task, requests = self.task, []
         for c in alive:
             each = c.structure.operations(self.search.inputs, len(self.split.fitted))
@@ -317,14 +317,14 @@ class Finals:
         return requests
 
     def rejudged(self, c: Candidate) -> Candidate:
-        """The same starts, judged on all that is held out."""
+        """The same starts, judged on all held-out data."""
         models = c.models
         return replace(c, errors=errors_of(free_runs(median_of(models), self.split), self.split))
 
     def _better(self, before: Candidate, starts: Sequence[Start], count: int) -> Candidate:
-        """The candidate after a leg of its first `count` starts, unless that has made it worse.
+        """The candidate after a leg of its first `count` starts, unless it became worse.
 
-        Starts for which there was no time stay in the median, unless it does credibly better
+        Starts for which there was no time stay in the median, unless the median is credibly better
         without them.
         """
         settled = replace(before, converged=True)
@@ -340,10 +340,10 @@ class Finals:
         return settled
 
     def _alone(self, c: Candidate) -> Candidate:
-        """The best start alone, where long held-out data say that it is better so."""
+        """The best start alone, if enough held-out data show that it is better."""
         if len(c.models) < 2 or self.split.scored < ENOUGH_TO_CHOOSE_BY:
             return c
-        # starts that are still on their way are best at different places: their median is safer
+        # unfinished starts are good at different places: their median is safer
         if self.is_hurried and not self.search.is_large:
             return c
         if c.structure.integrator and self.search.repeats and not self.search.is_large:
@@ -352,7 +352,7 @@ class Finals:
         return one if self.search.is_large or self._is_better_alone(one, c) else c
 
     def _is_better_alone(self, some: Candidate, all_: Candidate) -> bool:
-        """Whether a part of the starts does credibly better: a median errs less often elsewhere."""
+        """Whether some of the starts do credibly better: on other data a median errs less often."""
         if self.search.is_large:
             return some.error < all_.error
         ratio, deviation = compared(some.errors, all_.errors)

@@ -1,4 +1,4 @@
-"""What models are fitted to, what they are chosen by, and how their errors there are compared."""
+"""The data that models are fitted to and chosen by, and comparisons of their errors."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from .task import Provenance, sources
 SHARE = 0.2
 """Part of every experiment that is held out, at its end.
 
-Blocks inside a record lie where the drive has been before and after, and favour a network that
-learns the record by heart; a later part is the honest question.
+Blocks inside a record lie where the drive was before and after, and favour a network that memorises
+the record; a later part is the honest test.
 """
 FOLDS = 3
-"""Later parts that models are judged on, each by what was learned from all before it."""
+"""Number of later parts on which models are judged, each trained on the data before the part."""
 LEAST_HELD_OUT = 2 * INIT
 BLOCKS = 4
 RUN_UP = 10 * INIT
-"""Fitted samples that a held-out part begins with: its state is known when scoring starts."""
+"""Fitted samples at the beginning of a held-out part, so that its state is known for scoring."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Split:
     ----------
     fitted : Dataset
     held : Dataset
-        Begins in the fitted data, with outputs unknown there but for the first `INIT` samples.
+        Begins in the fitted data, where only the first `INIT` outputs are known.
     is_given : bool
-        The user's own validation data, from which nothing is ever learned.
+        Whether these are the user's own validation data, which are never trained on.
     sources : tuple of dict
-        What is scored, as JSON values.
+        The scored ranges, as JSON values.
     """
 
     fitted: Dataset
@@ -50,14 +50,14 @@ class Split:
 
     @property
     def scored(self) -> int:
-        """Samples that models are chosen by."""
+        """Number of samples by which models are chosen."""
         return sum(int(np.isfinite(e.y[INIT:]).sum()) for e in self.held.experiments)
 
     @property
     def spread(self) -> float:
-        """Error of a constant, the mean of what is fitted: the worst that counts.
+        """Error of a constant, the mean of the fitted data: the largest meaningful error.
 
-        Without its outermost percent: one wild value would make every error look small.
+        Without its outermost percent, since one outlier would make every error look small.
         """
         fitted = np.concatenate([e.y for e in self.fitted.experiments])
         low, high = np.nanquantile(fitted, [0.005, 0.995])
@@ -68,15 +68,15 @@ class Split:
         return math.sqrt(mean_square(squares, weights))
 
     def shortened(self, fitted: int, held: int) -> Split:
-        """About so many samples, of every experiment its proportional part."""
+        """About so many samples, a proportional part of every experiment."""
         return replace(self, fitted=thinned(self.fitted, fitted), held=_shortened(self.held, held))
 
 
 def split(data: Dataset, skipped: float = 0.0) -> Split | None:
-    """Hold out the end of every experiment that is long enough; None where none is.
+    """Hold out the end of every experiment that is long enough; None if none is.
 
-    A short one is learned from as a whole: it must not keep the others from being compared on.
-    Where all are short, the last ones are held out as they are.
+    A short experiment is used for training as a whole; it must not prevent comparisons on the
+    others. If all are short, the last ones are held out whole.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def split(data: Dataset, skipped: float = 0.0) -> Split | None:
             fitted.append(e)
             continue
         if min(_measured(e.y[:at]), _measured(e.y[at:stop])) < LEAST_HELD_OUT:
-            # a long gap has left too little on one side to be split
+            # a long gap leaves too little on one side for a split
             fitted.append(e.cut(0, stop))
             continue
         fitted.append(e.cut(0, at))
@@ -111,7 +111,7 @@ def split(data: Dataset, skipped: float = 0.0) -> Split | None:
 
 
 def _whole(data: Dataset, skipped: float) -> tuple[list[Experiment], list[Experiment]]:
-    """Of many short experiments those before the last fifth, and that fifth."""
+    """Many short experiments split into those before the last fifth, and that fifth."""
     able = [e for e in data.experiments if _measured(e.y) >= LEAST_HELD_OUT]
     stop = round((1.0 - skipped) * len(able))
     at = stop - round(SHARE * len(able))
@@ -119,10 +119,10 @@ def _whole(data: Dataset, skipped: float) -> tuple[list[Experiment], list[Experi
 
 
 def folds(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]:
-    """Forward chaining: the last fifth by all before it, then the fifth before that, and so on.
+    """Forward chaining: the last fifth after all data before it, then the fifth before, and so on.
 
-    The newest comes first; none where experiments are too short. Validation data are a fold of
-    their own, the only one.
+    The newest fold comes first; there is none if experiments are too short. Validation data, if
+    given, are the only fold.
     """
     if validation is not None:
         return (Split(data, validation, is_given=True, sources=tuple(sources(validation))),)
@@ -131,7 +131,7 @@ def folds(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]
 
 
 def _moves(data: Dataset) -> bool:
-    """Whether there is something to learn: a step at the end of a record may all be held out."""
+    """Whether there is motion to learn from: a step near the end can be entirely held out."""
     try:
         data.require_excited()
     except DataError:
@@ -161,7 +161,7 @@ def _shortened(data: Dataset, samples: int) -> Dataset:
 
 
 def thinned(data: Dataset, samples: int) -> Dataset:
-    """Blocks from all over every experiment: a chirp is another signal at its end."""
+    """Blocks spread over every experiment: a chirp is a different signal at its end."""
     if len(data) <= samples:
         return data
     share = samples / len(data)
@@ -181,20 +181,20 @@ def _blocks(e: Experiment, samples: int) -> list[Experiment]:
 # --- errors on what is held out, and their comparison ---------------------------------------------
 
 ERROR_BLOCKS = 12
-"""Blocks of squared errors that a comparison resamples, over all held-out parts together."""
+"""Number of blocks of squared errors in a comparison, over all held-out parts together."""
 RESAMPLES = 400
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Squared free-run errors on what is held out, summed block by block.
+    """Squared free-run errors on held-out data, summed block by block.
 
     Attributes
     ----------
     squares : array, shape (B,)
         Sum of squared errors of each block, each times its weight.
     counts : array, shape (B,)
-        Sum of the weights of the known outputs in it: their number where all count alike.
+        Sum of the weights of the known outputs in it: their number if all weights are equal.
     """
 
     squares: FloatArray
@@ -208,7 +208,7 @@ class Errors:
 
 
 RUNAWAY = Errors(np.array([np.inf]), np.array([1.0]))
-"""Of a model whose free run leaves the finite numbers."""
+"""Errors of a model whose free run diverges."""
 
 
 def errors_of(runs: Sequence[FloatArray] | None, held: Split) -> Errors:
@@ -229,7 +229,7 @@ def errors_of(runs: Sequence[FloatArray] | None, held: Split) -> Errors:
 
 
 def free_runs(core: Core, held: Split) -> list[FloatArray] | None:
-    """Free runs over the held-out parts, each from its own estimated state; None for a runaway."""
+    """Free runs over the held-out parts, each from its estimated state; None if one diverges."""
     runs = []
     for e in held.held.experiments:
         try:
@@ -244,8 +244,8 @@ def free_runs(core: Core, held: Split) -> list[FloatArray] | None:
 def compared(one: Errors, other: Errors) -> tuple[float, float]:
     """Logarithm of the ratio of two rms errors, and its standard error.
 
-    Errors of neighbouring samples belong together, so whole blocks are resampled, the same ones of
-    both models (Kuensch 1989; Efron and Tibshirani 1993, section 8.6).
+    Neighbouring errors are correlated, so whole blocks are resampled, the same ones for both models
+    (Kuensch 1989; Efron and Tibshirani 1993, section 8.6).
     """
     one_runs, other_runs = np.isfinite(one.squares).all(), np.isfinite(other.squares).all()
     if not (one_runs and other_runs):

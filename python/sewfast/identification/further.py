@@ -1,4 +1,4 @@
-"""A model trained further, on the same data or on others, in its own structure and scaling."""
+"""Further training of a model, on the same data or on others, in its own structure and scaling."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def trained(task: Task, model: Model) -> Model:
     Raises
     ------
     SettingError
-        For a model of a kind that is not trained further, or an ensemble that holds one; where the
-        data have other inputs or another sample time than the model's.
+        For a model of a kind that cannot be trained further, or an ensemble with one; if the data
+        differ from the model's in inputs or sample time.
     DataError
-        Where the data have other units.
+        If the data have other units.
     FitError
-        Where the model's free run on the data leaves the finite numbers.
+        If the model's free run on the data diverges.
     Interrupted
-        On Ctrl-C and at the end of a time budget. `best` is as good as the model at least: the
-        model itself where no step was made, an ensemble with the members that were reached.
+        On Ctrl-C and at the end of a time budget. `best` is at least as good as the model: the
+        model itself if no step was made, an ensemble with the members trained so far.
     """
     for m in model.members or (model,):
         _require_trainable(m)
@@ -49,7 +49,7 @@ def trained(task: Task, model: Model) -> Model:
 
 
 def _members(task: Task, model: Ensemble) -> Model:
-    """Every member in its turn: the task's budget holds for all of them together."""
+    """Train every member in turn, within one time budget."""
     began = time.perf_counter()
     members, known = list(model.members), {"initial_state": "estimated", "seed": task.seed}
     known |= {"trained_further": True}
@@ -73,9 +73,9 @@ def _members(task: Task, model: Ensemble) -> Model:
 
 
 def _best(model: Model, stopped: KeyboardInterrupt) -> Model:
-    """What there is when the training of a single model has been stopped."""
+    """The best model when the training of a single model is stopped."""
     best: Model | None = getattr(stopped, "best", None)
-    # without a step, and of an estimate that is solved anew, nothing is better than the model
+    # without a step, and for an estimate that is solved afresh, that is the given model
     is_further = best is not None and best.training.get("iterations") and best.kind != "iv"
     return best if best is not None and is_further else model
 
@@ -88,7 +88,7 @@ def _as_given(model: Model) -> Model:
 def _single(task: Task, model: Model) -> Model:
     began = time.perf_counter()
     if isinstance(model, (ARX, IV)):
-        # both are solved anew: what they begin with does not matter
+        # both are solved afresh, without a start
         o = model.orders
         own = replace(task, na=o["na"], nb=o["nb"], nk=o["nk"])
         return arx(own) if isinstance(model, ARX) else iv(own)
@@ -101,7 +101,7 @@ def _single(task: Task, model: Model) -> Model:
             return _state_space(task, model, began)
         return _lagged(task, model, began)
     except FitError as e:
-        # the core asks for other starts and sizes, which a model that is given does not have
+        # messages of the core that ask for other starts and sizes do not apply here
         raise FitError(
             name=f"{task.data.source}", expected="data on which the model's free run is finite",
             received="none", remedy="check scale and signs of the data, or identify anew",
@@ -109,7 +109,7 @@ def _single(task: Task, model: Model) -> Model:
 
 
 def _require_trainable(model: Model) -> None:
-    """A fit that can begin at this model."""
+    """Refuse models at which no fit can begin."""
     if isinstance(model, StructuredModel):
         raise SettingError(
             name="model", expected="a model that can be trained further",
@@ -191,7 +191,7 @@ def _lagged(task: Task, model: Model, began: float) -> Model:
         nb=s["nb"],
         nk=s["nk"],
         hidden=s["hidden"],
-        # only says that there is a linear part, and estimates initial states
+        # only states that there is a linear part, and estimates initial states
         linear=_core.fit_arx(arrays(task.data), na=s["na"], nb=s["nb"], nk=s["nk"], offset=True),
         u_mean=s["u_mean"],
         u_scale=s["u_scale"],
@@ -211,7 +211,7 @@ def _lagged(task: Task, model: Model, began: float) -> Model:
 
 
 def _decay(model: Model) -> float:
-    """The weight decay that the model was trained with."""
+    """The weight decay with which the model was trained."""
     known = model.training.get("weight_decay", 0.0)
     return float(known) if isinstance(known, (int, float)) else 0.0
 

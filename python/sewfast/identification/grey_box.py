@@ -1,4 +1,4 @@
-"""The grey box: a motor's equations by output error, a network where held-out data ask for one."""
+"""The grey box: a motor's equations by output error, with a network if held-out data need one."""
 
 from __future__ import annotations
 
@@ -17,41 +17,40 @@ from ..errors import DataError, FitError, SettingError
 from ..models import Model
 from ..models.grey_box import MOST_UNITS, GreyBox
 from ..motorfit import PLACE, estimated, rad_per_second, records_of
-from ..motorfit.marquardt import Normal, minimised
-from .effort import Look, Pool
+from ..motorfit.estimation import Normal, minimised
 from .folds import Errors, Split, compared, errors_of, folds, free_runs, thinned
-from .task import Provenance, Task, documented, finite, wrap
+from .task import Look, Pool, Provenance, Task, documented, finite, wrap
 
 TERMS = ("lag", "delay", "coulomb", "offset", "drop", "stribeck", "limit")
 IF_CLEAR = ("sag",)
-"""Of a motor: one that does not ask where a turn begins."""
+"""Terms of a motor without effects over the turn."""
 HIDDEN = 4
-"""Units of the network that is tried."""
+"""Hidden units of the network that is tried."""
 STARTS = 2
-"""Of the network, which begins at random weights; the better one is taken."""
+"""Random starts of the network; the best one is kept."""
 EXCERPT, POLISHING = 8_000, 10
-"""Samples to which the starts are trained, and iterations of the better one on all of them."""
+"""Samples on which the starts are trained, and iterations of the best one on all samples."""
 SEARCHED, MOST_FITTED = 10_000, 100_000
-"""Samples that a motor is fitted to in a search of structures, and at its end."""
+"""Samples to which a motor is fitted during a search of structures, and at its end."""
 PER_SAMPLE = 2e-4
-"""Seconds that the fits of a motor take on one processor, that to all data at the end included."""
+"""Time of a motor's fits on one processor, including the final one to all data [s]."""
 ENOUGH = 1.0
-"""Squared distance in standard errors at which the descent ends."""
+"""Squared step in standard errors at which the descent ends."""
 ARGUMENTS, OUTPUTS = 3.0, 0.1
-"""Standard deviations of the weights beforehand, in units of the scales; they keep a network small
-where the record says nothing, and weigh as much as a single residual does."""
+"""Prior standard deviations of the weights, in units of the scales. They keep a network small where
+the record gives no information, and count as much as a single residual."""
 CREDIBLE = 2.0
-"""Standard errors by which the network has to bring the held-out error down."""
+"""Standard errors by which the network has to reduce the held-out error."""
 WORTH_IT = math.log(0.98)
-"""And of its logarithm at least so much."""
+"""Least reduction of the logarithm of that error."""
 NOISES = tuple(10.0**e for e in range(-10, -1))
-"""Process noises that are tried, in squares of the scales."""
+"""Process noises to try, in squares of the scales."""
 PROBED = 20_000
-"""Samples that the choice of one looks at."""
+"""Samples used to choose the process noise."""
 
 
 def grey_box(task: Task) -> Model:
-    """The motor, with a network where that is credibly better on held-out data."""
+    """The motor, with a network if that is credibly better on held-out data."""
     began = time.perf_counter()
     require_motor(task.data)
     hidden, tried = _hidden(task)
@@ -68,14 +67,14 @@ def grey_box(task: Task) -> Model:
 
 
 def require_motor(data: Dataset) -> None:
-    """One command and a speed.
+    """Require one command and a speed.
 
     Raises
     ------
     DataError
         For another number of inputs.
     SettingError
-        For an output that is in no unit of speed.
+        For an output without a unit of speed.
     """
     if data.n_inputs != 1:
         raise DataError(
@@ -93,13 +92,13 @@ def require_motor(data: Dataset) -> None:
 
 
 def fitted(task: Task, data: Dataset, hidden: int, look: Look | None = None) -> _core.GreyBox:
-    """The motor's parameters, a network of so many units beside it, and the noise of its states."""
+    """The motor's parameters, a network of `hidden` units beside it, and the process noise."""
     core = _motor(data, look)
     return _with_noise(_with_network(core, task, data, hidden, look) if hidden else core, data)
 
 
 def _hidden(task: Task) -> tuple[int, list[Provenance]]:
-    """Units of the network, by what is held out, and what was compared."""
+    """Hidden units of the network, chosen on held-out data, and the comparison."""
     if task.hidden is not None:
         if task.hidden > MOST_UNITS:
             raise SettingError(
@@ -121,9 +120,9 @@ def _hidden(task: Task) -> tuple[int, list[Provenance]]:
 
 @dataclass(frozen=True)
 class MotorCandidate:
-    """The motor's equations, with a network or without, and their errors on what is held out.
+    """The motor's equations, with or without a network, and their errors on held-out data.
 
-    `errors` are those on every part that was asked, the newest first.
+    `errors` has those of every tested part, the newest first.
     """
 
     core: _core.GreyBox
@@ -137,20 +136,20 @@ class MotorCandidate:
 
     @property
     def rmse(self) -> float:
-        """On the newest part."""
+        """Error on the newest part."""
         return self.errors[0].rmse
 
     def row(self) -> Provenance:
-        """For the table."""
+        """The candidate's row of the table."""
         return {"kind": "grey_box", "hidden": self.hidden, "free_run_rmse": finite(self.rmse)}
 
 
 def candidate(
     task: Task, parts: Sequence[Split], pool: Pool, until: float | None
 ) -> MotorCandidate | None:
-    """A motor fitted on each of the parts; None where the data are none of a motor.
+    """A motor fitted on each of the parts; None if the data are not those of a motor.
 
-    Without a network first: where time is short, that is what there is.
+    First without a network, which is the result if time is short.
     """
     try:
         require_motor(task.data)
@@ -175,7 +174,7 @@ def candidate(
 
 
 def _or_none(found: Callable[[], MotorCandidate]) -> MotorCandidate | None:
-    """None where the data are none of a motor after all."""
+    """The candidate; None if the fit fails because the data are not those of a motor."""
     try:
         return found()
     except (DataError, FitError, SettingError, np.linalg.LinAlgError):
@@ -183,7 +182,7 @@ def _or_none(found: Callable[[], MotorCandidate]) -> MotorCandidate | None:
 
 
 def completed(task: Task, found: MotorCandidate, part: Split, look: Look) -> _core.GreyBox:
-    """The candidate fitted to all data, unless that does worse on the part it was chosen by."""
+    """The candidate fitted to all data, unless that is worse on the part by which it was chosen."""
     try:
         core = fitted(task, thinned(task.data, MOST_FITTED), found.hidden, look)
     except (DataError, FitError, SettingError, np.linalg.LinAlgError):
@@ -214,7 +213,7 @@ def _is_better(more: MotorCandidate, alone: MotorCandidate) -> bool:
 
 
 def _motor(data: Dataset, look: Look | None = None) -> _core.GreyBox:
-    """The equations alone, at the least squares of the free run."""
+    """The equations alone, at the least-squares solution of the free run."""
     found = estimated(records_of(data, None, None), TERMS, _at_any_time(look), if_clear=IF_CLEAR)
     state, records = found.state, found.records
     free = [n for n in state.names() if n not in ("k_b", "delay")]
@@ -248,17 +247,17 @@ _DERIVED = ("nx", "nk", "n_inputs", "integrator", "hidden")
 
 
 def _at_any_time(look: Look | None) -> Callable[[], None]:
-    """`look` without what it shows of a fit's progress."""
+    """`look` without arguments: it checks for the end but shows no progress."""
     return (lambda: None) if look is None else lambda: look(0, 0, math.inf)
 
 
 def _with_network(
     core: _core.GreyBox, task: Task, data: Dataset, hidden: int, look: Look | None = None
 ) -> _core.GreyBox:
-    """Motor and network together at the least squares of the free run.
+    """Motor and network together, at the least-squares solution of the free run.
 
-    The network begins without an effect. Its starts are trained to an excerpt, the better one to
-    all data.
+    The network begins without effect. Its starts are trained on an excerpt, the best one on all
+    data.
     """
     part = thinned(data, EXCERPT)
     begun = []
@@ -276,9 +275,9 @@ def _with_network(
 def trained_from(
     core: _core.GreyBox, start: FloatArray, data: Dataset, iterations: int, look: Look | None = None
 ) -> _core.GreyBox:
-    """From parameters of the motor, and weights after them, to the least squares of the free run.
+    """Descend from the motor's parameters and the weights to the least squares of the free run.
 
-    Weights are held near 0 as if each had been measured once, with a standard deviation beforehand.
+    The prior holds weights near 0 as if each had been measured once.
     """
     asked, free = _at_any_time(look), len(core.settings["free"])
     motor, hidden = start[:free], (len(start) - free) // 4
@@ -286,7 +285,7 @@ def trained_from(
     prior = np.concatenate([np.zeros(free), prior]) * math.sqrt(core.settings["residual_variance"])
     states = [state for _, _, _, state in _runs(core, data)]
     low = np.full(len(start), -np.inf)
-    for j, value in enumerate(motor):  # what is above nothing stays there
+    for j, value in enumerate(motor):  # parameters above 0 stay there
         low[j] = 1e-3 * value if value > 0.0 else -np.inf
 
     def at(x: FloatArray) -> _core.GreyBox | None:
@@ -332,7 +331,7 @@ def trained_from(
 
 
 def _weights(e: Experiment) -> FloatArray:
-    """Roots of the weights; nothing where nothing was measured."""
+    """Square roots of the weights; 0 where nothing was measured."""
     root = np.ones(len(e)) if e.weights is None else np.sqrt(e.weights)
     return np.where(np.isfinite(e.y), root, 0.0)
 
@@ -340,7 +339,7 @@ def _weights(e: Experiment) -> FloatArray:
 def _runs(
     core: _core.GreyBox, data: Dataset
 ) -> Iterator[tuple[Experiment, FloatArray, FloatArray, FloatArray]]:
-    """Experiments with their free run, error (NaN where none was measured) and initial state."""
+    """Experiments with their free run, error (NaN where not measured) and initial state."""
     for e in data.experiments:
         first = e.initial_samples(INIT)
         state = core.estimate_initial_state(e.u[:first], e.y[:first])
@@ -349,7 +348,7 @@ def _runs(
 
 
 def _cost(core: _core.GreyBox, data: Dataset) -> float:
-    """J of the free run [output unit squared]; infinite for a runaway."""
+    """J of the free run [output unit squared]; infinite if it diverges."""
     try:
         pairs = [(_weights(e), error) for e, _, error, _ in _runs(core, data)]
     except FitError:
@@ -359,7 +358,7 @@ def _cost(core: _core.GreyBox, data: Dataset) -> float:
 
 
 def _with_noise(core: _core.GreyBox, data: Dataset) -> _core.GreyBox:
-    """With the process noise of the least one-step error."""
+    """The model with the process noise that has the least one-step error."""
     part: Sequence[tuple[Experiment, FloatArray]] = [
         (e, state) for e, _, _, state in _runs(core, data)
     ]

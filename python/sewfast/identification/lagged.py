@@ -1,4 +1,4 @@
-"""The lagged network: the paper's preset, and the one that starts from linear output error."""
+"""The lagged network: the paper's preset, and the network that starts from linear output error."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from .task import (
 
 BLOCKS = 8
 HELD_OUT = (2, 5)
-"""Blocks to select on: inside the record, where a chirp is neither at its start nor at its end."""
+"""Blocks held out for selection: inside the record, away from both ends of a chirp."""
 LEAST_BLOCK = 2 * INIT
 DECAYS = (1e-2, 1e-4)
-"""Weight decays that the default network is trained with, the strongest first."""
+"""Weight decays of the default network, the strongest first."""
 ABOUT_AS_WELL = 1.25
-"""Largest ratio to the best held-out error at which a stronger weight decay is taken."""
+"""Largest ratio to the best held-out error for which a stronger weight decay is chosen."""
 SAME = 1e-6
-"""Relative difference of two errors that says that the network is still its linear start."""
+"""Relative difference of two errors below which the network is still its linear start."""
 NOTHING_LEFT = 1e-6
-"""J, in scaled units, at which a linear model explains everything."""
+"""J in scaled units below which a linear model explains everything."""
 _USUAL_STARTS = 4
 LINEAR_SHARE = 0.4
-"""Of a time budget; linear fits that took it all would leave none for the network."""
+"""Share of a time budget for the linear fits, so that some is left for the network."""
 WORTH_IT = 0.98
-"""The network must bring the free-run error below this part of the linear model's."""
+"""The network must reduce the free-run error to below this part of the linear model's."""
 
 
 def paper(task: Task) -> Model:
@@ -77,9 +77,9 @@ def paper(task: Task) -> Model:
 def neural_oe(task: Task) -> Model:
     """The network, trained in free run from the linear output-error model.
 
-    What comes back is always a trained network. Where held-out blocks stop the training before its
-    first step, because no step does better there than the linear model, the network is trained on
-    all data without them, and a note says so.
+    The result is always a trained network. If the held-out blocks stop the training before its
+    first step, because no step is better there than the linear model, the network is trained on
+    all data instead, with a note.
     """
     began = time.perf_counter()
     linear, start = begun(task, began)
@@ -91,7 +91,7 @@ def neural_oe(task: Task) -> Model:
     provenance = {"samples_fitted": len(trial.data), **decays}
     if len(network.trace) > 1 and not _is_still_linear(choice):
         return _network_model(task, network, began, provenance | _choice_provenance(choice))
-    # a strong decay would take the network back to its linear part
+    # a strong decay would pull the network back to its linear part
     everything = replace(task, validation=None)
     network = _network_fit(everything, start, DECAYS[-1], began)
     _require_trained(task, network)
@@ -101,13 +101,13 @@ def neural_oe(task: Task) -> Model:
 
 
 def begun(task: Task, began: float) -> tuple[_core.LinearModel, _core.LinearModel]:
-    """The linear model of the data, and the one that networks begin at."""
+    """The linear model of the data, and the one from which networks start."""
     brief = replace(task, progress=task.clock.limited(task.progress, LINEAR_SHARE))
     try:
         linear = _linear(brief, began)
         return linear, _start(brief, linear)
     except Interrupted as stopped:
-        # a network that was asked for by name is not replaced by a linear model
+        # a network requested by name is not replaced by a linear model
         raise KeyboardInterrupt from stopped
 
 
@@ -118,8 +118,8 @@ def unselected(task: Task, start: _core.LinearModel, began: float) -> Model:
 
 
 def _require_trained(task: Task, network: _core.NeuralFit) -> None:
-    """A network that has made no step is the linear model it began at, and not returned as one."""
-    # J is in scaled units: a linear model that leaves nothing needs no step
+    """Refuse a network without any training step: it is still its linear start."""
+    # J is in scaled units: a linear model without error needs no step
     if len(network.trace) < 2 and network.cost > NOTHING_LEFT:
         raise FitError(
             f"{task.data.source}: expected a network that does better than its linear start, found "
@@ -128,7 +128,7 @@ def _require_trained(task: Task, network: _core.NeuralFit) -> None:
 
 
 def _is_still_linear(choice: Provenance) -> bool:
-    """Whether network and linear model have the same error on held-out blocks."""
+    """Whether the network still has the linear model's error on held-out blocks."""
     rmse = choice.get("free_run_rmse", {})
     network, linear = rmse.get("neural_oe"), rmse.get("oe")
     if network is None or linear is None:
@@ -140,7 +140,7 @@ def _is_still_linear(choice: Provenance) -> bool:
 
 
 def _linear(task: Task, began: float) -> _core.LinearModel:
-    """Output error, as far as its share of the time budget goes; ARX where that is nowhere."""
+    """Output error, within its share of the time budget; ARX if there is no time at all."""
     try:
         return linear_fit(task, began).model
     except KeyboardInterrupt as e:
@@ -153,10 +153,10 @@ def _linear(task: Task, began: float) -> _core.LinearModel:
 
 
 def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
-    """Where the training begins: the linear model, or a smaller one that is misled less.
+    """The start of the training: the linear model, or a smaller one if that one is misled.
 
-    Networks that begin at a slow pole which the drive has not (`orders.is_misled`) hardly ever find
-    away from it.
+    Networks that start at a slow pole which the drive does not have (`orders.is_misled`) rarely
+    leave it.
     """
     orders = task.orders
     na, nb = orders["na"] - 1, orders["nb"] - 1
@@ -174,7 +174,7 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
         except FitError:
             return linear
         except KeyboardInterrupt:
-            # by Ctrl-C, or by the linear fits' share of a time budget
+            # Ctrl-C, or the end of the linear fits' share of a time budget
             if not task.clock.over(LINEAR_SHARE):
                 raise
             return linear
@@ -188,9 +188,9 @@ def _selected_network(
 ) -> tuple[_core.NeuralFit, Provenance]:
     """The network with the strongest weight decay that does about as well as the best.
 
-    Held-out blocks lie where the drive has been before; a smoother network is the safer one where
-    it has not (the one-standard-error rule: Hastie, Tibshirani, Friedman 2009, section 7.10). One
-    that runs away or sticks is taken only where all do.
+    Held-out blocks lie where the drive has been before; elsewhere a smoother network is safer (the
+    one-standard-error rule: Hastie, Tibshirani, Friedman 2009, section 7.10). A network that
+    diverges or does not forget its initial state is chosen only if all do.
     """
     decays = DECAYS if task.validation is not None else DECAYS[:1]
     fits = [_network_fit(task, linear, decay, began) for decay in decays]
@@ -266,7 +266,7 @@ def _with_blocks_held_out(task: Task) -> Task:
 
 
 def _with_enough_measured(pieces: list[Experiment]) -> list[Experiment]:
-    """The pieces that a long gap in the output has left something of."""
+    """The pieces in which enough outputs were measured."""
     return [e for e in pieces if len(e) - e.unmeasured > LEAST_BLOCK]
 
 

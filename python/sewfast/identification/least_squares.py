@@ -15,9 +15,9 @@ from ..errors import DataError, Interrupted, SettingError
 
 Differences: TypeAlias = Literal["2-point", "3-point", "cs"]
 
-#: Relative steps: rounding and truncation in balance; complex steps cancel nothing.
+#: Relative steps that balance rounding and truncation; complex steps have no cancellation.
 _STEPS = {"2-point": 2.0**-26, "3-point": 2.0 ** (-52 / 3), "cs": 2.0**-300}
-#: Relative errors that they leave in a Jacobian.
+#: Relative errors of the resulting Jacobian.
 _ERRORS = {"2-point": 2.0**-24, "3-point": 2.0**-33, "cs": 0.0}
 
 
@@ -25,14 +25,14 @@ _ERRORS = {"2-point": 2.0**-24, "3-point": 2.0**-33, "cs": 0.0}
 class LeastSquaresResult:
     """A solution, how the iteration reached it and how well the data determine it.
 
-    As with SciPy's result, ``result["x"]`` is ``result.x``, and ``dict(result)`` has all of it.
+    As with SciPy's result, ``result["x"]`` is ``result.x``, and ``dict(result)`` works.
     ``success`` is True only if a test for a minimum held and was confirmed: the Jacobian has
     full rank, and further undamped steps became shorter and ended below the tolerances.
 
     Attributes
     ----------
     x
-        Parameters, shape (n,): the best found, whatever the end.
+        Parameters, shape (n,): the best found, for any termination.
     cost
         ``0.5 * sum(fun(x)**2)``.
     fun, jac
@@ -46,7 +46,7 @@ class LeastSquaresResult:
         1, 2, 3: success by ``gtol``, ``ftol``, ``xtol``; 0: ``max_nfev`` is used up; below 0: the
         other terminations.
     message
-        What to do about the termination.
+        Advice on the termination.
     nfev, njev
         Evaluations of ``fun`` and of the Jacobian; as in SciPy's ``trf``, evaluations that a
         numerical Jacobian makes are not counted.
@@ -101,7 +101,7 @@ class LeastSquaresResult:
         return gradient
 
     def keys(self) -> tuple[str, ...]:
-        """Names of the values, as of a mapping."""
+        """Names of the values."""
         return (*(f.name for f in fields(self)), "grad")
 
     def __getitem__(self, name: str) -> Any:
@@ -110,7 +110,7 @@ class LeastSquaresResult:
         Raises
         ------
         KeyError
-            Where there is none of it.
+            If there is no value of that name.
         """
         if name not in self.keys():
             raise KeyError(name)
@@ -239,7 +239,7 @@ def least_squares(
 
 
 class _Model:
-    """The caller's functions, their values checked and made the core's arrays."""
+    """The caller's functions, with their values checked and converted for the core."""
 
     def __init__(
         self,
@@ -264,7 +264,7 @@ class _Model:
         self.upper: FloatArray | None = None
 
     def first(self) -> FloatArray:
-        """Residuals at the start, which set their number."""
+        """Residuals at the start, which fix their number."""
         values = self._values(self._start.copy())
         self._m = values.size
         return values
@@ -300,7 +300,7 @@ class _Model:
 
     def _differences(self, x: FloatArray, residuals: FloatArray, kind: str) -> FloatArray:
         matrix = np.empty((self._m, x.size))
-        # a parameter that passes through zero keeps a step that its start suggests
+        # a parameter near zero keeps a step of the size of its start
         sizes = np.maximum(np.abs(x), _STEPS["2-point"] * np.abs(self._start))
         for j, size in enumerate(np.where(sizes > 0, sizes, 1.0)):
             step = _STEPS[kind] * size
@@ -324,7 +324,7 @@ class _Model:
     def _beside(self, x: FloatArray, j: int, step: float) -> tuple[FloatArray, float]:
         moved = x.copy()
         moved[j] += step
-        # what was added is what was rounded
+        # the step actually made, after rounding
         place = float(moved[j])
         return self.residuals(moved), place
 

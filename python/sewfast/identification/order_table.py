@@ -1,4 +1,4 @@
-"""`OrderTable`: how well linear models of every order and delay do, and which one to take."""
+"""`OrderTable`: errors of linear models of every order and delay, and which one to use."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ from .delays import DelayEstimate, LaggedRegression, Solution, delay, reach
 Progress: TypeAlias = Callable[[int, int, float], object]
 
 BLOCKS = 10
-"""Parts of the later data whose errors tell how sure a difference between structures is."""
+"""Number of parts of the later data, for the standard error of a difference between structures."""
 ABOUT_AS_WELL = 1.005
-"""Ratio of free-run errors that is no difference: a tenth of the noise, where noise is all."""
+"""Ratio of free-run errors below which they count as equal."""
 EXACT = 1e-3
-"""Part of the output's standard deviation that the unknown inputs before the later part cost."""
+"""Error due to the unknown inputs before the later part, in standard deviations of the output."""
 IV_ITERATIONS = 10
 SHOWN = 12
 
 
 @dataclass(frozen=True)
 class Structure:
-    """One row: a linear model's orders and what the data say of it.
+    """One row: a linear model's orders and its errors.
 
     Attributes
     ----------
     na, nb, nk : int
     parameters : int
-        Effective number: what the training data fix of them.
+        Number of parameters that the training data determine.
     one_step : float
         rms one-step error of the ARX model on later data [output unit].
     free_run : float
-        rms free-run error on later data of that model, or of the one that instrumental variables
-        make of it where that is better; inf where neither has a free run.
+        rms free-run error on later data of that model, or of its refinement by instrumental
+        variables if that is better; inf if both diverge.
     aic, aicc, bic, fpe : float
-        Of the ARX model on the training data, every structure on the same samples (Ljung 1999,
-        section 16.4). FPE in the output's unit squared.
+        Criteria of the ARX model on the training data, the same samples for every structure (Ljung
+        1999, section 16.4). FPE in the output's unit squared.
     lipschitz : float
         Index of He and Asada (1993) of a model with these lags, linear or not; relative to others.
     """
@@ -128,20 +128,8 @@ class OrderTable:
 
         Parameters
         ----------
-        ax : Axes or sequence of Axes, optional
-            One panel.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the panels of a new figure.
-
-        Raises
-        ------
-        SettingError
-            If matplotlib is not installed, or the file cannot be written.
+        ax, file
+            As for `Drawing.plot`.
         """
         return stacked([self._draw], (2.8,)).plot(ax, file)
 
@@ -232,14 +220,14 @@ def orders(
     na, nb : int or iterable of int
         Orders to try; a number n means 1 to n.
     nk : int, iterable of int, or None
-        Delays to try; a number means that one delay. None: 1 and what `sewfast.delay` finds
-        plausible.
+        Delays to try; a number means that one delay. None: 1 and the plausible delays of
+        `sewfast.delay`.
     validation : Dataset or None
         Data for the errors; None: the last part of each experiment.
     held_out : float
-        That part, between 0 and 1.
+        Size of that part, between 0 and 1.
     progress : callable(done, total, lowest_error) or None
-        In a notebook a bar is shown where this is left out; None shows none.
+        If left out, a notebook shows a progress bar; None shows nothing.
 
     Returns
     -------
@@ -261,8 +249,8 @@ def orders(
     within 0.5 % of the lowest, or above it by no more than two standard errors of the difference
     over ten blocks (compare the one-standard-error rule: Hastie, Tibshirani, Friedman 2009, 7.10).
     Errors below 0.1 % of the output's standard deviation count as zero.
-    Information criteria judge one-step errors, which at a high sampling rate hardly depend on the
-    model; they are there to compare.
+    Information criteria judge one-step errors, which hardly depend on the model at a high sampling
+    rate; they are listed for comparison.
     """
     require_dataset(data, "data")
     data.require_inputs()
@@ -392,8 +380,8 @@ def _models(
 ) -> Iterator[_core.LinearModel]:
     """The structure by least squares and by instrumental variables.
 
-    Where the drive is not linear, the second can follow the record's trend with a slow pole that no
-    other record shows; the first cannot.
+    For a nonlinear drive, instrumental variables can follow the record's trend with a slow pole
+    that no other record shows; least squares cannot.
     """
     theta, inputs = arx.theta, train.n_inputs
     b = theta[na:-1].reshape(inputs, nb)
@@ -408,7 +396,7 @@ def _models(
 
 
 def _blocks(model: _core.LinearModel, later: Dataset) -> FloatArray:
-    """Mean squared free-run error in each block of the later data; inf where it has no free run."""
+    """Mean squared free-run error in each block of the later data; inf if the run diverges."""
     try:
         errors = [_errors(model, e.u, e.y) for e in later.experiments]
     except FitError:
@@ -451,7 +439,7 @@ def _chosen(rows: list[Structure], errors: list[FloatArray], exact: float) -> tu
 
 
 def _is_not_worse(errors: FloatArray, least: FloatArray) -> bool:
-    """By two standard errors of the difference over the blocks."""
+    """Whether the difference over the blocks is within two standard errors."""
     n = len(least)
     if n < 3 or len(errors) != n or not np.isfinite(errors).all():
         return False
@@ -463,9 +451,9 @@ def _is_not_worse(errors: FloatArray, least: FloatArray) -> bool:
 
 
 POINTS = 600
-"""Samples compared pairwise, evenly over the data."""
+"""Number of samples compared pairwise, spread evenly over the data."""
 SHARE = 0.02
-"""Of the points, the number of largest quotients that are averaged."""
+"""Part of the points: number of largest quotients that are averaged."""
 
 
 def lipschitz_index(data: Dataset, na: int, nb: int, nk: int) -> float:
@@ -485,7 +473,7 @@ def lipschitz_index(data: Dataset, na: int, nb: int, nk: int) -> float:
     Returns
     -------
     float
-        NaN where there are too few samples.
+        NaN if there are too few samples.
     """
     mean, scale = _moments(data)
     rows = np.vstack([_regressors(e, na, nb, nk, mean, scale) for e in data.experiments])
@@ -496,10 +484,10 @@ def lipschitz_index(data: Dataset, na: int, nb: int, nk: int) -> float:
     y, phi = rows[:, 0], rows[:, 1:]
     power = np.sum(phi**2, axis=1)
     apart = power[:, None] + power - 2.0 * phi @ phi.T
-    # distances below rounding are no distances, among them those of points from themselves
+    # distances within rounding do not count, such as those of points from themselves
     near = apart <= 1e-14 * power.max()
     quotients = np.where(near, 0.0, (y[:, None] - y) ** 2 / np.where(near, 1.0, apart)).ravel()
-    # every pair is there twice
+    # every pair occurs twice
     count = 2 * max(1, int(SHARE * len(y)))
     largest = np.partition(quotients, len(quotients) - count)[-count:]
     if largest.min() <= 0.0:

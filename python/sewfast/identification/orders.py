@@ -1,8 +1,8 @@
-"""Linear output error of several orders and delays: which one the data ask for.
+"""Linear output error of several orders and delays, and which one the data need.
 
-The errors on what is held out decide, by the rule that chooses networks too: the simplest model
-that is within one standard error of the best. A larger order that gains a hair often does so by a
-slow pole that no motor has, and with a steady gain that is wrong.
+The errors on held-out data decide, by the rule used for networks too: the simplest model within one
+standard error of the best. A larger order with a tiny gain often owes it to a slow pole that no
+motor has, and its steady gain is wrong.
 """
 
 from __future__ import annotations
@@ -16,30 +16,29 @@ import numpy as np
 from .. import _core
 from ..errors import DataError, FitError
 from .delays import delay, reach
-from .effort import Look, Pool
 from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs
-from .task import Provenance, Task, arrays, finite
+from .task import Look, Pool, Provenance, Task, arrays, finite
 
 ORDERS = (1, 2, 3, 4, 5, 6, 7, 8)
 DELAYS = (2, 3, 4, 5, 6)
-"""Looked at beside the delay of one sample, unless one is given."""
+"""Delays tried besides one sample, unless a delay is given."""
 LATE_ORDERS = (1, 2, 3)
-"""Looked at with a dead time that is estimated to lie beyond these delays."""
+"""Orders tried with an estimated dead time beyond these delays."""
 SAMPLES_OF_DELAY = 2_000
-"""Of that estimate."""
+"""Confidence level of that estimate."""
 SAMPLES = 6_000
 HELD_OUT = 10 * SAMPLES
-"""Of a fit that only decides: blocks from all over the record."""
+"""Samples of a fit that is only used for a decision: blocks spread over the record."""
 ITERATIONS = 60
 WORTH_AN_ORDER = 0.98
-"""A larger order that does not bring the error below this part has not gained."""
+"""A larger order has to reduce the error to below this part to count as a gain."""
 PATIENCE = 2
-"""Orders without gain after which larger ones are left out."""
+"""Number of orders without gain after which larger ones are skipped."""
 MISLED = 1.2
-"""A model whose error exceeds a smaller one's by more is no start for a network."""
+"""A model whose error exceeds a smaller one's by this factor is no start for a network."""
 SPARE_POLES = (0.6, 0.8, 0.4, 0.9, 0.7, 0.5, 0.3)
 LEAST_GAIN = math.log(1.005)
-"""A difference in error below half a per cent counts as none, however well it is known."""
+"""Differences in error below half a per cent count as zero, however significant."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +52,12 @@ class LinearCandidate:
 
     @property
     def rmse(self) -> float:
-        """On the newest fold."""
+        """Error on the newest fold."""
         return self.errors[0].rmse
 
     @property
     def parameters(self) -> int:
-        """Coefficients; a sample of delay costs nothing, and gains nothing."""
+        """Number of coefficients; delays do not count."""
         return 2 * self.order + 2
 
     def to_json(self) -> Provenance:
@@ -69,13 +68,13 @@ class LinearCandidate:
 
 @dataclass
 class LinearTable:
-    """Linear models that were fitted for a decision.
+    """Linear models fitted for a decision.
 
     Parameters
     ----------
     task : Task
     folds : sequence of Split
-        The newest first; models are fitted to thinned excerpts of what each learns from.
+        The newest first; models are fitted to thinned excerpts of their training data.
     pool : Pool
     """
 
@@ -93,11 +92,11 @@ class LinearTable:
         return 1 if self.task.nk is None else self.task.nk
 
     def search(self, until: float | None) -> None:
-        """Orders upwards until two have not gained, then delays of the best small order.
+        """Try orders upwards until two bring no gain, then delays of the best small order.
 
-        A long dead time is looked at before large orders, which feign one and take most of the
-        time; the smallest orders come first, as networks begin there. The very first is fitted
-        however short the time, so that there is a linear model.
+        A long dead time is tried before large orders, which mimic one and take most of the time;
+        the smallest orders come first, as networks start from them. The very first is always
+        fitted, so that there is a linear model.
         """
         self.add([(ORDERS[0], self.nk)], None)
         self.add([(ORDERS[1], self.nk)], until)
@@ -106,7 +105,7 @@ class LinearTable:
         best, idle = math.inf, 0
         orders = iter(ORDERS)
         while idle < PATIENCE:
-            # as many at once as there are threads, so that none of them waits
+            # one per thread, so that none of them waits
             some = [o for _, o in zip(range(max(2, self.pool.threads)), orders, strict=False)]
             if not some:
                 break
@@ -118,15 +117,15 @@ class LinearTable:
             if until is not None and self.pool.clock.over() and self.candidates:
                 break
         if self.task.nk is None and self.candidates:
-            # what looked like an order may have been a delay, so one order less is asked as well
+            # an apparent order can be a delay, so one order less is tried as well
             small = min(self.choice.order, 3)
             self.add(((o, nk) for nk in DELAYS for o in (small - 1, small) if o > 0), until)
 
     def _late(self) -> list[tuple[int, int]]:
-        """Small orders with the estimated dead time, where it is longer than `DELAYS`.
+        """Small orders with the estimated dead time, if it is longer than `DELAYS`.
 
-        Large orders feign a dead time at the cost of poles that the drive has not. The estimate can
-        be late by a sample.
+        Large orders mimic a dead time with poles that the drive does not have. The estimate can be
+        late by a sample.
         """
         data = self.folds[0].shortened(SAMPLES_OF_DELAY, SAMPLES_OF_DELAY).fitted
         try:
@@ -156,16 +155,16 @@ class LinearTable:
         return fitted(self._excerpts[fold], order, nk, look)
 
     def error(self, order: int, nk: int) -> float:
-        """On the newest fold; infinite where that model was not found."""
+        """Error on the newest fold; infinite if there is no such model."""
         found = self.candidates.get((order, nk))
         return math.inf if found is None else found.rmse
 
     @property
     def eligible(self) -> list[LinearCandidate]:
-        """Those that may be chosen.
+        """Models that can be chosen.
 
-        Direct feedthrough is only a network's start, unless it is asked for. A delay makes a model
-        smaller, and is believed only where it does as well as the best model without.
+        Direct feedthrough is only a network's start, unless requested. A delay makes a model
+        smaller, and is accepted only if it does as well as the best model without.
         """
         usual = [c for c in self.candidates.values() if c.nk == self.nk]
         least = min((self._pooled(c).rmse for c in usual), default=math.inf) * math.exp(LEAST_GAIN)
@@ -174,7 +173,7 @@ class LinearTable:
 
     @property
     def best(self) -> LinearCandidate:
-        """The lowest error on the newest fold."""
+        """The model with the lowest error on the newest fold."""
         return min(self.eligible, key=lambda c: c.rmse)
 
     @property
@@ -183,7 +182,7 @@ class LinearTable:
         return simplest(self.eligible, self._pooled)
 
     def _pooled(self, c: LinearCandidate) -> Errors:
-        """Errors on all folds, each relative to the least one there: every fold counts alike."""
+        """Errors on all folds, each relative to the lowest there, so that folds count equally."""
         if len(self.folds) == 1:
             return c.errors[0]
         squares, counts = [], []
@@ -198,10 +197,10 @@ class LinearTable:
         return Errors(np.concatenate(squares), np.concatenate(counts))
 
     def start(self, order: int, nk: int) -> _core.LinearModel | None:
-        """A model of that order for a network to begin at.
+        """A model of that order as a network's start.
 
-        Where the fit of that order is misled (it has found a slow pole that is none), the smaller
-        one with further fast poles.
+        If the fit of that order is misled (it has found a spurious slow pole), the smaller one with
+        additional fast poles.
         """
         fitted_ = self.candidates.get((order, nk))
         smaller = [c for (o, k), c in self.candidates.items() if o < order and k == nk]
@@ -221,7 +220,7 @@ class LinearTable:
 def simplest(
     candidates: Sequence[LinearCandidate], errors: Callable[[LinearCandidate], Errors]
 ) -> LinearCandidate:
-    """The candidate with the fewest parameters whose error is not credibly above the lowest."""
+    """The candidate with the fewest parameters and an error not credibly above the lowest."""
     best = min(candidates, key=lambda c: errors(c).rmse)
     for c in sorted(candidates, key=lambda c: (c.parameters, c.nk)):
         ratio, deviation = compared(errors(c), errors(best))
@@ -231,7 +230,7 @@ def simplest(
 
 
 def fitted(split: Split, order: int, nk: int, look: Look | None) -> _core.LinearModel | None:
-    """Output error of that order on what the split learns from; None where there is no model."""
+    """Output error of that order on the fitted part of the split; None if there is no model."""
     try:
         return _core.fit_oe(
             arrays(split.fitted),
@@ -246,11 +245,11 @@ def fitted(split: Split, order: int, nk: int, look: Look | None) -> _core.Linear
 
 
 def is_misled(model: _core.LinearModel, smaller: _core.LinearModel, part: Split) -> bool:
-    """Whether a model runs clearly worse than a smaller one, on what is held out or was learned.
+    """Whether a model is clearly worse than a smaller one, on held-out or on fitted data.
 
-    A drive that saturates lures a fit to a slow pole that it has not: its free initial state
-    follows each record's trend. Started from a few samples such a model fails even on the record
-    that it was fitted to.
+    A drive that saturates can mislead a fit to a slow pole which the drive does not have: the free
+    initial state follows each record's trend. Started from a few samples, such a model fails even
+    on the record to which it was fitted.
     """
     for of in (part, replace(part, held=part.fitted)):
         own, other = (errors_of(free_runs(m, of), of).rmse for m in (model, smaller))

@@ -1,4 +1,4 @@
-"""Output functions that data suggest: a sensor that rectifies, or one that ends at a limit."""
+"""Output functions suggested by the data: a sensor that rectifies, or one with a limit."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from .. import _core
 from ..dataset import Dataset, FloatArray
 from ..dynamic_model import INIT
 from ..errors import FitError
-from .effort import Look
-from .task import Pairs
+from .task import Look, Pairs
 
 OUTPUTS = ("linear", "saturation", "abs")
 CORNER = 0.03
@@ -20,17 +19,17 @@ CORNER = 0.03
 NEAR_ZERO = 0.05
 """Part of the range within which an output counts as zero."""
 BELOW_ZERO = 0.03
-"""Part of the range that a rectified output reaches below zero, by noise."""
+"""Part of the range by which noise takes a rectified output below zero."""
 PILE = 0.02
-"""Share of the samples within a hundredth of the range from its end that makes a pile."""
+"""Least share of the samples within a hundredth of the range from its end that forms a pile."""
 SHARPNESS = 4.0
-"""How many times denser than its surroundings a pile is."""
+"""Least density of a pile relative to its surroundings."""
 MEMORIES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)
 """Poles of the low-pass filters whose sign is the first guess of the output's."""
 FIRST_ROUNDS, ROUNDS = 2, 12
-"""Of all first guesses; of the better two."""
+"""Iterations of all first guesses; of the better two."""
 SIGN_SAMPLES = 2_000
-"""Of all experiments together: signs are found in turns, and every turn is a fit."""
+"""Most samples of all experiments together: every round of the search for signs is a fit."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Output:
         if self.name == "abs":
             return np.array([CORNER])
         if self.name == "saturation":
-            # a part of the data may not move at all, and then has no scale of its own
+            # a part of the data can be constant, without a scale of its own
             low, high = ((v - mean) / (scale or 1.0) for v in (self.low, self.high))
             return np.array([low, high, CORNER])
         return np.zeros(0)
@@ -57,7 +56,7 @@ ABS = Output("abs")
 
 
 def suggested(data: Dataset) -> list[Output]:
-    """Output functions worth a trial; the plain one always is."""
+    """Output functions to try, always including the linear one."""
     found = [LINEAR]
     if _changes_sign(data) and _may_be_rectified(_known(data)):
         found.append(ABS)
@@ -73,7 +72,7 @@ def named(name: str, data: Dataset) -> Output:
 
 
 def saturation(data: Dataset) -> Output | None:
-    """Limits where the output piles up at an end of its range; the other end is left free."""
+    """Limits at the ends of the range at which the output piles up; other ends are free."""
     y = _known(data)
     low, high = float(y.min()), float(y.max())
     width = high - low
@@ -86,7 +85,7 @@ def saturation(data: Dataset) -> Output | None:
 
 
 def scale_of(data: Dataset, output: Output) -> tuple[float, float]:
-    """Mean and scale of the output as the core takes them."""
+    """Mean and scale of the output for the core."""
     y = _known(data)
     if output.name == "abs":
         return 0.0, float(np.sqrt(np.mean(y**2)))
@@ -99,21 +98,21 @@ def _known(data: Dataset) -> FloatArray:
 
 
 def _piles(distance: FloatArray, width: float) -> bool:
-    """Whether samples crowd within a hundredth of the range, and not beside it."""
+    """Whether samples pile up within a hundredth of the range, but not next to it."""
     at = float(np.mean(distance <= width / 100.0))
     beside = float(np.mean((distance > width / 100.0) & (distance <= width / 20.0))) / 4.0
     return at >= PILE and at > SHARPNESS * beside
 
 
 def _changes_sign(data: Dataset) -> bool:
-    """Whether an input goes clearly to both sides of zero: only then is there a sign to lose."""
+    """Whether an input is clearly on both sides of zero: only then can the output lose a sign."""
     u = np.concatenate([e.u for e in data.experiments])
     low, high = u.min(axis=0), u.max(axis=0)
     return bool((np.minimum(-low, high) > 0.2 * np.maximum(-low, high)).any())
 
 
 def _may_be_rectified(y: FloatArray) -> bool:
-    """Never clearly below zero, and often at zero without staying there for good."""
+    """Whether the output is never clearly below zero, and often but not permanently at zero."""
     top = float(y.max())
     if top <= 0.0 or float(y.min()) < -BELOW_ZERO * top:
         return False
@@ -126,11 +125,11 @@ def _may_be_rectified(y: FloatArray) -> bool:
 def rectified_start(
     data: Dataset, order: int, nk: int, look: Look | None = None
 ) -> _core.LinearModel | None:
-    """The linear model whose magnitude comes nearest to a rectified output.
+    """The linear model whose magnitude is closest to a rectified output.
 
-    Signs and model in turns: the model's own sign goes onto the measured magnitude, and output
-    error is fitted to that, from the signs of the input through low-pass filters of several
-    memories (alternating projections, as for the phase of a diffraction pattern: Fienup 1982).
+    Alternating projections (Fienup 1982): the model's sign is applied to the measured magnitude,
+    and output error is fitted to the result. The first signs are those of the input through
+    low-pass filters with several time constants.
     """
     share = min(1.0, SIGN_SAMPLES / len(data))
     lengths = [max(2 * INIT, round(share * len(e))) for e in data.experiments]
@@ -144,7 +143,7 @@ def rectified_start(
 
 @dataclass(frozen=True)
 class _Restored:
-    """A model, its squared error, and the signs that it gives to the output."""
+    """A model, its squared error, and its signs of the output."""
 
     error: float
     model: _core.LinearModel | None
@@ -212,8 +211,8 @@ def rms_error(
 ) -> float:
     """Root mean square of y - seen(free run), each run from its own estimated state.
 
-    Behind a sensor that does not see the sign, a state of either sign explains a start; the first
-    samples are not counted.
+    Behind a rectifying sensor, states of both signs explain the first samples, which are therefore
+    not counted.
     """
     squares = []
     for u, y, *_ in pairs:

@@ -1,4 +1,4 @@
-"""The search for a structure: cheap trials of many, longer ones of the better half, then growth."""
+"""The search for a structure: short trials of many, longer ones of the better half, then growth."""
 
 from __future__ import annotations
 
@@ -30,45 +30,45 @@ from .trials import (
 MOST_NX, MOST_HIDDEN, MOST_HIDDEN_SMALL = 8, 32, 16
 LEAST_DECAY, MOST_DECAY = 1e-10, 1e-1
 DECAY_MATTERS = 6_000
-"""Samples from which on the climb does not ask for another weight decay; the end does."""
+"""Samples from which on only the finalists, not the climb, try another weight decay."""
 HOPELESS = 0.98
-"""Where the best network of the second halving is not below this part of the linear error."""
+"""The search ends if the best of the second halving exceeds this part of the linear error."""
 ROUNDING = 1e-11
-"""Error of a linear model, in parts of the largest output, that is the arithmetic's own."""
+"""Error of a linear model, relative to the largest output, that is only rounding."""
 WORTH_A_STEP = 0.97
-"""A step of the climb must bring the error below this part."""
+"""A step of the climb must reduce the error to below this part."""
 LEAST_STEP = 0.01
-"""Relative gain of a step that is taken where the gain is known to be one."""
+"""Relative gain of a step that suffices if the gain is significant."""
 WORTH_A_RECTIFIER = 0.8
 FAR_BEHIND = 2.0
-"""A kind of network whose best is this many times worse than the other's climbs no further."""
+"""A kind of network whose best is worse than the other's by this factor climbs no further."""
 STILL_NEAR = 3.0
-"""How many times larger than the best one's a size's error may be after the screening."""
+"""Largest ratio of a size's error to the best one's after the screening."""
 SECOND_ROUTE = 0.25
-"""Part of its operations below which a search still has the means to climb a second route."""
+"""Part of its operations below which a search can still climb a second route."""
 ROUNDS = 6
 MOST_STARTS, SHARE_OF_STARTS = 8, 0.1
-"""Fresh starts of a structure at a time, and the part of the operations that those of all take."""
+"""Fresh starts of a structure at a time, and the part of the operations for all of them."""
 SCREEN_ITERATIONS, HALVING_ITERATIONS, CLIMB_ITERATIONS = 20, (25, 40), 40
 INTEGRATING_POLE = 0.9995
-"""A slower real pole of the linear models asks for an integrator."""
+"""Real pole of the linear models above which an integrator is tried."""
 ENDLESS_GAIN = 5.0
-"""Steady gain times the input's range, in widths of the output's range, of what never settles."""
+"""Steady gain times the input's range, in widths of the output's range, of an integrating plant."""
 SAYS_LITTLE = 0.5
-"""Error of the best linear model, in deviations of the output, above which it tells no poles."""
+"""Error of the best linear model, in deviations of the output, above which poles are ignored."""
 INTEGRATING_ITERATIONS, INTEGRATING_STARTS = 60, 8
 
 
 class Search(Trials):
-    """One search: its steps, and what is tried in each."""
+    """One search: its steps, and the structures tried in each."""
 
     @property
     def is_released(self) -> bool:
-        """Whether a finalist is asked with less weight decay: the climb has not asked for it."""
+        """Whether a finalist is also tried with less weight decay, since the climb did not."""
         return self.samples >= DECAY_MATTERS
 
     def run(self) -> None:
-        """Linear models, then networks of every likely size, then what grows out of the best."""
+        """Linear models, then networks of every likely size, then larger ones from the best."""
         self.linear.search(self.pool.clock.until(SHARE_OF_LINEAR))
         if self.is_exact:
             return
@@ -80,23 +80,23 @@ class Search(Trials):
             self.climb()
 
     def _as_motor(self) -> grey_box.MotorCandidate | None:
-        """The equations of a motor, on the two latest parts, where nothing else was asked for."""
+        """The equations of a motor, on the two latest parts, unless another kind was requested."""
         task = self.task
         if self.wants_network or {task.nk, task.nx, task.hidden, task.output} != {None}:
             return None
-        # what linear models are judged on, so that both can be compared block by block
+        # the same data as for linear models, so that both can be compared block by block
         parts = [f.shortened(grey_box.SEARCHED, HELD_OUT) for f in self.folds[:2]]
         until = self.pool.clock.until(SHARE_OF_MOTOR)
         wanted = grey_box.PER_SAMPLE * len(parts[0].fitted)
         if until is not None and until - time.perf_counter() < wanted:
-            return None  # begun and not ended it would take the networks' time for nothing
+            return None  # unfinished, it would waste the networks' time
         return grey_box.candidate(task, parts, self.pool, until)
 
     @property
     def is_exact(self) -> bool:
-        """Whether the linear model's error is rounding, of which a network could only win a part.
+        """Whether the linear model's error is only rounding, so that a network cannot help.
 
-        A network that was asked for by name is trained all the same.
+        A network requested by name is trained in any case.
         """
         if self.wants_network or not self.linear.eligible:
             return False
@@ -105,9 +105,9 @@ class Search(Trials):
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether no network is visibly better than linear, or than a motor's equations, by now.
+        """Whether no network is visibly better so far than linear models or a motor's equations.
 
-        Growing them would not help.
+        Larger ones would not help.
         """
         if self.wants_network or not self.linear.eligible or self.best is None:
             return False
@@ -115,7 +115,7 @@ class Search(Trials):
         return self.best.error >= min(HOPELESS * self.linear.best.rmse, motor)
 
     def screen(self) -> list[Candidate]:
-        """A short training of every likely structure; the best first."""
+        """Train every likely structure briefly; the best first."""
         likely = self._likely()
         starts = self._screened_starts(likely)
         at_once = self._at_once(likely)
@@ -130,10 +130,10 @@ class Search(Trials):
         return sorted(found, key=lambda c: c.error)
 
     def _at_once(self, likely: Sequence[Structure]) -> list[Structure]:
-        """Networks without any delay, of the smallest order whose linear model is not far behind.
+        """Networks without delay, of the smallest order whose linear model is not far behind.
 
-        Further states make up for the missing sample of an input that changes slowly, at great
-        expense: among large networks the question comes too late.
+        Additional states can replace the missing sample of a slowly changing input, at great cost:
+        among large networks it is too late to try this.
         """
         if self.task.nk is not None or self.task.data.counts is not None or self.nk != 1:
             return []
@@ -144,7 +144,7 @@ class Search(Trials):
         return [replace(s, nk=0) for s in likely if s.nx == order and s.output == LINEAR]
 
     def _is_halved(self, s: Structure) -> bool:
-        """Whether the median of the starts and the best one do by far better without a delay."""
+        """Whether the median of the starts and the best one are far better without a delay."""
         one, other = self.candidates[s], self.candidates[replace(s, nk=1)]
         if not (one.is_sound and other.starts):
             return False
@@ -153,21 +153,21 @@ class Search(Trials):
         return one.error < worth * other.error and costs[0] < worth**2 * costs[1]
 
     def _screened_starts(self, likely: Sequence[Structure]) -> int:
-        """Starts of each structure."""
+        """Number of starts of each structure."""
         samples = len(self.trials[0].fitted)
         round_ = SCREEN_ITERATIONS * sum(s.operations(self.inputs, samples) for s in likely)
         return self._cheap_starts(round_, 4 if self.is_small else 3)
 
     def _cheap_starts(self, operations: float, least: int) -> int:
-        """As many starts as are cheap at so much for one: a size is judged by the luckiest."""
+        """Number of starts that are cheap at this cost for one: the best start judges a size."""
         able = int(SHARE_OF_STARTS * self.budget / max(operations, 1.0))
         return min(MOST_STARTS, max(least, able))
 
     def halve(self, alive: Sequence[Candidate], iterations: int) -> list[Candidate]:
-        """The better half is trained further, with fresh starts for some luck.
+        """Train the better half further, together with fresh starts.
 
-        The first time the best of every number of states is among it, unless it is far behind: few
-        iterations say little of how good a size will be.
+        The first time it includes the best of every number of states, unless that is far behind:
+        after few iterations it is hard to rank sizes.
         """
         half = list(alive[: max(2, len(alive) // 2)])
         near = [c for c in alive if c.error <= STILL_NEAR * alive[0].error]
@@ -181,11 +181,11 @@ class Search(Trials):
         return sorted(self.continued(kept, iterations, fresh), key=lambda c: c.error)
 
     def climb(self) -> None:
-        """Larger networks, other decays and delays, from the best so far while each step gains.
+        """Try larger networks, other decays and delays from the best so far, while steps gain.
 
-        State-space and lagged networks climb side by side, as long as neither is far behind; where
-        the search has been cheap so far, so does the best state-space network of another order:
-        which of the two leads by now is often luck.
+        State-space and lagged networks climb side by side, as long as neither is far behind. If the
+        search was cheap so far, the best state-space network of another order does too: which of
+        the two leads at this point is often luck.
         """
         asked: set[tuple[str, Structure]] = set()
         climbing = [c for c in (self.best_of("neural_ss"), self.best_of("neural_oe")) if c]
@@ -212,7 +212,7 @@ class Search(Trials):
         moves: Sequence[tuple[Candidate, str, Structure]],
         found: Sequence[Candidate],
     ) -> Candidate | None:
-        """The best of the moves from `best`, trained a little further; None where none gains."""
+        """The best of the moves from `best`, trained a little further; None if none gains."""
         own = [new for (c, _, _), new in zip(moves, found, strict=True) if c is best]
         better = [new for new in own if self._is_step(new, best)]
         if not better:
@@ -223,7 +223,7 @@ class Search(Trials):
     # --- what is tried --------------------------------------------------------------------------
 
     def _likely(self) -> list[Structure]:
-        """Sizes about the linear order, with every output function that the data suggest."""
+        """Sizes near the linear order, with every output function that the data suggest."""
         nk, task = self.linear.nk, self.task
         hidden = (4, 8) if task.hidden is None else (task.hidden,)
         orders = self._orders() if task.nx is None else [task.nx]
@@ -234,7 +234,7 @@ class Search(Trials):
             for h in hidden
         ]
         if self.nk > nk:
-            # a delay can feign an order, and the other way round: both are asked
+            # a delay can mimic an order and vice versa: try both
             order = self.linear.choice.order
             all_ += [replace(s, nk=self.nk) for s in all_ if s.nx == order]
         affordable = [s for s in all_ if self.is_affordable(s)]
@@ -244,7 +244,7 @@ class Search(Trials):
         return affordable
 
     def _orders(self) -> list[int]:
-        """The first four of the linear order, the best one, and their neighbours."""
+        """The first four orders, the best linear one, and their neighbours."""
         if not self.linear.eligible:
             return [2, 3]
         order, best = self.linear.choice.order, self.linear.best.order
@@ -253,7 +253,7 @@ class Search(Trials):
 
     @property
     def nk(self) -> int:
-        """The delay of the linear model that the data ask for."""
+        """The delay of the chosen linear model."""
         return self.linear.choice.nk if self.linear.eligible else self.linear.nk
 
     def _outputs(self) -> list[Output]:
@@ -263,7 +263,7 @@ class Search(Trials):
         return [o for o in suggested(data) if o != ABS or self._is_rectified()]
 
     def _is_rectified(self) -> bool:
-        """Whether a linear model behind a rectifier does better than any without."""
+        """Whether a linear model with a rectified output is better than any without."""
         behind = self.start(2, self.nk, ABS)
         if behind is None:
             return False
@@ -273,7 +273,7 @@ class Search(Trials):
         return rms_error(behind, pairs, np.abs) < WORTH_A_RECTIFIER * bound
 
     def _integrating(self) -> list[Structure]:
-        """Small networks behind an integrator, where a linear pole is nearly 1."""
+        """Small networks followed by an integrator, if a linear pole is nearly 1."""
         if self.task.nx is not None or self.task.output not in (None, "linear"):
             return []
         if not self.linear.eligible:
@@ -281,7 +281,7 @@ class Search(Trials):
         orders: tuple[int, ...] = (2, 3)
         likely: tuple[int, ...] = (1, 2) if self.repeats else (1, 2, 4, 8)
         if not self._integrates():
-            # a drive that friction holds still most of the time hides its integrator from them
+            # linear models miss the integrator of a drive that friction holds most of the time
             if self.linear.best.rmse < SAYS_LITTLE * self._deviation:
                 return []
             orders, likely = (2,), (4,)
@@ -295,25 +295,25 @@ class Search(Trials):
 
     @property
     def _deviation(self) -> float:
-        """Of the held-out output from its mean."""
+        """Standard deviation of the held-out output."""
         held = [e.y for e in self.trials[0].held.experiments]
         return float(np.nanstd(np.concatenate(held)))
 
     @cached_property
     def diagnosis(self) -> Diagnosis:
-        """What the record is, where that decides what can be identified from it."""
+        """Properties of the record that decide what can be identified from it."""
         return diagnose(self.task.data)
 
     @property
     def repeats(self) -> bool:
-        """Whether the record repeats one trajectory: what is held out was then seen before."""
+        """Whether the record repeats one trajectory, so that held-out data were seen before."""
         return self.diagnosis.find("repeats") is not None
 
     def _integrates(self) -> bool:
-        """Whether the linear models that do best have a pole at 1, and a steady gain without end.
+        """Whether the best linear models have a pole at 1 and an unbounded steady gain.
 
-        A record of a drive with friction or limits lures larger orders to a pole near 1, too; they
-        do worse on what is held out, so that only the best ones are asked.
+        Friction or limits also lead larger orders to a pole near 1, but these do worse on held-out
+        data: only the best models count.
         """
         if self.diagnosis.find("integrator") is not None:
             return True
@@ -329,7 +329,7 @@ class Search(Trials):
         )
 
     def _lagged(self) -> list[Structure]:
-        """The lagged network of second order; weight decay has another meaning there."""
+        """The lagged network of second order; its weight decay has a different meaning."""
         task = self.task
         if task.nx is not None or task.output not in (None, "linear"):
             return []
@@ -403,15 +403,15 @@ class Search(Trials):
             return False
         ratio, deviation = compared(found.errors, best.errors)
         if found.error < worth * best.error:
-            # of many steps on few held-out samples some gain by luck, and lead to large networks
+            # on few held-out samples some of many steps gain by luck, and lead to large networks
             return not self.is_small or ratio < -deviation
-        # below the noise a step gains little of the error, and still gains; on much data wider
-        # networks would go on doing so for long
+        # near the noise even a useful step gains little; on much data ever wider networks would
+        # keep gaining in this way
         is_cheap = not self.is_large or found.structure.hidden <= best.structure.hidden
         is_small_step = worth == WORTH_A_STEP and is_cheap
         return is_small_step and ratio < -max(2.0 * deviation, LEAST_STEP)
 
 
 def decayed(s: Structure, factor: float) -> Structure:
-    """The same with another weight decay."""
+    """The structure with its weight decay multiplied by a factor."""
     return replace(s, decay=float(f"{s.decay * factor:.0e}"))

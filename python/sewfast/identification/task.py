@@ -1,11 +1,14 @@
-"""`Task`: one identification with its settings; what every model says of its origin."""
+"""`Clock` and `Pool`: time budget and threads. `Task`: one identification and its provenance."""
 
 from __future__ import annotations
 
 import math
+import threading
 import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 from ..dataset import Dataset, FloatArray
 from ..errors import FitError
@@ -13,7 +16,166 @@ from ..models import Model
 from ..models.base import Fitted
 from ..threads import Workers
 from ..validation import validate
-from .effort import Clock, Progress
+
+# --- Clock and threads ----------------------------------------------------------------------------
+
+Progress: TypeAlias = Callable[[int, int, float], object]
+Look: TypeAlias = Callable[[int, int, float], None]
+"""Progress callback of a compiled fit; it raises KeyboardInterrupt to end the fit."""
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+PERIOD = 0.02
+"""Interval at which the calling thread checks for Ctrl-C and shows progress [s]."""
+STEPS = 1000
+"""Total of the progress count."""
+
+
+class Clock:
+    """Time since it was created, and a budget; without one it never runs out.
+
+    Attributes
+    ----------
+    budget : float or None
+        Seconds.
+    truncated : bool
+        Whether the budget has cut anything short: the result then depends on the machine.
+    """
+
+    def __init__(self, budget: float | None) -> None:
+        self.budget = budget
+        self.truncated = False
+        self._began = time.perf_counter()
+
+    @property
+    def spent(self) -> float:
+        """Seconds since the beginning."""
+        return time.perf_counter() - self._began
+
+    def until(self, share: float) -> float | None:
+        """Time at which this share of the budget is used up (`time.perf_counter`); None without."""
+        return None if self.budget is None else self._began + share * self.budget
+
+    def over(self, share: float = 1.0) -> bool:
+        """Whether this share of the budget is used up; if so, sets `truncated`."""
+        is_over = self.budget is not None and self.spent >= share * self.budget
+        self.truncated = self.truncated or is_over
+        return is_over
+
+    def limited(self, progress: Progress | None, share: float) -> Progress | None:
+        """`progress` that ends a fit, as Ctrl-C would, when this share of the budget is used up."""
+        until = self.until(share)
+        if until is None:
+            return progress
+
+        def look(done: int, total: int, best: float) -> None:
+            if progress is not None:
+                progress(done, total, best)
+            if time.perf_counter() >= until:
+                self.truncated = True
+                raise KeyboardInterrupt
+
+        return look
+
+
+class Stopped(Exception):
+    """Ctrl-C during the work; the search holds the results so far."""
+
+
+class Pool:
+    """Runs compiled work on several threads while the calling one listens.
+
+    Parameters
+    ----------
+    threads : int
+    clock : Clock
+    progress : callable(done, total, best) or None
+        Called from the calling thread, at most every `PERIOD`.
+    """
+
+    def __init__(self, threads: int, clock: Clock, progress: Progress | None) -> None:
+        self.threads = threads
+        self.clock = clock
+        self.progress = progress
+        self.share = 0.0
+        self.best = float("inf")
+
+    def map(
+        self,
+        work: Callable[[T, Look], R | None],
+        items: Sequence[T],
+        *,
+        until: float | None = None,
+        share: float | None = None,
+    ) -> list[R | None]:
+        """`work(item, look)` of every item, in the order of the items.
+
+        Parameters
+        ----------
+        work : callable
+            Passes `look` to the compiled function, which then ends at a deadline or on Ctrl-C with
+            its best result so far.
+        items : sequence
+        until : float or None
+            Deadline on `time.perf_counter`; items not begun by then give None.
+        share : float or None
+            Part of the whole identification that is done after the items, for the progress.
+
+        Raises
+        ------
+        Stopped
+            On Ctrl-C.
+        """
+        stopping = threading.Event()
+        began, ended = self.share, self.share if share is None else share
+
+        def look(*_: object) -> None:
+            if stopping.is_set() or (until is not None and time.perf_counter() >= until):
+                raise KeyboardInterrupt
+
+        def one(item: T) -> R | None:
+            try:
+                look()
+                return work(item, look)
+            except KeyboardInterrupt:
+                return None
+
+        with ThreadPoolExecutor(min(self.threads, max(len(items), 1))) as threads:
+            futures = [threads.submit(one, item) for item in items]
+            try:
+                self._listen(futures, began, ended)
+            except KeyboardInterrupt:
+                stopping.set()
+                raise Stopped from None
+            except BaseException:
+                stopping.set()
+                raise
+        if until is not None and time.perf_counter() >= until:
+            self.clock.truncated = True
+        self.share = ended
+        return [f.result() for f in futures]
+
+    def _listen(self, futures: Sequence[Future[Any]], began: float, ended: float) -> None:
+        pending = set(futures)
+        while pending:
+            # a signal also interrupts wait()
+            _, pending = wait(pending, timeout=PERIOD)
+            part = 1.0 - len(pending) / len(futures)
+            self.show(began + part * (ended - began))
+
+    def show(self, share: float) -> None:
+        """Call the progress function, if any, with the larger share of work or time done."""
+        if self.progress is None:
+            return
+        clock = self.clock
+        if clock.budget is not None:
+            share = max(share, clock.spent / clock.budget)
+        self.progress(min(STEPS, round(STEPS * share)), STEPS, self.best)
+
+
+# --- One identification ---------------------------------------------------------------------------
+
 
 Provenance: TypeAlias = dict[str, Any]
 Pairs: TypeAlias = list[tuple[FloatArray, ...]]
@@ -21,7 +183,7 @@ Pairs: TypeAlias = list[tuple[FloatArray, ...]]
 
 @dataclass(frozen=True)
 class Task:
-    """One identification: data, where to select on, and settings (None: the usual)."""
+    """One identification: training data, validation data, and settings (None: the default)."""
 
     data: Dataset
     validation: Dataset | None
@@ -43,7 +205,7 @@ class Task:
 
     @property
     def orders(self) -> dict[str, int]:
-        """Of a lagged model."""
+        """Orders of a lagged model."""
         return {"na": self.na, "nb": self.nb, "nk": 1 if self.nk is None else self.nk}
 
     def fit_options(self, **orders: int) -> dict[str, Any]:
@@ -53,7 +215,7 @@ class Task:
 
     @property
     def iterations_or_usual(self) -> int:
-        """Of one fit whose number is left open."""
+        """Most iterations of a fit, 100 by default."""
         return 100 if self.iterations is None else self.iterations
 
     @property
@@ -63,12 +225,12 @@ class Task:
 
 
 def arrays(data: Dataset) -> Pairs:
-    """Inputs and output of each experiment, and its weights where it has some."""
+    """Inputs and output of each experiment, and its weights if it has any."""
     return [(e.u, e.y) if e.weights is None else (e.u, e.y, e.weights) for e in data.experiments]
 
 
 def sources(data: Dataset) -> list[Provenance]:
-    """Where the samples are from, as JSON values."""
+    """Origin of the samples, as JSON values."""
     return [{"name": e.name, "range": e.range_text, "samples": len(e)} for e in data.experiments]
 
 
@@ -79,12 +241,12 @@ def wrap(cls: type[Model], core: Any, data: Dataset) -> Model:
 
 
 def with_provenance(model: Model, extra: Provenance) -> Model:
-    """The model with more of its provenance."""
+    """The model with additional provenance."""
     return replace(model, training={**model.training, **extra})
 
 
 def documented(model: Model, task: Task, began: float, extra: Provenance) -> Model:
-    """The model with what every kind of model says of its origin, and `extra`."""
+    """The model with the provenance that every kind records, and `extra`."""
     data = task.data
     common = {
         "data": sources(data),
@@ -100,7 +262,7 @@ def documented(model: Model, task: Task, began: float, extra: Provenance) -> Mod
 
 
 def fit_provenance(fit: Fitted) -> Provenance:
-    """How a fit went."""
+    """Provenance of a fit: cost, iterations and termination."""
     return {
         "cost": fit.cost,
         "cost_horizon": "free run",
@@ -111,7 +273,7 @@ def fit_provenance(fit: Fitted) -> Provenance:
 
 
 def free_run_rmse(model: Model, data: Dataset) -> float:
-    """Pooled error of the free run; infinite where the model runs away."""
+    """Pooled rms error of the free run; infinite if it diverges."""
     try:
         return validate(model, data).simulation.rmse
     except FitError:
@@ -119,5 +281,5 @@ def free_run_rmse(model: Model, data: Dataset) -> float:
 
 
 def finite(value: float) -> float | None:
-    """For JSON, which knows no infinity."""
+    """None for infinity and NaN, which JSON cannot hold."""
     return value if math.isfinite(value) else None

@@ -1,8 +1,8 @@
-"""Training of networks: what distinguishes one from another, and starts of many at once.
+"""Training of networks: their structures, and many starts at once.
 
-A `Structure` sizes a network. A `Request` asks for some starts of one; requests are cut into jobs
-of one start each, which threads of this process or a user's workers run in any order with the same
-result.
+A `Structure` defines a network. A `Request` is for some starts of one structure; requests are split
+into jobs of one start each, which threads of this process or a user's workers run in any order with
+the same result.
 """
 
 from __future__ import annotations
@@ -19,25 +19,24 @@ from .. import _core
 from ..dataset import Dataset
 from ..errors import FitError
 from ..threads import Workers, spread
-from .effort import Look, Pool, Stopped
 from .outputs import LINEAR, Output, scale_of
-from .task import Pairs, Provenance, arrays
+from .task import Look, Pairs, Pool, Provenance, Stopped, arrays
 
 HIDDEN_SCALE = 1.0
 OVERHEAD = 2_000
-"""What a sample costs apart from its sensitivities, in multiplications."""
+"""Cost of a sample apart from its sensitivities, in multiplications."""
 
 Network: TypeAlias = _core.NeuralSS | _core.NeuralOE
 
 
 @dataclass(frozen=True)
 class Structure:
-    """What distinguishes one network from another.
+    """The structure of a network: its sizes, delay, weight decay and output function.
 
     Attributes
     ----------
     nx : int
-        States; of a lagged network the past outputs, with nx + 1 past inputs.
+        States; for a lagged network the past outputs, with nx + 1 past inputs.
     nk : int
         Delay [samples].
     hidden : int
@@ -61,7 +60,7 @@ class Structure:
 
     @property
     def size(self) -> tuple[int, bool, str]:
-        """What networks of one size share: their hidden units and all else may differ."""
+        """The size of a network for comparisons, without its hidden units, decay and output."""
         return self.nx, self.integrator, self.kind
 
     def parameters(self, inputs: int) -> int:
@@ -93,9 +92,9 @@ class Start:
     ----------
     model : compiled network
     cost : float
-        J on what is held out, else on the training data.
+        J on held-out data, else on the training data.
     fault : str
-        What the guard found wrong with it; empty for a sound one.
+        The fault found by the guard; empty for a sound start.
     """
 
     model: Network
@@ -112,8 +111,8 @@ class Start:
 class Request:
     """Some starts of one structure on some data.
 
-    `initial` are models to be trained further, one start each; otherwise `starts` new ones are
-    drawn around `linear`, numbered from `first` on.
+    `initial` are models to train further, one start each; otherwise `starts` new ones are drawn
+    around `linear`, numbered from `first` on.
     """
 
     structure: Structure
@@ -139,7 +138,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Job:
-    """One start: all that a worker needs, picklable for state-space networks."""
+    """One start with everything a worker needs; picklable for state-space networks."""
 
     experiments: Pairs
     held: Pairs
@@ -151,7 +150,7 @@ class Job:
     deadline: float | None
 
     def run(self, look: Look | None) -> tuple[Network, float] | None:
-        """The trained network and its cost; None where it failed."""
+        """The trained network and its cost; None if it failed."""
         fit = self._lagged if "na" in self.settings else self._state_space
         try:
             return fit(look)
@@ -169,7 +168,7 @@ class Job:
             first_start=self.number,
             seed=self.seed,
             threads=1,
-            # the search asks it of whole records
+            # the search applies the guard to whole records
             guard=False,
             progress=look,
         )
@@ -201,7 +200,7 @@ class Job:
 
 
 def run_job(job: Job) -> tuple[dict[str, Any], float] | None:
-    """A job of a state-space network on a worker; what comes back is picklable too."""
+    """A job of a state-space network on a worker; its result is picklable too."""
     own = Job(
         [_aligned(pair) for pair in job.experiments],
         [_aligned(pair) for pair in job.held],
@@ -244,7 +243,7 @@ def train(
     workers : executor or None
         Trains the state-space networks; the bits are the same.
     until : float or None
-        Deadline on `time.perf_counter`; starts return their best until then.
+        Deadline on `time.perf_counter`; starts then return their best so far.
     share : float or None
         As in `Pool.map`.
 
@@ -266,7 +265,7 @@ def train(
 
 
 def _spread(workers: Workers, jobs: Sequence[Job]) -> list[tuple[Network, float] | None]:
-    """State-space networks by the workers, lagged ones (a few, and quick) here."""
+    """Run state-space networks on the workers, lagged ones (few and quick) in this process."""
     remote = [i for i, job in enumerate(jobs) if "nx" in job.settings]
     try:
         answers = iter(spread(workers, run_job, [jobs[i] for i in remote]))
@@ -336,5 +335,5 @@ def _values_aligned(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _aligned(values: Iterable[Any]) -> Any:
-    """Copies as the core takes them: what came over a network may lie in memory otherwise."""
+    """Copies in the memory layout of the core, which values from a network connection can lack."""
     return tuple(np.array(v, order="C") if isinstance(v, np.ndarray) else v for v in values)

@@ -1,7 +1,7 @@
-"""What a search has to work with: trained candidates, their held-out errors, and its effort.
+"""The basis of a search: trained candidates, their held-out errors, and the effort spent.
 
-All sizes are counted in multiplications, not in seconds, so that a seed gives the same model on
-every machine; a time budget is converted into multiplications by the speed of the first trials.
+Effort is counted in multiplications, not in seconds, so that a seed gives the same model on every
+machine; a time budget is converted into multiplications by the speed of the first trials.
 """
 
 from __future__ import annotations
@@ -15,38 +15,38 @@ from typing import Any
 from .. import _core
 from ..errors import FitError
 from ..models.base import EnsembleCore
-from .effort import Look, Pool
 from .folds import RUNAWAY, Errors, Split, errors_of, free_runs
 from .grey_box import MotorCandidate
 from .orders import LinearTable
 from .outputs import ABS, LINEAR, Output, rectified_start
-from .task import Provenance, Task, arrays, finite
+from .task import Look, Pool, Provenance, Task, arrays, finite
 from .training import Network, Request, Start, Structure, train
 
 SMALL, LARGE = 3_750, 45_000
 """Samples up to which a data set is small, and above which it is large."""
 TRIAL_SAMPLES, TRIAL_SAMPLES_LARGE = 20_000, 12_000
-"""Fitted samples of a trial. Fewer than 20,000 cost a factor of up to 3 in the final error."""
+"""Fitted samples of a trial. Fewer than 20,000 raise the final error by a factor of up to 3."""
 SEARCH_OPERATIONS, SEARCH_OPERATIONS_LARGE = 1.8e11, 5e11
-"""Multiplications after which nothing further is tried; a core makes some 1.4e10 in a second."""
+"""Multiplications after which the search ends; a core does some 1.4e10 per second."""
 WORST = 3.0
 """Starts whose J exceeds this multiple of the best one's are left out of a candidate."""
 SAMPLES_PER_PARAMETER = 4
 BY_FAR = 0.2
-"""Below this part of the linear error on the newest part a network needs no other evidence."""
+"""Below this part of the linear error on the newest part, a network needs no further evidence."""
 NEARLY = 1.02
-"""Up to this larger an error counts as equal in trials on much data: the smaller network trains
-further in the same time, and extrapolates better."""
+"""In trials on much data an error larger by up to this factor counts as equal: a smaller network
+trains further in the same time, and extrapolates better."""
 WORTH_A_FEEDTHROUGH, STILL_WORTH_A_FEEDTHROUGH = 0.5, 0.9
-"""nk = 0 is no plant for a loop, and a smoothed speed leans ahead a little: it must be worth it, at
-equal size, and beside the best with a delay, whose further states may have made up for it."""
+"""Error ratios required of nk = 0, compared with equal size, and with the best with a delay (whose
+additional states can compensate). nk = 0 is no plant for a loop, and a smoothed speed anticipates
+the input a little."""
 SHARE_OF_GUARD = 0.95
 SHARE_OF_LINEAR, SHARE_OF_MOTOR = 0.12, 0.4
 SHARE_OF_SEARCH, SHARE_OF_SEARCH_VERIFIED = 0.58, 0.45
-"""Parts of a time budget after which no linear model, no motor and no network is tried any more."""
+"""Parts of a time budget after which no further linear model, motor and network is tried."""
 SHARE_OF_LINEAR_STARTS = 0.1
-"""Part of it that fitting the linear models takes which the next networks begin at; where it ends
-before, they begin at smaller ones."""
+"""Part of it for fitting the linear models at which the next networks start; networks whose model
+is not ready start at a smaller one."""
 
 
 @dataclass(frozen=True)
@@ -61,33 +61,33 @@ class Candidate:
 
     @property
     def error(self) -> float:
-        """Root mean square on what is held out."""
+        """Root mean square error on held-out data."""
         return self.errors.rmse
 
     @property
     def members(self) -> list[Start]:
-        """The starts that count: sound unless none is, not far worse than the best; best first."""
+        """The starts that count: sound if any is, not far worse than the best; best first."""
         return counting(self.starts)
 
     @property
     def models(self) -> list[Network]:
-        """Of the starts that count."""
+        """Networks of the starts that count."""
         return [s.model for s in self.members]
 
     @property
     def is_sound(self) -> bool:
-        """Whether any start has passed the guard."""
+        """Whether any start passed the guard."""
         return any(s.is_sound for s in self.starts)
 
     def to_json(self) -> Provenance:
-        """For the table."""
+        """The candidate's row of the table."""
         row = self.structure.to_json() | {"starts": len(self.starts)}
         row |= {"sound": sum(s.is_sound for s in self.starts)}
         return row | {"free_run_rmse": finite(self.error)}
 
 
 def counting(starts: Iterable[Start]) -> list[Start]:
-    """Sound starts, unless there is none, that are not far worse than the best; best first."""
+    """Starts not far worse than the best, sound ones if there are any; best first."""
     starts = list(starts)
     able = sorted([s for s in starts if s.is_sound] or starts, key=lambda s: s.cost)
     return [s for s in able if s.cost <= WORST * able[0].cost]
@@ -102,21 +102,21 @@ def best_of_each_size(ranked: Iterable[Candidate]) -> list[Candidate]:
 
 
 def median_of(models: Sequence[Network]) -> Any:
-    """One model as it is, several as their median."""
+    """One model unchanged, several as their median."""
     return models[0] if len(models) == 1 else EnsembleCore(tuple(models), "median")
 
 
 @dataclass
 class Trials:
-    """What a search works on, what it has spent, and the candidates that it found.
+    """Data of a search, the effort it has spent, and the candidates it found.
 
     Attributes
     ----------
     trials : tuple of Split
-        The folds, as short as trials are; the newest first.
+        The folds, shortened for trials; the newest first.
     linear : LinearTable
     candidates : dict of Structure to Candidate
-        On the newest fold; the latest training of each.
+        Candidates on the newest fold, each after its latest training.
     operations : float
         Multiplications spent.
     """
@@ -136,38 +136,38 @@ class Trials:
         self.linear = LinearTable(self.task, self.folds[:1], self.pool)
         self.most = SEARCH_OPERATIONS_LARGE if self.is_large else SEARCH_OPERATIONS
         self.budget, self.rate = self.most, 0.0
-        # part of a time budget at which the present stage has to be done; 0 for the search's own
+        # part of a time budget by which the present stage must be finished; 0 for the search's own
         self.share = 0.0
-        # whether the screening has found that the output depends on the input of the same sample
+        # whether the screening found that the output depends on the input of the same sample
         self.feeds_through = False
-        # the equations of a motor, where the data are those of one
+        # the equations of a motor, if the data are those of one
         self.motor: MotorCandidate | None = None
         self._starts: dict[tuple[int, int, str, int], _core.LinearModel | None] = {}
         self._guarded = arrays(self.task.data)
 
     @property
     def is_small(self) -> bool:
-        """Little data: variance is what matters, and many starts are cheap."""
+        """Whether the data are few: variance dominates, and many starts are cheap."""
         return self.samples <= SMALL
 
     @property
     def is_large(self) -> bool:
-        """Much data: little variance, and larger networks to gain from."""
+        """Whether the data are many: little variance, and larger networks can pay."""
         return self.samples > LARGE
 
     @property
     def decay(self) -> float:
-        """Weight decay to begin with."""
+        """Initial weight decay."""
         return 1e-4 if self.samples < 4_000 else 1e-7 if self.is_large else 1e-5
 
     @property
     def until(self) -> float | None:
-        """When the present stage has to end, on `time.perf_counter`."""
+        """Deadline of the present stage, on `time.perf_counter`."""
         return self.pool.clock.until(self.share or self._share_of_search)
 
     @property
     def _share_of_search(self) -> float:
-        """Networks that will not be better by far are verified, which takes time as well."""
+        """Share of a time budget; networks that are not far better need time for verification."""
         best, linear = self.best, self.linear
         if self.wants_network or best is None or not linear.eligible:
             return SHARE_OF_SEARCH
@@ -177,14 +177,14 @@ class Trials:
 
     @property
     def _until_started(self) -> float | None:
-        """When the linear models that networks begin at have to be there."""
+        """Deadline of the linear models at which networks start."""
         until, budget = self.until, self.pool.clock.budget
         if until is None or budget is None:
             return None
         return min(until, time.perf_counter() + SHARE_OF_LINEAR_STARTS * budget)
 
     def able(self, operations: float) -> float:
-        """The part of these operations for which the present stage has time, at most 1."""
+        """Part of these operations for which the present stage has time, at most 1."""
         if self.until is None:
             return 1.0
         left = max(0.0, self.until - time.perf_counter())
@@ -192,7 +192,7 @@ class Trials:
 
     @property
     def is_over(self) -> bool:
-        """Whether the search has had its share of operations or of the time budget."""
+        """Whether the search has used up its operations or its share of the time budget."""
         self.pool.clock.truncated |= self._is_late
         return self._is_late or self.operations >= self.budget
 
@@ -201,9 +201,9 @@ class Trials:
         return self.until is not None and time.perf_counter() >= self.until
 
     def _calibrate(self, seconds: float, operations: float) -> None:
-        """Convert what is left of a time budget into multiplications, by the best speed so far."""
+        """Convert the rest of a time budget into multiplications, by the best speed so far."""
         until = self.until
-        # short trainings of small networks say little of the speed of long ones
+        # short trainings of small networks are slower per multiplication than long ones
         self.rate = max(self.rate, operations / max(seconds, 1e-3))
         if until is not None:
             left = max(0.0, until - time.perf_counter())
@@ -216,11 +216,11 @@ class Trials:
 
     @property
     def best(self) -> Candidate | None:
-        """The lowest held-out error, a sound candidate first."""
+        """The candidate with the lowest held-out error, a sound one if possible."""
         return self._lowest(self.eligible)
 
     def best_of(self, kind: str) -> Candidate | None:
-        """The lowest held-out error of one kind, a sound candidate first."""
+        """The same among candidates of one kind."""
         return self._lowest(c for c in self.eligible if c.structure.kind == kind)
 
     def _ranked(self, kind: str) -> list[Candidate]:
@@ -230,7 +230,7 @@ class Trials:
 
     @property
     def eligible(self) -> list[Candidate]:
-        """Candidates that may be chosen: with direct feedthrough only where it is worth it."""
+        """Candidates that can be chosen; direct feedthrough only if it is worth it."""
         found = [c for c in self.candidates.values() if math.isfinite(c.error) and c.starts]
         delayed = min((c.error for c in found if c.structure.nk > 0), default=math.inf)
         worth = STILL_WORTH_A_FEEDTHROUGH if self.feeds_through else WORTH_A_FEEDTHROUGH
@@ -244,13 +244,13 @@ class Trials:
         return min(sound, key=lambda c: c.error, default=None)
 
     def simplest(self, candidates: Sequence[Candidate]) -> Candidate:
-        """The best; on much data the one with the fewest parameters that does about as well."""
+        """The best one; on much data the one with fewest parameters that does about as well."""
         most = (NEARLY if self.is_large else 1.0) * min(c.error for c in candidates)
         near = [c for c in candidates if c.error <= most]
         return min(near, key=lambda c: (c.structure.parameters(self.inputs), c.error))
 
     def rows(self) -> Iterator[Provenance]:
-        """The table: linear models, then networks in the order of their trials."""
+        """Rows of the table: linear models, then networks in the order of their trials."""
         yield from self.linear.rows()
         yield from () if self.motor is None else (self.motor.row(),)
         yield from (c.to_json() for c in self.candidates.values())
@@ -258,10 +258,10 @@ class Trials:
     # --- training -------------------------------------------------------------------------------
 
     def is_affordable(self, s: Structure, fold: int = 0) -> bool:
-        """Whether the fold has samples enough for its parameters."""
+        """Whether the fold has enough samples for the parameters."""
         parameters, fitted = s.parameters(self.inputs), self.trials[fold].fitted
         known = sum(len(e) - e.unmeasured for e in fitted.experiments)
-        # without a surplus over parameters and initial states the core refuses to train it
+        # the core only trains with a surplus over parameters and initial states
         if known <= parameters + s.nx * len(fitted.experiments):
             return False
         is_given = None not in (self.task.nx, self.task.hidden)
@@ -283,7 +283,7 @@ class Trials:
     def continued(
         self, candidates: Sequence[Candidate], iterations: int, fresh: Sequence[int]
     ) -> list[Candidate]:
-        """Candidates trained further, each with so many fresh starts; never worse than before."""
+        """Candidates trained further, each with some fresh starts; never worse than before."""
         requests = []
         for c, more in zip(candidates, fresh, strict=True):
             requests.append(self.request(c.structure, iterations, initial=c.models))
@@ -315,7 +315,7 @@ class Trials:
         initial: Sequence[Network] = (),
         fold: int = 0,
     ) -> Request:
-        """Starts of a structure on a trial's data, or models to be trained further on them."""
+        """Request for starts of a structure on a trial's data, or for training models further."""
         data = self.trials[fold]
         needs_linear = not initial or s.kind == "neural_oe"
         linear = self.start(s.nx, s.nk, s.output, fold) if needs_linear else None
@@ -328,7 +328,7 @@ class Trials:
         requests: Sequence[Request],
         share: float | None = None,
     ) -> list[list[Start]]:
-        """Starts of every request, looked at by the guard."""
+        """Starts of every request, checked by the guard."""
         wanted = sum(r.operations for r in requests)
         self.operations += wanted
         began = time.perf_counter()
@@ -342,13 +342,13 @@ class Trials:
             until=self.until,
             share=share,
         )
-        # nothing to train says nothing of the machine's speed
+        # without training there is no speed to measure
         if wanted and not self._is_late:
             self._calibrate(time.perf_counter() - began, wanted)
         return self.guarded(found)
 
     def guarded(self, found: Sequence[Sequence[Start]]) -> list[list[Start]]:
-        """The starts with what the guard finds on whole records."""
+        """The starts with the guard's findings on whole records."""
         flat = [start for starts in found for start in starts]
         bounds = self.bounding_models
 
@@ -360,7 +360,7 @@ class Trials:
 
     @property
     def bounding_models(self) -> list[_core.LinearModel]:
-        """Linear models whose memory bounds that of networks."""
+        """Linear models whose memory of the initial state bounds that of networks."""
         if not self.linear.eligible:
             return []
         most = max(2, self.linear.choice.order)
@@ -384,7 +384,7 @@ class Trials:
     def start(
         self, nx: int, nk: int, output: Output = LINEAR, fold: int = 0
     ) -> _core.LinearModel | None:
-        """The linear model that networks of this order and delay begin at."""
+        """The linear model at which networks of this order and delay start."""
         if fold == 0 and output != ABS:
             self.linear.add([(nx, nk)], self.until)
             return self.linear.start(nx, nk)
@@ -394,7 +394,7 @@ class Trials:
         return self._starts[key]
 
     def _prepare(self, structures: Sequence[Structure], fold: int) -> None:
-        """Fit what `start` needs, side by side."""
+        """Fit the models that `start` needs, in parallel."""
         plain = {(s.nx, s.nk) for s in structures if s.output != ABS}
         if fold == 0:
             self.linear.add(sorted(plain), self._until_started)

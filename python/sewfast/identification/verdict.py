@@ -1,4 +1,4 @@
-"""The closing words of `identify`: good enough to tune on or not, why, and what to do next."""
+"""The verdict of `identify`: whether a model is good enough to tune on, why, and what to do."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..dynamic_model import INIT
 from ..models import Model
 from ..validation import GOOD, by_input, free_run_error, judged, noise_of, without_input
 from .folds import Split
-from .short import UNSEEN, time_constant
+from .linear import UNSEEN, time_constant
 from .task import Provenance
 
 if TYPE_CHECKING:
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
 
 
 def verdict(choice: Choice, model: Model, error: float) -> Provenance:
-    """Whether a controller may be tuned on the model, in words and as values.
+    """Whether the model is good enough to tune a controller on, in words and as values.
 
     Parameters
     ----------
     choice : Choice
-        The search and what was held out.
+        The search and its held-out data.
     model : Model
-        What was chosen.
+        The chosen model.
     error : float
-        Free-run error on what is held out [output unit].
+        Free-run error on held-out data [output unit].
 
     Returns
     -------
@@ -48,9 +48,9 @@ def verdict(choice: Choice, model: Model, error: float) -> Provenance:
 
 
 def verdict_by_name(model: Model, data: Dataset, validation: Dataset | None) -> Provenance:
-    """`verdict` on a kind that was asked for: nothing was held out to choose by.
+    """`verdict` on a kind requested by name, for which no data were held out.
 
-    Judged on the validation data, else on what it was trained on, and the text says which.
+    It is judged on the validation data, else on its training data; the text states which.
     """
     part = Split(data, validation or data, is_given=validation is not None)
     found = _judged(
@@ -58,7 +58,7 @@ def verdict_by_name(model: Model, data: Dataset, validation: Dataset | None) -> 
     )
     if model.kind in ("arx", "iv", "oe") and found["grade"] in ("good", "fair"):
         slowest, longest = time_constant(model.core), max(len(e) for e in data.experiments)
-        # an integrator is no pole too many
+        # a real integrator is not a superfluous pole
         if slowest > UNSEEN * longest and diagnose(data).find("integrator") is None:
             found["grade"] = "poor"
             measured = found["text"].partition(": ")[2]
@@ -89,8 +89,8 @@ def _judged(
     error: float | None = None,
     where: str = _UNSEEN_DATA,
 ) -> Provenance:
-    """The model's grade by its error on what is held, with the reason and what to do next."""
-    # of one model on the same samples: what was held out is not what the error is always of
+    """The model's grade by its error on held-out data, with the reason and what to do next."""
+    # `error` can come from other samples; the share explained by the input needs the same ones
     own = free_run_error(model, part.held, part.held, INIT)
     error = own if error is None else error
     spread = part.spread
@@ -129,7 +129,7 @@ def _judged(
 
 
 def _what_to_record(data: Dataset) -> list[str]:
-    """What another recording should have that this one lacks."""
+    """Advice on another recording."""
     wanted = [
         "record longer, with more levels of the input and the speeds that the controller will use"
     ]

@@ -1,7 +1,7 @@
 """Identified models: linear ones and networks, with their files.
 
-Read in this order: `base` (`Model`, `Ensemble`), `linear`, `neural`, `grey_box`, `files` (and the
-table of kinds), `conversion` (linear models in other forms).
+Read in this order: `base` (`Model`, `Ensemble`), then the kinds: `linear`, `hammerstein`, `neural`,
+`grey_box`; `files` (with the table of kinds), `conversion` (linear models in other forms).
 """
 
 from ..dynamic_model import FreeRunJacobian

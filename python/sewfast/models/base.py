@@ -1,4 +1,4 @@
-"""`Model`: what every identified model is to its user."""
+"""`Model`: the interface of every identified model, and `Ensemble`."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _OF_LINEAR_MODELS = (
     "dc_gain", "frequency_response", "poles", "steady_output", "to_continuous", "to_control",
     "to_scipy", "to_ss", "to_tf", "transfer_function",
 )  # fmt: skip
-"""What other models have about an operating point only."""
+"""Methods of linear models that other models have only at an operating point."""
 
 
 class NotLinearError(SettingError, AttributeError):
-    """A transfer function, or what follows from one, was asked of a model that has none."""
+    """A linear method was called on a model that is not linear."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -55,7 +55,7 @@ class Model(DynamicModel):
 
     @property
     def members(self) -> tuple[Model, ...]:
-        """The models that an ensemble consists of; a single model has none."""
+        """The members of an ensemble; empty for a single model."""
         return ()
 
     def linearise(self, u: ArrayLike | None = None) -> OperatingPoint:
@@ -120,14 +120,14 @@ class Model(DynamicModel):
             )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # the compiled model is made again from its numbers, as when a file is read
+        # the compiled model is rebuilt from its numbers, as when a file is read
         from .files import restored
 
         return restored, (self.to_dict(), self.alternatives)
 
 
 class SingleModel(Model):
-    """A model of one kind: what its file and its variations need, beside what every model has."""
+    """A model of one kind, with the methods for its file and its variations."""
 
     @staticmethod
     @abstractmethod
@@ -136,15 +136,15 @@ class SingleModel(Model):
 
     @abstractmethod
     def with_output_scaled(self, factor: float) -> dict[str, Any]:
-        """The parameters that change where the output is a factor as large."""
+        """The parameters that change if the output is scaled by a factor."""
 
     def with_input_delayed(self, samples: int) -> dict[str, Any]:
-        """The parameters that change where the input acts some samples later."""
+        """The parameters that change if the input acts some samples later."""
         return {"nk": self.parameters()["nk"] + samples}
 
 
 class Fitted(Protocol):
-    """A compiled fit: the model and how it went."""
+    """A compiled fit: the model, its cost and its termination."""
 
     @property
     def model(self) -> Any: ...
@@ -164,12 +164,12 @@ class StructuredModel(SingleModel):
     @staticmethod
     @abstractmethod
     def structures(size: int | None) -> tuple[Mapping[str, int], ...]:
-        """What is tried, the plainest first; of one size where it is given."""
+        """Structures to try, the simplest first; with one size if given."""
 
     @staticmethod
     @abstractmethod
     def fitted(experiments: Any, **settings: Any) -> Fitted:
-        """A fit of one structure: `na`, `nb`, `nk`, `max_iterations`, `progress`, its numbers."""
+        """Fit one structure: its entries, `na`, `nb`, `nk`, `max_iterations`, `progress`."""
 
 
 # --- Ensemble: several models of one plant as one -------------------------------------------------
@@ -179,18 +179,17 @@ Combine: TypeAlias = Literal["median", "mean"]
 COMBINATIONS: tuple[Combine, ...] = ("median", "mean")
 MOST_MEMBERS = 1000
 LEAST_SHARE = 0.5
-"""Members that must stand an input for the ensemble to answer at all."""
+"""Part of the members that must not diverge for the ensemble to have a run."""
 _OF_ALL_MEMBERS = ("input_range", "output_range", "region")
-"""What a file keeps once for all members."""
+"""Entries that a file stores once for all members."""
 
 
 @dataclass(frozen=True, eq=False)
 class EnsembleCore:
-    """The members' arithmetic; the state is that of all members, one after the other.
+    """The members' arithmetic; the state consists of the members' states in order.
 
-    A member that runs away on an input is left out of that run: its output says nothing, and the
-    median of the others is what the ensemble is for. Where fewer than half are left, it is a
-    `FitError`.
+    A member that diverges on an input is left out of that run; the median of the others remains.
+    If fewer than half are left, a `FitError` is raised.
     """
 
     members: tuple[Core, ...]
@@ -201,7 +200,7 @@ class EnsembleCore:
         return np.concatenate([m.rest_state() for m in self.members])
 
     def estimate_initial_state(self, u: FloatArray, y: FloatArray) -> FloatArray:
-        """Every member's own estimate."""
+        """The members' estimates."""
         return np.concatenate([m.estimate_initial_state(u, y) for m in self.members])
 
     def simulate(self, u: FloatArray, state: FloatArray) -> FloatArray:
@@ -209,7 +208,7 @@ class EnsembleCore:
         return self._combined(self.simulations(u, state))
 
     def simulations(self, u: FloatArray, state: FloatArray) -> FloatArray:
-        """Free runs of the members that stand this input, (members, N)."""
+        """Free runs of the members that do not diverge on this input, (members, N)."""
         return self._runs(state, lambda m, x: m.simulate(u, x))
 
     def predict(self, u: FloatArray, y: FloatArray, state: FloatArray, horizon: int) -> FloatArray:
@@ -217,9 +216,9 @@ class EnsembleCore:
         return self._combined(self._runs(state, lambda m, x: m.predict(u, y, x, horizon)))
 
     def jacobian(self, u: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The run and its derivatives by all members' parameters and states, member by member.
+        """The run and its derivatives with respect to all members' parameters and states.
 
-        A median has the derivative of the member, or the two, in the middle.
+        Columns are member by member. The median has the derivative of the middle member or two.
         """
         found = [m.jacobian(u, x) for m, x in self._with_states(state)]
         runs = np.array([run for run, _ in found])
@@ -228,7 +227,7 @@ class EnsembleCore:
         return self._combined(runs), np.hstack(rows)
 
     def _weights(self, runs: FloatArray) -> FloatArray:
-        """How much each member counts at each sample, (members, N)."""
+        """Weight of each member at each sample, (members, N)."""
         n = len(runs)
         if self.combine == "mean":
             return np.full(runs.shape, 1.0 / n)
@@ -285,10 +284,10 @@ class Ensemble(Model):
         members : sequence of Model
             With the same inputs, output and sample time; none of them an ensemble.
         combine : {"median", "mean"}
-            Taken over the members' runs, sample by sample. A median ignores a few members that go
-            astray on a new input.
+            How to combine the members' runs, sample by sample. A median ignores a few members that
+            go astray on a new input.
         training : mapping, optional
-            Its provenance.
+            Provenance of the ensemble.
 
         Raises
         ------
@@ -305,7 +304,7 @@ class Ensemble(Model):
 
     @cached_property
     def members(self) -> tuple[Model, ...]:
-        """The models it consists of; they know what it stores of the training data."""
+        """The models it consists of, with the entries on training data that it stores once."""
         known = {k: self.training[k] for k in _OF_ALL_MEMBERS if k in self.training}
         return tuple(
             m if known.keys() <= m.training.keys() else replace(m, training={**known, **m.training})
@@ -319,7 +318,7 @@ class Ensemble(Model):
 
     @property
     def orders(self) -> dict[str, int]:
-        """The orders that all members share, and the number of members."""
+        """The orders common to all members, and the number of members."""
         first, *others = (m.orders for m in self.members)
         common = {k: v for k, v in first.items() if all(o.get(k) == v for o in others)}
         return {"members": len(self.members), **common}
@@ -331,7 +330,7 @@ class Ensemble(Model):
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Those of the members, each with its member's number, counted from 0."""
+        """The members' parameter names, each with the member's number (from 0)."""
         return tuple(f"{i}: {n}" for i, m in enumerate(self.members) for n in m.parameter_names)
 
     @property
@@ -340,7 +339,7 @@ class Ensemble(Model):
         return tuple(f"{i}: {n}" for i, m in enumerate(self.members) for n in m.state_names)
 
     def _jacobian(self, u: FloatArray, state: FloatArray) -> FreeRunJacobian:
-        # the core's columns are member by member, parameters and then states of each
+        # the core's columns are member by member, first parameters, then states
         y, rows = self.core.jacobian(u, state)
         theta, states, at = [], [], 0
         for m in self.members:
@@ -367,7 +366,7 @@ class Ensemble(Model):
 
 @dataclass(frozen=True, eq=False)
 class _ModelsCore(EnsembleCore):
-    """The arithmetic together with the models that it comes from."""
+    """The arithmetic together with its models."""
 
     models: tuple[Model, ...]
 

@@ -16,7 +16,7 @@ from ..errors import SettingError, not_installed
 
 
 NODES = 8
-"""Of the quadrature, which is the [8/8] Pade approximant: rounding below a distance of 0.25."""
+"""Nodes of the quadrature, the [8/8] Pade approximant: exact to rounding within 0.25 of I."""
 NEAR = 0.25
 
 
@@ -29,7 +29,7 @@ class ContinuousModel:
     A, B, C, D : array, shape (n, n), (n, nu), (1, n), (1, nu)
         With time in seconds. The state is that of `to_ss` at the sampling instants.
     dead_time : float
-        [s]; what is left of the delay `nk` after the sample that the hold takes.
+        Dead time [s]: the delay `nk` without the sample that the hold accounts for.
     input_names, output_name
         As in the model.
     """
@@ -48,7 +48,7 @@ class ContinuousModel:
         return tuple(sorted(map(complex, np.linalg.eigvals(self.A)), key=lambda p: -p.real))
 
     def frequency_response(self, omega: ArrayLike) -> NDArray[np.complex128]:
-        """G(i omega), shape (n_inputs, len(omega)), for omega in rad/s; dead time included."""
+        """G(i omega), shape (n_inputs, len(omega)), for omega in rad/s, including the dead time."""
         w = np.atleast_1d(np.asarray(omega, dtype=np.float64))
         eye = np.eye(len(self.A))
         rows = [(self.C @ np.linalg.solve(1j * v * eye - self.A, self.B) + self.D)[0] for v in w]
@@ -82,7 +82,7 @@ def continuous(
     Raises
     ------
     SettingError
-        Where a pole is at or left of 0: no differential equation gives it.
+        Where a pole is zero or negative: no differential equation has such a discretisation.
     """
     spare = max(core.nk - 1, 0)
     s = observer_form(_core.LinearModel(core.a, core.b, core.nk - spare, core.offset))
@@ -143,7 +143,7 @@ def _require_logarithm(poles: Any, s: StateSpace, core: _core.LinearModel) -> No
 
 
 # --- A linear model's coefficients as transfer function and state space, and back -----------------
-# Only deviations from an operating point are converted; the offset is what makes one out of them.
+# Only deviations from an operating point are converted; the offset restores absolute values.
 
 
 class StateSpace(NamedTuple):
@@ -162,9 +162,9 @@ def transfer_function(core: _core.LinearModel) -> tuple[FloatArray, FloatArray]:
 
 
 def difference_equation(num: ArrayLike, den: ArrayLike, offset: float) -> _core.LinearModel:
-    """The model of a transfer function in powers of z^-1, the opposite of `transfer_function`.
+    """The model of a transfer function in powers of z^-1, the inverse of `transfer_function`.
 
-    Leading zeros that all numerators share become the delay; trailing ones are left out.
+    Leading zeros common to all numerators become the delay; trailing ones are dropped.
 
     Raises
     ------
@@ -193,9 +193,9 @@ def difference_equation(num: ArrayLike, den: ArrayLike, offset: float) -> _core.
 def observer_form(core: _core.LinearModel) -> StateSpace:
     """State space of order max(na, nk + nb - 1) in observer form.
 
-    `x_i(k)` is what inputs and outputs up to sample k - 1 contribute to `y(k+i-1)`:
+    `x_i(k)` is the contribution of inputs and outputs up to sample k - 1 to `y(k+i-1)`:
     `x_i(k) = sum_{m >= i} ( -a_m y(k-1-m+i) + beta_m u(k-1-m+i) )`, with the numerator
-    `beta_0 + beta_1 z^-1 + ..`, in which the delay is leading zeros.
+    `beta_0 + beta_1 z^-1 + ..`, whose leading zeros are the delay.
     """
     num, den = transfer_function(core)
     n = max(len(den), num.shape[1]) - 1
@@ -245,7 +245,7 @@ def with_common_denominator(
     Raises
     ------
     SettingError
-        Where a numerator has a higher degree than its denominator: that looks into the future.
+        Where a numerator has a higher degree than its denominator, which is not causal.
     """
     distinct: list[FloatArray] = []
     for den in denominators:
@@ -320,7 +320,7 @@ def _padded(rows: FloatArray, size: int) -> FloatArray:
 
 
 def _shortened(rows: FloatArray) -> FloatArray:
-    """Without the columns of zeros at the end, but for the first one."""
+    """The rows without trailing columns of zeros, but with at least one column."""
     used = np.flatnonzero(np.any(rows != 0.0, axis=0))
     return rows[:, : used[-1] + 1] if len(used) else rows[:, :1]
 
@@ -384,7 +384,7 @@ def polynomials_of(system: Any, Ts: float | None) -> tuple[FloatArray, FloatArra
     Raises
     ------
     SettingError
-        For continuous time, several outputs, no sample time, or what is no system.
+        For continuous time, several outputs, no sample time, or an object that is no system.
     """
     dt = _sample_time(getattr(system, "dt", None), Ts)
     if all(hasattr(system, name) for name in "ABCD"):
@@ -416,7 +416,7 @@ def _polynomial_lists(system: Any) -> tuple[list[FloatArray], list[FloatArray]]:
 
 
 def _sample_time(dt: Any, Ts: float | None) -> float:
-    """Of the system; `Ts` where that has none (`dt` True or None: unspecified)."""
+    """Sample time of the system, or `Ts` if it has none (`dt` True or None: unspecified)."""
     if dt is not None and not isinstance(dt, bool) and dt > 0:
         if Ts is not None and abs(dt - Ts) > 1e-9 * Ts:
             raise SettingError(

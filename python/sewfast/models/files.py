@@ -1,4 +1,4 @@
-"""Model files in: versioned JSON -> `Model`."""
+"""Reading model files: versioned JSON -> `Model`."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ SCHEMA = f"model-{VERSION}.json"
 SINGLE: tuple[type[SingleModel], ...] = (
     ARX, IV, LinearOE, HammersteinWiener, GreyBox, NeuralOE, NeuralSS,
 )  # fmt: skip
-"""Every kind of model but the ensemble."""
+"""Every kind of model except the ensemble."""
 STRUCTURED = tuple(c for c in SINGLE if issubclass(c, StructuredModel))
-"""Kinds that are fitted in one of several structures, which held-out data choose."""
+"""Kinds with several structures, one of which is chosen on held-out data."""
 _KINDS = {c.kind: c for c in SINGLE}
 _FIELDS = ("version", "kind", "Ts", "inputs", "output", "counts", "parameters", "training")
 
 
 def load_model(path: str | os.PathLike[str]) -> Model:
-    """Read a model that `Model.save` wrote; nothing in the file is executed.
+    """Read a model written by `Model.save`; nothing in the file is executed.
 
     Parameters
     ----------
@@ -52,12 +52,12 @@ def load_model(path: str | os.PathLike[str]) -> Model:
 
 
 def from_dict(values: dict[str, Any]) -> Model:
-    """The model that `Model.to_dict` gave these values."""
+    """The model of these values, the inverse of `Model.to_dict`."""
     return _read(Fields("model", {"version": VERSION} | values))
 
 
 def restored(values: dict[str, Any], alternatives: tuple[Model, ...]) -> Model:
-    """The model of `from_dict` with its alternatives: what a pickle holds."""
+    """The model of `from_dict` with its alternatives, for unpickling."""
     return replace(from_dict(values), alternatives=alternatives)
 
 
@@ -114,7 +114,7 @@ def _single(fields: Fields, own: Fields) -> Model:
 
 
 def _training(training: Fields, inputs: int) -> Mapping[str, Any]:
-    """What is read back later must have its form; the rest is the trainer's own record."""
+    """Provenance; entries that are used later are checked, the rest is only kept."""
     known = training.values
     if "input_range" in known:
         ranges = training.matrix("input_range")
@@ -139,7 +139,7 @@ def _core(parameters: Fields, cls: type[SingleModel]) -> object:
 
 
 def _require_width(fields: Fields, parameters: Fields, inputs: int) -> None:
-    """Names and parameters must speak of the same number of inputs."""
+    """Require the same number of inputs in names and parameters."""
     width = len(parameters.any("b")) if "b" in parameters.values else parameters.integer("n_inputs")
     if width != inputs:
         raise fields.refuse("inputs", f"{width} inputs, as in the parameters", fields.any("inputs"))

@@ -1,4 +1,4 @@
-"""The grey box: a motor's equations, and a small network for what they leave."""
+"""The grey box: a motor's equations, and a small network for the rest."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ MOST_UNITS: int = _core.GREYBOX_UNITS
 class GreyBox(SingleModel):
     """A DC motor with dry friction and the dead zone of its inverter, and a network for the rest.
 
-    Speeds follow a command as in docs/physics.md, all in units of the command; loads that repeat
-    over a turn have no place in it, since a speed does not say where a turn begins. The network's
+    The speed follows the command as in docs/physics.md, all in units of the command; loads that
+    repeat over a turn are left out, since a speed does not show where a turn begins. The network's
     output is one more load: ``sum c tanh(b + p w + q x)``, of speed w and drive x in units of
     their scales.
 
@@ -36,7 +36,7 @@ class GreyBox(SingleModel):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Everything beside `theta`."""
+        """Everything except `theta`."""
         return self.core.settings
 
     @property
@@ -58,12 +58,12 @@ class GreyBox(SingleModel):
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Speed, drive and the command before, in units of their scales."""
+        """Speed, drive and the previous command, in units of their scales."""
         return ("speed", "drive", "command before")
 
     @property
     def motor(self) -> dict[str, float]:
-        """The motor's parameters by the names of docs/physics.md, per rad/s and in commands."""
+        """The motor's parameters by name (docs/physics.md), per rad/s and in commands."""
         return dict(zip(NAMES, self.settings["values"].tolist(), strict=True))
 
     def parameters(self) -> dict[str, Any]:
@@ -125,7 +125,7 @@ class GreyBox(SingleModel):
 
 
 def _completed(values: FloatArray, limit: float) -> FloatArray:
-    """All parameters; older files end before `limit`, and know no term that comes after it."""
+    """All parameters; older files end before `limit`, without the later terms."""
     at = NAMES.index("limit")
     if len(values) == at:
         values = np.append(values, np.zeros(len(NAMES) - at - 1))

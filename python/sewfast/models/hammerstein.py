@@ -1,4 +1,4 @@
-"""The Hammerstein-Wiener model: linear dynamics between static characteristics."""
+"""The Hammerstein-Wiener model: linear dynamics between static curves."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..storage import Fields
 from .base import StructuredModel
 
 PIECES = 8
-"""Of a characteristic, where `identify` is not told a number."""
+"""Pieces of a curve, unless `identify` is given a number."""
 _SAMPLES = 5
 """Points of a drawn curve for each piece."""
 
@@ -24,9 +24,9 @@ class Characteristic(NamedTuple):
     Attributes
     ----------
     name : str
-        The input that it bends, or the output.
+        Name of its input, or of the output.
     x, y : array
-        Points on it, the knots among them.
+        Points on the curve, including the knots.
     """
 
     name: str
@@ -38,8 +38,8 @@ class HammersteinWiener(StructuredModel):
     """u -> f -> linear difference equation -> g -> y, fitted in free run.
 
     Each input has a curve f, piecewise linear over its training range: a dead band, a saturation, a
-    valve. The output has a curve g that rises strictly: a sensor that is not straight. Each curve
-    is the identity at the ends of its range, which fixes the gain of what is between them.
+    valve. The output has a strictly increasing curve g, such as that of a nonlinear sensor. Each
+    curve is the identity at the ends of its range, which fixes the gain of the linear part.
 
     References
     ----------
@@ -66,8 +66,8 @@ class HammersteinWiener(StructuredModel):
     def theta(self) -> FloatArray:
         """`[a, b input by input, offset, f input by input, g]`, shape (p,).
 
-        f: how far the curve is off the straight line at its inner knots, over the input's range;
-        g: logarithms of the slopes of its pieces but the first, over that of the first.
+        f: deviation of the curve from the straight line at its inner knots, over the input's range;
+        g: logarithms of the slopes of its pieces relative to the first one.
         """
         return self.core.theta
 
@@ -124,7 +124,7 @@ class HammersteinWiener(StructuredModel):
 
     @staticmethod
     def structures(size: int | None) -> tuple[Mapping[str, int], ...]:
-        """A curve before the dynamics, one behind them, both; `size` is their pieces."""
+        """A curve before the dynamics, one behind them, or both, with `size` pieces each."""
         n = PIECES if size is None else size
         pairs = ((n, 1), (1, n), (n, n))
         return tuple({"input_pieces": i, "output_pieces": o} for i, o in pairs)

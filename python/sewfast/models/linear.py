@@ -107,8 +107,8 @@ class LinearDifference(SingleModel):
         -------
         StateSpace
             x(k+1) = A x(k) + B u(k), y(k) = C x(k) + D u(k), of order n = max(na, nk + nb - 1);
-            shapes (n, n), (n, n_inputs), (1, n), (1, n_inputs). `x_i(k)` is what inputs and
-            outputs up to sample k - 1 contribute to y(k+i-1); the delay is among these states.
+            shapes (n, n), (n, n_inputs), (1, n), (1, n_inputs). `x_i(k)` is the contribution of
+            inputs and outputs up to sample k - 1 to y(k+i-1); the states include the delay.
         """
         return observer_form(self.core)
 
@@ -128,7 +128,7 @@ class LinearDifference(SingleModel):
         return control_transfer_function(*in_descending_powers(self.core), self.Ts, inputs, output)
 
     def to_scipy(self) -> Any:
-        """`scipy.signal.dlti` with dt = Ts: a transfer function, for several inputs a state space.
+        """`scipy.signal.dlti` with dt = Ts: a transfer function, or a state space for many inputs.
 
         Raises
         ------
@@ -138,7 +138,7 @@ class LinearDifference(SingleModel):
         return scipy_system(*in_descending_powers(self.core), self.to_ss(), self.Ts)
 
     def to_continuous(self) -> ContinuousModel:
-        """The differential equation that becomes this model under a zero-order hold.
+        """The differential equation whose discretisation with a zero-order hold is this model.
 
         Raises
         ------
@@ -156,12 +156,12 @@ class LinearDifference(SingleModel):
         return response
 
     def steady_output(self, u0: ArrayLike) -> float:
-        """The output at which the model rests under constant inputs: with `u0` a steady point.
+        """The output at which the model rests under constant inputs `u0`.
 
         Raises
         ------
         SettingError
-            Where `u0` has not one value per input, or a pole at 1 leaves nothing to rest at.
+            Where `u0` has not one value per input, or for a pole at 1, which has no such level.
         """
         at_rest = 1.0 + float(self.core.a.sum())
         if at_rest == 0.0:
@@ -187,22 +187,22 @@ class LinearDifference(SingleModel):
         Parameters
         ----------
         num : array_like, shape (m,) or (n_inputs, m)
-            Leading zeros that all rows share are the delay `nk`.
+            Leading zeros common to all rows are the delay `nk`.
         den : array_like, shape (na + 1,)
         Ts : float
             Sample time [s].
         offset : float
-            What a transfer function does not hold: `model.core.offset` of the model it came from.
+            Offset, which a transfer function lacks: `model.core.offset` of its original model.
         operating_point : (u0, y0) or None
-            Instead of `offset`: the inputs and the output, in the data's units, from which the
-            transfer function's deviations count. The model then rests at y0 under u0.
+            Instead of `offset`: the inputs and the output, in the data's units, about which the
+            transfer function describes deviations. The model then rests at y0 under u0.
         input_names, output_name, input_units, output_unit
             As in the data set; by default `u` or `u1, u2, ..` and `y`, without units.
 
         Returns
         -------
         Model
-            Of the class it is called on.
+            A model of the class on which it is called.
 
         Raises
         ------
@@ -233,8 +233,8 @@ class LinearDifference(SingleModel):
     ) -> Any:
         """A model from a state space with one output; options as in `from_tf`.
 
-        From observer form, as `to_ss` gives it, nothing is lost but the last bit of `b` where
-        nk = 0; else na is the order n and rounding errors are those of an eigenvalue problem.
+        The observer form of `to_ss` is converted exactly, up to the last bit of `b` if nk = 0; in
+        any other form na is the order n, with the rounding errors of an eigenvalue problem.
 
         Raises
         ------
@@ -250,9 +250,9 @@ class LinearDifference(SingleModel):
         Parameters
         ----------
         system : control.TransferFunction or control.StateSpace
-            Its names are taken over. Different denominators are multiplied out.
+            Its names are used. Different denominators are multiplied out.
         Ts : float or None
-            Sample time [s] where `system.dt` is True.
+            Sample time [s] if `system.dt` is True.
         **options
             As in `from_tf`.
 
@@ -298,7 +298,7 @@ class ARX(LinearDifference):
 
 
 class IV(LinearDifference):
-    """Refined instrumental variables, SRIV (Young 2011, section 6.4): no bias by output noise."""
+    """Refined instrumental variables, SRIV (Young 2011, section 6.4): unbiased by output noise."""
 
     kind: ClassVar[str] = "iv"
     title: ClassVar[str] = "Refined instrumental variables"
@@ -319,7 +319,7 @@ def _polynomial(coefficients: Any, delay: int) -> str:
 
 
 def _pole_text(pole: complex, Ts: float) -> str:
-    """A pole with what its mode does: time constant, frequency, alternation, integration."""
+    """A pole and its mode: time constant, frequency, alternation or integration."""
     size = abs(pole)
     number = f"{pole.real:.6g}{pole.imag:+.6g}i" if pole.imag else f"{pole.real:.6g}"
     if abs(pole - 1.0) <= 1e-9:
@@ -333,7 +333,7 @@ def _pole_text(pole: complex, Ts: float) -> str:
         hertz = abs(cmath.phase(pole)) / (2 * math.pi * Ts)
         return f"{number} ({tau}, {hertz:.4g} Hz)"
     if pole.real < 0.0:
-        # no lag of the plant gives this: delay, noise or an order too many
+        # not a lag of the plant: due to delay, noise or too high an order
         return f"{number} (alternates from sample to sample, dies away in {tau})"
     return f"{number} ({tau})"
 

@@ -14,13 +14,13 @@ from .base import SingleModel
 
 
 class _Network(SingleModel):
-    """What both have in common: settings, parameters and scales in the compiled model."""
+    """Common to both networks: settings, parameters and scales of the compiled model."""
 
     core: _core.NeuralOE | _core.NeuralSS
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Sizes, scaling and whatever else makes the model beside `theta`, as JSON values."""
+        """Sizes, scaling and all other settings except `theta`, as JSON values."""
         raw = self.core.settings
         return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in raw.items()}
 

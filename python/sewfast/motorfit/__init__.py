@@ -1,9 +1,9 @@
 """A motor's equations fitted to its record: output error on exact sensitivities.
 
-Read `terms` (the method) first: `records` is what is fitted, `task` what is compared and summed,
-`starts` where it begins, `waves` what repeats over the turn, `marquardt` how it goes down,
-`intervals` how sure it is. The motor's equations and their sensitivities are the core's. `physics`
-prints what is found here, `identify` makes a model of it.
+Read `terms` (the method, and profile-likelihood intervals) first, then `records` (the data), `task`
+(free parameters and residuals), `starts` (initial values, and effects that repeat over the turn)
+and `estimation` (descent, whitening filters, covariance). The motor's equations and their
+sensitivities are in the core. `physics` prints the result, `identify` makes a model of it.
 """
 
 from .records import Records, rad_per_second, records_of

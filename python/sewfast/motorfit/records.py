@@ -1,4 +1,4 @@
-"""Recordings as the fit of a motor takes them: in rad/s, cut at gaps, spikes left out."""
+"""Recordings prepared for the fit of a motor: in rad/s, split at gaps, without spikes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ..recording import Recording
 from ..units import REVOLUTIONS_PER_SECOND, revolutions_per_second
 
 SHORTEST = 50
-"""Samples of a piece between gaps; a shorter one says less than its unknown start costs."""
+"""Shortest piece between gaps, in samples; a shorter one is not worth its unknown start."""
 LEAST = 200
-"""Samples of all pieces."""
+"""Least samples of all pieces together."""
 SPIKE = 8.0
-"""Standard deviations from the median of its neighbours, from which a sample is a spike."""
+"""Standard deviations from the median of its neighbours above which a sample is a spike."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,13 +32,13 @@ class Piece:
     u, y : array, shape (N,)
         Command and speed [rad/s].
     used : array of bool, shape (N,)
-        Samples that the fit compares.
+        Samples compared in the fit.
     speed : float
-        At the first sample [rad/s].
+        Speed at the first sample [rad/s].
     angle : array, shape (N,)
-        Of the shaft [rad], from the counts, or as the sum of the speeds.
+        Angle of the shaft [rad], from the counts, or as the sum of the speeds.
     current : array, shape (N,), or None
-        As measured.
+        Measured current.
     """
 
     u: FloatArray
@@ -51,10 +51,10 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Records:
-    """All pieces, and what their numbers mean.
+    """All pieces, with the meaning of their values.
 
-    `mean` says that a speed is the mean over the sample before it, as a difference of counts is;
-    `quantum` is the step of its values [rad/s], 0 where it has none.
+    `mean`: the speed is the mean over the previous sample, as a difference of counts is;
+    `quantum`: the step of its values [rad/s], 0 without quantisation.
     """
 
     pieces: tuple[Piece, ...]
@@ -67,9 +67,9 @@ class Records:
     spikes: int
 
     def liveliest(self, n: int) -> Records:
-        """Those `n` samples or fewer in a row whose speed varies most; all where there are no more.
+        """The `n` consecutive samples whose speed varies most; all if there are no more.
 
-        The pieces are views: a sample that is left out of one is left out of the other.
+        The pieces are views: a sample left out of one is left out of the other.
         """
         if sum(len(p.u) for p in self.pieces) <= n:
             return self
@@ -86,7 +86,7 @@ class Records:
 
 
 def rad_per_second(unit: str) -> float:
-    """How many rad/s one of a unit of speed is."""
+    """Factor from a unit of speed to rad/s."""
     turns = revolutions_per_second(unit)
     if turns is None:
         raise SettingError(
@@ -99,12 +99,12 @@ def rad_per_second(unit: str) -> float:
 def records_of(
     data: Recording | Dataset, current: str | ArrayLike | None, speed_unit: str | None
 ) -> Records:
-    """What is fitted.
+    """The records to fit.
 
     Raises
     ------
     DataError
-        Where nothing of use is left, or a current is missing.
+        If no usable samples are left, or a current is missing.
     SettingError
         Without a unit of the speed.
     """
@@ -122,7 +122,7 @@ def records_of(
         )
     unit = speed_unit if speed_unit is not None else data.output_unit
     factor = rad_per_second(unit)
-    # a speed that was computed from counts without looking ahead is their difference
+    # a speed computed from counts without looking ahead is their difference
     differs = data.counts is not None and not data.looks_ahead
     quantum = 2.0 * math.pi / data.counts[1] / data.Ts if data.counts and differs else 0.0
     whole, spikes = [], 0
@@ -191,7 +191,7 @@ def _pieces(
     *,
     mean: bool,
 ) -> tuple[list[Piece], int]:
-    """Cut where a command or an angle is missing; a missing speed is only left out."""
+    """Split where a command or an angle is missing; a missing speed is only left out."""
     known = np.isfinite(u)
     if angle is not None:
         known &= np.isfinite(angle)
@@ -212,7 +212,7 @@ def _pieces(
         good = measured & ~spiked
         speed = np.interp(k, k[good], speed[good])
         used = good.copy()
-        used[0] = False  # it is where the simulation starts
+        used[0] = False  # the start of the simulation
         turned = _integral(speed, Ts, mean=mean) if angle is None else angle[part]
         first = _first(speed, quantum)
         i = None if current is None else np.ascontiguousarray(current[part])
@@ -234,8 +234,8 @@ def _window(p: Piece, start: int, stop: int, quantum: float) -> Piece:
 def spikes_of(y: FloatArray, quantum: float) -> NDArray[np.bool_]:
     """Samples far from the median of themselves and their four neighbours.
 
-    What is usual is the distance that nine in ten keep to: of 300 samples eleven may be spikes. At
-    a corner, and at either end, a signal is off by no more than two of its quicker steps.
+    The usual distance is that of nine in ten samples: up to eleven of 300 samples can be spikes. At
+    a corner, and at either end, a signal is off by at most two of its quicker steps.
     """
     if len(y) < 10:
         return np.zeros(len(y), dtype=bool)
@@ -252,7 +252,7 @@ def _integral(y: FloatArray, Ts: float, *, mean: bool) -> FloatArray:
 
 
 def _first(y: FloatArray, quantum: float) -> float:
-    """The speed at the start, by a line through the first samples; standstill where it is that."""
+    """The speed at the start, from a line through the first samples, or 0 at standstill."""
     head = y[: min(20, len(y))]
     if np.abs(head[:5]).max() <= 1.01 * quantum or not head[:5].any():
         return 0.0

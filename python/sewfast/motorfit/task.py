@@ -1,4 +1,4 @@
-"""What a motor's fit compares: free parameters, the whitened residuals of a record, their sums."""
+"""The task of a motor's fit: free parameters, whitened residuals of a record, and their sums."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import numpy as np
 from .. import _core
 from ..arrays import FloatArray
 from ..errors import SettingError
-from .intervals import covariance_of, filtered, inverse, whitener
-from .marquardt import Normal, minimised
+from .estimation import Normal, covariance_of, filtered, inverse, minimised, whitener
 from .records import Records, spikes_of
 
 PARAMETERS = tuple(_core.GREYBOX_PARAMETERS)
@@ -37,53 +36,54 @@ TERMS: dict[str, tuple[str, ...]] = {
     "cogging_3": ("cogging_3c", "cogging_3s"),
     "torque_ripple": ("torque_ripple_c", "torque_ripple_s"),
 }
-"""Parts of a motor beside back-EMF and inertia, and the parameters of each."""
+"""Terms of a motor besides back-EMF and inertia, and the parameters of each."""
 WAVES = ("cogging_1", "cogging_2", "cogging_3", "torque_ripple")
-"""Terms that repeat as often per turn as the record says, in the order of `State.orders`."""
+"""Terms whose orders per turn are found from the record, as listed in `State.orders`."""
 OPTIONAL = ("stribeck_difference", "sag", "eccentricity")
-"""Terms that few motors have, and each of which makes the others less sure: they are fitted where
-they are asked for, or stand out clearly."""
+"""Terms that few motors have, and each of which makes the others less certain: they are fitted if
+requested, or if they stand out clearly."""
 VISCOUS, VISCOUS_SPREAD = 0.05, 0.15
-"""Of k_v: viscous friction that is expected where no current parts it from back-EMF, and how far
-from that it may well be. Nothing in its place would be a certainty: the dead zone sees the current
-that it takes, and dry friction would stand for what is missing. On 36 machines with 1 to 32 % of
-it, intervals of k_v, k_a and k_s held the truth 102 times of 108; with a spread of .05, 90 times.
+"""Prior mean and standard deviation of viscous friction, relative to k_v, if no current separates
+it from back-EMF. Assuming none would be too certain: its current acts on the dead zone, and dry
+friction would compensate for it. On 36 machines with 1 to 32 % of it, intervals of k_v, k_a and k_s
+contained the truth 102 times of 108; with a standard deviation of .05, 90 times.
 """
 ITERATIONS = 40
 COARSE, NEAR, FINE = 1.0, 0.1, 0.01
-"""Squared distances to the minimum in standard errors: on the way, for tests, for what is printed.
-"""
+"""Squared distances to the minimum in standard errors: for intermediate fits, tests, results."""
 QUASISTATIC = 0.05
-"""Of the command's standard deviation: that of its accelerating part from which k_a is shown. Of 60
-slow ramps, sines and triangles one interval, at .003, was off by 87 % of the truth; those of .01 to
-.05 were as wide as two thirds of it or more; from .05 on 43 of 46 held it, the others off by .6 %.
+"""Least standard deviation of the accelerating part of the command, relative to the whole, to show
+k_a. Of 60 slow ramps, sines and triangles one interval, at .003, was off by 87 % of the truth;
+those at .01 to .05 were at least two thirds of it wide; from .05 on 43 of 46 contained it, the
+others were off by .6 %.
 """
 PER_TIME_CONSTANT = 50.0
-"""Steps of the integration, of second order: they are off by a fifteenth of a thousandth of it."""
+"""Integration step (second order) relative to the time constant: an error of 1/15,000 of it."""
 QUICKEST = 1.0 / 16.0
-"""Of a sample: a time constant that no record shows."""
+"""Shortest time constant that a record can show, in samples."""
 STARTS = 5
-"""Steps at most by which the pieces' starts are settled: dry friction bends what one step takes for
-straight where the start is on the wrong side of a standstill."""
+"""Most steps for estimating the initial speeds: dry friction makes the problem nonlinear if a start
+is on the wrong side of a standstill."""
 AMMETER = 1e-3
-"""Of the current's root mean square: the error down to which it is believed; and of its scale. A
-simulator's has none, and what the model leaves of it, at reversals, then outweighs all speeds."""
+"""Least error of the current and of its scale, relative to its root mean square. A simulator's
+current has none, and its residuals at reversals would then outweigh all speeds."""
 TIMING = 0.01
-"""Of a sample: standard deviation of the instant from which a command acts, which no residual
-shows. It moves delay and time constants, of a motor without noise by more than all the rest."""
+"""Standard deviation, in samples, of the instant at which a command begins to act, which no
+residual shows. It affects delay and time constants, for a motor without noise more than all else.
+"""
 WHITE = 12
-"""Order of the autoregression that says how what is left over hangs together."""
+"""Order of the autoregression that models the residual's colour."""
 
 
 @dataclass(frozen=True)
 class State:
-    """Values of all parameters, and which are free."""
+    """Values of all parameters, and which of them are free."""
 
     theta: FloatArray
     resistance: float | None
     terms: tuple[str, ...]
     orders: tuple[int, ...] = (0,) * len(WAVES)
-    """How often per turn each of `WAVES` repeats; 0 where there is none."""
+    """Order per turn of each of `WAVES`; 0 for none."""
 
     def names(self) -> list[str]:
         free = ["k_e", "k_a", "k_b", *(["R"] if self.resistance is not None else [])]
@@ -108,7 +108,7 @@ class State:
         return replace(self, theta=theta, resistance=resistance)
 
     def having(self, terms: Sequence[str], **values: float) -> State:
-        """With other terms: those that go are set to nothing."""
+        """The state with other terms; parameters of dropped terms are set to 0."""
         theta = self.theta.copy()
         for t in set(self.terms) - set(terms):
             for p in TERMS[t]:
@@ -127,16 +127,16 @@ _NOT_NEGATIVE = {"tau", "delay", "k_s", "k_t", "drop"}
 
 @dataclass
 class Task:
-    """The records, and filters that weigh what is left over of speeds [rad/s] and currents [A]."""
+    """The records, and the filters that weigh residuals of speeds [rad/s] and currents [A]."""
 
     records: Records
     steps: int = 2
     converged: bool = False
     spikes: int = 0
     k_v: float = math.nan
-    """From the start: the scale of what is expected of viscous friction."""
+    """k_v of the start: the scale of the prior of viscous friction."""
     look: Callable[[], object] = lambda: None
-    """Called before every simulation; what it raises ends the fit."""
+    """Called before every simulation; an exception of it ends the fit."""
     speed_filter: FloatArray = field(default_factory=lambda: np.ones(1))
     current_filter: FloatArray = field(default_factory=lambda: np.ones(1))
 
@@ -145,7 +145,7 @@ class Task:
         return self.records.pieces[0].current is not None
 
     def simulated(self, state: State, free: Sequence[str]) -> list[tuple[FloatArray, ...]]:
-        """Of each piece speed, drive and their derivatives."""
+        """Speed, drive and their derivatives for each piece."""
         places = [PLACE[n] for n in free]
         r = self.records
         return [
@@ -157,7 +157,7 @@ class Task:
         ]  # fmt: skip
 
     def residuals(self, state: State) -> FloatArray:
-        """Simulated less measured, whitened; of each piece the speeds and then the currents."""
+        """Simulated minus measured values, whitened; speeds and then currents of each piece."""
         found = []
         for p, (y, drive, _, _) in zip(self.records.pieces, self.simulated(state, ()), strict=True):
             found.append(filtered(y - p.y, p.used, self.speed_filter))
@@ -200,7 +200,7 @@ class Task:
         return cost + off, gradient + by, matrix + curvature
 
     def _expected(self, state: State) -> Normal:
-        """What is known of viscous friction beforehand, as one more squared residual."""
+        """The prior of viscous friction, as an additional squared residual."""
         names = state.names()
         by, curvature = np.zeros(len(names)), np.zeros((len(names), len(names)))
         if self.has_current or not math.isfinite(self.k_v):
@@ -211,7 +211,7 @@ class Task:
         return off**2, by, curvature
 
     def cost(self, state: State) -> float:
-        """Of the whitened residuals; infinite where nothing can be simulated."""
+        """Cost of the whitened residuals; infinite if the simulation fails."""
         try:
             cost, _, _ = self._summed(state, ())
         except SettingError:
@@ -252,15 +252,15 @@ class Task:
         return np.concatenate(ys), np.concatenate(models)
 
     def rmse(self, state: State) -> float:
-        """Of the free run's speed [rad/s]."""
+        """Root mean square error of the free run's speed [rad/s]."""
         y, model = self.outcome(state)
         return float(np.sqrt(np.mean((y - model) ** 2)))
 
     def weigh(self, state: State, order: int = WHITE) -> None:
-        """Filters that make white, of variance 1, what this fit leaves over.
+        """Set the filters that whiten the residuals of this fit, to variance 1.
 
-        An encoder's steps in a difference of counts cancel from sample to sample, and a load that
-        no term has stays for many: each has its own colour, and counts as little as it deserves.
+        Encoder steps in a difference of counts cancel from sample to sample, while an unmodelled
+        load lasts for many: each has its colour, and receives the proper weight.
         """
         speeds, currents, known = [], [], []
         for p, (y, drive, _, _) in zip(self.records.pieces, self.simulated(state, ()), strict=True):
@@ -276,7 +276,7 @@ class Task:
             self.current_filter = np.minimum(whitener(currents, 0), best)
 
     def leave_out_spikes(self, state: State) -> None:
-        """Samples whose error stands far off its neighbours': a fit shows smaller spikes."""
+        """Leave out samples with errors far from those of their neighbours, as a fit shows them."""
         for p, (y, *_) in zip(self.records.pieces, self.simulated(state, ()), strict=True):
             used = np.flatnonzero(p.used)
             far = used[spikes_of((y - p.y)[used], self.records.quantum)]
@@ -284,10 +284,10 @@ class Task:
             self.spikes += len(far)
 
     def settle_starts(self, state: State) -> None:
-        """Speeds at the pieces' first samples, by least squares together with what is free.
+        """Estimate the pieces' initial speeds by least squares together with the free parameters.
 
-        A line through the first samples is no more than a first guess where the motor is fast
-        beside the sampling, or the record noisy.
+        A line through the first samples is only a first guess if the motor is fast compared with
+        the sampling, or the record noisy.
         """
         for _ in range(STARTS):
             columns, moving = self._starts(state)
@@ -309,10 +309,10 @@ class Task:
                 return
 
     def _starts(self, state: State) -> tuple[FloatArray, list[int]]:
-        """Derivatives of the residuals by the starts of pieces that do not begin at a standstill.
+        """Derivatives of the residuals by the initial speeds of pieces that begin in motion.
 
-        They fade with the motor's time constant; at a standstill dry friction holds, and nothing
-        fades.
+        They decay with the motor's time constant; a piece that begins at standstill is held there
+        by dry friction.
         """
         T = state.theta[PLACE["k_a"]] / max(state.theta[0] + state.theta[1], 1e-12)
         pieces = self.records.pieces
@@ -328,9 +328,9 @@ class Task:
         return np.concatenate(found), moving
 
     def is_slow(self, state: State) -> bool:
-        """Whether the command that accelerates hardly changes beside the whole command.
+        """Whether the accelerating part of the command hardly changes compared with the whole.
 
-        A constant acceleration, as under a ramp, takes what dry friction takes.
+        A constant acceleration, as in a ramp, cannot be separated from dry friction.
         """
         rates = [np.diff(y) / self.records.Ts for y, *_ in self.simulated(state, ())]
         u = np.concatenate([p.u for p in self.records.pieces])
@@ -338,26 +338,26 @@ class Task:
         return bool(effort < QUASISTATIC * float(np.std(u)))
 
     def stribeck_speeds(self) -> tuple[float, float]:
-        """In which friction may fall off: below, there is hardly a sample to show it."""
+        """Range of the speed over which friction can fall off; below it there are few samples."""
         usual = float(np.quantile(np.abs(np.concatenate([p.y for p in self.records.pieces])), 0.9))
         return 0.01 * usual, usual
 
     def ripples(self) -> tuple[float, float]:
-        """Over which the drop may rise: over all of the command it would be a resistance."""
+        """Range of the command over which the drop can rise; over all of it, it is a resistance."""
         usual = float(np.quantile(np.abs(np.concatenate([p.u for p in self.records.pieces])), 0.9))
         return 0.001 * usual, 0.1 * usual
 
     def settle_steps(self, state: State) -> None:
-        """Integration steps for the time constant that was found; the lag is solved exactly."""
+        """Choose integration steps for the estimated time constant; the lag is solved exactly."""
         k_v = max(state.theta[0] + state.theta[1], 1e-12)
         fastest = min(self.records.Ts / 2.0, state.theta[PLACE["k_a"]] / k_v / PER_TIME_CONSTANT)
         self.steps = int(np.clip(math.ceil(self.records.Ts / max(fastest, 1e-12)), 2, 64))
 
     def covariance(self, state: State) -> FloatArray:
-        """Of the estimate, (n, n); that the starts are estimated too is counted in.
+        """Covariance of the estimate, (n, n), including the estimation of the initial speeds.
 
-        Sums of scores over a window stand for their long-run covariance. To it comes that neither
-        clocks nor steps of an integration are exact within a sample.
+        From sums of scores over a window, plus the inexactness of clocks and integration steps
+        within a sample.
         """
         n, J = len(state.names()), [self.jacobian(state), self._starts(state)[0]]
         k_v = max(state.theta[0] + state.theta[1], 1e-12)
@@ -380,7 +380,7 @@ class Task:
 
 
 def fitted(task: Task, state: State, enough: float = COARSE) -> State:
-    """At the least squares of all that is free in it."""
+    """The state at the least-squares solution for its free parameters."""
     names = state.names()
     low, high = bounds_of(task, state)
     found = minimised(
@@ -392,14 +392,14 @@ def fitted(task: Task, state: State, enough: float = COARSE) -> State:
         enough=enough,
         iterations=ITERATIONS,
     )
-    # where dry friction makes the cost a broken line no test confirms a minimum: it is near enough
-    # where what is left to gain is less than what noise alone would give
+    # with the kinks of dry friction no test confirms a minimum: it is close enough
+    # if the remaining gain is less than noise alone would give
     task.converged = found.left < len(names)
     return state.at(found.x)
 
 
 def bounds_of(task: Task, state: State) -> tuple[FloatArray, FloatArray]:
-    """Least and largest values of what is free, (n,) each."""
+    """Least and largest values of the free parameters, (n,) each."""
     names = state.names()
     low = np.array([_least(n, state) for n in names])
     high = np.full(len(names), np.inf)
@@ -416,7 +416,7 @@ def bounds_of(task: Task, state: State) -> tuple[FloatArray, FloatArray]:
 
 
 def least_inertia(task: Task, state: State) -> float:
-    """k_a of a motor that is too fast for the samples to show it, and for steps to follow it."""
+    """k_a of a motor that is too fast for the samples to show and for the integration to follow."""
     return float(QUICKEST * task.records.Ts * max(state.theta[0] + state.theta[1], 0.0))
 
 

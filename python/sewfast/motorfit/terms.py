@@ -1,4 +1,4 @@
-"""Which terms of a motor a record shows: all are fitted together, then those that it does show.
+"""Terms of a motor that a record shows, and intervals of their parameters by profile likelihood.
 
 A start comes from linear regression of smoothed signals over a few lags and delays, judged by the
 free run. All terms are then fitted together, those that the record does not show are removed
@@ -15,60 +15,70 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import FloatArray
-from .intervals import inverse
+from .estimation import CONFIDENCE, Normal, inverse, minimised
 from .records import Records
-from .starts import started
-from .task import FINE, NEAR, TERMS, WAVES, State, Task, fitted, least_inertia
-from .waves import CLEAR, with_waves
+from .starts import CLEAR, started, with_waves
+from .task import (
+    FINE,
+    NEAR,
+    PARAMETERS,
+    TERMS,
+    WAVES,
+    State,
+    Task,
+    bounds_of,
+    fitted,
+    least_inertia,
+)
 
 ORDERS = {"load_1": 1, "load_2": 2, "inertia_2": 2}
-"""How often a term repeats in a turn."""
+"""Number of times that a term repeats in a turn."""
 SHAPES = {"ripple", "w_s"}
-"""Parameters that say how a term goes, not how large it is."""
+"""Parameters of a term's shape, not of its size."""
 SHAPED = {"drop", "stribeck"}
-"""Terms that have one."""
+"""Terms with such a parameter."""
 ALWAYS = {"delay", "limit", "coulomb"}
-"""Terms that stay: a delay of nothing is an answer, a limit has a test of its own, and without dry
-friction, which every motor has, k_v would take its place unnoticed."""
+"""Terms that are always kept: a delay of zero is a valid result, a limit has a separate test, and
+without dry friction, which every motor has, k_v would absorb it unnoticed."""
 
 SHOWN = 1.0
-"""Wald's statistic of a single parameter from which its term stays: one that is larger than its
-standard deviation makes the others worse by its absence than by its uncertainty (Toro-Vizcarrondo
-and Wallace 1968, JASA 63). Whether it is printed is a question of its own interval."""
+"""Wald's statistic of a single parameter above which its term is kept: omitting a parameter larger
+than its standard deviation harms the others more than its uncertainty does (Toro-Vizcarrondo and
+Wallace 1968, JASA 63). Its own interval decides whether it is printed."""
 SURE = 16.0
-"""The same of a term that is fitted only where it stands out."""
+"""The same for a term that is fitted only if it stands out."""
 UNEXPLAINED = 0.005
-"""Share of the speed's variance, from which a limit is looked for with all parameters free."""
+"""Unexplained share of the speed's variance above which a limit is sought with all terms free."""
 LIMITED = 0.9
-"""Of the cost without, that a limit of the current has to fall below."""
+"""Largest cost with a limit of the current, relative to the cost without."""
 STRETCH = 10_000
-"""Samples on which the way is found; all of them then have their say. Of 20 s at 1 kHz, 5,000 end
-in another minimum for 1 of 60 machines, 2,500 for 1 of 8; all 20,000 gain nothing."""
+"""Samples of the first fit, before all are used. Of 20 s at 1 kHz, 5,000 samples end in another
+minimum for 1 of 60 machines, 2,500 for 1 of 8; all 20,000 gain nothing."""
 BUMPS = (0.02, 0.06)
-"""Of the usual speed, at which Stribeck's friction is tried to fall off."""
+"""Speeds tried for the fall of Stribeck friction, relative to the usual speed."""
 ON_THE_WAY = 8
-"""Integration steps per sample at most, until the terms are settled: a motor far faster than its
-samples takes 64, of which the parameters move by a few per cent of an answer that is not final."""
+"""Most integration steps per sample until the terms are chosen: a motor far faster than its samples
+would need 64, which changes intermediate parameters by only a few per cent."""
 WORSE = 1.1
-"""Times the free-run error that a whitened fit may have over a plain one."""
+"""Largest free-run error of a whitened fit relative to a plain one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """What a record says of a motor.
+    """Result of the fit of a motor.
 
     Attributes
     ----------
     state : State
-        All parameters at the least squares, and the terms that are shown.
+        All parameters at the least-squares solution, and the terms that are shown.
     covariance : array, shape (n, n)
-        Of what is free in the state.
+        Covariance of the free parameters of the state.
     reasons : mapping of str by name
-        Terms, and the inertia, that the record does not show, and why.
+        Terms (or the inertia) that the record does not show, and why.
     records : Records
-        With the starts that were settled and the spikes that were left out.
+        The records with estimated initial speeds and without spikes.
     task : Task
-        What was compared.
+        The task of the final fit.
     """
 
     state: State
@@ -87,8 +97,8 @@ def estimated(
 ) -> Estimated:
     """The parameters, and which of the terms the records show.
 
-    Terms in `if_clear` are fitted where what is left over without them shows them clearly. `look`
-    is called from time to time; what it raises ends the fit.
+    Terms in `if_clear` are fitted only if the residuals without them show them clearly. `look` is
+    called from time to time; an exception of it ends the fit.
 
     Raises
     ------
@@ -111,7 +121,8 @@ def estimated(
     first = Task(part, look=look)
     state = fitted(first, started(first, terms))
     steps, first.steps = first.steps, min(first.steps, ON_THE_WAY)
-    if not math.isfinite(first.cost(state)):  # so few overshoot: no record shows its inertia
+    # so few steps diverge only if the motor is too fast for the record to show its inertia
+    if not math.isfinite(first.cost(state)):
         first.steps = steps
     first.settle_starts(state)
     first.leave_out_spikes(state)
@@ -123,13 +134,13 @@ def estimated(
     true = functools.partial(_trued, c=state.value("eccentric_c"), s=state.value("eccentric_s"))
     first.records = true(first.records)
     before, state = state, with_waves(first, state, terms)
-    if state is not before:  # what hid behind the waves may be clear now
+    if state is not before:  # terms hidden by the waves can be clear now
         state = fitted(first, state)
         first.weigh(state)
         state = _with_clear(first, state, if_clear)
     terms = tuple(t for t in TERMS if t in (*terms, *state.terms))
     needed = {t: SHOWN if t in given and t not in WAVES else SURE for t in terms}
-    # with the starts that were settled, where they are the same
+    # keep the estimated initial speeds where the pieces are the same
     records = first.records if part is records else true(records)
     task = Task(records, first.steps, k_v=first.k_v, look=look)
     task.settle_starts(state)
@@ -155,9 +166,9 @@ def estimated(
 
 
 def _trued(records: Records, *, c: float, s: float) -> Records:
-    """With angles of the shaft in place of those that an eccentric encoder shows.
+    """Records with angles of the shaft instead of those shown by an eccentric encoder.
 
-    A wave of order n would else have sidebands at n - 1 and n + 1.
+    Otherwise a wave of order n would have sidebands at n - 1 and n + 1.
     """
     if c == 0.0 and s == 0.0:
         return records
@@ -169,7 +180,7 @@ def _trued(records: Records, *, c: float, s: float) -> Records:
 
 
 def _turns_both_ways(records: Records) -> bool:
-    """Whether it turns in either direction for a hundredth of the time, faster than it creeps."""
+    """Whether it turns both ways, each for a hundredth of the time, faster than a creep."""
     y = np.concatenate([p.y for p in records.pieces])
     clear = max(2.0 * records.quantum, 0.02 * float(np.abs(y).max()))
     return bool(min(np.mean(y > clear), np.mean(y < -clear)) > 0.01)
@@ -182,7 +193,7 @@ def _never_slow(records: Records) -> bool:
 
 
 def _too_fast(records: Records, terms: tuple[str, ...]) -> dict[str, str]:
-    """What repeats over a turn, and passes between two samples; with the reason."""
+    """Terms that repeat over a turn but pass between two samples, with the reason."""
     y = np.concatenate([p.y for p in records.pieces])
     turn = float(np.quantile(np.abs(y), 0.95)) * records.Ts
     why = (
@@ -196,7 +207,7 @@ def _too_fast(records: Records, terms: tuple[str, ...]) -> dict[str, str]:
 
 
 def _with_limit(task: Task, state: State, terms: tuple[str, ...]) -> State:
-    """With a limit of the current, where the cost without is clearly higher."""
+    """The state with a limit of the current, if the cost without is clearly higher."""
     if "limit" not in terms:
         return state
     drive = np.concatenate([np.abs(d) for _, d, _, _ in task.simulated(state, ())])
@@ -209,7 +220,7 @@ def _with_limit(task: Task, state: State, terms: tuple[str, ...]) -> State:
         tried = [best]
     elif np.mean((y - model) ** 2) < UNEXPLAINED * np.var(y):
         return state
-    # where much is left to explain, other parameters have bent to stand for a limit
+    # if much is unexplained, other parameters have moved to compensate for a missing limit
     found = min((fitted(task, s) for s in tried), key=task.cost)
     return found if task.cost(found) < LIMITED * before else state
 
@@ -236,7 +247,7 @@ def _all_terms(task: Task, state: State, terms: tuple[str, ...]) -> State:
 
 
 def _with_clear(task: Task, state: State, terms: tuple[str, ...]) -> State:
-    """With those of the terms that what is left over shows clearly, one after the other."""
+    """The state with those of the terms that the residuals show clearly, one after the other."""
     while clear := _clear(task, state, terms):
         state = fitted(task, state.having([*state.terms, *clear]))
         task.weigh(state)
@@ -244,7 +255,7 @@ def _with_clear(task: Task, state: State, terms: tuple[str, ...]) -> State:
 
 
 def _clear(task: Task, state: State, terms: tuple[str, ...]) -> list[str]:
-    """Those without which the fit is clearly worse, by their scores (Rao 1948)."""
+    """Terms without which the fit is clearly worse, by their scores (Rao 1948)."""
     bumpy = "stribeck" in state.terms and _parts_sides(task, state.value("w_s"))
     tried = [t for t in terms if t not in state.terms and (bumpy or t != "stribeck_difference")]
     if not tried:
@@ -265,9 +276,9 @@ def _clear(task: Task, state: State, terms: tuple[str, ...]) -> list[str]:
 
 
 def _parts_sides(task: Task, w_s: float) -> bool:
-    """Whether friction that falls off over this speed [rad/s] can show its own in each direction.
+    """Whether friction that falls off over this speed [rad/s] can be told apart by direction.
 
-    Slower, there is no sample to show it; faster, the difference is a constant load.
+    At lower speeds there are no samples; at higher ones the difference is a constant load.
     """
     least, usual = task.stribeck_speeds()
     return max(2.0 * least, task.records.quantum) <= w_s <= 0.3 * usual
@@ -276,11 +287,11 @@ def _parts_sides(task: Task, w_s: float) -> bool:
 def _shown_terms(
     task: Task, start: State, needed: Mapping[str, float], steps: int
 ) -> tuple[State, dict[str, float], FloatArray]:
-    """All terms fitted together, then without those that are not shown, in as many steps as needed.
+    """Fit all terms together, then drop those that are not shown, in as many steps as needed.
 
-    `needed` has the statistic from which each stays. Returns the state, the statistics of the terms
-    left out, and the covariance of what is free. It counts in that a dead zone or Stribeck's
-    friction which is not shown may still be there, hidden in the resistance or in dry friction.
+    `needed` has the statistic above which each is kept. Returns the state, the statistics of the
+    dropped terms, and the covariance of the free parameters. The covariance allows for a dead zone
+    or Stribeck friction that is not shown but hidden in the resistance or in dry friction.
     """
     task.weigh(start)
     state = fitted(task, start, NEAR)
@@ -296,11 +307,11 @@ def _shown_terms(
         wald = {t: _wald(t, names, x, covariance) for t in kept if t not in ALWAYS}
         shown = {t: max(v, explained.get(t, 0.0)) for t, v in wald.items()}
         if "stribeck" in kept and x[names.index("w_s")] > 0.99 * fast:
-            shown["stribeck"] = 0.0  # it falls off nowhere: that is Coulomb's friction
+            shown["stribeck"] = 0.0  # it never falls off: Coulomb friction
         if "stribeck_difference" in kept:
             if not _parts_sides(task, x[names.index("w_s")]):
                 shown["stribeck_difference"] = 0.0
-            shown["stribeck"] = math.inf  # the difference has its shape, and goes first
+            shown["stribeck"] = math.inf  # the difference has its shape, and is dropped first
         weakest = min(shown, key=lambda t: shown[t] / needed[t], default=None)
         if weakest is None or shown[weakest] >= needed[weakest]:
             break
@@ -320,10 +331,10 @@ def _shown_terms(
 
 
 def _explained(task: Task, state: State, term: str, covariance: FloatArray) -> float:
-    """The deviance of a fit without a term, over what errors of this colour would give.
+    """Deviance of a fit without a term, over its expectation for errors of this colour.
 
-    Where a shape is vague the amplitude is too, whatever the term explains: Wald's statistic is
-    then a poor one (Chandler and Bate 2007, Biometrika 94, for the factor).
+    If the shape of a term is uncertain, so is its amplitude, however much it explains: Wald's
+    statistic is then inadequate (Chandler and Bate 2007, Biometrika 94, for the factor).
     """
     cost, _, matrix = task.normal(state)
     variance = max(cost / task.count, 1e-300)
@@ -345,7 +356,7 @@ def _wald(term: str, names: list[str], x: FloatArray, covariance: FloatArray) ->
 def _without(
     gone: tuple[str, ...], names: list[str], x: FloatArray, covariance: FloatArray
 ) -> tuple[list[str], FloatArray, FloatArray]:
-    """The estimate on condition that some parameters are nothing."""
+    """The estimate conditional on some parameters being 0."""
     out = [j for j, n in enumerate(names) if n in gone]
     sizes = [j for j in out if names[j] not in SHAPES]
     left = [j for j in range(len(names)) if j not in out]
@@ -355,3 +366,113 @@ def _without(
         x[left] - gain @ x[sizes],
         covariance[np.ix_(left, left)] - gain @ covariance[np.ix_(sizes, left)],
     )
+
+
+# --- Profile-likelihood intervals -----------------------------------------------------------------
+
+
+# Profile-likelihood intervals: how far a quantity can move while all parameters are refitted.
+#
+# An interval by curvature is symmetric and assumes a parabolic cost. Here the quantity is held away
+# from its estimate, everything else is fitted again, and the ends are where the cost has risen by
+# as much as chance explains (Venzon and Moolgavkar 1988, Applied Statistics 37). The residuals are
+# not white noise, so that the rise is scaled by the ratio of the variance of the scores to the one
+# that white noise would give (Chandler and Bate 2007, Biometrika 94).
+
+HELD = 100.0
+"""Stiffness that holds the quantity, relative to the cost's curvature: it yields by 1 %."""
+TRIES = 4
+REACHED = 0.02
+"""Relative accuracy of an end."""
+LONGEST = 3.0
+"""Largest ratio of a step to the previous one."""
+ITERATIONS = 12
+
+Values = Mapping[str, float]
+
+
+def profiled(
+    found: Estimated, of: Callable[[Values], float], slope: FloatArray, half: float
+) -> tuple[float, float]:
+    """Ends of the 95 % interval of a quantity.
+
+    Parameters
+    ----------
+    found : Estimated
+        The least-squares estimate.
+    of : callable
+        The quantity as a function of all parameters by name and the resistance `R`.
+    slope : array, shape (n,)
+        Its derivatives with respect to the free parameters.
+    half : float
+        Half-width of the interval by curvature, above 0: the start of the search.
+    """
+    task, state = found.task, found.state
+    x = state.vector()
+    start, _, matrix = task.normal(state)
+    value = of(values_of(state))
+    spread, _ = inverse(matrix)
+    along = spread @ slope
+    size = max(float(slope @ along), 1e-300)
+    # rise of the cost at the end of an interval
+    rise = (half / CONFIDENCE) ** 2 / size * CONFIDENCE**2
+    low, high = bounds_of(task, state)
+    held = HELD / size
+    ends = []
+    for sign in (-1.0, 1.0):
+        step, end = sign * half, value + sign * half
+        for _ in range(TRIES):
+            goal = value + step
+
+            def normal(at: FloatArray, goal: float = goal) -> Normal:
+                cost, gradient, gram = task.normal(state.at(at))
+                off, by = _off(state.at(at), of, goal)
+                return (
+                    cost + held * off**2, gradient + held * off * by,
+                    gram + held * np.outer(by, by),
+                )  # fmt: skip
+
+            def cost(at: FloatArray, goal: float = goal) -> float:
+                off = of(values_of(state.at(at))) - goal
+                return task.cost(state.at(at)) + held * off**2
+
+            first = np.clip(x + step * along / size, low, high)
+            if not math.isfinite(cost(first)):
+                break
+            reached = minimised(
+                normal, cost, first, (low, high), task.count, enough=FINE, iterations=ITERATIONS
+            ).x
+            way = of(values_of(state.at(reached))) - value
+            share = math.sqrt(max(task.cost(state.at(reached)) - start, 0.0) / rise)
+            if way * sign <= 0.0:
+                break
+            end = value + way / max(share, 1.0 / LONGEST)
+            if abs(share - 1.0) < REACHED:
+                break
+            step = end - value
+        ends.append(end)
+    return ends[0], ends[1]
+
+
+def values_of(state: State) -> dict[str, float]:
+    """All parameters by name, and the resistance."""
+    known = dict(zip(PARAMETERS, state.theta.tolist(), strict=True))
+    return known | {"R": math.nan if state.resistance is None else state.resistance}
+
+
+def slope_of(
+    known: Values, of: Callable[[Values], float], names: list[str], spreads: FloatArray
+) -> FloatArray:
+    """Derivatives of a quantity with respect to the free parameters, (n,)."""
+    slope = np.zeros(len(names))
+    for j, name in enumerate(names):
+        value = known[name]
+        h = 1e-4 * abs(value) or max(min(1e-3 * float(spreads[j]), 1e-6), 1e-12)
+        more, less = (of({**known, name: value + s * h}) for s in (1.0, -1.0))
+        slope[j] = (more - less) / (2.0 * h)
+    return slope
+
+
+def _off(state: State, of: Callable[[Values], float], goal: float) -> tuple[float, FloatArray]:
+    known, names = values_of(state), state.names()
+    return of(known) - goal, slope_of(known, of, names, np.zeros(len(names)))

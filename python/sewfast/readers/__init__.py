@@ -1,8 +1,8 @@
 """Files in: CSV, `.mat`, `.npz`, Parquet and MCAP, read into a `Table` or a `Dataset`.
 
-Read in this order: `recording` (`read`, `read_table`), `timebase` (the sample time of a column),
-`delimited`, `containers`, `logs` (formats of other tools), `frames` (tables in memory),
-`installed` (formats that other packages add).
+Read in this order: `recording` (`read`, `read_table`, formats that other packages add), `timebase`
+(the sample time of a column, moments), `delimited`, `containers`, `logs` (formats of other tools),
+`blackbox`, `frames` (tables in memory), `roles` (which column is the input, which the output).
 """
 
 from .containers import Table

@@ -1,9 +1,9 @@
-"""Logs that are read here without a package: Betaflight's black box, Saleae's analogue export.
+"""Logs that need no other package: Betaflight's black box, Saleae's analogue export.
 
 The black box format is that of Betaflight's own documents ("Blackbox logging internals") and of its
 encoder: a text header that names the fields, their predictors and encodings, then frames. I frames
-stand alone, P frames hold differences from the two frames before. What is damaged is left out up to
-the next I frame, as a flight that ended in a crash is worth reading up to there.
+stand alone, P frames hold differences from the two frames before. After damage, reading goes on at
+the next I frame: a log that ends in a crash is worth reading up to there.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _FRAMES = frozenset(b"IPSGHE")
 
 
 class Damaged(ValueError):
-    """What is there cannot be a frame, or the file ends within one."""
+    """The bytes are no valid frame, or the file ends within one."""
 
 
 # --- Black box: numbers ---------------------------------------------------------------------------
 
 
 class _Bytes:
-    """A file and the place that is read next."""
+    """The bytes of a file and the position of the next one."""
 
     def __init__(self, raw: bytes, at: int) -> None:
         self.raw, self.at = raw, at
@@ -46,7 +46,7 @@ class _Bytes:
         return self.raw[self.at - 1]
 
     def unsigned(self) -> int:
-        """Seven bits a byte, the lowest first; the eighth says that another one follows."""
+        """Seven bits a byte, the lowest first; the eighth is set if another byte follows."""
         value = 0
         for shift in (0, 7, 14, 21, 28):
             b = self.byte()
@@ -76,7 +76,7 @@ def _each(read: Callable[[_Bytes], int]) -> Callable[[_Bytes, int], list[int]]:
 
 
 def _tag8_8svb(data: _Bytes, count: int) -> list[int]:
-    """A byte whose bits say which of up to eight fields are not 0; one field alone has none."""
+    """A byte whose bits mark which of up to eight fields are not 0; a single field has none."""
     if count == 1:
         return [data.signed()]
     tag = data.byte()
@@ -142,7 +142,7 @@ _ENCODINGS: dict[int, tuple[Callable[[_Bytes, int], list[int]], int]] = {
     9: (lambda data, count: [0] * count, 1),
     10: (_tag2_3svariable, 3),
 }
-"""By number in the header: the reader of a group of fields, and how many such a group has."""
+"""By number in the header: the reader of a group of fields, and the size of such a group."""
 _WHOLE = (7, 8, 10)
 """Encodings whose groups have all their fields."""
 
@@ -160,7 +160,7 @@ class _Frame:
     encodings: list[int] = field(default_factory=list)
 
     def values(self, data: _Bytes) -> list[int]:
-        """The fields as they are written, without what is predicted."""
+        """The fields as they are written, without their predictions."""
         found: list[int] = []
         k = 0
         while k < len(self.encodings):
@@ -180,7 +180,7 @@ class _Frame:
 
 @dataclass
 class _Header:
-    """What the text before the frames says."""
+    """The text before the frames."""
 
     frames: dict[str, _Frame] = field(default_factory=dict)
     settings: dict[str, str] = field(default_factory=dict)
@@ -275,7 +275,7 @@ def _flight(header: _Header, data: _Bytes) -> tuple[list[str], array[int]]:
     interval = max(header.number("I interval", 32), 1)
     share = header.settings.get("P interval", "1/1").split("/")
     try:
-        # as a share of the loops, 1/2, or as every how many of them there is a frame
+        # a share of the loops, 1/2, or the number of loops per frame
         part, whole = (int(share[0]), int(share[1])) if len(share) == 2 else (1, int(share[0]))
     except ValueError:
         part, whole = 1, 1
@@ -302,11 +302,11 @@ def _flight(header: _Header, data: _Bytes) -> tuple[list[str], array[int]]:
                 if _event(data):
                     break
             else:
-                raise Damaged("no frame begins so")
+                raise Damaged("no frame begins with this byte")
             if data.at < len(data.raw) and data.raw[data.at] not in _FRAMES:
-                raise Damaged("another frame does not follow")
+                raise Damaged("no frame follows")
         except Damaged:
-            # what comes next is of use from the next whole frame on
+            # differences are meaningless until the next whole frame
             last = before = None
             data.at = _next_whole(data.raw, start + 1)
             continue
@@ -326,7 +326,7 @@ def _next_whole(raw: bytes, at: int) -> int:
 
 
 def _skipped(iteration: int, interval: int, part: int, whole: int) -> int:
-    """Loops after an iteration that the flight controller was not to log."""
+    """Number of loops after an iteration that the flight controller was set not to log."""
     if part >= whole:
         return 0
     place = (iteration + 1) % interval
@@ -339,7 +339,7 @@ def _predicted(
     header: _Header, frame: _Frame, data: _Bytes, last: list[int] | None,
     before: list[int] | None, skipped: int,
 ) -> list[int]:  # fmt: skip
-    """The fields of a frame, with what their predictors say added."""
+    """The fields of a frame with their predictions added."""
     values = frame.values(data)
     names = frame.names
     motor = names.index("motor[0]") if "motor[0]" in names else -1
@@ -352,7 +352,7 @@ def _predicted(
         elif predictor == 2:
             base = 0 if last is None or older is None else 2 * last[k] - older[k]
         elif predictor == 3:
-            # as C divides: towards 0
+            # rounded towards 0, as in C
             base = 0 if last is None or older is None else int((last[k] + older[k]) / 2)
         elif predictor == 4:
             base = header.number("minthrottle", 1150)
@@ -375,16 +375,16 @@ def _predicted(
 
 
 def _wrapped(value: int, signed: bool) -> int:
-    """A sum as 32 bits hold it."""
+    """A sum wrapped to 32 bits."""
     return _of_bits(value, 32) if signed else value & 0xFFFFFFFF
 
 
 def _event(data: _Bytes) -> bool:
-    """Read over an event; whether it is the log's end."""
+    """Skip an event; return whether it ends the log."""
     kind = data.byte()
     if kind == 255:
         if data.raw[data.at : data.at + 11] != b"End of log\0":
-            raise Damaged("an end that is none")
+            raise Damaged("an end without its mark")
         return True
     if kind == 0 or kind == 15:  # beep, disarm
         data.unsigned()

@@ -1,4 +1,4 @@
-"""`Table`, and files of named arrays (`.mat`, HDF5, `.npz`) as such."""
+"""`Table`, and files of named arrays (`.mat`, HDF5, `.npz`) read into one."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class Table:
     units : mapping of name to text
         From headers such as `u [V]` or `speed (RPM)`; absent where unknown.
     unusable : mapping of name to text
-        Columns that are there but hold no series of numbers, each with the reason.
+        Columns without a usable series of numbers, each with the reason.
     lines : sequence of int or None
         Line of each row in a text file, 1-based.
     Ts : float or None
         Sample time [s] where the file states it.
     Ts_source : str
-        Where it states it, for messages.
+        The place of that statement, for messages.
     notes : sequence of str
-        What was left out when the file was read.
+        Rows and columns left out when the file was read.
     counts_per_rev : float or None
         Encoder counts of one turn, of the column `counts`, where the file states it.
     """
@@ -106,7 +106,7 @@ class Table:
         return self.units.get(self.resolve(name), "")
 
     def row(self, k: int) -> str:
-        """Where sample `k` stands in the file, for messages."""
+        """The place of sample `k` in the file, for messages."""
         return f"sample {k} (0-based)" if self.lines is None else f"line {self.lines[k]}"
 
 
@@ -128,8 +128,8 @@ def from_headers(
 ) -> Table:
     """A table from a header row; `bad` holds the reason for each column that cannot be used.
 
-    A column that is there twice with the same header and values, as loggers repeat the time, is
-    taken once.
+    A column that occurs twice with the same header and values (some loggers repeat the time) is
+    used once.
     """
     names, units = split_units(headers)
     unusable = {
@@ -170,8 +170,8 @@ Value: TypeAlias = Any
 def read_npz(path: Path, raw: bytes) -> Table:
     """Read the arrays of an `.npz` archive; pickled objects are never loaded.
 
-    An archive may unpack to a thousand times its size: what its members claim is bounded before any
-    of them is unpacked, and a member gives no more than it claims.
+    An archive can unpack to a thousand times its size. The claimed sizes of its members are
+    therefore checked before any is unpacked, and a member never yields more than it claims.
     """
     try:
         with np.load(io.BytesIO(raw), allow_pickle=False) as archive:
@@ -200,7 +200,7 @@ def _npz_member(archive: Any, name: str) -> Value:
 def read_mat(path: Path, raw: bytes) -> Table:
     """Read a MATLAB file of version 4, 5 (SciPy) or 7.3 (HDF5, h5py).
 
-    Vectors are columns whichever way they lie. A matrix of shape (N, n) with n <= N gives `NAME.0`
+    Row and column vectors both become columns. A matrix of shape (N, n) with n <= N gives `NAME.0`
     to `NAME.n-1`, a struct `NAME.FIELD`, struct arrays and cells `NAME.0`, `NAME.1`, all 0-based.
     """
     hdf5 = b"\x89HDF\r\n\x1a\n"
@@ -210,7 +210,7 @@ def read_mat(path: Path, raw: bytes) -> Table:
     except (DataError, SettingError):
         raise
     except Exception as e:
-        # damaged files make the parsers fail in any way
+        # a damaged file can make the parsers raise anything
         raise DataError(f"{path}: expected a MATLAB file, but it cannot be read: {e}") from e
 
 
@@ -264,7 +264,7 @@ def _hdf5_value(h5py: Any, file: Any, item: Any, depth: int) -> Value:
 
 
 def _struct(fields: dict[str, Value]) -> Value:
-    """A struct; the struct array, where every field is a list of the same length."""
+    """A struct, or a struct array where all fields are lists of one length."""
     lengths = {len(v) if isinstance(v, list) else -1 for v in fields.values()}
     if len(lengths) != 1 or lengths == {-1}:
         return fields
@@ -299,7 +299,7 @@ _RATES = ("fs", "f_s", "sample_rate", "samplerate", "sampling_rate")
 
 
 def _period(stated: Mapping[str, float]) -> tuple[float | None, str]:
-    """The sample time [s] that single numbers of a file state with one voice, and which does."""
+    """The sample time [s] on which the file's scalar variables agree, and which states it."""
     found = {}
     for name, value in stated.items():
         last = name.rsplit(".", 1)[-1].lower()

@@ -15,7 +15,7 @@ from ..dataset import FloatArray
 from ..errors import DataError
 from ..units import is_unit, split_unit
 from .containers import MAX_COLUMNS, Table, from_headers
-from .stamps import is_moment, seconds_of_texts
+from .timebase import is_moment, seconds_of_texts
 
 MAX_LINE = 1_000_000
 _PREAMBLE = 200
@@ -23,15 +23,15 @@ _PREAMBLE = 200
 _MISSING = frozenset(
     re.split(" ", "nan na n/a <na> #n/a #na #nv null none nat - -- 1.#qnan -1.#ind 1.#ind")
 ) | {""}
-"""What programs write where there is no value, in lower case."""
+"""How programs write a missing value, in lower case."""
 _DELIMITERS = ";\t|,"
 _WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
 """A cell between spaces: `u`, `1.5` or `u [V]`."""
 _MARKED = re.compile(r"[+-]?\d[\d.,]*(?:e[+-]?\d+)?", re.IGNORECASE)
 _APART = re.compile(r"[+-]?\d{1,3}(?:['’\u00a0\u2009\u202f ]\d{3})+(?=[.,]\d|$)")
-"""Digits in groups of three between marks that are nothing else."""
+"""Digits in groups of three, separated by marks with no other meaning."""
 _FOOTER = 20
-"""Lines below a table that are left out if they have fewer cells."""
+"""Most lines below a table that are left out if they have fewer cells."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,12 @@ class _Layout:
 def read_delimited(path: Path, raw: bytes) -> Table:
     """Read delimited text with a header row.
 
-    Lines above the header, as oscilloscopes write them, are skipped, which `Table.notes` says, and
+    Lines above the header, as oscilloscopes write them, are skipped, with a note in `Table.notes`;
     a row of units below it gives the units. The delimiter is comma, semicolon, tab, bar or space;
-    decimal commas and thousands separators are recognised by the cells. Lines that begin with `#`
+    decimal commas and thousands separators are recognised from the cells. Lines that begin with `#`
     are comments, and a few shorter lines at the end are left out, with a note.
     Empty cells are NaN, dates and times of day become seconds from the first one. Columns with text
-    are kept as unusable, each with the line and the cell, so that they only matter to those who
-    select them.
+    are marked unusable, each with line and cell, so that they raise an error only if selected.
 
     Raises
     ------
@@ -89,7 +88,7 @@ def _decode(path: Path, raw: bytes) -> str:
             f"{path}: expected text (CSV), .mat, .npz or Parquet; received binary data of an "
             "unknown kind"
         )
-    # DOS ends a text with ^Z, and loggers that reserve their space leave zeros
+    # DOS ends a text with ^Z; loggers that reserve space in advance leave zeros
     return text.rstrip("\0\x1a").replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -111,12 +110,12 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 
 def _pick_delimiter(line: str) -> str:
-    """The most frequent of the delimiters; the earlier where tied."""
+    """The most frequent delimiter; the first of several equally frequent ones."""
     return max(_DELIMITERS, key=line.count)
 
 
 def _is_numeric(cells: list[str]) -> bool:
-    """Whether all cells are numbers, or moments as a time column has them."""
+    """Whether all cells are numbers or, as in a time column, moments."""
     return all(_is_number(c) or is_moment(c) for c in cells)
 
 
@@ -127,8 +126,8 @@ def _is_number(cell: str) -> bool:
 def _layout(path: Path, text: str) -> _Layout:
     """Find the header: the first line with content, or the comment above bare numbers.
 
-    Where numbers begin farther down, below a line of names that fits them, what is above is no
-    table: the header of an oscilloscope's export.
+    Where numbers begin farther down, below a line of names that fits them, the lines above are not
+    part of the table but a preamble, such as that of an oscilloscope's export.
     """
     below = _below_preamble(path, text)
     if below is not None:
@@ -150,9 +149,9 @@ def _layout(path: Path, text: str) -> _Layout:
         header, body, above = _cells(line, delimiter), text[offset:], skipped + 1
         found = _numbers(body[:MAX_LINE].lstrip("\n").partition("\n")[0])
         if found is not None and len(_cells(line, found[0])) == found[1] > 1:
-            # names may hold the other ones: `Time, s;Voltage, V`
+            # names can contain other delimiters: `Time, s;Voltage, V`
             delimiter, header = found[0], _cells(line, found[0])
-        # two cells may be one number with a decimal comma
+        # two cells can be one number with a decimal comma
         if len(header) == 1 and found is not None and (found[0] != "," or found[1] > 2):
             spaced = _cells(line, " ")
             if found[0] != " " or len(spaced) != found[1]:
@@ -175,9 +174,10 @@ def _layout(path: Path, text: str) -> _Layout:
 
 
 def _below_preamble(path: Path, text: str) -> _Layout | None:
-    """The layout of a table that does not begin in the file's first line with content.
+    """The layout of a table with lines above its header.
 
-    None where it does, or where it is not clear where it begins: then the first line is the header.
+    None where the table begins in the first line with content, or where its beginning is not clear:
+    the first line is then the header.
     """
     lines: list[tuple[int, str]] = []
     for offset, line in _lines(text):
@@ -188,7 +188,7 @@ def _below_preamble(path: Path, text: str) -> _Layout | None:
         found = _numbers(line)
         if found is None:
             continue
-        # a line of numbers within a preamble has no other of its width below it
+        # a line of numbers in a preamble has no line of the same width below it
         following = text[offset : offset + MAX_LINE].lstrip("\n").partition("\n")[0]
         again = _numbers(following)
         if following.strip() and (again is None or again[1] != found[1]):
@@ -206,7 +206,7 @@ def _above_numbers(
     for k in reversed(above):
         names = _texts(lines[k][1], delimiter, width)
         if names is None and not heads and _describes(lines[k][1], delimiter, width):
-            # a line on the columns, such as their sample times, between names and numbers
+            # a line that describes the columns, such as sample times, between names and numbers
             continue
         if len(heads) == 1 and all(map(_looks_like_unit, heads[0])):
             names = names or _numbered(lines[k][1], delimiter, width)
@@ -221,7 +221,7 @@ def _above_numbers(
         heads.pop()
         header = heads[0]
     elif len(heads) == len(above):
-        # names and a row of text: an ordinary table, whose columns with text are named later
+        # names and a row of text: an ordinary table; its columns of text are reported later
         return None
     else:
         header = heads[-1]
@@ -245,7 +245,7 @@ def _above_numbers(
 
 
 def _numbers(line: str) -> tuple[str, int] | None:
-    """Delimiter and number of cells of a line that holds numbers and nothing else."""
+    """Delimiter and number of cells of a line of numbers; None for any other line."""
     if not line.strip() or len(line) > MAX_LINE:
         return None
     for delimiter in (*_DELIMITERS, " "):
@@ -263,7 +263,7 @@ def _numbers(line: str) -> tuple[str, int] | None:
 def _texts(line: str, delimiter: str, width: int) -> list[str] | None:
     """The cells of a line of names: as many as there are columns, none of them a number."""
     cells = _cells(line, delimiter)
-    # LabVIEW names a column of comments, in which most lines have no cell
+    # LabVIEW names a column of comments, but most lines have no cell for it
     while len(cells) > width and cells[-1].lower() in ("", "comment"):
         cells.pop()
     named = len(cells) == width and all(c and not _is_number(c) for c in cells)
@@ -271,20 +271,20 @@ def _texts(line: str, delimiter: str, width: int) -> list[str] | None:
 
 
 def _describes(line: str, delimiter: str, width: int) -> bool:
-    """Whether a line tells something about each column: a text, then numbers."""
+    """Whether a line describes each column: a text, then numbers."""
     cells = _cells(line, delimiter)
     return len(cells) == width and bool(cells[0]) and not _is_numeric(cells[:1])
 
 
 def _numbered(line: str, delimiter: str, width: int) -> list[str] | None:
-    """The cells of a line of names above units, among them numbers, as those of a scope."""
+    """The cells of a line of names above units, where some names are numbers (scope channels)."""
     cells = _cells(line, delimiter)
     named = len(cells) == width and all(cells) and not _is_numeric(cells)
     return cells if named else None
 
 
 def _looks_like_unit(cell: str) -> bool:
-    """Whether a cell below a name is its unit: in brackets, or one that measurements have."""
+    """Whether a cell below a name is its unit: text in brackets, or a known unit."""
     text = cell.strip()
     if len(text) > 2 and text[0] + text[-1] in ("()", "[]"):
         return True
@@ -292,15 +292,15 @@ def _looks_like_unit(cell: str) -> bool:
 
 
 def _decimal(delimiter: str, body: str) -> str:
-    """The decimal mark of a file that holds numbers alone; `_written` looks at the cells."""
+    """The decimal mark of a file of plain numbers; `_written` decides from the cells."""
     return "," if delimiter != "," and "," in body and "." not in body else "."
 
 
 def _written(layout: _Layout, rows: list[list[str]]) -> _Layout:
-    """The layout with decimal mark and thousands separator as the cells show them.
+    """The layout with the decimal mark and thousands separator found in the cells.
 
-    A cell with both marks shows which is which. Where there is none, a comma is a decimal one if no
-    cell has a point. `"1,234"` alone, quoted between commas, may be either and stays unread.
+    A cell with both marks shows which is which. Without such a cell, a comma is a decimal mark if
+    no cell has a point. `"1,234"` alone, quoted between commas, is ambiguous and not read.
     """
     if "," not in layout.body or (layout.delimiter == "," and '"' not in layout.body):
         return replace(layout, decimal=".")
@@ -320,7 +320,7 @@ def _written(layout: _Layout, rows: list[list[str]]) -> _Layout:
 
 def _checked(layout: _Layout) -> _Layout:
     if layout.header and not layout.header[-1]:
-        # rows of some loggers end with a delimiter
+        # some loggers end each row with a delimiter
         layout.header.pop()
     if len(layout.header) > MAX_COLUMNS:
         raise DataError(
@@ -332,7 +332,7 @@ def _checked(layout: _Layout) -> _Layout:
 
 
 def _fast_pass(layout: _Layout) -> list[FloatArray] | None:
-    """All cells by NumPy's parser; None where one is not a number or a row has another length."""
+    """All cells, by NumPy's parser; None if a cell is not a number or the rows differ in length."""
     body = layout.body.rstrip("\n")
     if layout.decimal == ",":
         body = body.replace(",", ".")
@@ -368,9 +368,9 @@ def _slow_pass(layout: _Layout) -> Table:
 
 
 def _rows(layout: _Layout) -> tuple[list[int], list[list[str]], tuple[str, ...]]:
-    """Line numbers and cells of the rows, checked against the header, and a note on what is below.
+    """Line numbers and cells of the rows, checked against the header, and a note on lines below.
 
-    Blank lines and comments are no rows.
+    Blank lines and comments do not count as rows.
     """
     width = len(layout.header)
     lines: list[int] = []
@@ -429,7 +429,7 @@ def _comma_hint(layout: _Layout, received: int) -> str:
 
 
 def _column(layout: _Layout, cells: Sequence[str]) -> FloatArray | None:
-    """The numbers of a column; None where a cell is none."""
+    """The numbers of a column; None if a cell is not a number."""
     try:
         # most columns; Python's own digit separators are not a number format of data files
         if layout.decimal == "." and not layout.thousands and not any("_" in c for c in cells):
@@ -446,7 +446,7 @@ def _column(layout: _Layout, cells: Sequence[str]) -> FloatArray | None:
 
 
 def _spoiled(layout: _Layout, cells: Sequence[str]) -> tuple[int, FloatArray]:
-    """The first cell that is no number, and NaN for the column."""
+    """Index of the first cell that is not a number, and NaN for the column."""
     wrong = (_number(c, layout.decimal, layout.thousands) is None for c in cells)
     return next(k for k, one in enumerate(wrong) if one), np.full(len(cells), np.nan)
 

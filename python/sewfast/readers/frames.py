@@ -1,7 +1,7 @@
 """Tables in memory: pandas, polars, Arrow, xarray or a mapping of columns -> `Table`.
 
-None of these packages is imported before an object of theirs is given. What is missing (null, NA,
-NaT) is NaN; moments and durations become seconds from the first one.
+None of these packages is imported before one of its objects is passed. Missing values (null, NA,
+NaT) become NaN; moments and durations become seconds from the first one.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from ..arrays import FloatArray
 from ..errors import DataError, SettingError, not_installed
 from .containers import Table, from_headers
-from .stamps import seconds_of_objects
+from .timebase import seconds_of_objects
 
 _NUMBER = (int, float, np.number, Decimal)
 
 Found = tuple[str, FloatArray | None, str, str]
-"""Header, numbers or None, unit where that is kept elsewhere, why there are no numbers."""
+"""Header, numbers or None, unit if the header lacks it, reason why there are no numbers."""
 
 
 def table_of(frame: Any) -> Table:
@@ -32,9 +32,10 @@ def table_of(frame: Any) -> Table:
     ----------
     frame : pandas, polars or xarray object, mapping of name to array, or Arrow stream
         Anything with `__arrow_c_stream__` is read by pyarrow; a structured array of NumPy is a
-        table, too. An index of pandas is a column where it is named or holds moments; without a
-        name it is `t`; of several levels those with names are columns. Units come from headers such
-        as `u [V]`, from `attrs["units"]` (pandas, xarray) or a field's metadata `unit` (Arrow).
+        table, too. A pandas index becomes a column if it is named or holds moments; without a name
+        it is `t`; of several levels only the named ones become columns. Units come from headers
+        such as `u [V]`, from `attrs["units"]` (pandas, xarray) or a field's metadata `unit`
+        (Arrow).
 
     Raises
     ------
@@ -67,7 +68,7 @@ def table_of(frame: Any) -> Table:
 
 
 def _collected_lazily(frame: Any) -> Any:
-    """The table of a polars LazyFrame, which is computed only now, and may fail in any way."""
+    """The table of a polars LazyFrame, which is computed only now and can raise anything."""
     try:
         return frame.collect()
     except Exception as e:
@@ -79,7 +80,7 @@ def _collected_lazily(frame: Any) -> Any:
 
 
 def collected(path: Path, found: Iterator[Found]) -> Table:
-    """A table of what was found in each column.
+    """A table made of the columns found.
 
     Raises
     ------
@@ -102,7 +103,7 @@ def collected(path: Path, found: Iterator[Found]) -> Table:
 
 
 def of_arrow(table: Any) -> Iterator[Found]:
-    """Columns of a pyarrow table; of text those that hold numbers or moments."""
+    """Columns of a pyarrow table; columns of text only if they hold numbers or moments."""
     import pyarrow as pa
 
     for i, entry in enumerate(table.schema):
@@ -146,12 +147,12 @@ def _of_pandas(frame: Any) -> Iterator[Found]:
         if not numbered and index.dtype.kind in "iufmM" and name not in map(str, frame.columns):
             yield _with_unit(name, _of_series(index), units)
     for i, name in enumerate(frame.columns):
-        # by place: a name may occur twice
+        # by position: a name can occur twice
         yield _with_unit(str(name), _of_series(frame.iloc[:, i]), units)
 
 
 def _of_series(column: Any) -> tuple[FloatArray | None, str, str]:
-    """Of a column or an index of pandas."""
+    """Numbers, unit and reason of a column or an index of pandas."""
     if str(column.dtype).startswith("period"):
         column = column.dt.to_timestamp()
     if column.dtype.kind in "mM":
@@ -200,7 +201,7 @@ def _with_unit(name: str, found: tuple[Any, str, str], units: Any) -> Found:
 def _array(values: Any) -> NDArray[Any]:
     try:
         if isinstance(values, np.ma.MaskedArray):
-            # what is masked was not measured
+            # masked values were not measured
             mask = np.ma.getmaskarray(values)
             return np.where(mask, np.nan, np.asarray(values.data, dtype=np.float64))
         return np.asarray(values)
@@ -210,7 +211,7 @@ def _array(values: Any) -> NDArray[Any]:
 
 
 def _numbers(values: NDArray[Any]) -> tuple[FloatArray | None, str, str]:
-    """Numbers, their unit where they are seconds, or why they are none."""
+    """Numbers, their unit if they are seconds, or the reason why there are none."""
     kind = values.dtype.kind
     if values.ndim != 1:
         return None, "", f"has shape {values.shape}"
@@ -228,7 +229,7 @@ def _numbers(values: NDArray[Any]) -> tuple[FloatArray | None, str, str]:
 
 
 def _held(values: NDArray[Any]) -> str:
-    """What is in an array that holds no numbers."""
+    """The kind of values in an array without numbers."""
     if values.dtype.kind != "O":
         return "text" if values.dtype.kind in "UT" else str(values.dtype)
     one = next((v for v in values if v is not None and not isinstance(v, _NUMBER)), None)

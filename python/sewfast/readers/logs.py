@@ -1,11 +1,11 @@
 """Logs of other tools -> `Table`: MDF, TDMS, ULog, WPILOG, ROS bags, MCAP, Betaflight, Saleae.
 
-Such a log holds signals that each have time stamps of their own. The signal with the most samples
-gives the rows; those with the same stamps are added as they are, any other is held: each row
-has its last value, NaN before the first. No value is interpolated.
+Each signal of such a log has its own time stamps. The signal with the most samples gives the rows.
+Signals with the same stamps are added unchanged; any other is held: each row has its last value,
+NaN before the first. No value is interpolated.
 
-A reader of somebody else's, given a damaged file, may raise anything, print, crash in its C parts
-or loop for ever. So it runs in a process of its own; whatever becomes of it is a `DataError`.
+On a damaged file, a reader from another package can raise anything, print, crash in its C code or
+loop for ever. It therefore runs in a separate process, and every failure becomes a `DataError`.
 """
 
 from __future__ import annotations
@@ -31,15 +31,16 @@ from .blackbox import BLACKBOX, SALEAE, blackbox_series, saleae_series
 from .containers import MAX_COLUMNS, Table, freeze
 
 LARGEST = 50_000_000
-"""Rows of a table, at the most."""
+"""Most rows of a table."""
 PATIENCE, PATIENCE_PER_MB = 20.0, 5.0
-"""For a reader, and for each megabyte that it reads [s]."""
+"""Time limit of a reader, and addition per megabyte of the file [s]."""
 MEMORY, MEMORY_PER_BYTE = 2_000_000_000, 50
-"""For a reader, and for each byte that it reads [B]: a damaged length makes it ask for any."""
+"""Memory limit of a reader, and addition per byte of the file [B]: a damaged length field can make
+it request any amount."""
 _DEPTH = 8
-"""Of a message within messages."""
+"""Deepest nesting of messages that is read."""
 _ELEMENTS = 64
-"""Of an array in a message that become columns."""
+"""Most elements of an array in a message that become columns."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,10 @@ def _from_a_process(path: Path, raw: bytes, name: str) -> list[Signal]:
 
 
 def send(name: str) -> None:
-    """In the process of a reader: what it finds in the file of the command line, as `.npz`."""
+    """Write the signals of the file named on the command line to stdout, as `.npz`.
+
+    This is the whole program of a reader's process.
+    """
     out, sys.stdout = sys.stdout.buffer, sys.stderr
     path = Path(sys.argv[1])
     raw = path.read_bytes()
@@ -124,14 +128,14 @@ def send(name: str) -> None:
         if signal.t is not None:
             arrays[f"{k}.t"] = signal.t
         texts += [signal.name, signal.unit]
-    # a pipe cannot be sought in
+    # a pipe cannot seek
     whole = io.BytesIO()
     np.savez(whole, texts=np.array(texts, dtype=str), **arrays)
     out.write(whole.getvalue())
 
 
 def _bound_memory(most: int) -> None:
-    """Let this process have no more than `most` bytes, where the system can see to that."""
+    """Limit the memory of this process to `most` bytes, where the system supports it."""
     try:
         import resource
     except ImportError:  # Windows
@@ -212,7 +216,7 @@ def _reason(signal: Signal) -> str | None:
 
 
 def _unique(names: Sequence[str]) -> list[str]:
-    """Names that occur again get a number."""
+    """The names, with a number appended to repeated ones."""
     seen: dict[str, int] = {}
     found = []
     for name in names:
@@ -233,7 +237,7 @@ def _mdf(path: Path, raw: bytes) -> Iterator[Signal]:
             t = np.asarray(channel.timestamps, dtype=np.float64)
             values, invalid = np.asarray(channel.samples), channel.invalidation_bits
             if invalid is not None and values.dtype.kind in "biuf":
-                # the bus or the sensor was not there
+                # the bus or the sensor was not connected
                 values = np.where(np.asarray(invalid, dtype=bool), np.nan, values)
             yield Signal(channel.name, t, values, channel.unit or "")
 
@@ -290,7 +294,7 @@ def _rosbag(path: Path, raw: bytes) -> Iterator[Signal]:
 def _mcap(path: Path, raw: bytes) -> Iterator[Signal]:
     """MCAP files with JSON messages: `/topic.field`, stamped when they were logged.
 
-    Of topics in other encodings no value is known, and they are named as such.
+    Topics in other encodings are listed without values.
     """
     from mcap.reader import make_reader
 
@@ -304,7 +308,7 @@ def _mcap(path: Path, raw: bytes) -> Iterator[Signal]:
             times, values = series.setdefault(name, ([], []))
             times.append(message.log_time)
             values.append(value)
-    # nanoseconds since 1970 are more than a float64 holds
+    # a float64 cannot hold nanoseconds since 1970 exactly
     first = min((times[0] for times, _ in series.values()), default=0)
     for name, (stamps, values) in series.items():
         yield Signal(name, (np.array(stamps) - first) * 1e-9, np.array(values))
@@ -328,7 +332,7 @@ def _numbers(name: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
 
 
 _FORMATS = {"double": "<f8", "float": "<f4", "int64": "<i8", "boolean": "?"}
-"""WPILib's types of a number, as NumPy has them; `TYPE[]` is an array of them."""
+"""WPILib's numeric types as NumPy types; `TYPE[]` is an array of them."""
 
 
 def _wpilog(path: Path, raw: bytes) -> Iterator[Signal]:
@@ -350,7 +354,7 @@ def _wpilog(path: Path, raw: bytes) -> Iterator[Signal]:
         payload = raw[at : at + length]
         at += length
         if len(payload) < length:
-            break  # a log that was cut off keeps what came before
+            break  # a truncated log is read up to its last whole record
         if entry == 0:
             _control(payload, kinds)
         elif entry in kinds:
@@ -367,7 +371,7 @@ def _wpilog(path: Path, raw: bytes) -> Iterator[Signal]:
 
 
 def _control(payload: bytes, kinds: dict[int, tuple[str, np.dtype[Any], bool]]) -> None:
-    """Start (0) or finish (1) of an entry; others do not matter."""
+    """Apply a control record: start (0) or finish (1) of an entry; others are ignored."""
     if payload[:1] == b"\x01":
         kinds.pop(struct.unpack_from("<I", payload, 1)[0], None)
     if payload[:1] != b"\x00":
@@ -396,7 +400,7 @@ def _saleae(path: Path, raw: bytes) -> Iterator[Signal]:
 
 @dataclass(frozen=True)
 class _Kind:
-    """How a log begins, what it is called, who reads it (None: we), and how."""
+    """First bytes of a log, its title, the package that reads it (None: sewfast), its reader."""
 
     magic: tuple[bytes, ...]
     title: str
@@ -422,9 +426,9 @@ def _kind_of(raw: bytes) -> str | None:
             return name
     if not raw.startswith(MAGIC):
         return None
-    # an MCAP file says of what kind it is behind opcode and length of its header
+    # an MCAP file states its profile behind the opcode and length of its header
     if raw.startswith(b"ros", len(MAGIC) + 13):
         return "rosbag"
-    # of a recording of ours, damaged or packed by others, one of these is left
+    # a recording of sewfast, even if damaged or repacked, still contains one of these
     own = any(mark in raw for mark in (b"/sewfast/", b"sewfast.recording", LIBRARY.encode()))
     return None if own else "mcap"

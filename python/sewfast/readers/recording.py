@@ -5,26 +5,36 @@ from __future__ import annotations
 import io
 import logging
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.experiment import as_weights, require_some_weight
-from ..errors import DataError, SettingError, located, not_installed, printable, unreadable
+from ..errors import (
+    DataError,
+    SettingError,
+    SewfastError,
+    located,
+    not_installed,
+    printable,
+    unreadable,
+)
 from ..recordfile.format import MAGIC
 from ..recordfile.reader import decode_recording
 from ..speed import speed_between_gaps
 from .containers import Table, freeze, read_mat, read_npz
 from .delimited import read_delimited
 from .frames import collected, of_arrow, table_of
-from .installed import read_installed
 from .logs import is_log, read_log
 from .roles import recognised
 from .timebase import TOLERANCE, Grid, time_base
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 LOG = logging.getLogger("sewfast")
 
@@ -48,7 +58,7 @@ def read_parquet(path: Path, raw: bytes) -> Table:
     try:
         found = pq.read_table(io.BytesIO(raw))
     except Exception as e:
-        # damaged files make the parser fail in any way
+        # a damaged file can make the parser raise anything
         raise DataError(f"{path}: expected a Parquet file, but it cannot be read: {e}") from e
     if found.num_rows == 0:
         raise DataError(f"{path}: expected rows of numbers, received none")
@@ -64,12 +74,98 @@ def read_mcap(path: Path, raw: bytes) -> Table:
     Raises
     ------
     DataError
-        Where the file is no recording of the package, or holds no sample.
+        Where the file is not a recording of sewfast, or has no samples.
     """
     found = decode_recording(path, raw)
     columns = {name: freeze(c) for name, c in found.table_columns().items()}
     header = found.header
     return Table(path, columns, found.units, Ts=header.Ts, counts_per_rev=header.counts_per_rev)
+
+
+# --- Formats of other packages -> Table -----------------------------------------------------------
+
+# An entry point `sewfast.readers` of any installed package reads a file. Its name is the file's
+# ending without the dot, its object a function of the path that returns a table in memory (as for
+# `table_of`) or a `Table`. Nothing is registered: the metadata of the installed packages are the
+# list, searched for a file whose ending is not in `OWN`.
+
+GROUP = "sewfast.readers"
+OWN = frozenset({"csv", "tsv", "txt", "mat", "npz", "npy", "parquet", "mcap", "xls", "xlsx"})
+"""Endings that sewfast reads itself; looking an entry point up takes milliseconds a file."""
+
+
+def read_installed(path: Path) -> Table | None:
+    """Read a file by the installed package that handles its ending; None if there is none.
+
+    Raises
+    ------
+    DataError
+        Where the package's function fails, or returns no table of numbers.
+    SettingError
+        Where several packages handle the ending, or the function cannot be imported.
+    """
+    ending = path.suffix.lower().removeprefix(".")
+    if not ending or ending in OWN:
+        return None
+    # imported here: it loads parsers for mail and archives, which reading CSV does not need
+    from importlib.metadata import entry_points
+
+    found = tuple(entry_points(group=GROUP, name=ending))
+    if not found:
+        return None
+    if len(found) > 1:
+        raise SettingError(
+            name=str(path), expected=f"one installed package that reads .{ending}",
+            received=" and ".join(sorted(map(_package, found))),
+            remedy="uninstall one, or read the table with one of them and pass it on: read(table)",
+        )  # fmt: skip
+    (point,) = found
+    try:
+        return _installed_table(path, _function(path, point)(path))
+    except SewfastError:
+        raise
+    except Exception as e:
+        # a function of another package can raise anything
+        raise DataError(
+            name=str(path), expected=f"a file that {_package(point)} can read",
+            received=f"{type(e).__name__}: {printable(str(e))[:200]}",
+            remedy=f"see the documentation of {_package(point)}",
+        ) from e  # fmt: skip
+
+
+def _function(path: Path, point: EntryPoint) -> Callable[[Path], Any]:
+    try:
+        function = point.load()
+    except Exception as e:
+        # importing runs code of another package
+        raise _unusable(path, point, f"{type(e).__name__}: {printable(str(e))[:200]}") from e
+    if not callable(function):
+        raise _unusable(path, point, f"{point.value}, a {type(function).__name__}")
+    read: Callable[[Path], Any] = function
+    return read
+
+
+def _unusable(path: Path, point: EntryPoint, received: str) -> SettingError:
+    return SettingError(
+        name=str(path), expected=f"a function of {_package(point)} that reads .{point.name}",
+        received=received, remedy=f"update {_package(point)}, or uninstall it",
+    )  # fmt: skip
+
+
+def _installed_table(path: Path, found: Any) -> Table:
+    if isinstance(found, Table):
+        return replace(found, path=path)
+    try:
+        return replace(table_of(found), path=path)
+    except SettingError as e:
+        raise DataError(
+            name=str(path), expected="a table from the package that reads it",
+            received=type(found).__name__, remedy="its function returns a mapping of name to array",
+        ) from e  # fmt: skip
+
+
+def _package(point: EntryPoint) -> str:
+    return point.dist.name if point.dist is not None else point.value
 
 
 # --- One file of any known format -> Table; recognised by its first bytes, then by its extension
@@ -82,12 +178,12 @@ def read_table(path: Any) -> Table:
     Parameters
     ----------
     path : path or table
-        The file's first bytes decide the format if they can, otherwise its extension. A
-        table is one of pandas, polars, pyarrow (or anything with `__arrow_c_stream__`), an xarray
-        Dataset or a mapping of name to array; null, NA and NaT are NaN, moments become seconds from
-        the first one. Logs are MDF, TDMS, PX4 ULog, WPILib's data log and ROS bags (`.bag`,
-        `.mcap`); the signal with most samples gives the rows, others are held. A file whose ending
-        an installed package knows by an entry point `sewfast.readers` is read by it.
+        The file's first bytes decide the format if possible, otherwise its extension. A table comes
+        from pandas, polars, pyarrow (or anything with `__arrow_c_stream__`), xarray (a Dataset) or
+        is a mapping of name to array; null, NA and NaT are NaN, moments become seconds from the
+        first one. Logs are MDF, TDMS, PX4 ULog, WPILib's data log and ROS bags (`.bag`, `.mcap`);
+        the signal with most samples gives the rows, others are held. If an installed package
+        handles the file's ending (entry point `sewfast.readers`), that package reads it.
 
     Returns
     -------
@@ -117,7 +213,7 @@ def _table(path: Path, raw: bytes) -> Table:
         return read_log(path, raw)
     if raw.startswith(MAGIC) or path.suffix.lower() == ".mcap":
         return read_mcap(path, raw)
-    # before containers, whose first bytes do not say what is in them
+    # before the containers: their first bytes do not identify the content
     if (found := read_installed(path)) is not None:
         return found
     if raw.startswith(b"PAR1"):
@@ -191,7 +287,7 @@ def read(
         Sample time [s]. Where the file has a time column with even steps, the two must agree
         within 1 % and this one is used. Where its steps are uneven, the rows are resampled to it
         (by default to the median step): outputs by straight lines, inputs as held; steps of more
-        than 3.5 periods are gaps, NaN in all columns. Notes say what was done.
+        than 3.5 periods are gaps, NaN in all columns. The notes of the data set describe this.
     counts, counts_per_rev : str and float, or None
         Column of encoder counts. The output is then the speed [RPM] computed from it by a Kalman
         smoother, each piece between gaps (NaN) separately, and `output` only names it (`speed` by
@@ -248,7 +344,7 @@ def read(
     base = time_base(table, Ts, time)
     slower = base.grid is not None and base.Ts > (1.0 + TOLERANCE) * base.grid.period
     if slower and base.grid is not None:
-        # at the recording's own pace first: what a slower one cannot show has to be filtered out
+        # first at the recording's own rate, so that `resample` can filter before slowing down
         wanted, base = base.Ts, time_base(table, base.grid.period, time)
     weigh = None if weights is None else _weights(table, weights, names[0])
     if base.grid is not None:
@@ -256,7 +352,7 @@ def read(
         if weigh is not None:
             if output and not counts:
                 table = _without_weightless(table, output, weigh)
-            # what lies in a gap was not measured and needs no weight
+            # samples in a gap were not measured and need no weight
             weigh = np.nan_to_num(base.grid.output(weigh))
         table = _on_grid(table, base.grid, names, (*measured, *channels))
     u = _side_by_side(table, names)
@@ -314,7 +410,7 @@ def _output(
     Ts: float,
     n: int,
 ) -> tuple[FloatArray, str, str, tuple[str, float] | None]:
-    """Output, its name, its unit and the counts that it comes from."""
+    """Output, its name, its unit and, if it is computed from counts, their source."""
     if counts is not None and counts_per_rev is not None:
         y = _speed(table, counts, counts_per_rev, Ts)
         return y, output or "speed", "RPM", (table.resolve(counts), float(counts_per_rev))

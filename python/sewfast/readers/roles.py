@@ -1,4 +1,4 @@
-"""Which column of a table is the input and which the output, by their names and units."""
+"""Recognise the input and the output of a table by the names and units of its columns."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .timebase import time_column
 
 @dataclass(frozen=True)
 class _Sort:
-    """Columns of one sort, known by the words that a name is made of or by a unit."""
+    """Columns of one sort, recognised by the words in their names or by their units."""
 
     words: frozenset[str]
     units: frozenset[str]
@@ -43,9 +43,9 @@ _OUTPUTS = (
     ),
     _sort("temperature temp temperatur", ("°c", "degc", "k")),
 )
-"""The first sort of which there is a column counts; the others are what was logged beside it."""
+"""The first sort with a column counts; columns of later sorts were logged beside it."""
 _SUPPLY = re.compile(r"(battery|batt|bat|vbat|supply|bus|akku|batterie|versorgung)(?![a-z])")
-"""What a drive is fed from, which nobody commands."""
+"""Names of a drive's supply, which is not a command."""
 _NUMBER = re.compile(
     r"#|(sample|row|line|record|packet|frame)s?([_ ]?(no|nr|number|index))?|index|idx|no|nr|seq"
 )
@@ -63,20 +63,20 @@ _WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+(?![^\W\d_A-Z])")
 
 @dataclass(frozen=True)
 class Roles:
-    """Input and output of a table, as its names and units show them."""
+    """Input and output of a table, recognised by names and units."""
 
     input: str
     output: str
 
 
 def roles(table: Table) -> Roles | None:
-    """Input and output of a table; None where its names and units leave a doubt.
+    """Input and output of a table; None if its names and units leave any doubt.
 
     Time, references, row numbers, supplies and columns that never change are neither. The plain
     names `u` and `y` come first, then a voltage or a command (a current only where there is no
     voltage) as input and a speed or a position (a temperature only where there is neither) as
-    output. A column whose name and unit both say so comes before one of which only one does. Where
-    one of the two is known and one column is left, that is the other.
+    output. A column with both a matching name and a matching unit comes before one with a single
+    match. Where one role is decided and one column is left, that column takes the other role.
     """
     time = time_column(table)
     length = max((len(table[name]) for name in table.names), default=0)
@@ -102,7 +102,7 @@ def recognised(table: Table) -> Roles:
     Raises
     ------
     DataError
-        Where its names and units leave a doubt.
+        If its names and units leave any doubt.
     """
     found = roles(table)
     if found is None:
@@ -132,7 +132,7 @@ def _stem(name: str) -> str:
 
 
 def left_out(table: Table) -> str:
-    """Why columns that one may expect there are neither, as the end of a message."""
+    """The end of a message: columns of the right kind that were ruled out, and why."""
     why = list(table.unusable.values())[:3]
     still = [name for name in table.names if not _moves(table, name)]
     if still:
@@ -145,7 +145,7 @@ def _only(names: list[str], plain: str) -> str | None:
 
 
 def _first(table: Table, names: list[str], sorts: Sequence[_Sort]) -> str | None:
-    """The column of the first sort that any belongs to; None where several do equally well."""
+    """The best column of the first sort that has any; None if several match equally well."""
     for sort in sorts:
         scores = {name: _score(table, name, sort) for name in names}
         best = max(scores.values(), default=0)
@@ -156,6 +156,6 @@ def _first(table: Table, names: list[str], sorts: Sequence[_Sort]) -> str | None
 
 
 def _score(table: Table, name: str, sort: _Sort) -> int:
-    """2 for a column whose name and unit are those of the sort, 1 for one of both, else 0."""
+    """2 for a column whose name and unit both match the sort, 1 for one match, else 0."""
     words = {word.lower() for word in _WORD.findall(unit_in_name(name)[0])} - _QUALIFIERS
     return (bool(words) and words <= sort.words) + (table.unit(name).lower() in sort.units)

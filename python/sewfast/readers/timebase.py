@@ -1,24 +1,28 @@
-"""The sample time of a table, and an even grid for time stamps that are not even."""
+"""The sample time of a table, and an even grid for uneven time stamps."""
 
 from __future__ import annotations
 
+import datetime
+import itertools
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..dataset import FloatArray
+from ..arrays import FloatArray
 from ..errors import DataError, SettingError
 from .containers import Table
 
 TOLERANCE = 0.01
-"""Of the period: how far steps may be from it to count as even."""
+"""Part of the period by which even steps can differ from it."""
 GAP = 3.5
-"""Steps of more periods than that are gaps: what happened in them is not known."""
+"""Steps of more periods than this are gaps, in which nothing is known."""
 LATEST = 1e300
-"""Largest time [s] that can be reckoned with; beyond it sums of times leave the numbers."""
+"""Largest time [s]; sums of larger ones would overflow."""
 _MOST_PER_ROW = 100
 _SECONDS = {
     "": 1.0, "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3,
@@ -36,22 +40,22 @@ _TIME = re.compile(
 """Names of a time column, with its unit or as its unit alone; `x-axis` and `x_value` are those of
 Keysight's scopes and of LabVIEW, `millis` and `micros` those of an Arduino."""
 _DATE = re.compile(r"date|date[_ ]?time|datum|zeitpunkt|moment")
-"""Names of one where its cells were dates with times of day."""
+"""Names of a time column whose cells were dates with times of day."""
 _SMALLER = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
 LONG, ABSURD, SHORT = 0.5, 900.0, 1e-5
-"""Sample times [s] of a time column without a unit. From `LONG` on it is said that it may not count
-seconds: drives are sampled every 20 us to 200 ms, so that 1 ms and more in milliseconds, and 1 us
-and more in smaller units, lie above it. Processes with time constants of minutes are sampled
-above it as well, but none that is controlled above `ABSURD`: that is asked about. Units that would
-make one below `SHORT` are not named."""
+"""Sample times [s] of a time column without a unit, read as seconds. From `LONG` on, a warning says
+that the unit can be another one: drives are sampled every 20 us to 200 ms, so a column that counts
+milliseconds (from 1 ms) or smaller units (from 1 us) lies above it. So do processes with time
+constants of minutes, but no controlled process lies above `ABSURD`, which is refused. Units that
+would make a sample time below `SHORT` are not suggested."""
 _EPOCH = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "us"), (1e11, 1e-3, "ms"))
-"""From which number on a time without a unit is one since 1970 in which unit: seconds since then
-reach 1e11 in the year 5138, milliseconds had in 1973."""
+"""From which number on a time without a unit counts which unit since 1970: seconds reach 1e11 in
+the year 5138, milliseconds reached it in 1973."""
 
 
 @dataclass(frozen=True, eq=False)
 class TimeBase:
-    """Where samples lie in time.
+    """Sample time of a table, and how its rows become samples.
 
     Attributes
     ----------
@@ -60,7 +64,7 @@ class TimeBase:
     grid : Grid or None
         How rows become samples; None where every row is one.
     notes : tuple of str
-        What was taken for granted.
+        Assumptions that were made.
     """
 
     Ts: float
@@ -77,7 +81,7 @@ class Grid:
     count : int
         Rows of the table.
     rows : array of int
-        Those that are used: of several with one time stamp the last.
+        Indices of the rows used: of several with one time stamp the last.
     t : array, shape (rows,)
         Their times [s], the first at 0.
     Ts : float
@@ -97,7 +101,7 @@ class Grid:
 
     @property
     def times(self) -> FloatArray:
-        """Of the grid [s]."""
+        """Times of the grid [s]."""
         return np.arange(1 + math.floor(self.t[-1] / self.Ts + 0.01)) * self.Ts
 
     @property
@@ -119,7 +123,7 @@ class Grid:
         length = self.t[after] - self.t[before]
         share = np.clip((at - self.t[before]) / length, 0.0, 1.0)
         line = known[before] + share * (known[after] - known[before])
-        # a row that is hit needs no other, nor is anything known of the inside of a gap
+        # inside a gap nothing is known; a grid time that coincides with a row needs no other row
         line = np.where(length > GAP * self.period, np.nan, line)
         line = np.where(share < TOLERANCE, known[before], line)
         found = np.where(share > 1.0 - TOLERANCE, known[after], line)
@@ -128,8 +132,8 @@ class Grid:
     def held(self, column: FloatArray) -> FloatArray:
         """The mean over each step of the grid of a column that is held from row to row.
 
-        So as much acts on the plant as before, as in `Dataset.resample`. NaN where a part of the
-        step lies in a gap or belongs to a row without a value.
+        This keeps the input's integral, as `Dataset.resample` does. NaN where a part of the step
+        lies in a gap or belongs to a row without a value.
         """
         if self.exact:
             return self.output(column)
@@ -175,7 +179,7 @@ def _means(values: FloatArray, edges: FloatArray, ends: FloatArray) -> FloatArra
 
 
 def time_column(table: Table) -> str | None:
-    """The column that is named as time: t, time, timestamp, seconds, also time_ms and the like."""
+    """The column with a name for time: t, time, timestamp, seconds, also time_ms and the like."""
     names = [n for n in table.names if _is_time(n)] or [
         n for n in table.names if _DATE.fullmatch(n.lower()) and table.unit(n) == "s"
     ]
@@ -193,7 +197,7 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
     ----------
     table : Table
     given : float or None
-        Sample time [s] by the caller: checked against even time stamps, the step of the grid for
+        The caller's sample time [s]: checked against even time stamps, the step of the grid for
         uneven ones.
     column : str or None
         Name of the time column; found by its name where None.
@@ -236,7 +240,7 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
         scale, said = _guessed(table, name, period, given)
         t, steps, period = t * scale, steps * scale, period * scale
     if np.abs(steps - period).max() <= TOLERANCE * period:
-        # the mean is exact where every printed time is rounded
+        # the mean step is exact even where every printed time is rounded
         found = float(t[-1] / len(steps))
         Ts = found if given is None else _agreed(table, f"column {name!r}", found, given)
         return TimeBase(Ts, None, said)
@@ -254,10 +258,10 @@ def _agreed(table: Table, source: str, found: float, given: float) -> float:
 
 
 def _unit(table: Table, name: str) -> tuple[float | None, tuple[str, ...]]:
-    """Seconds of one unit of a time column: of its header, else of its name (time_ms).
+    """Seconds per unit of a time column, from its header, else from its name (time_ms).
 
-    A number that is too large for seconds since 1970 is one in a smaller unit, which a note says.
-    None where nothing says a unit.
+    Numbers too large for seconds since 1970 count a smaller unit, which a note states. None if no
+    unit is stated.
     """
     unit = table.unit(name)
     if not unit:
@@ -278,18 +282,18 @@ def _unit(table: Table, name: str) -> tuple[float | None, tuple[str, ...]]:
 def _guessed(
     table: Table, name: str, step: float, given: float | None
 ) -> tuple[float, tuple[str, ...]]:
-    """Seconds of one unit of a time column that states none, by its median step.
+    """Seconds per unit of a time column that states no unit, from its median step.
 
-    Seconds, unless a sample time is given that fits a smaller unit. Seconds that are long for a
-    drive are pointed out, since the column may well count milliseconds.
+    The unit is seconds, unless the caller's sample time fits a smaller one. Steps that are long for
+    a drive cause a warning, since the column then probably counts milliseconds.
 
     Raises
     ------
     SettingError
-        Where seconds would make a sample time that no machine is run at.
+        Where seconds would make a sample time that no machine uses.
     """
     for unit, scale in _SMALLER if given is not None and given < 0.01 * step else ():
-        # far finer than the rows is no grid for them
+        # not for a grid far finer than the rows
         if given is not None and 0.5 * given < step * scale < 2.0 * given:
             return scale, (f"{table.path.name}: column {name!r} is taken as {unit}, as Ts says",)
     if step < LONG or given is not None:
@@ -314,12 +318,12 @@ def _guessed(
 
 
 def _seconds(table: Table, name: str, unit: float) -> FloatArray:
-    """Times [s] from 0 on, which never go back.
+    """Times [s] from 0 on, never decreasing.
 
     Raises
     ------
     DataError
-        For fewer than two, values that are not finite, or a time that goes back.
+        For fewer than two times, values that are not finite, or a time that goes back.
     """
     raw = table[name]
     if len(raw) < 2:
@@ -356,7 +360,7 @@ def _grid(table: Table, name: str, t: FloatArray, period: float, given: float | 
     count = len(t)
     rows = np.flatnonzero(np.append(np.diff(t) > 0.0, True))
     t = t[rows] - t[rows[0]]
-    # rows that lie on a grid with places left empty: the period that fits them best
+    # rows on a grid with empty places: the period that fits them best
     with np.errstate(over="ignore", invalid="ignore"):
         place = np.cumsum(np.append(0.0, np.rint(np.diff(t) / period)))
         fitted = float(t @ place / (place @ place)) if place[-1] > 0.0 else period
@@ -368,7 +372,7 @@ def _grid(table: Table, name: str, t: FloatArray, period: float, given: float | 
     )
     Ts = fitted if exact else period if given is None else float(given)
     most = max(_MOST_PER_ROW * len(t), 10_000)
-    # in this order: the quotient of the largest time stamps is no finite number
+    # in this order: a quotient of the largest time stamps would not be finite
     if not t[-1] < most * Ts:
         k = int(np.argmax(np.diff(t)))
         raise DataError(
@@ -383,3 +387,113 @@ def _grid(table: Table, name: str, t: FloatArray, period: float, given: float | 
             f"{Ts:.4g} s, received {t[-1]:.4g} s; give a shorter sample time (Ts, --ts)"
         )
     return Grid(count, rows, t, Ts, period, exact)
+
+
+# --- Moments as text or objects -> seconds --------------------------------------------------------
+
+# Loggers and spreadsheets write a date and a time of day, `2026-03-14 10:00:00.010`, or the time of
+# day alone. Only differences matter here, so every column counts from its first moment.
+
+
+_MOMENT = re.compile(
+    r"(?:(?P<ymd>\d{4}[-/.]\d\d?[-/.]\d\d?)|(?P<other>\d\d?[./-]\d\d?[./-]\d{4}))?[T ]*"
+    r"(?P<h>\d\d?):(?P<m>[0-5]\d)(?::(?P<s>[0-5]\d)(?:[.,:](?P<f>\d{1,9}))?)?"
+    r"\s*(?P<half>[AaPp][Mm])?\s*(?P<zone>[Zz]|[+-]\d\d:?\d\d)?"
+)
+_DAY = 86_400 * 10**9
+
+
+def is_moment(text: str) -> bool:
+    """Whether a text is a time of day, with or without a date."""
+    return _MOMENT.fullmatch(text.strip()) is not None
+
+
+def seconds_of_texts(texts: Sequence[str]) -> FloatArray | None:
+    """Seconds from the first moment; None if a text is not a moment.
+
+    A date is year, month, day, or day, month, year between points; between slashes the month comes
+    first if that gives valid dates. Times of day without a date continue after midnight.
+    """
+    found = [_MOMENT.fullmatch(text.strip()) for text in texts]
+    for month_first in (True, False):
+        try:
+            moments = [_nanoseconds(m, month_first=month_first) for m in found if m is not None]
+        except ValueError:  # no such day
+            continue
+        if len(moments) != len(found) or not moments:
+            return None
+        if all(m is None or not (m["ymd"] or m["other"]) for m in found):
+            moments = _across_midnight(moments)
+        return np.array([m - moments[0] for m in moments], dtype=np.float64) * 1e-9
+    return None
+
+
+def seconds_of_objects(values: Sequence[Any]) -> FloatArray | None:
+    """Seconds of Python's datetimes or times of day (from the first one) or durations.
+
+    None for anything else; NaN where a value is missing (None, NaT, NaN).
+    """
+    known = [v for v in values if v is not None and v == v]
+    if not known:
+        return None
+    made: list[int] = []
+    for value in known:
+        if isinstance(value, str):
+            return None if len(known) < len(values) else seconds_of_texts(list(values))
+        if isinstance(value, datetime.datetime):
+            # in UTC, so that changes to and from summer time have no effect
+            naive = value if value.tzinfo is None else value.astimezone(datetime.timezone.utc)
+            made.append(_of_delta(naive.replace(tzinfo=None) - datetime.datetime(1970, 1, 1)))
+        elif isinstance(value, datetime.time):
+            midnight = datetime.datetime.combine(datetime.date(1970, 1, 1), datetime.time())
+            moment = datetime.datetime.combine(midnight.date(), value.replace(tzinfo=None))
+            made.append(_of_delta(moment - midnight))
+        elif isinstance(value, datetime.timedelta):
+            made.append(_of_delta(value))
+        else:
+            return None
+    if len({type(v) for v in known}) > 1:
+        return None
+    if isinstance(known[0], datetime.time):
+        made = _across_midnight(made)
+    first = 0 if isinstance(known[0], datetime.timedelta) else made[0]
+    seconds = iter(np.array([m - first for m in made], dtype=np.float64) * 1e-9)
+    return np.array([next(seconds) if v is not None and v == v else np.nan for v in values])
+
+
+def _of_delta(delta: datetime.timedelta) -> int:
+    """Whole nanoseconds; a float of seconds since 1970 would not keep microseconds."""
+    whole = (delta.days * 86_400 + delta.seconds) * 10**9 + delta.microseconds * 1000
+    return whole + int(getattr(delta, "nanoseconds", 0))
+
+
+def _nanoseconds(match: re.Match[str], *, month_first: bool) -> int:
+    hours = int(match["h"])
+    if match["half"]:
+        hours = hours % 12 + (12 if match["half"].lower() == "pm" else 0)
+    whole = (hours * 60 + int(match["m"])) * 60 + int(match["s"] or 0)
+    zone = match["zone"] or "Z"
+    if zone not in "Zz":
+        offset = (int(zone[1:3]) * 60 + int(zone[-2:])) * 60
+        whole += offset if zone[0] == "-" else -offset
+    written = match["ymd"] or match["other"]
+    days = _ordinal(written, month_first=month_first) if written else 0
+    return days * _DAY + whole * 10**9 + int((match["f"] or "0").ljust(9, "0"))
+
+
+def _ordinal(text: str, *, month_first: bool) -> int:
+    first, second, third = (int(part) for part in re.split(r"[-/.]", text))
+    if first > 31:
+        return datetime.date(first, second, third).toordinal()
+    if month_first and "/" in text:
+        return datetime.date(third, first, second).toordinal()
+    return datetime.date(third, second, first).toordinal()
+
+
+def _across_midnight(moments: list[int]) -> list[int]:
+    """Times of day, moved to the next day after each fall by more than half a day."""
+    days, made = 0, moments[:1]
+    for before, now in itertools.pairwise(moments):
+        days += before - now > _DAY // 2
+        made.append(now + days * _DAY)
+    return made

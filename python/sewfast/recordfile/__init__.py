@@ -1,7 +1,7 @@
-"""Recordings as MCAP files: written while the drive runs, readable after whatever happened.
+"""Recordings as MCAP files: written while the drive runs, readable after a crash or damage.
 
-Read in this order: `format` (the bytes), `writer` (by whole chunks), `filing` (where and over what
-it may write), `reader` (which salvages what is damaged).
+Read in this order: `format` (the bytes), `header`, `writer` (samples and events, exports),
+`filing` (the thread that owns the file), `reader` (which salvages damaged files).
 """
 
 from .header import Header

@@ -1,4 +1,4 @@
-"""`Filing`: the thread that owns a recording's file, and the file that grows piece by piece."""
+"""`Filing`: the thread that owns a recording's file, and the file it appends to."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from .header import Header, bearable
 
 _BATCH = 1 << 16
 _LOCKED = 0x7FFF_0000
-"""The byte that is locked on Windows, where others cannot read locked bytes: beyond recordings."""
+"""The byte to lock on Windows, beyond any recording: others cannot read locked bytes there."""
 
 
 class Mark(NamedTuple):
-    """What tells a file from one that has taken its place, or its content, since."""
+    """Identity of a file and its content, to notice that either was replaced since."""
 
     device: int
     inode: int
@@ -37,7 +37,7 @@ class Mark(NamedTuple):
 
 
 def marked(path: Path) -> Mark | None:
-    """The mark of what is there; None for nothing."""
+    """The mark of the file at a path; None if there is none."""
     try:
         found = path.stat()
     except OSError:
@@ -46,7 +46,7 @@ def marked(path: Path) -> Mark | None:
 
 
 def require_writable(path: Path, *, overwrite: bool) -> None:
-    """Refuse what `Sink` would refuse, and leave everything as it is.
+    """Raise the errors that `Sink` would raise, without changing anything.
 
     Raises
     ------
@@ -77,12 +77,12 @@ def _try(path: Path, opened: Path, flags: int) -> None:
 
 
 def _own(path: Path, file: int) -> None:
-    """Keep other recorders out of an open file: each would overwrite what the other has written.
+    """Lock an open file: two recorders would overwrite each other's chunks.
 
     Raises
     ------
     SettingError
-        Where another one has it.
+        Where another recorder holds the lock.
     """
     try:
         _lock(file)
@@ -93,17 +93,17 @@ def _own(path: Path, file: int) -> None:
             remedy="choose another name",
         ) from None  # fmt: skip
     except (ImportError, OSError):
-        # a file system or a Python without locks
+        # the file system or this Python has no locks
         pass
 
 
 def _lock(file: int, *, free: bool = False) -> None:
-    """Take the lock of an open file, or give it back; on Windows as documented, not run there.
+    """Take or release the lock of an open file; the code for Windows has not run there.
 
     Raises
     ------
     BlockingIOError
-        Where another process has it.
+        Where another process holds it.
     """
     try:
         import fcntl
@@ -123,14 +123,14 @@ def _lock(file: int, *, free: bool = False) -> None:
 
 def _give_back(file: int) -> None:
     with suppress(ImportError, OSError):
-        # a process that was forked meanwhile must not keep it
+        # explicitly, because a process forked in the meantime would keep it
         _lock(file, free=True)
     with suppress(OSError):
         os.close(file)
 
 
 def exists(path: Path) -> SettingError:
-    """The refusal to write over a file."""
+    """The error for a file that must not be overwritten."""
     return SettingError(
         name=str(path), expected="a new name", received="a file, which is kept",
         remedy="choose another name, or overwrite=True (--overwrite)",
@@ -142,20 +142,20 @@ def _folder(path: Path) -> DataError:
 
 
 class Sink:
-    """An open file; a piece that cannot be written as a whole is taken back.
+    """An open file; a piece that cannot be written completely is removed again.
 
     Parameters
     ----------
     path : Path
     overwrite : bool
-        Whether an existing file may be replaced.
+        Whether to replace an existing file.
 
     Raises
     ------
     SettingError
-        Where the file exists and may not be replaced, or another recording is being made in it.
+        Where the file exists and `overwrite` is False, or another recorder is writing to it.
     DataError
-        Where it cannot be made: a folder, no such folder, no permission.
+        Where it cannot be created: a folder, no such folder, no permission.
     """
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
@@ -164,7 +164,7 @@ class Sink:
         self.crc = 0
         flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
         try:
-            # without O_EXCL two writers could meet in one file
+            # without O_EXCL two writers could open the same new file
             self._file = os.open(path, flags | (0 if overwrite else os.O_EXCL), 0o666)
         except FileExistsError as e:
             raise (_folder(path) if path.is_dir() else exists(path)) from e
@@ -172,7 +172,7 @@ class Sink:
             raise unwritable(DataError, path, e) from e
         try:
             _own(path, self._file)
-            # nothing is lost before it is certain that the file is this one's
+            # truncate only after the lock is held, so that a refusal loses nothing
             os.ftruncate(self._file, 0)
         except OSError as e:
             self.close()
@@ -182,12 +182,12 @@ class Sink:
             raise
 
     def append(self, piece: bytes) -> None:
-        """Hand a piece to the operating system: from then on `kill -9` cannot take it away.
+        """Pass a piece to the operating system: from then on it survives `kill -9`.
 
         Raises
         ------
         OSError
-            Where it does not fit; the file then ends where the piece would have begun.
+            Where it does not fit; the file then ends before the piece.
         """
         rest = memoryview(piece)
         try:
@@ -201,7 +201,7 @@ class Sink:
         self.crc = zlib.crc32(piece, self.crc)
 
     def sync(self) -> None:
-        """Ask for what was appended to be on the disk itself, against a loss of power."""
+        """Flush the file to the disk itself, against a loss of power."""
         with suppress(OSError):
             os.fsync(self._file)
 
@@ -210,7 +210,7 @@ class Sink:
 
 
 def batched(pieces: Iterable[bytes]) -> Iterator[bytes]:
-    """The same bytes in larger pieces, which cost fewer calls."""
+    """The same bytes in larger pieces, for fewer calls."""
     batch = bytearray()
     for piece in pieces:
         batch += piece
@@ -222,7 +222,7 @@ def batched(pieces: Iterable[bytes]) -> Iterator[bytes]:
 
 @contextmanager
 def replacing(target: Path) -> Iterator[Path]:
-    """A temporary name beside a file, which takes the file's place where the block succeeds.
+    """A temporary name beside a file, renamed to the file if the block succeeds.
 
     Raises
     ------
@@ -242,17 +242,17 @@ def replacing(target: Path) -> Iterator[Path]:
 
 
 # --- Filing: the thread that owns a recording's file; what callers give it, it writes in order ----
-# A thread of its own, because Ctrl-C is raised in the main thread, at any point of it: a chunk or a
-# column half done would be damage. It also writes what has waited for long enough while nobody
-# calls, and keeps a slow disk away from the link.
+# A separate thread, because Ctrl-C is raised in the main thread at any point and could leave half a
+# chunk. The thread also writes samples that have waited long enough even if no call comes, and
+# keeps a slow disk from blocking the link.
 
 
 MESSAGE_SAMPLES = 100
 """Samples at which a message is written."""
 OLDEST = 0.2
-"""Seconds that a sample waits for a full message; the operating system has it within .25 s."""
+"""Longest wait of a sample for a full message [s]; the operating system gets it within .25 s."""
 MOST_WAITING = 10_000
-"""Samples that wait for the disk before a caller has to."""
+"""Most samples that wait for the disk before `put` blocks."""
 
 
 class Block(NamedTuple):
@@ -270,7 +270,7 @@ class Event(NamedTuple):
 
 
 class End(NamedTuple):
-    """The recording ends, how, and which sample would have come next."""
+    """End of the recording: the outcome, and the number of the sample that would follow."""
 
     outcome: str
     due: int
@@ -280,7 +280,7 @@ Item: TypeAlias = Block | Event | End
 
 
 class Filing:
-    """Owner of the file. Only `put`, `finish`, `failure` and `refusal` are for other threads."""
+    """Owner of the file. Other threads call only `put`, `finish`, `failure` and `refusal`."""
 
     def __init__(
         self, path: Path, header: Header, *, overwrite: bool, lazy: bool, compress: bool
@@ -307,7 +307,7 @@ class Filing:
         self._thread.start()
 
     def put(self, item: Item) -> None:
-        """Hand over; returns at once unless the disk has fallen far behind."""
+        """Queue an item; returns at once unless the disk is far behind."""
         while self._given - self._received > MOST_WAITING and self.failure is None:
             time.sleep(0.001)
         self._items.put(item)
@@ -315,16 +315,16 @@ class Filing:
             self._given += len(next(iter(item.columns.values())))
 
     def finish(self) -> None:
-        """Wait until the end that was put is in the file."""
+        """Wait until the queued end is in the file."""
         self._thread.join()
 
     @property
     def is_made(self) -> bool:
-        """Whether there is a file; certain once it is finished."""
+        """Whether the file was created; final after `finish`."""
         return self._opened is not None
 
     def refusal(self, error: Exception) -> SewfastError:
-        """What to say to callers when the file could not be written."""
+        """The error for callers when the file could not be written."""
         if isinstance(error, SewfastError):
             return error
         reason = getattr(error, "strerror", None) or repr(error)
@@ -340,14 +340,14 @@ class Filing:
         return self._opened
 
     def _open(self) -> None:
-        # what has come since it was asked for may be the only account of a run
+        # a file created since the check can be the only record of a run
         if marked(self._path) not in (None, self._before):
             raise exists(self._path)
         self._opened = Sink(self._path, overwrite=self._overwrite)
         self._write_header()
 
     def _write_header(self) -> None:
-        """Twice: a recording cannot be read without it, and one copy may be damaged."""
+        """Write the header twice: no recording is readable without it, and one can get damaged."""
         at = self._header.start_ns()
         message = Message(Topic.HEADER, at, at, self._header.encode())
         try:
@@ -369,7 +369,7 @@ class Filing:
             if self.is_made:
                 self._finish(item)
         except Exception as e:
-            # whatever it is, callers must learn of it
+            # callers must be told of any error
             self.failure = e
         finally:
             if self.is_made:
@@ -387,7 +387,7 @@ class Filing:
         if isinstance(item, Event):
             self._append(Message(Topic.EVENTS, item.at, item.at, format.dumps(item.content)))
             return
-        # repeated where Ctrl-C hit the caller between handing over and taking note of it
+        # a repeat, if Ctrl-C hit the caller between queueing and counting
         if item.first < self._end:
             return
         if item.first > self._end:
@@ -425,7 +425,7 @@ class Filing:
             self._write_samples(self._waiting)
 
     def _write_samples(self, count: int) -> None:
-        """The `count` samples that wait longest, as one message."""
+        """Write the `count` oldest waiting samples as one message."""
         columns = {name: values[:count] for name, values in self._pending.items()}
         data = format.encode(self._first, self._header.Ts, columns)
         begin = self._header.time_ns(self._first)
@@ -444,7 +444,7 @@ class Filing:
         planned, outcome = self._header.n, end.outcome
         due = end.due if planned is None or outcome != "complete" else planned
         if due > self._first and bearable(due - self._received, len(self._header.columns)):
-            # what was planned and never came is a gap as well
+            # planned samples that never came are a gap as well
             self._skip_to(due)
         content = {
             "outcome": outcome,

@@ -19,7 +19,7 @@ from ..errors import DataError, not_installed
 
 
 class Topic(IntEnum):
-    """Channel number of each kind, fixed so that every chunk can be read without the others."""
+    """Channel number of each topic, fixed so that every chunk can be read on its own."""
 
     HEADER = 1
     SAMPLES = 2
@@ -102,15 +102,15 @@ _PROPERTIES: dict[Topic, dict[str, Any]] = {
 
 
 MOST_GAPS_LISTED = 10_000
-"""Gaps that the completeness message spells out; they follow from the samples anyway."""
+"""Most gaps listed in the completeness message; the samples show all of them anyway."""
 EXACT = 2**53
 """Whole numbers up to here are exact in float64."""
 
 
 def numbers(name: str, values: object) -> list[Any]:
-    """A column as JSON values that read back to the same float64; NaN is null.
+    """A column as JSON values that parse to the same float64; NaN is null.
 
-    Whole numbers are written as such, float32 by the shortest text that gives the same float32.
+    Whole numbers are written as such, float32 as the shortest text of the same float32.
 
     Raises
     ------
@@ -174,7 +174,7 @@ def parse(data: bytes) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        Where it is none, or holds numbers that are not finite.
+        Where it is not a JSON object, or holds numbers that are not finite.
     """
     try:
         content = json.loads(data, parse_constant=_refuse)
@@ -219,7 +219,7 @@ def _column(content: Mapping[str, Any], name: str, kinds: tuple[type, ...]) -> F
     if type(values) in kinds:
         # one message a sample
         values = [values]
-    # the exact type: True is no number here, and NumPy would take text for one
+    # the exact type: NumPy would accept True and text as numbers
     if not isinstance(values, list) or not set(map(type, values)) <= set(kinds):
         raise ValueError(f"column {name!r} is missing or holds no numbers")
     try:
@@ -247,8 +247,9 @@ PACKED_HEAD = struct.Struct("<BQQQQII4sQ")
 """The same of a compressed chunk, with the compression's name and its compressed size."""
 ZSTD = b"zstd"
 MOST_RATIO = 200
-"""Of what all chunks are to the file: 200 constant columns come to 96. A reader unpacks no more, so
-that a small file cannot ask for any memory; a writer leaves chunks plain that would lead there."""
+"""Largest ratio of all unpacked chunks to the file; 200 constant columns reach 96. A reader unpacks
+no more, so that a small file cannot exhaust memory; a writer leaves chunks plain that would exceed
+it."""
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 """Channel, sequence, log time, publish time."""
 FOOTER_BODY = struct.Struct("<QQI")
@@ -265,7 +266,7 @@ class Message(NamedTuple):
     publish_time: int
     data: bytes
     sequence: int = 0
-    """Counted by the writer, on each channel for itself."""
+    """Counted by the writer, per channel."""
 
 
 def _record(opcode: int, body: bytes) -> bytes:
@@ -322,9 +323,9 @@ class Assembler:
         self._first, self._last = 2**64 - 1, 0
 
     def chunk(self, messages: Sequence[Message], at: int, *, leading: bool = False) -> bytes:
-        """A chunk of messages on one topic, and its index; `at` is where in the file it will stand.
+        """A chunk of messages on one topic, and its index; `at` is its position in the file.
 
-        The first chunk is `leading`: schemas and channels stand in it.
+        The first chunk is `leading`: it contains the schemas and channels.
         """
         topic = messages[0].topic
         records = bytearray(self._catalogue if leading else b"")
@@ -355,8 +356,8 @@ class Assembler:
         return whole + index
 
     def _packed(self, topic: Topic, records: bytes, at: int) -> bytes | None:
-        """A chunk's content, compressed; None where it stays plain."""
-        # the header message stays readable where nothing can unpack the rest
+        """A chunk's content, compressed; None if it stays plain."""
+        # the header stays readable for programs without zstd
         if self._pack is None or topic is Topic.HEADER:
             return None
         if self._unpacked + len(records) > MOST_RATIO * at:
@@ -372,7 +373,7 @@ class Assembler:
         return MESSAGE_HEAD.pack(message.topic, sequence, *times) + message.data
 
     def ending(self, at: int, data_crc: int) -> Iterator[bytes]:
-        """All that follows the last chunk, in pieces; `at` is where it will stand."""
+        """Everything after the last chunk, in pieces; `at` is its position in the file."""
         end = _record(DATA_END, struct.pack("<I", data_crc))
         yield end
         start = place = at + len(end)
@@ -419,7 +420,7 @@ def _chunk_index(
 
 
 def zstandard(purpose: str) -> Any:
-    """The package that packs and unpacks chunks.
+    """The package that compresses chunks.
 
     Raises
     ------

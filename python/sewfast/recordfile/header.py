@@ -1,4 +1,4 @@
-"""`Header`: what a recording says of itself, as JSON in its first message."""
+"""`Header`: the description of a recording, as JSON in its first message."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_COLUMNS = 256
 LARGEST_HEADER = 1 << 20
 """Bytes of the header as JSON."""
 MOST_MISSING = 50_000_000
-"""Values that all gaps of a recording together may hold: a reader allocates them."""
+"""Most values in all gaps of a recording together: a reader allocates them."""
 SHORTEST_TS, LONGEST_TS = 1e-9, 1e6
 """Sample times [s]: the file counts nanoseconds."""
 LAST_NS = 2**64 - 1
@@ -40,17 +40,17 @@ def now() -> str:
 
 @dataclass(frozen=True)
 class Header:
-    """What a recording says of itself, written before its first sample.
+    """Description of a recording, written before its first sample.
 
     Parameters
     ----------
     name : str
-        Of the excitation or reference.
+        Name of the excitation or reference.
     Ts : float
         Sample time [s].
     columns : mapping of name to unit
-        For example ``{"u": "V", "counts": "1", "speed_true": "RPM"}``; ``t`` and ``index`` are the
-        file's own.
+        For example ``{"u": "V", "counts": "1", "speed_true": "RPM"}``; ``t`` and ``index`` are
+        reserved.
     n : int or None
         Planned number of samples; None: until stopped.
     counts_per_rev : float or None
@@ -58,14 +58,14 @@ class Header:
     device : mapping
         Identity: name, firmware, boot id, schema hash, protocol version.
     settings : mapping
-        Signal, seed, limits, gains, watchdog: what is needed to do it again.
+        Signal, seed, limits, gains, watchdog: everything needed to repeat the run.
     started : str
-        When sample 0 was taken, ISO 8601 with its offset from UTC; now by default.
+        Time of sample 0, ISO 8601 with its offset from UTC; now by default.
 
     Raises
     ------
     SettingError
-        For a value that is outside its range, or that JSON does not know.
+        For a value that is outside its range or has no JSON form.
     """
 
     name: str
@@ -104,7 +104,7 @@ class Header:
     def start_ns(self) -> int:
         """`started` in nanoseconds since 1970-01-01 UTC."""
         try:
-            # Python 3.10 does not know the Z
+            # Python 3.10 cannot parse the Z
             at = datetime.fromisoformat(self.started.replace("Z", "+00:00"))
         except (AttributeError, TypeError, ValueError):
             at = None
@@ -118,7 +118,7 @@ class Header:
         return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 
     def time_ns(self, index: int) -> int:
-        """When sample `index` was taken, in nanoseconds since 1970-01-01 UTC."""
+        """Time of sample `index` in nanoseconds since 1970-01-01 UTC."""
         return min(self.start_ns() + round(index * self.Ts * 1e9), LAST_NS)
 
     def encode(self) -> bytes:
@@ -203,7 +203,7 @@ def _columns(columns: object) -> Mapping[str, str]:
 
 
 def _plain(what: str, content: object) -> Mapping[str, Any]:
-    """A copy that JSON gives back as it is."""
+    """A copy that survives JSON unchanged."""
     if not isinstance(content, Mapping):
         raise SettingError(name=what, expected="a mapping", received=type(content).__name__)
     return MappingProxyType(plain(what, content))
@@ -219,7 +219,7 @@ def plain(what: str, content: Mapping[str, Any]) -> dict[str, Any]:
     """
     try:
         text = json.dumps(dict(content), allow_nan=False, ensure_ascii=False, default=_python)
-        # half a surrogate pair could not be printed
+        # half of a surrogate pair could not be printed
         text.encode()
     except (TypeError, ValueError, RecursionError) as e:
         raise SettingError(

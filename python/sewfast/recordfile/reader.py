@@ -1,4 +1,4 @@
-"""`read_recording`: an MCAP recording in whatever state -> `RecordedFile`."""
+"""`read_recording`: an MCAP recording, whole or damaged -> `RecordedFile`."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ from .format import (
 from .header import LARGEST_HEADER, MOST_MISSING, Header, bearable, plain
 
 # --- The whole chunks of an MCAP file, and what between them is damaged ---------------------------
-# Nothing is believed that no checksum covers: a chunk is searched for, not reached by the lengths
-# of the records before it. Its own head states its size three times, twice where it is compressed,
-# and its CRC-32 covers the rest. The search has a budget: a file that is made of heads alone would
-# cost a checksum of megabytes each.
+# Only data covered by a checksum are trusted: chunks are searched for, not reached by the lengths
+# of the records before them. A chunk's head states its size three times (twice if compressed), and
+# its CRC-32 covers the rest. The search has a budget, because each head without a chunk costs a
+# checksum over megabytes.
 
 
 LARGEST_FILE = 4 << 30
@@ -54,11 +54,11 @@ LARGEST_FILE = 4 << 30
 LARGEST_CHUNK = 4 << 20
 """Bytes; a recording's own chunks are far smaller."""
 BUDGET = 4
-"""Checksums that fail may cover so many times the file; each damaged chunk is covered by one."""
+"""Budget of failed checksums, in multiples of the file; each damaged chunk costs one."""
 
 
 class Chunk(NamedTuple):
-    """A chunk whose CRC holds: its place in the file and its messages."""
+    """A chunk with a valid CRC: its place in the file and its messages."""
 
     start: int
     stop: int
@@ -71,8 +71,8 @@ def chunks(raw: bytes) -> Iterator[Chunk]:
     Raises
     ------
     DataError
-        For a file of so many heads without their chunks that no damage explains them, and for one
-        that unpacks to more than `MOST_RATIO` times its size.
+        For a file with more heads without chunks than damage can explain, and for one that unpacks
+        to more than `MOST_RATIO` times its size.
     SettingError
         Where a chunk is compressed and zstandard is not installed.
     """
@@ -101,7 +101,7 @@ def chunks(raw: bytes) -> Iterator[Chunk]:
 
 
 class _Claim(NamedTuple):
-    """What a head states: where the content begins and ends, its size when unpacked, its CRC."""
+    """The statements of a head: begin and end of the content, its unpacked size, its CRC."""
 
     begin: int
     stop: int
@@ -111,7 +111,7 @@ class _Claim(NamedTuple):
 
 
 def _claimed(raw: bytes, at: int) -> _Claim | None:
-    """What the head at a place states; None where there is none."""
+    """The statements of the head at a position; None if there is no head."""
     for head, name in ((CHUNK_HEAD, ()), (PACKED_HEAD, (ZSTD,))):
         begin = at + head.size
         if begin > len(raw):
@@ -137,10 +137,10 @@ def _chunk_at(raw: bytes, at: int, claim: _Claim) -> Chunk | None:
 
 
 def _unpacked(stored: memoryview, size: int) -> bytes | None:
-    """The content of a compressed chunk; None where it is damaged, or not of the stated size."""
+    """The content of a compressed chunk; None if it is damaged or not of the stated size."""
     zstd = zstandard("reading a compressed recording")
     try:
-        # a frame may state another size than the head, and would be given it
+        # a frame can state another size than the head, and would allocate it
         found = zstd.ZstdDecompressor().stream_reader(stored).read(size + 1)
     except zstd.ZstdError:
         return None
@@ -161,7 +161,7 @@ def _messages(body: bytes) -> tuple[Message, ...] | None:
 
 
 def records(raw: bytes, start: int, stop: int) -> Iterator[tuple[int, int, int]]:
-    """Opcode, begin and end of each record's content; opcode -1 where they do not fit."""
+    """Opcode, begin and end of each record's content; opcode -1 if a record does not fit."""
     at = start
     while at < stop:
         if at + RECORD.size > stop:
@@ -177,13 +177,13 @@ def records(raw: bytes, start: int, stop: int) -> Iterator[tuple[int, int, int]]
 
 
 def is_start(raw: bytes, stop: int) -> bool:
-    """Whether the bytes before the first chunk are what a file begins with."""
+    """Whether the bytes before the first chunk are a valid beginning of a file."""
     opcodes = [r[0] for r in records(raw, len(MAGIC), stop)]
     return raw.startswith(MAGIC) and opcodes == [HEADER]
 
 
 def is_index(raw: bytes, start: int, stop: int) -> bool:
-    """Whether the bytes between two chunks are nothing but a message index."""
+    """Whether the bytes between two chunks are only a message index."""
     for opcode, begin, end in records(raw, start, stop):
         size = end - begin
         if opcode != MESSAGE_INDEX or size < 6 or size != 6 + _u32(raw, begin + 2):
@@ -192,9 +192,9 @@ def is_index(raw: bytes, start: int, stop: int) -> bool:
 
 
 def ending_fault(raw: bytes, start: int, *, damaged: bool) -> str | None:
-    """What is wrong behind the last chunk; None where the checksums of the whole file hold.
+    """The fault behind the last chunk; None if the checksums of the whole file are valid.
 
-    In a file known to be `damaged` the checksum over all of it says nothing new.
+    In a file known to be `damaged`, the checksum over all of it is not tested.
     """
     at = start
     for _, begin, end in records(raw, start, len(raw)):
@@ -231,7 +231,7 @@ def _u32(raw: bytes, at: int) -> int:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RecordedFile:
-    """What was read from a recording file.
+    """The content of a recording file.
 
     Attributes
     ----------
@@ -240,13 +240,13 @@ class RecordedFile:
     columns : mapping of name to array of shape (N,)
         float64, row k is sample k; NaN in gaps and where nothing was measured.
     gaps : tuple of (first, count)
-        Samples that are not there.
+        Missing samples.
     events : tuple of mapping
         `kind`, `index` (int or None), `elapsed` [s], `detail`, in the order written.
     outcome : str
-        How the recording ended by its own account; "torn" where that is missing.
+        How the recording ended, according to its completeness message; "torn" without one.
     damage : tuple of str
-        What was found damaged and left out.
+        Damaged parts, which were left out.
     """
 
     path: Path
@@ -258,28 +258,28 @@ class RecordedFile:
     damage: tuple[str, ...]
 
     def __len__(self) -> int:
-        """Samples from the first to the last, those in gaps included."""
+        """Number of samples from the first to the last, including gaps."""
         return len(next(iter(self.columns.values())))
 
     @property
     def received(self) -> int:
-        """Samples that are there."""
+        """Number of samples in the file."""
         return len(self) - sum(count for _, count in self.gaps)
 
     @property
     def complete(self) -> bool:
-        """Ended as planned, no gap, no damage."""
+        """Whether it ended as planned, without gaps and damage."""
         planned = self.header.n in (None, self.received)
         return self.outcome == "complete" and not self.gaps and not self.damage and planned
 
     @property
     def units(self) -> dict[str, str]:
-        """Unit of each column, `t` included; pure numbers have none."""
+        """Unit of each column, including `t`; pure numbers have no unit."""
         known = {name: unit for name, unit in self.header.columns.items() if unit not in ("", "1")}
         return {"t": "s", **known}
 
     def table_columns(self) -> dict[str, FloatArray]:
-        """`t` [s] and the columns, as they are exported."""
+        """`t` [s] and the columns, as for an export."""
         t = np.round(np.arange(len(self)) * self.header.Ts, 9)
         return {"t": t, **self.columns}
 
@@ -295,7 +295,7 @@ class RecordedFile:
 
     @property
     def summary(self) -> str:
-        """How much is there, in one line."""
+        """Samples, outcome, gaps and damage in one line."""
         planned = "" if self.header.n is None else f" of {self.header.n}"
         gaps = f"{len(self.gaps)} gap(s)" if self.gaps else "no gap"
         damage = f"{len(self.damage)} damage(s)" if self.damage else "no damage"
@@ -341,7 +341,7 @@ def _made(
     outcome: str,
     damage: tuple[str, ...],
 ) -> RecordedFile:
-    """What was read, immutable."""
+    """The content as an immutable `RecordedFile`."""
     for column in columns.values():
         column.flags.writeable = False
     frozen = tuple(MappingProxyType(dict(event)) for event in events)
@@ -352,19 +352,19 @@ def _event(event: Mapping[str, Any]) -> str:
     at = "" if event["index"] is None else f" at sample {event['index']}"
     detail = dict(event["detail"])
     if detail.get("reason") == "none":
-        # a device says so of every event; only with a reason does the value mean something
+        # devices send this field with every event; it only has a meaning together with a reason
         detail = {key: value for key, value in detail.items() if key not in ("reason", "value")}
     text = ", ".join(f"{key} {value}" for key, value in detail.items())
     return f"{event['kind']}{at}" + (f": {text}" if text else "")
 
 
 def read_recording(path: str | os.PathLike[str]) -> RecordedFile:
-    """Read a recording; what is damaged or missing is left out and named.
+    """Read a recording; damaged parts are left out and listed.
 
     Parameters
     ----------
     path : path
-        An MCAP file that `RecordWriter` wrote, also one whose writer was killed.
+        An MCAP file written by `RecordWriter`, even if the writer was killed.
 
     Returns
     -------
@@ -373,15 +373,15 @@ def read_recording(path: str | os.PathLike[str]) -> RecordedFile:
     Raises
     ------
     DataError
-        Where the file cannot be read, is no MCAP file, or none of the two copies of its header
-        message is whole.
+        Where the file cannot be read, is not an MCAP file, or both copies of its header message
+        are damaged.
     """
     path = _named(path)
     return decode_recording(path, _bytes(path))
 
 
 def read_header(path: str | os.PathLike[str]) -> Header:
-    """Read what a recording says of itself, without its samples.
+    """Read the header of a recording, without its samples.
 
     Raises
     ------
@@ -389,7 +389,7 @@ def read_header(path: str | os.PathLike[str]) -> Header:
         As `read_recording`.
     """
     path = _named(path)
-    # both copies of the header message stand in the first bytes, not compressed
+    # both copies of the header message are in the first bytes, not compressed
     raw, found = _bytes(path, 3 * LARGEST_HEADER), _Contents()
     for chunk in _chunks(path, raw):
         for message in chunk.messages:
@@ -464,7 +464,7 @@ def _headless(path: Path, raw: bytes, damage: list[str]) -> DataError:
 
 
 class _Contents:
-    """What the messages of one file add up to."""
+    """Collects the messages of one file."""
 
     def __init__(self) -> None:
         self.header: Header | None = None
@@ -477,7 +477,7 @@ class _Contents:
         self._last_event = -1
 
     def take(self, message: Message) -> None:
-        """Add a message; one that makes no sense is left out as damage."""
+        """Add a message; an invalid one is left out and noted as damage."""
         if message.topic is Topic.HEADER and self.header is not None:
             return
         try:
@@ -526,7 +526,7 @@ class _Contents:
         return _made(path, header, columns, gaps, self.events, outcome, damage)
 
     def _end(self, width: int) -> int:
-        """Samples that there should be, by the file's own account where it has one."""
+        """Number of samples there should be, from the completeness message if there is one."""
         if self.completeness is None:
             return self._next
         lost = self.completeness["received"] - self._received

@@ -1,4 +1,4 @@
-"""`RecordWriter`: samples and events into an MCAP file; what is not written over."""
+"""`RecordWriter`: samples and events into an MCAP file; files that are not overwritten; exports."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from .reader import RecordedFile, read_header, read_recording
 
 ENDING = ".mcap"
 _COMPUTED = 1 << 5
-"""The capability of a device that is no machine but computes one (docs/PROTOCOL.md)."""
+"""The capability of a device that simulates a machine (docs/PROTOCOL.md)."""
 
 
 def require_ending(path: str | os.PathLike[str]) -> Path:
-    """A recording's name, which other programs tell by its ending.
+    """The path of a recording, whose ending other programs rely on.
 
     Raises
     ------
@@ -53,22 +53,22 @@ def require_ending(path: str | os.PathLike[str]) -> Path:
 
 
 def require_replaceable(path: str | os.PathLike[str], *, overwrite: bool) -> None:
-    """Refuse to lose a recording: an `.mcap` is replaced only where a computer can make it again.
+    """Protect recordings: an `.mcap` is replaced only if it can be computed again.
 
-    A recording of a virtual machine can be made again, and so can what is no recording but made
-    from one. One that cannot be read may be of a drive.
+    That holds for recordings of a virtual machine and for exports of a recording. A file that
+    cannot be read is protected, since it can be a recording of a drive.
 
     Parameters
     ----------
     path : path
-        File that is about to be written.
+        File about to be written.
     overwrite : bool
-        Whether it may be replaced whatever it is.
+        Whether to allow its replacement in any case.
 
     Raises
     ------
     SettingError
-        Where it is to be kept.
+        Where the file is protected.
     """
     found = Path(path)
     if overwrite or found.suffix.lower() != ENDING or not _is_there(found):
@@ -83,7 +83,7 @@ def require_replaceable(path: str | os.PathLike[str], *, overwrite: bool) -> Non
 
 
 def require_free(paths: Iterable[str | os.PathLike[str] | None], *, overwrite: bool) -> None:
-    """Refuse to write over anything at all: for what is the only account of a run on a drive.
+    """Refuse to overwrite any file: for output that is the only record of a run on a drive.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def require_free(paths: Iterable[str | os.PathLike[str] | None], *, overwrite: b
 
 
 def _is_there(path: Path) -> bool:
-    """Whether there is anything to be lost; a folder is refused by whoever writes."""
+    """Whether there is a file to lose; a folder is refused later, when it is written to."""
     try:
         return path.is_file() and path.stat().st_size > 0
     except (OSError, ValueError):
@@ -125,11 +125,11 @@ def _kept(path: Path, what: str) -> SettingError:
 
 
 class RecordWriter:
-    """One recording, written under its final name: what was written stays readable.
+    """One recording, written under its final name: whatever is written stays readable.
 
-    A message holds 100 samples, fewer where the oldest would wait for longer than .2 s, and has a
-    chunk of its own, which goes to the operating system at once. A killed recorder loses the
-    samples that were waiting, nothing else.
+    A message holds 100 samples, or fewer if the oldest would wait longer than .2 s. Each message is
+    a chunk, which goes to the operating system at once. A killed recorder loses only the samples
+    that were waiting.
 
     Parameters
     ----------
@@ -137,13 +137,13 @@ class RecordWriter:
         File to write; `.mcap` is the usual ending.
     header : Header
     overwrite : bool
-        Whether an existing file may be replaced.
+        Whether to replace an existing file.
     lazy : bool
-        Make the file with the first sample or event; without any, there is none, and one that
-        exists is left as it is. That it could be made is found out here all the same.
+        Create the file with the first sample or event. Without any, no file is created and an
+        existing one is left alone. Whether it can be created is checked here in any case.
     compress : bool
-        Compress each chunk by zstd (`sewfast[zstd]`). All that holds of a plain file holds: a chunk
-        is written as a whole, and a damaged one costs its own samples.
+        Compress each chunk by zstd (`sewfast[zstd]`). The guarantees of a plain file remain: a
+        chunk is written as a whole, and a damaged one costs only its own samples.
 
     Raises
     ------
@@ -155,9 +155,9 @@ class RecordWriter:
     Notes
     -----
     Leaving the ``with`` block closes the file: "complete", "interrupted" after Ctrl-C, "failed"
-    after another exception. A thread of its own owns the file, so that neither a slow disk nor
-    Ctrl-C comes between a sample and its place; that the disk is full is said by the next call.
-    Events may come from any thread, samples from one at a time.
+    after another exception. A separate thread owns the file, so that neither a slow disk nor Ctrl-C
+    interrupts a write; a full disk is reported by the next call. Events can come from any thread,
+    samples from one at a time.
 
     Examples
     --------
@@ -202,7 +202,7 @@ class RecordWriter:
             self.close()
             return
         stopped = issubclass(kind, (KeyboardInterrupt, SystemExit, GeneratorExit))
-        # the error that is on its way says more
+        # the exception being raised is more informative
         with suppress(DataError):
             self.close("interrupted" if stopped else "failed")
 
@@ -213,7 +213,7 @@ class RecordWriter:
 
     @property
     def is_made(self) -> bool:
-        """Whether there is a file, as soon as the recording is closed."""
+        """Whether a file was created; final once the recording is closed."""
         return self._filing.is_made
 
     def samples(self, first: int, columns: Mapping[str, ArrayLike]) -> None:
@@ -222,7 +222,7 @@ class RecordWriter:
         Parameters
         ----------
         first : int
-            Number of the first one; it may jump ahead, which leaves a gap.
+            Number of the first one; a jump ahead leaves a gap.
         columns : mapping of name to array of shape (k,)
             All columns of the header, one length, any k. NaN: not measured.
 
@@ -272,21 +272,21 @@ class RecordWriter:
             )  # fmt: skip
 
     def event(self, kind: str, index: int | None = None, **detail: Any) -> None:
-        """Write down that something happened, at once.
+        """Record an event, at once.
 
         Parameters
         ----------
         kind : str
             "armed", "tripped", "gap", "reset", ...
         index : int or None
-            Sample at which it happened, where that is known.
+            Sample at which it happened, if known.
         **detail
             Finite numbers, text, lists and dicts.
 
         Raises
         ------
         SettingError
-            For a detail that JSON does not know.
+            For a detail without a JSON form.
         DataError
             Where the file cannot be written any further.
         """
@@ -299,15 +299,15 @@ class RecordWriter:
         self._filing.put(Event(content, since if index is None else self.header.time_ns(index)))
 
     def close(self, outcome: str = "complete", *, taken: int | None = None) -> None:
-        """Write what waits, the completeness record and the index; a closed file stays closed.
+        """Write waiting samples, the completeness record and the index; can be called repeatedly.
 
         Parameters
         ----------
         outcome : str
-            "complete", "interrupted", "failed", "tripped" or another word that says how it ended.
+            "complete", "interrupted", "failed", "tripped" or another word for how it ended.
         taken : int or None
-            Samples that the device took, where it said so: the last ones that did not come are a
-            gap. A complete recording has the planned number.
+            Samples that the device took, if it reported them: missing last ones are a gap. A
+            complete recording has the planned number.
 
         Raises
         ------
@@ -320,7 +320,7 @@ class RecordWriter:
         try:
             self._filing.finish()
         except KeyboardInterrupt:
-            # one Ctrl-C must not cost the end of the file, a second one may
+            # a single Ctrl-C must not cost the end of the file; a second one can
             self._filing.finish()
             raise
         if self._filing.failure is not None and not self._is_reported:
@@ -349,7 +349,7 @@ def _index(what: str, value: object) -> int:
 def save_columns(
     path: str | os.PathLike[str], header: Header, columns: Mapping[str, ArrayLike]
 ) -> None:
-    """Write a recording that is already there; the file is either complete or absent.
+    """Write a finished recording; the file is either complete or absent.
 
     Parameters
     ----------
@@ -372,23 +372,23 @@ def save_columns(
 
 
 CHUNK_SAMPLES, CHUNK_BYTES = 500, 1 << 20
-"""Of a chunk, whichever comes first: a reader takes no longer one than 4 MiB for a recording's."""
+"""Limits of a chunk, whichever comes first: a reader accepts chunks of at most 4 MiB."""
 
 
 def save_curves(
     path: str | os.PathLike[str], recording: RecordedFile, *, compress: bool = False
 ) -> None:
-    """Write a recording anew, whole and with one message a sample; it appears whole or not at all.
+    """Write a recording again with one message per sample; the file is complete or absent.
 
-    `read_recording` reads it as it reads any other. Samples in gaps have no message, what was
-    damaged is not in it, and a recording that is torn remains one that says so.
+    `read_recording` reads it like any other. Samples in gaps have no message, damaged parts are
+    left out, and a torn recording stays marked as torn.
 
     Raises
     ------
     DataError
         Where the file cannot be written.
     SettingError
-        Where it is to be compressed and zstandard is not installed.
+        For compression without zstandard.
     """
     with replacing(Path(path)) as temporary:
         assembler = Assembler(recording.header.columns, single=True, compress=compress)
@@ -459,7 +459,7 @@ def _account(recording: RecordedFile) -> dict[str, Any]:
 
 
 def _is_earlier(out: Path, recording: RecordedFile) -> bool:
-    """Whether a file is an earlier export of this recording, and holds no more than it."""
+    """Whether a file is an earlier export of this recording, without additional samples."""
     if out.suffix.lower() != ".mcap" or not out.is_file():
         return False
     try:
@@ -476,7 +476,7 @@ def export(
     overwrite: bool = False,
     compress: bool = False,
 ) -> RecordedFile:
-    """Write a recording's columns with `t` in the format that the extension of `out` says.
+    """Write a recording's columns with `t` in the format given by the extension of `out`.
 
     Gaps are rows of NaN. Events, settings and the device's identity go into `.mcap` only.
 
@@ -485,27 +485,27 @@ def export(
     path : path
         The recording.
     out : path
-        `.csv`, `.parquet`, `.mat`, `.npz`, or `.mcap`: one message a sample, for programs that
-        plot; also the repair of a file that lacks its end. An existing file is replaced in one
-        step, except a recording of a drive.
+        `.csv`, `.parquet`, `.mat`, `.npz`, or `.mcap`: one message per sample, for plotting
+        programs; also repairs a file without its end. An existing file is replaced in one step,
+        except a recording of a drive.
     overwrite : bool
         Whether to replace such a recording as well.
     compress : bool
-        Of `.mcap`: compress its chunks by zstd (`sewfast[zstd]`), which PlotJuggler, Foxglove and
+        Compress the chunks of an `.mcap` by zstd (`sewfast[zstd]`), which PlotJuggler, Foxglove and
         sewfast read.
 
     Returns
     -------
     RecordedFile
-        What was read.
+        The recording.
 
     Raises
     ------
     DataError
-        Where the recording cannot be read or the other file not be written.
+        Where the recording cannot be read or the other file cannot be written.
     SettingError
         Where the extension is unknown or its package is not installed, `out` is the recording
-        itself, or another one that cannot be had again; to compress another format.
+        itself or another one that cannot be made again, or another format is to be compressed.
     """
     if compress and Path(out).suffix.lower() != ENDING:
         raise SettingError(

@@ -4,11 +4,9 @@ pub(crate) mod batch;
 mod kernel_plant;
 mod plants;
 mod scalar;
-mod signals;
 
 pub use kernel_plant::KernelPlant;
 pub use plants::{LaggedPlant, StatePlant, Varied};
-pub use signals::Signals;
 
 use sewfast_control::{AnyController, Refused};
 
@@ -44,6 +42,7 @@ pub trait Plant {
 /// # Errors
 /// `ErrorKind::Setting` for counts that are negative or not finite, or a phase outside 0 to 1.
 pub fn encoder(counts_per_unit: f64, phase: f64) -> Result<Option<Encoder>> {
+    // Written so that NaN is refused.
     if !(counts_per_unit >= 0.0 && counts_per_unit.is_finite() && (0.0..1.0).contains(&phase)) {
         return Err(Error::setting(format!(
             "expected counts per unit of 0 or more and a phase from 0 to below 1, got {counts_per_unit} and {phase}; \
@@ -58,8 +57,83 @@ pub fn encoder(counts_per_unit: f64, phase: f64) -> Result<Option<Encoder>> {
 #[inline(always)]
 fn counts(plant: &(impl Plant + ?Sized), encoder: Option<&Encoder>, since: f64) -> Option<f64> {
     let encoder = plant.encoder().or(encoder)?;
+    // -Ts before the first sample: the counter is taken to have run at this output until now, so that the first difference
+    // is its speed and not 0.
     let position = plant.position() + since * plant.output();
     Some(encoder.count(position))
+}
+
+/// Reference, feedforward and disturbance of a run, sample by sample.
+#[derive(Clone, Copy, Debug)]
+pub struct Signals<'a> {
+    /// What the output shall be \[y\].
+    pub reference: &'a [f64],
+    /// A command that is added before the limits \[u\].
+    pub feedforward: Option<&'a [f64]>,
+    /// A command that is added behind the limits, unseen by the controller \[u\].
+    pub disturbance: Option<&'a [f64]>,
+}
+
+impl<'a> Signals<'a> {
+    /// A reference alone.
+    pub fn new(reference: &'a [f64]) -> Self {
+        Self {
+            reference,
+            feedforward: None,
+            disturbance: None,
+        }
+    }
+
+    /// # Errors
+    /// `ErrorKind::Data` for signals that are empty, not finite or of different lengths.
+    pub(crate) fn check(&self) -> Result<()> {
+        check_reference(self.reference)?;
+        let beside = [
+            ("feedforward", self.feedforward),
+            ("disturbance", self.disturbance),
+        ];
+        for (name, signal) in beside {
+            let Some(signal) = signal else { continue };
+            if signal.len() != self.reference.len() {
+                return Err(Error::data(format!(
+                    "expected a {name} as long as the reference, {} samples, got {}; give one value a sample",
+                    self.reference.len(),
+                    signal.len()
+                )));
+            }
+            check_finite(name, signal)?;
+        }
+        Ok(())
+    }
+
+    /// The command that is added at sample `k` before the limits.
+    #[inline(always)]
+    fn feedforward_at(&self, k: usize) -> Option<f64> {
+        self.feedforward.map(|added| at(added, k))
+    }
+
+    /// The command that is added at sample `k` behind the limits.
+    #[inline(always)]
+    fn disturbance_at(&self, k: usize) -> Option<f64> {
+        self.disturbance.map(|added| at(added, k))
+    }
+}
+
+#[inline(always)]
+fn at(signal: &[f64], k: usize) -> f64 {
+    signal.get(k).copied().unwrap_or(0.0)
+}
+
+/// # Errors
+/// `ErrorKind::Data` at the first value that is not finite.
+fn check_finite(name: &str, signal: &[f64]) -> Result<()> {
+    match signal.iter().position(|value| !value.is_finite()) {
+        None => Ok(()),
+        Some(k) => Err(Error::data(format!(
+            "expected finite values in the {name}, got {} at sample {k}; fill or cut it there",
+            signal[k]
+        ))),
+    }
 }
 
 /// How a run ended.
@@ -75,6 +149,7 @@ pub enum Outcome {
 }
 
 /// No drive's output is that large in any unit.
+// Not infinity: a loop that grows by 10 % a sample takes 7,000 samples to get there, and its squares overflow half way.
 const RUNAWAY: f64 = 1e15;
 /// Samples between two looks at a stop request, a few milliseconds of work.
 const WATCHED: usize = 2048;
@@ -131,6 +206,8 @@ impl Run {
         monitor: &Monitor,
     ) {
         match plant.known() {
+            // The whole loop inside one kernel: controller, encoder and plant are compiled for one processor, with no
+            // call from sample to sample.
             Some(known) => simd::run(ScalarLoop {
                 run: self,
                 known,
@@ -139,6 +216,8 @@ impl Run {
                 encoder,
                 monitor,
             }),
+            // Plants that only step themselves (the virtual machine, a state-space model): compiled for the baseline
+            // here, with kernels of their own inside.
             None => self.fill(plant, controller, signals, encoder, monitor),
         }
     }
@@ -153,6 +232,8 @@ impl Run {
         monitor: &Monitor,
     ) {
         // Room for all at once: a call to make more, even one that never comes, empties the registers at every sample.
+        // Compiled into its two callers: into the kernel of `ScalarLoop` with that one's registers, and for plants that
+        // step themselves.
         let samples = signals.reference.len();
         self.u.resize(samples, 0.0);
         self.y.resize(samples, 0.0);
@@ -175,11 +256,14 @@ impl Run {
         monitor: &Monitor,
     ) -> (usize, Outcome) {
         let samples = signals.reference.len();
+        // Slices as long as the loop, for the compiler: every k is within them.
         let commands = &mut self.u[..samples];
         let (outputs, feedback) = (&mut self.y[..samples], &mut self.feedback[..samples]);
         plant.reset();
         controller.reset();
         let ts = controller.ts();
+        // A difference of counters over Ts and counts per unit is the mean speed of the last sample time: an encoder
+        // gives no more.
         let scale = plant.encoder().or(encoder).map(Encoder::counts_per_unit);
         let per_speed = ts * scale.unwrap_or(1.0);
         let mut before = counts(plant, encoder, -ts);
@@ -189,17 +273,25 @@ impl Run {
                 (Some(before), Some(now)) => (now - before) / per_speed,
                 _ => y,
             };
+            // The counter itself is kept and not the position: what an encoder has rounded off once is not measured
+            // later either.
             before = now;
+            // Written so that NaN ends the run. What is measured counts, too: with many counts a unit the counter overflows
+            // where the output does not.
             if !(y.abs() < RUNAWAY && measured.is_finite()) {
                 return (k, Outcome::Diverged(k));
             }
+            // A power of two, so a mask; a look is an atomic read.
             if k % WATCHED == 0 && monitor.stopped() {
                 return (k, Outcome::Interrupted(k));
             }
+            // The command is held until the next sample: it acts on y(k+1) at the earliest, which is why a plant has a
+            // delay of 1 or more.
             let u = controller.decide(k == 0, r, measured, signals.feedforward_at(k));
             commands[k] = u;
             outputs[k] = y;
             feedback[k] = controller.filtered();
+            // Behind the controller and its limits, so that neither the anti-windup nor the record sees it.
             plant.advance(signals.disturbance_at(k).map_or(u, |added| u + added));
         }
         (samples, Outcome::Completed)
@@ -253,7 +345,7 @@ pub fn check_reference(reference: &[f64]) -> Result<()> {
             "expected a reference with samples, got an empty one",
         ));
     }
-    signals::check_finite("reference", reference)
+    check_finite("reference", reference)
 }
 
 impl From<Refused> for Error {

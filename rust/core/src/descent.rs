@@ -151,6 +151,8 @@ pub(crate) trait Method {
     }
 
     /// The point of the last cost becomes the present one.
+    // Costs and Jacobians share a simulation: the method is told which of the points it has simulated is to be
+    // linearised.
     fn keep(&mut self) {}
 
     /// Linearises at the present point; false where that is not finite.
@@ -162,6 +164,7 @@ pub(crate) trait Method {
     }
 
     /// The tests that end the iteration; they may refine the outcome.
+    // Before a step: at a minimum none is worth its simulations. `settled`, behind it, sees what the step gained.
     fn finished(&mut self, outcome: &mut Outcome) -> Option<Termination>;
 
     fn propose(&mut self, theta: &[f64], trial: &mut [f64]) -> Proposal;
@@ -189,8 +192,11 @@ pub(crate) fn descend(
         iterations: 0,
         trials: 0,
         termination: Termination::NotFinite,
+        // A limit of a million iterations asks for no room that is not used.
         trace: Vec::with_capacity(max_iterations.min(1000) + 1),
     };
+    // A start without a finite cost has no direction to go: it is an outcome and no error, as one of many starts may be
+    // so.
     match method.cost(&outcome.theta) {
         Some(cost) if cost.is_finite() => outcome.cost = cost,
         _ => {
@@ -214,20 +220,26 @@ fn iterate(
     monitor: &Monitor,
     accepted: &mut impl FnMut(&[f64], f64),
 ) -> Termination {
+    // One vector for all trials: an iteration allocates nothing.
     let mut trial = vec![0.0; method.parameters()];
+    // For methods that take a step back once its derivatives are known.
     let (mut last, mut last_cost) = (outcome.theta.clone(), outcome.cost);
     for _ in 0..max_iterations {
+        // Once an iteration: a rejected trial costs none.
         let finite = method.linearise(&outcome.theta);
         if finite && method.takes_back() {
+            // Its step was accepted by its cost, but its sensitivities are of no use to go on from.
             outcome.theta.copy_from_slice(&last);
             outcome.cost = last_cost;
         } else {
             last.copy_from_slice(&outcome.theta);
             last_cost = outcome.cost;
         }
+        // Asked behind the Jacobian, which ends early on a request and is then of no use.
         if monitor.stopped() {
             return Termination::Interrupted;
         }
+        // The Jacobian can overflow where the run did not: the point stays the best one.
         if !finite {
             return Termination::NotFinite;
         }
@@ -237,12 +249,14 @@ fn iterate(
             return end;
         }
         let before = outcome.cost;
+        // Ended without an accepted step: theta is the best point, but a refused trial has been simulated since.
         if let Some(end) = improve(method, outcome, &mut trial, monitor) {
             return end;
         }
         outcome.trace.push(outcome.cost);
         monitor.report_cost(outcome.cost);
         accepted(&outcome.theta, outcome.cost);
+        // Last, so that the step that shows the end is part of the outcome.
         if let Some(end) = method.settled(before, outcome.cost) {
             return end;
         }
@@ -257,21 +271,25 @@ fn improve(
     trial: &mut [f64],
     monitor: &Monitor,
 ) -> Option<Termination> {
+    // It ends by the method: `Marquardt` gives up after `MOST_REJECTIONS`.
     loop {
         if monitor.stopped() {
             return Some(Termination::Interrupted);
         }
         match method.propose(&outcome.theta, trial) {
+            // No step with this damping, and so no trial either.
             Proposal::Again => continue,
             Proposal::End(end) => return Some(end),
             Proposal::Trial => {}
         }
         outcome.trials += 1;
+        // With the cost to beat: a simulation may stop as soon as its partial sum is above.
         let cost = method.trial_cost(trial, outcome.cost);
         match method.judge(outcome.cost, cost) {
             Verdict::Rejected => {}
             Verdict::End(end) => return Some(end),
             Verdict::Accepted => {
+                // A verdict is given on a cost; without one there is none to accept.
                 outcome.cost = cost.unwrap_or(outcome.cost);
                 outcome.theta.copy_from_slice(trial);
                 method.keep();

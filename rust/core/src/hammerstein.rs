@@ -65,6 +65,8 @@ impl Knots {
 
     /// The piece that `x` is on, and how far along it; below 0 or above 1 beyond the ends.
     fn place(&self, x: f64) -> (usize, f64) {
+        // Knots are evenly spaced, so that the piece is a division and no search. `along` is not limited: beyond the
+        // ends the first and the last piece go straight on.
         let along = (x - self.low) / self.width();
         // NaN and what is below the first knot become piece 0
         let piece = (along.max(0.0) as usize).min(self.pieces - 1);
@@ -90,10 +92,12 @@ impl Bent {
 
     fn value_and_slope(&self, u: f64) -> (f64, f64) {
         let (i, t) = self.knots.place(u);
+        // c is in parts of the range: a bend has the same size whatever the input's unit, and one ridge fits all.
         let range = self.knots.high - self.knots.low;
         let (left, rise) = (self.c[i], self.c[i + 1] - self.c[i]);
         (
             u + range * (left + t * rise),
+            // df/du = 1 + range rise/width, and range/width is the number of pieces.
             1.0 + self.knots.pieces as f64 * rise,
         )
     }
@@ -102,6 +106,7 @@ impl Bent {
     fn add_gradient(&self, u: f64, factor: f64, by_c: &mut [f64]) {
         let (i, t) = self.knots.place(u);
         let range = self.knots.high - self.knots.low;
+        // f depends on the two knots beside u, by 1 - t and t; those at the ends are 0 and no parameters.
         for (knot, share) in [(i, 1.0 - t), (i + 1, t)] {
             if let Some(place) = knot.checked_sub(1).and_then(|inner| by_c.get_mut(inner)) {
                 *place += factor * range * share;
@@ -123,6 +128,8 @@ struct Rising {
 impl Rising {
     fn new(knots: Knots, d: &[f64]) -> Self {
         let n = knots.pieces;
+        // exp(d - largest): the softmax is the same, and no exponential overflows. It begins at 0, as the first piece's
+        // own d is 0: of n shares n - 1 are free.
         let largest = d.iter().fold(0.0, |most: f64, d| most.max(*d));
         let mut shares: Vec<f64> = std::iter::once(&0.0)
             .chain(d)
@@ -133,6 +140,8 @@ impl Rising {
         let range = knots.high - knots.low;
         let mut values = vec![knots.low];
         for share in &shares {
+            // Shares add up to 1, so that the rises add up to the range: g(high) = high, which fixes the factor between
+            // the curves.
             let rise = range * (LEAST_SLOPE / n as f64 + (1.0 - LEAST_SLOPE) * share);
             values.push(values[values.len() - 1] + rise);
         }
@@ -148,6 +157,7 @@ impl Rising {
     }
 
     fn value_and_slope(&self, x: f64) -> (f64, f64) {
+        // Exactly the identity: a Hammerstein model has no rounding of a curve that is not there.
         if self.knots.pieces == 1 {
             return (x, 1.0);
         }
@@ -162,9 +172,12 @@ impl Rising {
             return (y, 1.0);
         }
         let inner = &self.values[1..self.knots.pieces];
+        // The values rise, but are not evenly spaced: a search by halves. Inner ones alone, so that what is beyond the
+        // ends is on the first or the last piece.
         let i = inner.partition_point(|value| *value <= y);
         let (rise, width) = (self.rise(i), self.knots.width());
         let t = (y - self.values[i]) / rise;
+        // 1/g' is what a past output's noise is multiplied by: `LEAST_SLOPE` bounds it.
         (self.knots.at(i) + t * width, rise / width)
     }
 
@@ -172,6 +185,8 @@ impl Rising {
     /// `dg/dd_m = R (1 - LEAST_SLOPE) s_m ([m < i] - C_i + t ([m = i] - s_i))`.
     fn add_gradient(&self, x: f64, factor: f64, by_d: &mut [f64]) {
         let (i, t) = self.knots.place(x);
+        // From ds_i/dd_m = s_m ([i = m] - s_i): the pieces before x count in full, the one it is on by t, and the least
+        // slope not at all, as it does not depend on d.
         let before: f64 = self.shares[..i].iter().sum();
         let range = (self.knots.high - self.knots.low) * (1.0 - LEAST_SLOPE);
         for (m, (place, share)) in (1..).zip(by_d.iter_mut().zip(&self.shares[1..])) {
@@ -204,6 +219,9 @@ struct Parts {
 
 impl Parts {
     fn of(lags: Lags, inputs: &[Knots], output: Knots) -> Self {
+        //   theta   | a | b, input by input | offset | c, input by input | d |
+        //           ^ 0 .. regressors        ^ offset ^ bends             ^ slopes
+        // A curve of n pieces has n - 1 free numbers: the ends of f are fixed, as is the first slope of g.
         let offset = lags.regressors();
         let bends = offset + 1;
         let slopes = bends + inputs.iter().map(|k| k.pieces - 1).sum::<usize>();
@@ -302,6 +320,8 @@ impl HammersteinWiener {
         let mut x = self.theta[phi.len()];
         for (i, value) in phi.iter().enumerate() {
             let coefficient = self.theta[i];
+            // phi has past outputs y; the difference equation wants the x behind them, -a_i x(k-i) with x = g^-1(y) and
+            // dx/dy = 1/g'.
             let (value, slope) = if i < na {
                 let (past, slope) = self.output.inverse(*value);
                 (-past, -1.0 / slope)
@@ -321,17 +341,20 @@ impl Lagged for HammersteinWiener {
     }
 
     fn output(&self, phi: &[f64]) -> f64 {
+        // An empty closure: the walk for the output alone costs no derivatives.
         let x = self.linear_part(phi, |_, _, _, _| ());
         self.output.value_and_slope(x).0
     }
 
     fn output_and_slope(&self, phi: &[f64], slope: &mut [f64]) -> f64 {
         let x = self.linear_part(phi, |i, coefficient, _, steep| {
+            // As many as were asked, the past outputs first.
             if let Some(slope) = slope.get_mut(i) {
                 *slope = coefficient * steep;
             }
         });
         let (y, steep) = self.output.value_and_slope(x);
+        // dy/dphi_i = g'(x) dx/dphi_i.
         slope.iter_mut().for_each(|slope| *slope *= steep);
         y
     }
@@ -344,6 +367,8 @@ impl Parametric for HammersteinWiener {
 
     fn with_theta(&self, theta: &[f64]) -> Option<Self> {
         let finite = theta.iter().all(|value| value.is_finite());
+        // A trial beyond the unit circle is refused as one that diverges would be: its free run may still be finite over
+        // a short record.
         (finite && is_stable(&theta[..self.lags.na], MARGIN)).then(|| {
             Self::made(
                 self.lags,
@@ -358,6 +383,7 @@ impl Parametric for HammersteinWiener {
     /// `dx/dd = -(dg/dd)/g'`.
     fn gradient(&self, phi: &[f64], by_theta: &mut [f64], by_phi: &mut [f64]) -> f64 {
         let (Lags { na, nb, .. }, parts) = (self.lags, self.parts());
+        // Curves' derivatives are sums over several terms of phi, so that they begin at 0; a and b have one term each.
         by_theta[parts.offset..].fill(0.0);
         by_theta[parts.offset] = 1.0;
         let (linear, curves) = by_theta.split_at_mut(parts.bends);
@@ -373,6 +399,7 @@ impl Parametric for HammersteinWiener {
                 return;
             }
             let (j, of_input) = ((i - na) / nb, (i - na) % nb);
+            // Terms come input by input: with the first of each its bends begin behind those of the input before.
             if of_input == 0 && j > 0 {
                 first += self.inputs[j - 1].knots.pieces - 1;
             }
@@ -380,6 +407,7 @@ impl Parametric for HammersteinWiener {
             let own = &mut bends[first..first + inner];
             self.inputs[j].add_gradient(phi[i], coefficient, own);
         });
+        // All so far is dx; dy = g'(x) dx, and behind it what d moves at x itself.
         let (y, steep) = self.output.value_and_slope(x);
         by_theta.iter_mut().for_each(|value| *value *= steep);
         by_phi.iter_mut().for_each(|value| *value *= steep);
@@ -389,6 +417,7 @@ impl Parametric for HammersteinWiener {
     }
 
     fn shrunk(&self) -> Range<usize> {
+        // Bends and slopes, not a and b: a curve without data stays straight, the dynamics are what they are.
         let parts = self.parts();
         parts.bends..parts.end
     }
@@ -436,11 +465,13 @@ pub fn fit(
             knots(values, pieces.0)
         })
         .collect();
+    // Curves over the ranges of the data. g begins as the identity, so that the range of x is that of y.
     let output = knots(records.iter().flat_map(|r| r.y), pieces.1);
     output.check("output")?;
     inputs.iter().try_for_each(|knots| knots.check("input"))?;
     let straight = Parts::of(lags, &inputs, output);
     let mut theta = [linear.model.a(), linear.model.b(), &[linear.model.offset()]].concat();
+    // Zeros are straight curves: the start runs as the linear model does.
     theta.resize(straight.end, 0.0);
     let start = HammersteinWiener::new(lags, &inputs, output, theta)?;
     let states = &linear.initial_states;

@@ -1,16 +1,12 @@
 //! The network output-error model: a free-running network with its scaling.
 
-mod data_units;
 mod draw;
 mod free_run;
 mod network;
 mod problem;
-mod referee;
-mod regressor;
 mod scaling;
 mod sensitivities;
 mod train;
-mod warm;
 
 pub(crate) use network::{Meanwhile, Nothing};
 pub use network::{Network, Shape};

@@ -3,30 +3,25 @@
 mod draw;
 mod free_run;
 mod friction;
-mod growth;
 mod integrated;
 mod kalman;
-mod leak;
 mod network;
 mod output;
 mod problem;
 mod realisation;
 mod recording;
 mod referee;
-mod scaling;
 mod sensitivities;
 mod shape;
 mod single;
 mod state;
-mod stepper;
 mod train;
 
+pub use free_run::Stepper;
 pub use output::OutputFunction;
 pub use recording::Recording;
-pub use scaling::Scaling;
-pub use shape::Shape;
+pub use shape::{Scaling, Shape};
 pub use state::Statistics;
-pub use stepper::Stepper;
 pub use train::{NeuralSSFit, Settings, fit};
 
 use free_run::Trajectory;

@@ -52,6 +52,7 @@ impl<M: Parametric> Differentiable for M {
         let (na, columns) = (lags.na, parameters + lags.na);
         // the rows of the past outputs themselves come first, the oldest one on top
         let mut rows = vec![0.0; (na + run.len()) * columns];
+        // dy(-1-i)/dy_past_i = 1: the unit matrix, the newest past output in the last of these rows.
         for i in 0..na {
             rows[(na - 1 - i) * columns + parameters + i] = 1.0;
         }
@@ -60,9 +61,11 @@ impl<M: Parametric> Differentiable for M {
         phi[..na].copy_from_slice(y_past);
         for (k, &y) in run.iter().enumerate() {
             lags.write_inputs(u, k, &mut phi[na..]);
+            // All rows before this one, and room for it: S(k-m) is the m-th from the end.
             let (before, rest) = rows.split_at_mut((na + k) * columns);
             let row = &mut rest[..columns];
             self.gradient(&phi, &mut row[..parameters], &mut by_phi);
+            // S(k) = df/dtheta + sum_m df/dy(k-m) S(k-m); the columns of y_past have no part of their own.
             for (gain, old) in by_phi[..na].iter().zip(before.rchunks_exact(columns)) {
                 for (value, old) in row.iter_mut().zip(old) {
                     *value += gain * old;
@@ -70,6 +73,7 @@ impl<M: Parametric> Differentiable for M {
             }
             push_past(&mut phi[..na], y);
         }
+        // Those of the past outputs are no samples.
         rows.drain(..na * columns);
         Ok((run, rows))
     }
@@ -107,10 +111,12 @@ pub fn fit<M: Parametric>(
     max_iterations: usize,
     monitor: &Monitor,
 ) -> Result<Fit<M>> {
+    // Initial states are parameters, behind theta: wrong past outputs would be an error that the model has to explain.
     let theta = [Parametric::theta(start), initial_states.concat()].concat();
     let mut problem = FreeRun::new(start.clone(), records, ridge, monitor)?;
     let settings = lm::Settings {
         max_iterations,
+        // Parameters of different units: a, b and the bends of a curve.
         damping: Damping::Diagonal,
         ..lm::Settings::default()
     };
@@ -125,6 +131,7 @@ pub fn fit<M: Parametric>(
         Error::fit("expected a stable model, the fit found none; lower the orders")
     })?;
     Ok(Fit {
+        // What is told is the error alone, by which models with and without a ridge can be compared.
         cost: found.cost - problem.ridged(&found.theta),
         model,
         iterations: found.iterations,
@@ -156,6 +163,7 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
         let (shared, na) = (Parametric::theta(&model).len(), model.lags().na);
         let samples: usize = records.iter().map(Record::counting).sum();
         let unknowns = shared + na * records.len();
+        // Samples are counted and not weighed: a weight below 1 does not make them fewer equations.
         if samples <= unknowns {
             return Err(Error::data(format!(
                 "expected more than {unknowns} samples for as many parameters and initial states, got {samples} measured; record longer or lower na and nb"
@@ -166,11 +174,13 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
             shared,
             monitor,
             weight,
+            // In units of the cost, so that the same ridge means the same in every unit of y.
             ridge: ridge * variance(records, weight),
             runs: records
                 .iter()
                 .map(|r| vec![0.0; r.len() - r.first_measured()])
                 .collect(),
+            // theta, the states of one experiment, the error: those of others would be zeros.
             gram: Gram::new(shared + na + 1, na),
             records,
             model,
@@ -179,6 +189,7 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
 
     /// What holds the shrunk parameters near 0.
     fn ridged(&self, theta: &[f64]) -> f64 {
+        // 1/2 ridge sum t^2: a residual sqrt(ridge) t each, without a sum over samples.
         let shrunk = &theta[self.model.shrunk()];
         0.5 * self.ridge * shrunk.iter().map(|value| value * value).sum::<f64>()
     }
@@ -190,6 +201,7 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
 
     fn run(&mut self, model: &M, theta: &[f64], experiment: usize) -> Option<f64> {
         let (lags, record) = (model.lags(), &self.records[experiment]);
+        // By how long a sample takes: a power of two, so that the question is a mask.
         let (first, look) = (record.first_measured(), look(8 * lags.regressors()));
         let mut phi = vec![0.0; lags.regressors()];
         phi[..lags.na].copy_from_slice(self.state(theta, experiment));
@@ -202,12 +214,14 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
             *out = model.output(&phi);
             push_past(&mut phi[..lags.na], *out);
             let error = record.y[k] - *out;
+            // A selection, so that gaps do not branch.
             sum += if record.y[k].is_nan() {
                 0.0
             } else {
                 error * error
             };
         }
+        // A sum by weights is formed anew from the outputs: the loop above is that of every fit.
         Some(match record.weights {
             None => sum,
             Some(w) => weighted_squares(&w[first..], &record.y[first..], &self.runs[experiment]),
@@ -235,6 +249,8 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
             model.gradient(&phi, &mut by_theta, &mut by_phi);
             let weight = record.weights.map_or(1.0, |w| w[k]);
             let error = (record.y[k] - y, weight);
+            // `push` adds the gains times the rows before, keeps the error out of that, and leaves a sample without a
+            // measurement out of the sum.
             gram.push(&by_phi[..na], shared + na, error, |row| {
                 row[..shared].copy_from_slice(&by_theta);
                 row[shared..].fill(0.0);
@@ -246,6 +262,7 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
 
 /// The weighted variance of the measured outputs.
 fn variance(records: &[Record], weight: f64) -> f64 {
+    // Two walks, mean first: a sum of squares less the square of a mean would lose the digits of a position far from 0.
     let measured = || {
         records.iter().flat_map(|r| {
             let known = (0..r.len()).filter(|&k| !r.y[k].is_nan());
@@ -262,6 +279,7 @@ impl<M: Parametric> Problem for FreeRun<'_, M> {
     }
 
     fn cost(&mut self, theta: &[f64]) -> Option<f64> {
+        // No stable model: a trial that is refused before it runs.
         let model = self.model.with_theta(&theta[..self.shared])?;
         let mut sum = 0.0;
         for experiment in 0..self.records.len() {
@@ -279,9 +297,11 @@ impl<M: Parametric> Problem for FreeRun<'_, M> {
         let (shared, na, n) = (self.shared, model.lags().na, self.parameters());
         for experiment in 0..self.records.len() {
             self.sensitivities(&model, theta, experiment);
+            // Shared parameters add up, the states of an experiment have rows and columns of their own.
             let place = |i: usize| if i < shared { i } else { i + experiment * na };
             let (sums, width) = self.gram.finish();
             for i in 0..shared + na {
+                // The error is the last column, and its row of X'X is J'e.
                 jte[place(i)] += sums[(shared + na) * width + i] / self.weight;
                 for j in 0..=i {
                     jtj[place(i) * n + place(j)] += sums[i * width + j] / self.weight;

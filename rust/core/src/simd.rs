@@ -19,22 +19,24 @@
 //!
 //! A [`Kernel`] is written once over [`F64x8`] and compiled for AVX-512, for AVX2 with fused multiply-add and for the
 //! baseline; [`run`] takes the best one at run time, or the one that `SEWFAST_CPU` names. All do the same operations in
-//! the same order and differ only in the rounding of products that are added at once: on one level a kernel has one answer.
+//! the same order, `tanh` apart, and differ in the rounding of products that are added at once: on one level a kernel has one answer.
 
-mod level;
-mod one;
 mod plain;
 mod tanh;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
-pub use level::{Level, level};
+use std::sync::OnceLock;
+
+use crate::{Error, Result};
 
 /// Numbers in a group.
 pub(crate) const LANES: usize = 8;
 
 /// Eight numbers in memory, on a cache line of their own.
 #[derive(Clone, Copy, Debug, PartialEq)]
+// Aligned because a load of 64 bytes from anywhere else touches two cache lines and takes two accesses. Tables, weights
+// and states are `Lanes`; slices of plain numbers are read through `F64x8::first`, wherever they begin.
 #[repr(C, align(64))]
 pub(crate) struct Lanes(pub [f64; LANES]);
 
@@ -43,36 +45,26 @@ impl Lanes {
     pub const ZERO: Self = Self([0.0; LANES]);
 }
 
-/// Numbers that are computed with side by side, each for itself.
+/// Numbers that are computed with side by side, compared and chosen, each for itself: eight, or one.
 pub(crate) trait Arithmetic: Copy {
+    /// What [`are_less`](Self::are_less) gives where all are.
+    const ALL: u8;
+
     fn splat(value: f64) -> Self;
+    /// As many of the values as there is room for.
+    fn load(values: &[f64; LANES]) -> Self;
     fn add(self, other: Self) -> Self;
     fn sub(self, other: Self) -> Self;
     fn mul(self, other: Self) -> Self;
     fn div(self, other: Self) -> Self;
-    /// `self + a b`, rounded once where the processor can.
-    fn add_product(self, a: Self, b: Self) -> Self;
-    /// The smaller of `self` and `limit`; NaN stays NaN.
-    fn at_most(self, limit: f64) -> Self;
-    /// The larger of `self` and `limit`; NaN stays NaN.
-    fn at_least(self, limit: f64) -> Self;
-}
-
-/// Numbers that are compared and chosen, each for itself; at most eight.
-pub(crate) trait Choice: Arithmetic {
-    /// What [`are_less`](Self::are_less) gives where all are.
-    const ALL: u8;
-
-    /// As many of the values as there is room for.
-    fn load(values: &[f64; LANES]) -> Self;
+    // Limits are comparisons and not `f64::min`, which turns NaN into the limit: a run that has left the finite numbers
+    // would go on as if its output were merely limited.
     /// The smaller of `self` and `limits`, one by one; NaN in `self` stays NaN.
     fn at_most_each(self, limits: Self) -> Self;
     /// The larger of `self` and `limits`, one by one; NaN in `self` stays NaN.
     fn at_least_each(self, limits: Self) -> Self;
     /// `|self|`.
     fn abs(self) -> Self;
-    /// The largest integers that are not above `self`.
-    fn floor(self) -> Self;
     /// `yes` where `self < other`, else `no`.
     fn if_less(self, other: Self, yes: Self, no: Self) -> Self;
     /// `yes` where `self == other`, else `no`.
@@ -82,20 +74,35 @@ pub(crate) trait Choice: Arithmetic {
 }
 
 /// Eight numbers in registers.
-pub(crate) trait F64x8: Choice {
-    /// Sums that stay in registers: rows of a tile, and groups of columns, of which there are at most three.
+pub(crate) trait F64x8: Arithmetic {
+    /// Groups of sums that stay in registers beside one group of products: 8, 6 or 2.
     ///
-    /// A tile of r x c needs r c registers for sums, c for the row and one for the broadcast: 8 x 3 of the 32 of AVX-512, 4 x 1
-    /// (two each) of the 16 of AVX2. It also has to hide the latency of a fused multiply-add: 4 cycles on two units want 8 sums.
-    const TILE: (usize, usize);
+    /// A group takes one of the 32 registers of AVX-512, two of the 16 of AVX2, four of the 16 of the baseline; the sums leave room
+    /// for a group that is read and a number that is spread. The sums also have to hide the latency of a fused multiply-add: 4 cycles on
+    /// two units want 8 registers in the making.
+    const TILE_ROWS: usize;
 
+    /// `self + a b`, rounded once where the processor can.
+    fn add_product(self, a: Self, b: Self) -> Self;
+    /// The largest integers that are not above `self`.
+    fn floor(self) -> Self;
     fn store(self, values: &mut [f64; LANES]);
     /// The sum of all eight, in halves.
     fn sum(self) -> f64;
-    /// `|self|`, but `limit` where that is larger; NaN stays NaN.
-    fn abs_up_to(self, limit: f64) -> Self;
     /// `2^n` for numbers that hold the integer `n` in their low bits.
     fn power_of_two(self) -> Self;
+
+    /// The smaller of `self` and `limit`; NaN stays NaN.
+    #[inline(always)]
+    fn at_most(self, limit: f64) -> Self {
+        self.at_most_each(Self::splat(limit))
+    }
+
+    /// The larger of `self` and `limit`; NaN stays NaN.
+    #[inline(always)]
+    fn at_least(self, limit: f64) -> Self {
+        self.at_least_each(Self::splat(limit))
+    }
 
     /// `tanh`, as [`tanh::tanh`] computes it.
     #[inline(always)]
@@ -137,6 +144,8 @@ pub(crate) trait F64x8: Choice {
     /// that it leads to; rounded as is shortest here.
     #[inline(always)]
     fn fed_back(self, second: Self, direct: Self, rest: Self, weights: Self) -> (f64, Self) {
+        // Eight lanes to one number, and one number to eight lanes: `x86::Wide` has the order without this way through a
+        // scalar.
         let y = direct.add_product(second, self).sum();
         (y, rest.add_product(weights, Self::splat(y)))
     }
@@ -146,6 +155,8 @@ pub(crate) trait F64x8: Choice {
     fn first(values: &[f64]) -> Self {
         match values.first_chunk() {
             Some(values) => Self::load(values),
+            // NaN rather than a panic: it reaches the cost, and leaves no call in a kernel, around which registers would
+            // be emptied.
             None => Self::splat(f64::NAN),
         }
     }
@@ -164,16 +175,21 @@ pub(crate) trait Kernel {
     type Output;
 
     /// Does the work; `#[inline(always)]`, as everything it calls that uses `V`.
+    // `x86::wide` and `x86::half` carry the processor's features, and only what is compiled into them has these too. A
+    // function that stays a call is compiled for the baseline: each intrinsic in it is a call itself then, with its
+    // operands in memory.
     fn run<V: F64x8>(self) -> Self::Output;
 }
 
 /// Does the work on the level in use.
 pub(crate) fn run<K: Kernel>(kernel: K) -> K::Output {
-    run_at(level::in_use(), kernel)
+    run_at(in_use(), kernel)
 }
 
 /// Does the work on a level that this processor has.
 fn run_at<K: Kernel>(level: Level, kernel: K) -> K::Output {
+    // One branch for a whole kernel, not for an operation: what is chosen here is which of three copies of the kernel
+    // runs.
     #[cfg(target_arch = "x86_64")]
     match level {
         // SAFETY: levels that are handed on are those of the processor.
@@ -193,6 +209,98 @@ pub(crate) fn run_everywhere<K: Kernel>(mut kernel: impl FnMut() -> K) -> Vec<(L
     levels
         .map(|level| (level, run_at(level, kernel())))
         .collect()
+}
+
+/// What kernels are compiled for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Level {
+    /// What every processor of the architecture has.
+    Baseline,
+    /// AVX2 with fused multiply-add.
+    Avx2,
+    /// AVX-512, its doubles and quadwords (DQ) included.
+    Avx512,
+}
+
+impl Level {
+    /// All levels, the narrowest first.
+    pub const ALL: [Self; 3] = [Self::Baseline, Self::Avx2, Self::Avx512];
+
+    /// The name by which `SEWFAST_CPU` asks for it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Baseline => "baseline",
+            Self::Avx2 => "avx2",
+            Self::Avx512 => "avx512",
+        }
+    }
+
+    /// Whether this processor has it.
+    pub fn is_here(self) -> bool {
+        // Processor and operating system: a register that the system does not save at a change of threads is not there.
+        #[cfg(target_arch = "x86_64")]
+        let (half, wide) = (
+            is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
+            is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq"),
+        );
+        #[cfg(not(target_arch = "x86_64"))]
+        let (half, wide) = (false, false);
+        match self {
+            Self::Baseline => true,
+            Self::Avx2 => half,
+            // The ends of wide kernels (sums of eight) are instructions of AVX2, so that both have to be there.
+            Self::Avx512 => half && wide,
+        }
+    }
+
+    fn best() -> Self {
+        let here = Self::ALL.into_iter().rev().find(|level| level.is_here());
+        here.unwrap_or(Self::Baseline)
+    }
+}
+
+/// The variable that forces a level.
+const VARIABLE: &str = "SEWFAST_CPU";
+
+/// The level in use: the processor's best one, or the one that the environment variable `SEWFAST_CPU` names.
+///
+/// # Errors
+/// `ErrorKind::Setting` where the variable names no level, or one that this processor does not have; the best one is in
+/// use then.
+pub fn level() -> Result<Level> {
+    asked_for().map(|_| in_use())
+}
+
+fn asked_for() -> Result<Level> {
+    let Some(name) = std::env::var_os(VARIABLE) else {
+        return Ok(Level::best());
+    };
+    named(&name.to_string_lossy())
+}
+
+fn named(name: &str) -> Result<Level> {
+    let known = Level::ALL.into_iter().find(|level| level.name() == name);
+    match known {
+        Some(level) if level.is_here() => Ok(level),
+        // Refused and not lowered: a test that is to run on a level would pass without having run on it.
+        Some(_) => Err(Error::setting(format!(
+            "expected a processor with {name} for {VARIABLE}={name}, got one without; its best is {}",
+            Level::best().name()
+        ))),
+        None => Err(Error::setting(format!(
+            "expected baseline, avx2 or avx512 for {VARIABLE}, got {name:?}; without the variable the best is taken"
+        ))),
+    }
+}
+
+/// The level that every kernel runs on; it does not change while the program runs.
+#[inline]
+fn in_use() -> Level {
+    static IN_USE: OnceLock<Level> = OnceLock::new();
+    // Asked once: a model that is trained on one level and judged on another would differ in its last bits. A wrong name
+    // is no error here, where no caller could take it: `level`, which the Python module asks when it is loaded, reports
+    // it.
+    *IN_USE.get_or_init(|| asked_for().unwrap_or_else(|_| Level::best()))
 }
 
 #[cfg(test)]
@@ -215,7 +323,7 @@ mod tests {
                 a.div(b),
                 a.add_product(a, b),
                 V::splat(a.sum()),
-                a.abs_up_to(2.5),
+                a.abs().at_most(2.5),
                 a.at_most(2.5).at_least(-1.5),
                 V::splat(f64::from_bits(3)).power_of_two(),
                 a.at_most_each(b),
@@ -265,5 +373,16 @@ mod tests {
             assert_eq!(nan, [true; 6]);
             assert_eq!((values[13], values[15][0]), (b, 0.0));
         }
+    }
+
+    #[test]
+    fn takes_a_level_by_its_name_where_the_processor_has_it() {
+        for level in Level::ALL {
+            assert_eq!(named(level.name()).is_ok(), level.is_here());
+        }
+        assert_eq!(named("baseline"), Ok(Level::Baseline));
+        let refused = named("sse9").unwrap_err().message;
+        assert!(refused.contains("avx2") && refused.contains("sse9"));
+        assert!(Level::best().is_here());
     }
 }

@@ -247,13 +247,8 @@ impl Middle<'_> {
         if end <= begin {
             return;
         }
-        let most = match V::TILE.0 {
-            8 => 8,
-            4 => 6,
-            _ => 2,
-        };
         let count = signal.partners.len();
-        let size = count.div_ceil(count.div_ceil(most));
+        let size = count.div_ceil(count.div_ceil(V::TILE_ROWS));
         for first in (0..count).step_by(size) {
             let place = (p, first, begin, end);
             match size.min(count - first) {

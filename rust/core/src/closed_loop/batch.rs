@@ -25,8 +25,7 @@
 //! the caller's, one for a group.
 //!
 //! A lane does the operations of a loop that runs alone, in the same order: on one level it gives the bits of
-//! [`Run::record_by`](super::Run::record_by) as a lane. A loop that runs alone for its own sake takes a
-//! shorter way around a network of two past outputs and two inputs without delay.
+//! [`Run::record`](super::Run::record).
 
 mod controllers;
 
@@ -67,6 +66,8 @@ impl<C: InLanes> BatchLoop<'_, C> {
     ///
     /// Notes of a lane after its end mean nothing.
     pub fn run(self, notes: &mut [impl Notes]) -> [Outcome; MOST] {
+        // The usual model has its loops over the regressor unrolled. One more constant would be a copy of the whole
+        // batch for each kind of controller, level and kind of notes.
         if (self.known.lags.na, self.known.lags.regressors()) == (2, 4) {
             simd::run(Grouped::<_, _, 4>(self, notes))
         } else {
@@ -126,6 +127,11 @@ fn turn<V: F64x8, C: LaneController<V>, S: Notes, const N: usize>(
     ends: &mut Ends,
     now: Now<'_>,
 ) {
+    //   groups   4         3         2        1
+    //   g        0 1 2 3   0 1 2     0 1      0
+    //   due      2 3 0 1   2 0 1     1 0      0: decides and steps at once
+    // The due group decided half a round ago, for the lower half of g in the sample before, in which case there is
+    // nothing to step at k = 0. Each group so steps once between two of its decisions.
     let half = groups.len() / 2;
     let begun = now.k > 0 || now.g >= half;
     let due = if now.g < half {
@@ -133,9 +139,12 @@ fn turn<V: F64x8, C: LaneController<V>, S: Notes, const N: usize>(
     } else {
         now.g - half
     };
+    // Disjoint borrows: the decision of one group and the step of another are interleaved, and neither may be thought to
+    // change the other.
     if let Ok([loops, due]) = groups.get_disjoint_mut([now.g, due]) {
         let mut decision = Decision::new(loops, notes, ends, now);
         if begun {
+            // The plants' step leads and the decision fills its gaps: tanh has the divisions, the longest waits.
             due.plants.advance::<V, N>(due.applied, &mut decision);
         }
         decision.finish();
@@ -147,6 +156,7 @@ fn turn<V: F64x8, C: LaneController<V>, S: Notes, const N: usize>(
 
 /// Which lanes still run, and how the others ended.
 struct Ends {
+    // 64 bits for 32 lanes: `1 << 32` has to exist.
     running: u64,
     outcomes: [Outcome; MOST],
 }
@@ -162,6 +172,8 @@ impl Ends {
     /// Those of `lanes` that ran until now have ended.
     #[inline(always)]
     fn note(&mut self, lanes: u64, outcome: Outcome) {
+        // The first end counts. A lane that has ended computes on, as leaving it out would cost all others a selection in
+        // every operation.
         let ended = lanes & self.running;
         if ended != 0 {
             self.running &= !ended;
@@ -181,6 +193,8 @@ struct Loops<'a, V, C> {
     /// With counts per sample and unit of speed.
     encoder: Option<(&'a Encoder, f64)>,
     /// Counters at the last sample.
+    // Between two turns of a group these are memory and another group has the registers: 4 groups hold some 30 values
+    // each.
     before: V,
     measured: V,
     /// What reaches the plants.
@@ -199,6 +213,7 @@ impl<'a, V: F64x8, C: LaneController<V>> Loops<'a, V, C> {
             plants: BatchPlant::new(lanes.known),
             controllers: K::in_lanes::<V>(own),
             encoder,
+            // The plant rests at position 0 and speed 0, so that the counter a sample ago was the same.
             before: encoder.map_or(zero, |(encoder, _)| encoder.counts(zero)),
             measured: zero,
             applied: zero,
@@ -209,6 +224,7 @@ impl<'a, V: F64x8, C: LaneController<V>> Loops<'a, V, C> {
     #[inline(always)]
     fn measure(&mut self) -> u64 {
         let y: V = self.plants.output();
+        // As `Run::through` tests it, bit by bit of a mask; NaN is not below.
         let mut sound = y.abs().are_less(V::splat(RUNAWAY));
         self.measured = y;
         if let Some((encoder, per_speed)) = self.encoder {
@@ -217,16 +233,18 @@ impl<'a, V: F64x8, C: LaneController<V>> Loops<'a, V, C> {
             self.before = now;
             sound &= self.measured.abs().are_less(V::splat(f64::INFINITY));
         }
+        // Bits beyond the controllers of the last group name no loop: `Ends::running` begins without them.
         u64::from(!sound)
     }
 
-    /// LoopController on the commands.
+    /// Decides on the commands.
     #[inline(always)]
     fn decide(&mut self, signals: &Signals<'_>, k: usize, r: f64, notes: &mut impl Notes) {
         let y = self.plants.output();
         let u = self
             .controllers
             .decide(k == 0, r, signals.feedforward_at(k));
+        // As in `Run::through`, the command as the controller decided on it; the disturbance comes behind.
         notes.put(k, r, u, y, self.controllers.filtered());
         self.applied = match signals.disturbance_at(k) {
             None => u,
@@ -278,8 +296,12 @@ impl<V: F64x8, C: LaneController<V>, S: Notes> Meanwhile for Decision<'_, '_, V,
     #[inline(always)]
     fn go(&mut self) {
         let Now { k, r, g, signals } = self.now;
+        // Three chains: the encoder and its division; average, lag and observer; controller, limits and sums. Beside a network
+        // of one group of hidden units two of them stand within its step, beside more all three; beside a linear model,
+        // whose step is short, none.
         match self.stage {
             0 => {
+                // A group's lanes have its place among the bits of all.
                 let runaway = self.loops.measure() << (LANES * g);
                 self.ends.note(runaway, Outcome::Diverged(k));
             }
@@ -342,6 +364,8 @@ impl Default for Tally {
 impl Tally {
     /// Begins anew, for runs of these controllers whose outputs of so many samples are kept.
     pub fn begin(&mut self, controllers: &[&impl InLanes], kept: usize) {
+        // The room of the last run is used again: a search calls this for every group of candidates, and 8 numbers a
+        // sample are 256 kB at 4,000 samples.
         let mut y = std::mem::take(&mut self.y);
         y.resize(kept, Lanes::ZERO);
         *self = Self {
@@ -375,12 +399,16 @@ impl Notes for Tally {
     #[inline(always)]
     fn put<V: F64x8>(&mut self, k: usize, r: f64, u: V, y: V, _feedback: V) {
         let zero = V::splat(0.0);
+        // The first command is no change: before it the loop was at rest, not at 0.
         let last = if k == 0 { u } else { V::load(&self.last.0) };
         let change = u.sub(last);
+        // Products and sums apart, not fused: the sums of a lane are those of its loop on every level, sample after
+        // sample.
         let off = V::splat(r).sub(y);
         add(&mut self.error, off.mul(off));
         add(&mut self.command, u.mul(u));
         add(&mut self.change, change.mul(change));
+        // Samples are counted as 1.0: exact up to 2^53, and no second kind of register.
         let below = u.if_less(V::load(&self.high.0), V::splat(1.0), zero);
         add(
             &mut self.inside,

@@ -29,12 +29,13 @@ pub struct KernelPlant<'a> {
 impl KernelPlant<'_> {
     /// Samples between a command and its first appearance in the regressor.
     fn lead(&self) -> usize {
+        // The model's nk = 1 is the sample that every loop has: a command decided at k is in the regressor of y(k+1). So
+        // a model of delay nk around which more is held back waits for this many samples before.
         self.delay + self.lags.nk - 1
     }
 }
 
-/// One plant inside a kernel, where the whole loop is compiled for one processor; `R` holds its regressor. `BITS` asks for
-/// those of a lane, else a network's output is there sooner (where its [`SecondOrder`] is taken).
+/// One plant inside a kernel, where the whole loop is compiled for one processor; `R` holds its regressor.
 pub(super) struct ScalarPlant<'a, V, R> {
     known: KernelPlant<'a>,
     regressor: R,
@@ -63,6 +64,8 @@ impl<V: F64x8, R: Regressor> Plant for ScalarPlant<'_, V, R> {
 
     #[inline(always)]
     fn output(&self) -> f64 {
+        // The gain of a variation multiplies what is measured and not what is fed back: the model's own past outputs
+        // stay in its range.
         self.known.gain * self.regressor.newest()
     }
 
@@ -76,6 +79,7 @@ impl<V: F64x8, R: Regressor> Plant for ScalarPlant<'_, V, R> {
         let before = self.regressor.newest();
         self.regressor.take(u);
         let y = self.regressor.output::<V>(self.known.form);
+        // The trapezoid of two outputs, as between samples the output is taken to run straight.
         self.position += self.known.ts * (before + y) / 2.0;
         self.regressor.put(y);
     }
@@ -124,8 +128,13 @@ impl Regressor for AnyOrder {
     #[inline(always)]
     fn take(&mut self, u: f64) {
         shift(&mut self.inputs, u);
+        //   inputs   u(k) u(k-1) .. u(k-lead) .. u(k-lead-nb+1)      newest first
+        //   phi      y(k) .. y(k-na+1) | u(k-lead) .. u(k-lead-nb+1)
+        // The whole input part is copied and not shifted: with nb = 2 that is two numbers.
         let inputs = &mut self.phi[self.past..];
         let due = &self.inputs[self.lead..][..inputs.len()];
+        // By hand, as `copy_from_slice` is a call of memcpy for a length that is not known, which would empty the
+        // registers.
         let mut i = due.len();
         while i > 0 {
             i -= 1;
@@ -170,6 +179,9 @@ impl Regressor for SecondOrder {
 
     #[inline(always)]
     fn take(&mut self, u: f64) {
+        // phi = [y(k), y(k-1), u(k), u(k-1)]: the command is the newest input, as nothing is held back. An array by
+        // value, which the compiler splits into four registers; a slice would be memory, written and read again within
+        // the chain.
         self.0 = [self.0[0], self.0[1], u, self.0[2]];
     }
 
@@ -190,6 +202,7 @@ impl Regressor for SecondOrder {
 /// Puts a value in front of a few others.
 #[inline(always)]
 fn shift(newest_first: &mut [f64], value: f64) {
+    // By hand, for the same reason: `rotate_right` and `copy_within` are calls.
     let mut i = newest_first.len();
     while i > 1 {
         i -= 1;
@@ -202,8 +215,12 @@ fn shift(newest_first: &mut [f64], value: f64) {
 pub(super) struct BatchPlant<'a> {
     pub known: KernelPlant<'a>,
     /// Past outputs, newest first, then the inputs of the regressor.
+    // Entry by entry, eight loops each: `phi[c].0[i]` is entry c of loop i, so that a weight is spread and multiplies
+    // all loops at once.
     phi: Vec<Lanes>,
     /// Inputs that are still to reach the regressor, the next one at `next`.
+    // A ring, as delays can be long and only one entry is due; a regressor is short, and shifting it keeps its places
+    // known to the compiler.
     waiting: Vec<Lanes>,
     next: usize,
     position: Lanes,
@@ -236,6 +253,8 @@ impl<'a> BatchPlant<'a> {
     #[inline(always)]
     pub fn advance<V: F64x8, const N: usize>(&mut self, u: V, meanwhile: &mut impl Meanwhile) {
         let due = self.delayed(u);
+        // Known at compile time for the usual model: the network's loops over phi are unrolled, and its weights are
+        // addressed without a multiplication.
         let (na, n) = if N == 4 {
             (2, 4)
         } else {
@@ -243,13 +262,14 @@ impl<'a> BatchPlant<'a> {
         };
         let phi = &mut self.phi[..n];
         push_eight(&mut phi[na..], due);
+        // Read before the step and kept in a register: the position needs both ends of the sample.
         let newest = V::load(&phi[0].0);
         let y = match self.known.form {
             Form::Linear(model) => model.next_in_lanes::<V>(phi),
             Form::Network(network) => network.next_in_lanes::<V, N>(phi, meanwhile),
         };
         let moved = V::splat(self.known.ts).mul(newest.add(y));
-        // a product with 1/2 is as exact as the quotient
+        // A product with 1/2 is as exact as the quotient of the scalar loop, and spares the divider, which tanh needs.
         let moved = moved.mul(V::splat(0.5));
         V::load(&self.position.0)
             .add(moved)

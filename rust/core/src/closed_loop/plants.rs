@@ -9,6 +9,7 @@ use crate::{Error, Result};
 /// A lagged model as a plant: its regressor is kept from sample to sample.
 #[derive(Clone, Debug)]
 pub struct LaggedPlant<'a, M> {
+    // Both ways of the same model: `form` in the data's units, which kernels know, and `model` itself where it has none.
     model: &'a M,
     form: Option<Form>,
     /// Past outputs, newest first, then the inputs of the regressor.
@@ -48,6 +49,7 @@ impl<'a, M: Lagged> LaggedPlant<'a, M> {
             model,
             form: model.form(),
             phi: vec![0.0; lags.regressors()],
+            // From the command that is decided now to the oldest that the regressor holds.
             inputs: vec![0.0; lags.nk + lags.nb - 1],
             lags,
             position: 0.0,
@@ -75,6 +77,8 @@ impl<M: Lagged> Plant for LaggedPlant<'_, M> {
         let Lags { na, nk, .. } = self.lags;
         push(&mut self.inputs, u);
         self.phi[na..].copy_from_slice(&self.inputs[nk - 1..]);
+        // The form where there is one, here too: a plant that is stepped by itself and one inside a kernel then differ
+        // by rounding and not by how the scaling is applied.
         let y = match &self.form {
             Some(form) => form.output(&self.phi),
             None => self.model.output(&self.phi),
@@ -127,6 +131,7 @@ impl StatePlant {
                 "expected a sample time above 0, got {ts}"
             )));
         }
+        // The stepper begins where the model rests at input 0, which need not be output 0.
         Ok(Self {
             stepper: Stepper::new(model)?,
             position: 0.0,
@@ -195,6 +200,7 @@ impl<P: Plant> Varied<P> {
         if self.delay == 0 {
             return u;
         }
+        // A ring of `delay` entries: what is read is `delay` samples old, and its place is the newest one's.
         let due = std::mem::replace(&mut self.pending[self.next], u);
         self.next = (self.next + 1) % self.delay;
         due
@@ -213,6 +219,7 @@ impl<P: Plant> Plant for Varied<P> {
     }
 
     fn position(&self) -> f64 {
+        // The integral of the scaled output, so that an encoder counts what it would on the other machine.
         self.gain * self.plant.position()
     }
 
@@ -229,6 +236,8 @@ impl<P: Plant> Plant for Varied<P> {
     fn known(&self) -> Option<KernelPlant<'_>> {
         let known = self.plant.known()?;
         Some(KernelPlant {
+            // Handed through to the kernels, which apply it to all lanes: a search over variations is as fast as over
+            // one plant.
             gain: self.gain * known.gain,
             delay: self.delay + known.delay,
             ..known

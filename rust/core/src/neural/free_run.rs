@@ -2,17 +2,30 @@
 //!
 //! A run waits for itself: each output needs the one before. What does not depend on it, the inputs' share of the hidden
 //! units' arguments, is computed for a block of samples beforehand, and a second run fits into the waiting.
+//!
+//! ```text
+//!   z(k) = [ W1u u(k) + b1 ]                     drive     a block at once, off the chain
+//!        + [ W1y_na y(k-na) + .. + W1y_2 y(k-2) ]  older     known a sample before
+//!        + W1y_1 y(k-1)                            the chain: one product,
+//!   y(k) = direct(k) + w2' tanh(z(k))              one tanh, one sum of eight lanes
+//! ```
+//!
+//! Networks of one group of hidden units and up to four past outputs keep weights and past outputs in registers ([`together`]); the
+//! others go through memory ([`Chain::alone`]). Two runs side by side take 102 cycles a sample where one takes 76 (AVX-512; with AVX2
+//! 117 and 90, on the baseline 234 and 139: docs/PERFORMANCE.md), which pays where Levenberg and Marquardt try two dampings at once.
 
-use super::network::Network;
-use super::regressor;
+use super::network::{self, Network};
 use crate::Monitor;
 use crate::data::weighted_squares;
 use crate::limit::Limit;
 use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 
 /// Samples whose inputs are prepared at once.
+// A block's share of the inputs is 4 kB for a group of hidden units: written and read again within the first-level
+// cache.
 const BLOCK: usize = 64;
 /// Blocks between two looks at the monitor.
+// 4,096 samples, a tenth of a millisecond.
 const LOOK: usize = 64;
 
 /// One network's run; what it leaves behind goes where its caller says.
@@ -70,6 +83,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
         let samples = runs[0].outputs.len();
         let lags = runs[0].network.shape.lags;
         let mut chains = runs.map(Chain::new);
+        // Entry by entry of the regressor, the samples of a block contiguous: the drive reads one number of each.
         let mut inputs = vec![[0.0; BLOCK]; lags.regressors() - lags.na];
         for start in (0..samples).step_by(BLOCK) {
             let count = BLOCK.min(samples - start);
@@ -77,8 +91,9 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
                 return [None; RUNS];
             }
             for (entry, values) in inputs.iter_mut().enumerate() {
-                regressor::inputs(lags, u, first + start, entry, &mut values[..count]);
+                network::input_entry(lags, u, first + start, entry, &mut values[..count]);
             }
+            // Each run has weights of its own, but all have the same inputs, which are gathered once.
             for chain in chains.iter_mut().filter(|chain| chain.runs) {
                 chain.drive::<V>(&inputs, count);
             }
@@ -88,6 +103,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
                 let weights = weights.get(start..start + count).unwrap_or_default();
                 chain.conclude::<V>(start, (measured, weights), count, bound);
             }
+            // A run that has diverged or can no longer win is left out from the next block on; the other goes on alone.
             if chains.iter().all(|chain| !chain.runs) {
                 break;
             }
@@ -100,6 +116,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
 #[inline(always)]
 fn advance<V: F64x8, const RUNS: usize>(chains: &mut [Chain; RUNS], start: usize, count: usize) {
     let shape = chains[0].run.network.shape;
+    // 0 for what has no kernel with registers of its own.
     let na = if shape.groups() == 1 {
         shape.lags.na
     } else {
@@ -109,6 +126,7 @@ fn advance<V: F64x8, const RUNS: usize>(chains: &mut [Chain; RUNS], start: usize
         && one.runs
         && two.runs
     {
+        // Two runs of three past outputs would keep 20 registers, of four 26, beside what tanh needs.
         match na {
             1 => return together::<V, 1, 2>([one, two], start, count),
             2 => return together::<V, 2, 2>([one, two], start, count),
@@ -134,6 +152,8 @@ struct Chain<'a> {
     /// The last outputs, the oldest first, and behind them those of the block.
     outputs: Vec<f64>,
     /// Squared errors, every eighth.
+    // Eight sums, one for each place in a group of samples, kept from block to block: one sum alone would wait for each
+    // addition.
     sums: Lanes,
     sum: f64,
     limit: Limit,
@@ -144,6 +164,7 @@ impl<'a> Chain<'a> {
     fn new(run: Run<'a>) -> Self {
         let past = run.state.iter().rev().copied();
         Self {
+            // 8 groups of 64 samples are 32 kB at 64 hidden units: a first-level cache. Room for one direct row more.
             driven: vec![[Lanes::ZERO; BLOCK]; run.network.shape.groups() + 1],
             outputs: past.chain([0.0; BLOCK]).collect(),
             sums: Lanes::ZERO,
@@ -159,9 +180,11 @@ impl<'a> Chain<'a> {
     fn drive<V: F64x8>(&mut self, inputs: &[[f64; BLOCK]], count: usize) {
         let network = self.run.network;
         let n_phi = network.shape.lags.regressors();
+        // The direct way is the last of these groups, with b2 for its bias.
         for (group, driven) in self.driven.iter_mut().enumerate() {
             let bias = V::load(&network.bias[group].0);
             let weights = &network.first[group * n_phi..][..n_phi];
+            // Those of the inputs alone, which stand behind the outputs'.
             let weights = &weights[n_phi - inputs.len()..];
             for (k, driven) in driven.iter_mut().enumerate().take(count) {
                 let mut sum = bias;
@@ -180,6 +203,8 @@ impl<'a> Chain<'a> {
         let (shape, na) = (network.shape, network.shape.lags.na);
         let (groups, n_phi) = (shape.groups(), shape.lags.regressors());
         let (units, direct) = self.driven.split_at(groups);
+        //   outputs  | na before the block, oldest first | the block's, as they come |
+        // so that the past of sample k is a slice of it and nothing is moved within a block.
         let mut newest = V::splat(self.outputs[na - 1]);
         for k in 0..count {
             let (past, next) = self.outputs.split_at_mut(na + k);
@@ -196,6 +221,7 @@ impl<'a> Chain<'a> {
                 }
             }
             let y = network.limited(sum.sum());
+            // Spread here and not where it is used: every group's argument waits for it.
             newest = V::splat(y);
             next[0] = y;
         }
@@ -214,6 +240,8 @@ impl<'a> Chain<'a> {
         let outputs = &self.outputs[na..na + count];
         self.run.outputs[start..start + count].copy_from_slice(outputs);
         // NaN is no number below the bound either.
+        // Asked once a block and without a branch: a run that leaves the bound may go on for 64 samples, which nobody
+        // reads.
         let sound = outputs
             .iter()
             .fold(true, |sound, y| sound & (y.abs() < bound));
@@ -223,7 +251,10 @@ impl<'a> Chain<'a> {
         } else {
             self.sum += weighted_squares(weights, measured, outputs);
         }
+        // Sums of squares only grow, so that a partial sum beyond the limit decides. With weights they are added one by
+        // one, as hardly any training has them.
         self.runs &= !self.limit.is_reached(self.sum);
+        // The last na outputs are the past of the next block.
         self.outputs.copy_within(count..count + na, 0);
     }
 }
@@ -246,6 +277,8 @@ fn together<V: F64x8, const NA: usize, const RUNS: usize>(
     start: usize,
     count: usize,
 ) {
+    // Registers for a block: NA groups of W1, NA of the direct way, w2, NA past outputs spread over the lanes; 3 NA + 1
+    // for a run, beside what tanh needs.
     let mut weights = [[V::splat(0.0); NA]; RUNS];
     let mut direct = [[V::splat(0.0); NA]; RUNS];
     let mut second = [V::splat(0.0); RUNS];
@@ -260,6 +293,8 @@ fn together<V: F64x8, const NA: usize, const RUNS: usize>(
             past[r][m] = V::splat(chain.outputs[NA - 1 - m]);
         }
     }
+    // `arguments` is z of the sample at hand, computed a sample before: the loop is turned so that it begins with the
+    // tanh, and ends with what the next one waits for.
     let mut arguments = [V::splat(0.0); RUNS];
     for (r, chain) in chains.iter().enumerate() {
         let driven = V::load(&chain.driven[0][0].0);
@@ -268,13 +303,16 @@ fn together<V: F64x8, const NA: usize, const RUNS: usize>(
     }
     let limited = chains[0].run.network.saturates();
     let kept = !chains[0].run.hidden.is_empty();
+    // `min` tells the compiler that k is within the arrays of a block.
     for k in 0..count.min(BLOCK) {
         for r in 0..RUNS {
             let chain = &mut *chains[r];
+            // h(k), the head of the chain.
             let h = arguments[r].tanh_in_chain();
             if kept {
                 h.store(&mut chain.run.hidden[start + k].0);
             }
+            // Off the chain: lane 0 of `sum` is b2 + linear' phi, complete before h is.
             let mut sum = V::load(&chain.driven[1][k].0);
             for m in (0..NA).rev() {
                 sum = sum.add_product(direct[r][m], past[r][m]);
@@ -283,11 +321,15 @@ fn together<V: F64x8, const NA: usize, const RUNS: usize>(
             let driven = V::load(&chain.driven[0][(k + 1) % BLOCK].0);
             let rest = older(driven, &weights[r], &past[r]);
             let mut y;
+            // y and the next z at once, in the order of operations that is shortest on this level.
             (y, arguments[r]) = h.fed_back(second[r], sum, rest, weights[r][0]);
+            // A branch that is foretold where the limit is rare. The next argument has already been formed from the
+            // output as it was, and is formed again.
             if limited && chain.run.network.is_clipped(y) {
                 y = chain.run.network.limited(y);
                 arguments[r] = rest.add_product(weights[r][0], V::splat(y));
             }
+            // A register's name changes, nothing is moved.
             for m in (1..NA).rev() {
                 past[r][m] = past[r][m - 1];
             }
@@ -311,6 +353,8 @@ fn older<V: F64x8, const NA: usize>(driven: V, weights: &[V; NA], past: &[V]) ->
 #[inline(always)]
 fn squared_errors_on<V: F64x8>(sums: &mut Lanes, y: &[f64], run: &[f64]) -> f64 {
     let mut sum = V::load(&sums.0);
+    // Sample i of a block is lane i mod 8, and blocks are multiples of 8: with a record as a whole the same numbers
+    // would be added in the same order.
     let ((y, y_rest), (run, run_rest)) = (y.as_chunks(), run.as_chunks());
     for (y, run) in y.iter().zip(run) {
         sum = square(sum, V::load(y).sub(V::load(run)));
@@ -358,6 +402,7 @@ pub(super) fn outputs(
         bound: f64::INFINITY,
         monitor: None,
     };
+    // The run stopped at the end of the block in which it left the numbers: what was not simulated is zeros still.
     if whole.go()[0].is_none() {
         let end = outputs.iter().position(|y| !y.is_finite());
         outputs[end.unwrap_or(0)..].fill(f64::NAN);

@@ -53,6 +53,7 @@ impl Shape {
 
     /// Where `b1`, `w2`, `b2` and `linear` begin in theta.
     pub(crate) fn offsets(&self) -> [usize; 4] {
+        //   theta   | W1, unit by unit | b1 | w2 | b2 | linear, with a bypass |
         let bias = self.hidden * self.lags.regressors();
         let (second, constant) = (bias + self.hidden, bias + 2 * self.hidden);
         [bias, second, constant, constant + 1]
@@ -67,6 +68,8 @@ impl Shape {
     /// for `w2`, all hidden units, then `b2`, `linear`, the error and the past outputs.
     pub(super) fn columns(&self) -> Vec<usize> {
         let (n_phi, hidden) = (self.lags.regressors(), self.hidden);
+        // theta has W1 unit by unit, a row entry by entry of the regressor: so eight columns side by side are eight
+        // units with one scalar factor. All behind W1 stand in the same order in both.
         let first = (0..hidden).flat_map(|i| (0..n_phi).map(move |c| c * hidden + i));
         let others = n_phi * hidden..self.error_column();
         first.chain(others).collect()
@@ -74,6 +77,7 @@ impl Shape {
 
     /// Column of `b2`.
     pub(super) fn tail(&self) -> usize {
+        // n_phi kinds of columns of W1, then b1 and w2, each with a column for every unit.
         (self.lags.regressors() + 2) * self.hidden
     }
 
@@ -84,6 +88,8 @@ impl Shape {
 
     /// Column of the first past output.
     pub(super) fn state_column(&self) -> usize {
+        // Behind the error: where past outputs are no parameters, the columns that are summed end with the error, and
+        // J'J is as small as theta.
         self.error_column() + 1
     }
 
@@ -96,6 +102,8 @@ impl Shape {
     /// sums where they are `estimated`.
     pub(super) fn gram(&self, estimated: bool) -> Gram {
         let states = if estimated { self.lags.na } else { 0 };
+        // Groups are written whole: the last one ends beyond the last column, and so do those of the last kind of hidden
+        // units where there are fewer than eight of them.
         let written = self.tail() + self.tail_groups() * LANES;
         let units = (self.lags.regressors() + 1) * self.hidden + self.groups() * LANES;
         Gram::with_room(
@@ -116,6 +124,12 @@ pub struct Network {
     saturates: bool,
     /// For each group its weights for the regressor; behind the last one, in the first lane, those of the direct way to
     /// the output, whose bias is the constant.
+    //   first    group 0: | phi_1 | phi_2 | .. | phi_n |   group 1: ..   direct: | linear_1, 0 .. | ..
+    //   bias     group 0, group 1, ..                                     direct: | b2, 0 .. |
+    //   second   group 0, group 1, ..                                     a lane is a hidden unit
+    // The direct way to the output is a group like others, of which lane 0 alone is not zero: its argument is the sum to
+    // which second times h is added, and `sum` gives the output at once. A missing unit has weights of zero: tanh(0) = 0
+    // adds nothing, and its gradient is written over or not read.
     pub(super) first: Vec<Lanes>,
     pub(super) bias: Vec<Lanes>,
     pub(super) second: Vec<Lanes>,
@@ -142,6 +156,7 @@ impl Network {
         let n_phi = self.shape.lags.regressors();
         let [bias, second, constant, linear] = self.shape.offsets();
         for i in 0..self.shape.hidden {
+            // Units that are there: the lanes behind them are zero from `zero` on.
             let (group, lane) = (i / LANES, i % LANES);
             for c in 0..n_phi {
                 self.first[group * n_phi + c].0[lane] = theta[i * n_phi + c];
@@ -167,6 +182,8 @@ impl Network {
     #[inline(always)]
     fn argument<V: F64x8>(&self, group: usize, newest: f64, phi: &[f64]) -> V {
         let weights = &self.first[group * phi.len()..][..phi.len()];
+        // From the oldest to the newest: inputs stand behind the outputs in phi, so that this order is inputs, older
+        // outputs, newest. In a free run only the last product waits for the last sample.
         let older = weights.iter().zip(phi).skip(1).rev();
         let sum =
             |sum: V, (w, value): (&Lanes, &f64)| sum.add_product(V::load(&w.0), V::splat(*value));
@@ -183,6 +200,7 @@ impl Network {
         phi: &[f64],
         mut hidden: impl FnMut(usize, V),
     ) -> f64 {
+        // Lanes are added up once behind all groups, not for each group.
         let mut sum = self.argument::<V>(self.second.len(), newest, phi);
         for (group, second) in self.second.iter().enumerate() {
             let h = self.argument::<V>(group, newest, phi).tanh();
@@ -195,6 +213,7 @@ impl Network {
     /// The output, held to its limits.
     #[inline(always)]
     pub(super) fn limited(&self, output: f64) -> f64 {
+        // A branch: limits of infinity would be two operations on a free run's chain, and a branch that is foretold is none.
         if self.saturates {
             output.clamp(self.limits.0, self.limits.1)
         } else {
@@ -205,6 +224,8 @@ impl Network {
     /// True where the output lies on a limit, and so has no slope.
     #[inline(always)]
     pub(super) fn is_clipped(&self, output: f64) -> bool {
+        // On the limit counts as beyond it: there the output does not follow the weights any more, and a run that has
+        // been limited lies exactly there.
         output <= self.limits.0 || output >= self.limits.1
     }
 
@@ -217,6 +238,8 @@ impl Network {
     #[inline(always)]
     pub(super) fn unit<V: F64x8>(&self, group: usize, phi: &[f64]) -> (V, V) {
         let argument = self.argument::<V>(group, phi[0], phi);
+        // The exponential of `rise` beside the quotients of tanh: for derivatives that are handed out, where 1 - h^2 has
+        // to keep its digits in saturation. A training has `steep` instead.
         (argument.tanh(), argument.rise())
     }
 
@@ -255,6 +278,7 @@ impl Kernel for Once<'_> {
                 h.store(&mut hidden.0);
             }
         });
+        // y = limit, whatever the regressor: no slope.
         if network.is_clipped(output) {
             slope.fill(0.0);
             return output;
@@ -262,6 +286,7 @@ impl Kernel for Once<'_> {
         if !slope.is_empty() {
             slope.copy_from_slice(&network.linear[..slope.len()]);
             for (group, second) in network.second.iter().enumerate() {
+                // dy/dphi_c = linear_c + sum over units of w2 (1 - h^2) W1_c, for as many entries as were asked.
                 let steep = V::load(&second.0).mul(network.unit::<V>(group, phi).1);
                 let weights = &network.first[group * phi.len()..];
                 for (slope, w) in slope.iter_mut().zip(weights) {
@@ -289,5 +314,81 @@ impl Lagged for Network {
             hidden: &mut [],
             slope,
         })
+    }
+}
+
+/// Entry `entry` of the regressor's input part for the samples from `start` on; inputs before the first sample are held
+/// at their first value.
+#[inline]
+pub(super) fn input_entry(lags: Lags, u: &[f64], start: usize, entry: usize, out: &mut [f64]) {
+    let (channel, lag) = (entry / lags.nb, lags.nk + entry % lags.nb);
+    // Sample k takes u(k - lag); those before sample 0 are the first input.
+    let held = lag.saturating_sub(start).min(out.len());
+    let (before, known) = out.split_at_mut(held);
+    before.fill(u[channel]);
+    let from = (start + held).saturating_sub(lag);
+    // One input is contiguous, and a copy. Several are interleaved, sample by sample.
+    if lags.channels == 1 {
+        known.copy_from_slice(&u[from..from + known.len()]);
+        return;
+    }
+    let rows = u[from * lags.channels..].chunks_exact(lags.channels);
+    for (out, row) in known.iter_mut().zip(rows) {
+        *out = row[channel];
+    }
+}
+
+/// The output `back` samples before each of those from `start` of the run on; `state` holds those before the run, newest
+/// first.
+#[inline]
+pub(super) fn output_entry(run: &[f64], state: &[f64], start: usize, back: usize, out: &mut [f64]) {
+    let held = back.saturating_sub(start).min(out.len());
+    let (before, known) = out.split_at_mut(held);
+    for (i, out) in before.iter_mut().enumerate() {
+        // state[m] is y(first - 1 - m): what stands `back` before sample start + i of the run.
+        *out = state[back - 1 - start - i];
+    }
+    let from = (start + held).saturating_sub(back);
+    known.copy_from_slice(&run[from..from + known.len()]);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn is_the_regressor_sample_by_sample() {
+        let u: Vec<f64> = (0..60).map(f64::from).collect();
+        for channels in [1, 2, 3] {
+            let lags = Lags::new(2, 3, 2, channels).unwrap();
+            let samples = u.len() / channels;
+            for (start, count) in [(0, 3), (0, 20), (1, 1), (2, 9), (3, 1), (11, 9)] {
+                for entry in 0..3 * channels {
+                    let mut out = vec![f64::NAN; count];
+                    input_entry(lags, &u, start, entry, &mut out);
+                    let mut phi = vec![0.0; 3 * channels];
+                    for (k, out) in out.iter().enumerate() {
+                        assert!(start + k < samples);
+                        lags.write_inputs(&u, start + k, &mut phi);
+                        assert_eq!(*out, phi[entry]);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn takes_outputs_before_the_run_from_its_state() {
+        let (run, state) = ([10.0, 11.0, 12.0, 13.0, 14.0], [9.0, 8.0, 7.0]);
+        let taken = |start: usize, back: usize, count: usize| {
+            let mut out = vec![f64::NAN; count];
+            output_entry(&run, &state, start, back, &mut out);
+            out
+        };
+        assert_eq!(taken(0, 1, 5), [9.0, 10.0, 11.0, 12.0, 13.0]);
+        assert_eq!(taken(0, 3, 4), [7.0, 8.0, 9.0, 10.0]);
+        assert_eq!(taken(0, 3, 2), [7.0, 8.0]);
+        assert_eq!(taken(1, 3, 3), [8.0, 9.0, 10.0]);
+        assert_eq!(taken(3, 2, 2), [11.0, 12.0]);
     }
 }

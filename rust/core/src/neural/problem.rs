@@ -13,6 +13,8 @@ use crate::simd::{self, LANES, Lanes};
 use crate::{Monitor, Record};
 
 /// A free run beyond this many scales has diverged.
+// Scaled outputs are of size 1: no fit begins there, and a run that gets there does not come back. It ends in the block
+// in which it is seen.
 const DIVERGED: f64 = 1e4;
 
 /// One experiment in scaled units.
@@ -33,8 +35,10 @@ impl Experiment {
     pub fn new(record: &Record, scaling: &Scaling, na: usize, kind: InitialState) -> Self {
         let y: Vec<f64> = record.y.iter().map(|&y| scaling.output(y)).collect();
         let (first, state) = match kind {
+            // Zero in the data's unit: a machine at rest.
             InitialState::Zero => (0, vec![scaling.output(0.0); na]),
             InitialState::Measured => after_measured(&y, na),
+            // From the first measured sample on: a state before a gap would leave no trace in the cost.
             InitialState::Estimated => (record.first_measured(), vec![first_level(&y); na]),
         };
         Self {
@@ -98,6 +102,7 @@ fn squared_errors(measured: &[f64], run: &[f64]) -> f64 {
         let error = y - run;
         if error.is_nan() { 0.0 } else { error * error }
     };
+    // For validation, once an iterate: no kernel, the compiler's own vectors are enough.
     let (groups, rest) = measured.as_chunks::<LANES>();
     let (runs, rest_run) = run.as_chunks::<LANES>();
     let mut sums = [0.0; LANES];
@@ -112,6 +117,7 @@ fn squared_errors(measured: &[f64], run: &[f64]) -> f64 {
 
 /// The first sample behind `na` measured ones and those, newest first; the end where there is none.
 fn after_measured(y: &[f64], na: usize) -> (usize, Vec<f64>) {
+    // `na` measured outputs in a row are a past; the run begins behind them.
     let mut pasts = y.windows(na).enumerate();
     match pasts.find(|(_, past)| past.iter().all(|y| !y.is_nan())) {
         Some((k, past)) => (k + na, past.iter().rev().copied().collect()),
@@ -121,6 +127,7 @@ fn after_measured(y: &[f64], na: usize) -> (usize, Vec<f64>) {
 
 /// Mean of the first five measured outputs.
 fn first_level(y: &[f64]) -> f64 {
+    // Five, against noise; a guess, which the fit then moves.
     let first = || y.iter().filter(|y| !y.is_nan()).take(5);
     first().sum::<f64>() / first().count() as f64
 }
@@ -132,15 +139,20 @@ const MOST_TOGETHER: usize = 16_000_000;
 /// operations leaves the processor waiting.
 fn pays(shape: Shape, experiments: &[Experiment]) -> bool {
     let samples: usize = experiments.iter().map(Experiment::samples).sum();
+    // More groups overlap within one run already; more past outputs need more registers than two runs have. On the
+    // baseline a run is bound by the number of its operations (139 cycles, two side by side 234).
     let short = shape.groups() == 1 && shape.lags.na <= 2 && samples <= MOST_TOGETHER;
     short && simd::level() != Ok(simd::Level::Baseline)
 }
 
 /// A simulation, with what the Jacobian pass takes from it.
 struct Attempt {
+    // By which `sensitivities` finds the trial that was accepted: two were simulated, and either may be it.
     theta: Vec<f64>,
     network: Network,
     /// Outputs and hidden outputs, experiment by experiment.
+    // Room for the whole record, kept from trial to trial: 8 bytes a sample for outputs, 64 for a group of hidden
+    // outputs.
     runs: Vec<Vec<f64>>,
     hidden: Vec<Vec<Lanes>>,
 }
@@ -171,6 +183,7 @@ pub(super) struct FreeRun<'a> {
     samples: f64,
     /// The last simulations: one, and the one beside it where two at once pay.
     attempts: Vec<Attempt>,
+    // Rows and sums of one experiment: cleared, filled and scattered for each in turn.
     gram: Gram,
     columns: Vec<usize>,
 }
@@ -223,6 +236,7 @@ impl<'a> FreeRun<'a> {
     /// Weights are held back, the biases less, the linear part and the constant not at all.
     fn decay_of(&self, parameter: usize) -> f64 {
         let [bias, second, constant, _] = self.shape().offsets();
+        // Parts of theta by where they begin; linear part and constant are what the data say of a straight line.
         match parameter {
             i if i < bias => self.decay,
             i if i < second => 0.1 * self.decay,
@@ -245,6 +259,8 @@ impl<'a> FreeRun<'a> {
         thetas: [&[f64]; RUNS],
         limit: f64,
     ) -> [Option<f64>; RUNS] {
+        // A limit of None is a run that has failed: it is handed on from experiment to experiment, and its free runs end
+        // before their first block.
         let mut limits = thetas.map(|theta| {
             Some(Limit {
                 before: 0.0,
@@ -254,6 +270,7 @@ impl<'a> FreeRun<'a> {
             })
         });
         for (attempt, theta) in self.attempts.iter_mut().zip(thetas) {
+            // Of theta the first part; the states behind it are read by `state_in`.
             attempt.network.load(theta);
             attempt.theta.clear();
             attempt.theta.extend_from_slice(theta);
@@ -281,6 +298,8 @@ impl<'a> FreeRun<'a> {
             }
             .go();
             for (limit, sum) in limits.iter_mut().zip(sums) {
+                // The cost is a sum over experiments: what the first of them cost is taken off what is left for the
+                // next.
                 *limit = limit.zip(sum).map(|(limit, sum)| limit.after(sum));
             }
         }
@@ -298,11 +317,13 @@ impl<'a> FreeRun<'a> {
         let (shape, data) = (self.shape(), &self.experiments[experiment]);
         let place = self.state_at(experiment);
         let attempts = &self.attempts;
+        // The contract of `Problem`: only at the parameters of a successful cost, so that the run is there.
         let same = attempts.iter().find(|attempt| attempt.theta == theta);
         let attempt = same.unwrap_or(&attempts[0]);
         self.gram.clear();
         if self.estimated {
             for i in 0..shape.lags.na {
+                // dy(-1-i)/d(state i) = 1: the recursion begins with the unit matrix in the columns of the state.
                 self.gram.past_mut(i + 1)[shape.state_column() + i] = 1.0;
             }
         }
@@ -335,11 +356,16 @@ impl<'a> FreeRun<'a> {
                 first_state + i - own
             }
         };
+        // theta is shared by all experiments and adds up; the state of each has columns of its own, so that J'J has
+        // blocks of zeros between different experiments.
         let place = |i: usize| if i < own { i } else { i + experiment * na };
         let (sums, width) = self.gram.finish();
+        // The cost is 1/(2N) sum e^2, N being the sum of all experiments' weights.
         let scale = 1.0 / self.samples;
         for i in 0..own + states {
             let a = column(i);
+            // Only the lower triangle of the sums is there, in the order of a row's columns: the larger index is the
+            // row.
             jte[place(i)] += sums[a.max(error) * width + a.min(error)] * scale;
             for j in 0..=i {
                 let b = column(j);
@@ -385,6 +411,7 @@ impl Problem for FreeRun<'_> {
         }
         for (i, t) in theta.iter().enumerate() {
             let decay = self.decay_of(i);
+            // The penalty decay/2 t^2 as one more residual sqrt(decay) t each: its J'J is decay, its J'e -decay t.
             jtj[i * theta.len() + i] += decay;
             jte[i] -= decay * t;
         }

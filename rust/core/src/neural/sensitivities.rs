@@ -25,8 +25,7 @@
 //! are written once and never read back. Known numbers of past outputs keep these values in registers and not in an array: `na` = 2
 //! instead of any number saves 9 % of a training, `na` = 3 as much (12 hidden units 6 %); `na` = 1 saved 3 % and is not there.
 
-use super::network::{Network, Shape};
-use super::regressor;
+use super::network::{self, Network, Shape};
 use crate::Monitor;
 use crate::gram::{BLOCK, Gram};
 use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
@@ -75,11 +74,13 @@ impl<R: Rows> Recursion<'_, R> {
     /// Runs it.
     pub fn go(self) {
         let mut block = Block::new(self.network.shape);
+        // Blocks of y, since what has no measured outputs has no rows: its caller gives the run itself for y.
         for (i, measured) in self.y.chunks(BLOCK).enumerate() {
             if i % LOOK == 0 && self.monitor.is_some_and(Monitor::stopped) {
                 return;
             }
             let (start, count) = (i * BLOCK, measured.len());
+            // Regressors and errors are copies and differences without a kernel; all that has products is in `Advance`.
             block.fill(&self, start, count);
             for (k, measured) in measured.iter().enumerate() {
                 block.errors[k] = measured - self.run[start + k];
@@ -114,9 +115,12 @@ struct Block {
     groups: usize,
     columns: Vec<Column>,
     /// Entries of the regressor, then ones.
+    // Along the samples, as a group of columns passes over them; numbers, which are spread when they are used.
     scales: Vec<[f64; BLOCK]>,
     /// Slopes of the output by each hidden unit's argument, hidden outputs, and
     /// `[1, linear's regressor, 0 ..]`: the rows' own part behind the hidden units.
+    //   sources   | r: a group of units each | h: a group each | tail: b2, linear |      `BLOCK` samples each
+    // The kinds of columns of W1 and b1 read the same r; only their scale differs.
     sources: Vec<[Lanes; BLOCK]>,
     /// Slopes of the output by each past output.
     gains: Vec<[f64; BLOCK]>,
@@ -126,6 +130,10 @@ struct Block {
 impl Block {
     fn new(shape: Shape) -> Self {
         let (groups, n_phi, units) = (shape.groups(), shape.lags.regressors(), shape.hidden);
+        // (first column, source, scale): W1 entry by entry of phi with source r, then b1 as an entry whose scale is 1,
+        // then w2 with source h and scale 1; groups of units within each.
+        // The order is that of the columns, and it matters: the lanes of missing units lie over the first columns of the next
+        // kind, which come later and write over whatever stands there. No lane reads another.
         let parts = (0..=n_phi).map(|c| (c * units, 0, c));
         let parts = parts.chain([((n_phi + 1) * units, groups, n_phi)]);
         let units = parts.flat_map(|(at, source, scale)| {
@@ -148,15 +156,18 @@ impl Block {
     /// The regressors of a block, and what of them reaches the output directly.
     fn fill<R>(&mut self, recursion: &Recursion<'_, R>, start: usize, count: usize) {
         let (lags, n_phi) = (self.shape.lags, self.shape.lags.regressors());
+        // The last scale stays 1.
         for (c, entry) in self.scales[..n_phi].iter_mut().enumerate() {
             let entry = &mut entry[..count];
             if c < lags.na {
-                regressor::outputs(recursion.run, recursion.state, start, c + 1, entry);
+                network::output_entry(recursion.run, recursion.state, start, c + 1, entry);
             } else {
                 let start = recursion.first + start;
-                regressor::inputs(lags, recursion.u, start, c - lags.na, entry);
+                network::input_entry(lags, recursion.u, start, c - lags.na, entry);
             }
         }
+        // Columns b2 and linear have no weights behind them: their derivative is 1 and phi. The columns behind, of past
+        // outputs and error, are zeros in this source: past outputs live by the recursion alone.
         let direct = if self.shape.bypass { n_phi } else { 0 };
         for tail in 0..=direct {
             let source = &mut self.sources[2 * self.groups + tail / LANES];
@@ -193,6 +204,7 @@ impl Kernel for Advance<'_> {
             3 => self.advance::<V, 3>(),
             _ => self.advance::<V, 0>(),
         }
+        // The error is no derivative and not part of the recursion: it is written over what the last group left there.
         let width = self.rows.len() / (self.block.shape.lags.na + self.recursion.run.len());
         let (na, error) = (self.block.shape.lags.na, self.block.shape.error_column());
         let rows = self.rows.chunks_exact_mut(width).skip(na);
@@ -210,12 +222,16 @@ impl Advance<'_> {
             self.slopes::<V>(group);
         }
         self.gains::<V>();
+        // Behind slopes and gains, as a clipped sample has neither.
         self.clip();
         let mut next = 0;
         while next < self.block.columns.len() {
-            next += match (V::TILE.0, self.block.columns.len() - next) {
+            // Groups at once: each has a value and NA past ones in registers, all share the gains, and what one waits for is
+            // filled by the others. Six are two times three and not four and two. With 16 registers there are two, on the
+            // baseline one.
+            next += match (V::TILE_ROWS, self.block.columns.len() - next) {
                 (2, _) | (_, 1) => self.columns::<V, NA, 1>(next),
-                (4, _) | (_, 2) => self.columns::<V, NA, 2>(next),
+                (6, _) | (_, 2) => self.columns::<V, NA, 2>(next),
                 (_, 3 | 6) => self.columns::<V, NA, 3>(next),
                 _ => self.columns::<V, NA, 4>(next),
             };
@@ -233,6 +249,7 @@ impl Advance<'_> {
         let (slopes, outputs) = block.sources.split_at_mut(groups);
         let (slopes, outputs) = (&mut slopes[group], &mut outputs[group]);
         let count = self.recursion.run.len().min(BLOCK);
+        // With a trial's hidden outputs this pass has no tanh at all.
         let Some(hidden) = self.recursion.hidden else {
             let mut phi = vec![0.0; block.shape.lags.regressors()];
             for k in 0..count {
@@ -263,6 +280,7 @@ impl Advance<'_> {
             for (group, slopes) in self.block.sources[..groups].iter().enumerate() {
                 let weights = V::load(&network.first[group * n_phi + m].0);
                 for k in 0..count {
+                    // gain_m(k) = linear_m + sum over units of r W1_m; a sum of lanes a sample and past output.
                     gains[k] += V::load(&slopes[k].0).mul(weights).sum();
                 }
             }
@@ -277,6 +295,7 @@ impl Advance<'_> {
             return;
         }
         let block = &mut *self.block;
+        // dy = 0 there: no own part, and no way for the past to reach the future through this output.
         for (k, _) in run
             .iter()
             .enumerate()
@@ -294,10 +313,13 @@ impl Advance<'_> {
         let (block, count) = (&*self.block, self.recursion.run.len());
         let na = block.shape.lags.na;
         let width = self.rows.len() / (na + count);
+        // Arrays of fixed length by value, and no iterators within the loop: their places are known and the compiler
+        // keeps them in registers.
         let plan: [Column; COUNT] = std::array::from_fn(|c| block.columns[next + c]);
         let sources = plan.map(|column| &block.sources[column.source]);
         let scales = plan.map(|column| &block.scales[column.scale]);
         let gains: [&[f64; BLOCK]; NA] = std::array::from_fn(|m| &block.gains[m]);
+        // old[m] is S(k-1-m): read once a block from the rows in front of it, then handed on in registers.
         let mut old = [[V::splat(0.0); COUNT]; NA];
         for (m, old) in old.iter_mut().enumerate() {
             let row = &self.rows[(NA - 1 - m) * width..];
@@ -308,7 +330,10 @@ impl Advance<'_> {
         for k in 0..count.min(BLOCK) {
             let (past, row) = self.rows.split_at_mut((na + k) * width);
             for (c, column) in plan.iter().enumerate() {
+                // S(k) = source scale + sum_m gain_m S(k-m), the oldest first: gain_1 S(k-1), which the next sample
+                // waits for, is the last product of the chain.
                 let mut value = V::load(&sources[c][k].0).mul(V::splat(scales[c][k]));
+                // Any number of past outputs: their rows are read back from memory.
                 if NA == 0 {
                     for (gains, old) in block.gains.iter().zip(past.rchunks_exact(width)) {
                         value = value.add_product(V::splat(gains[k]), V::first(&old[column.at..]));
@@ -323,6 +348,8 @@ impl Advance<'_> {
                 if NA > 0 {
                     old[0][c] = value;
                 }
+                // Unaligned, as kinds of units follow each other without gaps: the row is as short as it can be, and J'J
+                // costs with its square.
                 value.write(&mut row[column.at..]);
             }
         }

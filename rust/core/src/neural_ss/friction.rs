@@ -13,8 +13,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::draw;
 use super::problem::Experiment;
-use super::scaling::root_mean_square;
-use super::shape::Shape;
+use super::shape::{Shape, root_mean_square};
 use crate::random::Random;
 
 /// Part of its standard deviation that a position moves in the samples of [`pace`].

@@ -1,13 +1,20 @@
-//! Training of a position by its speed first: a network of the differences of the outputs, behind which the integrator is set.
+//! Where the training of a position begins: at its speed, or at its recent motion.
 //!
 //! The free run of an integrator sums up what its speed is wrong by, and a small error of the friction moves all that
-//! follows; the cost has many valleys. The free run of the speed does not drift, and dry friction shows in it. Differences
-//! of noisy positions are noisy, `sqrt(2)` times as much in every sample, but there are many; the training that follows, on
-//! the positions as they are, takes the noise for what it is.
+//! follows; the cost has many valleys. Two problems with fewer of them are trained first:
+//!
+//! - [`Speed`]: a network of the differences of the outputs, behind which the integrator is set. The free run of the speed
+//!   does not drift, and dry friction shows in it. Differences of noisy positions are noisy, `sqrt(2)` times as much in every
+//!   sample, but there are many.
+//! - [`Leak`]: an integrator that leaks, on outputs that leak alike. Behind `H = (1 - q^-1) / (1 - p q^-1)` an error counts
+//!   for some `1/(1 - p)` samples, noise is hardly larger than before (a plain difference would double it), and the same
+//!   parameters run the model: the last state's pole is `p` where it was 1. What is summed up within the output, a small
+//!   part, is not filtered.
+//!
+//! The training that follows, with the pole at 1 and the positions as they are, takes the noise for what it is.
 
 use super::problem::Experiment;
-use super::scaling::root_mean_square;
-use super::shape::Shape;
+use super::shape::{Shape, root_mean_square};
 
 /// Recordings of the speed, and the shape of a network of it.
 pub(super) struct Speed {
@@ -30,6 +37,8 @@ impl Speed {
             integrator: false,
             ..position
         };
+        // The network of the speed is trained in units of its own, so that its outputs have the size that start weights
+        // and decay are made for.
         let mut experiments: Vec<Experiment> = experiments.iter().map(differences).collect();
         let scale = root_mean_square(experiments.iter().flat_map(|e| e.y.iter().copied()));
         if scale <= 0.0 {
@@ -53,6 +62,12 @@ impl Speed {
         let (nx, hidden, inputs) = (self.shape.nx, self.shape.hidden, self.shape.inputs);
         let (from, to) = (self.shape.parts(), position.parts());
         let mut theta = vec![0.0; position.parameters()];
+        //   speed      w(k)  = C x + D v + c + G h        x+ = A x + B v + E h
+        //   position   p+ = p + w,  y = p + w: the last state p, whose row of [A B E] and the output's row of [C D G] are w's
+        //   A' = | A 0 |   B' = | B |   E' = | E 0 |   C' = [C 1]   D' = D   G' = [G c/tanh(1)]
+        //        | C 1 |        | D |        | G c/tanh(1) |
+        // with C, D, G and c times `scale`. The unit behind the last has no weights and the bias 1, so that its output is
+        // tanh(1) at every sample.
         let mut copy = |from: usize, to: usize, count: usize, factor: f64| {
             let values = theta[to..][..count].iter_mut().zip(&speed[from..][..count]);
             values.for_each(|(to, from)| *to = factor * from);
@@ -68,6 +83,7 @@ impl Speed {
             let (e, own) = (from.e.start + i * hidden, to.e.start + i * position.hidden);
             copy(e, own, hidden, 1.0);
         }
+        // Rows are one number longer: the position is no argument of the hidden units.
         for i in 0..hidden {
             copy(from.wx.start + i * nx, to.wx.start + i * (nx + 1), nx, 1.0);
         }
@@ -93,7 +109,9 @@ impl Speed {
         theta[to.bh.end - 1] = 1.0;
         theta[to.e.end - 1] = constant;
         theta[to.g.end - 1] = constant;
+        // The pole of 1, and the zeros through which the position would act on anything.
         position.hold(&mut theta);
+        // Behind theta stand the experiments' initial states; each gets a position of 0 at its end.
         for state in speed[from.g.end..].chunks_exact(nx) {
             theta.extend(state.iter().chain([&0.0]));
         }
@@ -104,9 +122,84 @@ impl Speed {
 /// Each output less the one before; not known where one of them is not.
 fn differences(experiment: &Experiment) -> Experiment {
     let y = &experiment.y;
+    // NaN less anything is NaN: a gap takes the difference behind it along.
     let steps = y.iter().zip(y.iter().skip(1)).map(|(y, next)| next - y);
     Experiment {
         y: [f64::NAN].into_iter().take(y.len()).chain(steps).collect(),
+        ..experiment.clone()
+    }
+}
+
+/// Time constant of the leak, in samples in which a position moves by a quarter of its standard deviation.
+const MEMORY: f64 = 2.0;
+
+/// Recordings behind the filter, and the parameters that go with them.
+pub(super) struct Leak {
+    pub experiments: Vec<Experiment>,
+    pole: f64,
+    scale: f64,
+}
+
+impl Leak {
+    /// The filter for positions of this pace; none where nothing moves.
+    pub fn new(experiments: &[Experiment], pace: usize) -> Option<Self> {
+        // 1/(1 - p) samples are the time constant; at least two, p = 1/2.
+        let pole = 1.0 - 1.0 / (MEMORY * pace as f64).max(2.0);
+        let mut filtered: Vec<Experiment> = experiments.iter().map(|e| behind(pole, e)).collect();
+        let scale = root_mean_square(filtered.iter().flat_map(|e| e.y.iter().copied()));
+        if scale <= 0.0 {
+            return None;
+        }
+        for y in filtered.iter_mut().flat_map(|e| &mut e.y) {
+            *y /= scale;
+        }
+        Some(Self {
+            experiments: filtered,
+            pole,
+            scale,
+        })
+    }
+
+    /// Parameters and states for the filtered outputs: the position begins at 0, as those do.
+    pub fn entered(&self, theta: &mut [f64], shape: Shape) {
+        self.scaled(theta, shape, 1.0 / self.scale);
+        // H has no gain at rest: the constant part of the output is gone, c with it.
+        theta[shape.parts().constant].fill(0.0);
+        theta[shape.pole()] = self.pole;
+        for state in theta[shape.parameters()..].chunks_exact_mut(shape.nx) {
+            state[shape.nx - 1] = 0.0;
+        }
+    }
+
+    /// The same parameters for the outputs as they are; where their positions begin is left to be found.
+    pub fn left(&self, theta: &mut [f64], shape: Shape) {
+        self.scaled(theta, shape, self.scale);
+        theta[shape.pole()] = 1.0;
+    }
+
+    fn scaled(&self, theta: &mut [f64], shape: Shape, factor: f64) {
+        let parts = shape.parts();
+        // C, D, c and G stand side by side
+        theta[parts.c.start..parts.g.end]
+            .iter_mut()
+            .for_each(|t| *t *= factor);
+    }
+}
+
+/// The outputs behind the filter, from rest; a gap keeps the position that was last known.
+fn behind(pole: f64, experiment: &Experiment) -> Experiment {
+    let (mut last, mut sum) = (None, 0.0);
+    let filtered = experiment.y.iter().map(|y| {
+        if y.is_nan() {
+            return f64::NAN;
+        }
+        // z(k) = p z(k-1) + y(k) - y(k-1), the difference over a gap as one jump.
+        sum = pole * sum + (y - last.unwrap_or(*y));
+        last = Some(*y);
+        sum
+    });
+    Experiment {
+        y: filtered.collect(),
         ..experiment.clone()
     }
 }
@@ -182,5 +275,69 @@ mod tests {
         for (nx, hidden) in [(1, 3), (2, 2)] {
             assert!(Speed::new(&[experiment(vec![0.0, 1.0])], position(nx, hidden)).is_none());
         }
+    }
+
+    #[test]
+    fn forgets_a_step_and_keeps_gaps() {
+        let mut y = vec![0.0; 400];
+        y[100..].fill(1.0);
+        y[50] = f64::NAN;
+        let experiment = Experiment {
+            v: vec![0.0; 400],
+            y,
+            weights: Vec::new(),
+        };
+        let leak = Leak::new(&[experiment], 10).unwrap();
+        let y = &leak.experiments[0].y;
+        assert_eq!(y[99], 0.0);
+        assert!(y[50].is_nan());
+        assert!((y[120] / y[100] - (1.0_f64 - 1.0 / 20.0).powi(20)).abs() < 1e-12);
+        let power: f64 = y.iter().filter(|y| !y.is_nan()).map(|y| y * y).sum();
+        assert!((power / 399.0 - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn comes_back_to_the_parameters_it_was_entered_with() {
+        let shape = Shape {
+            nx: 3,
+            nk: 1,
+            inputs: 2,
+            outputs: 1,
+            hidden: 2,
+            integrator: true,
+        };
+        let y: Vec<f64> = (0..300).map(|k| (f64::from(k) * 0.05).sin()).collect();
+        let experiment = Experiment {
+            v: vec![0.0; 600],
+            y,
+            weights: Vec::new(),
+        };
+        let leak = Leak::new(&[experiment], 8).unwrap();
+        let before: Vec<f64> = (0..shape.parameters() + 3)
+            .map(|i| 0.1 + i as f64)
+            .collect();
+        let mut theta = before.clone();
+        leak.entered(&mut theta, shape);
+        assert_eq!(theta[shape.pole()], 1.0 - 1.0 / 16.0);
+        leak.left(&mut theta, shape);
+        assert_eq!(theta[shape.pole()], 1.0);
+        let changed = [
+            shape.pole(),
+            shape.parts().constant.start,
+            shape.parameters() + 2,
+        ];
+        for i in (0..theta.len()).filter(|i| !changed.contains(i)) {
+            assert!((theta[i] / before[i] - 1.0).abs() < 1e-12, "{i}");
+        }
+    }
+
+    #[test]
+    fn is_none_where_nothing_moves() {
+        let experiment = Experiment {
+            v: vec![0.0; 9],
+            y: vec![2.0; 9],
+            weights: Vec::new(),
+        };
+        assert!(Leak::new(&[experiment], 4).is_none());
     }
 }

@@ -25,6 +25,7 @@ pub(super) struct Filter<'a, F> {
     pub v: &'a [f64],
     /// Measured outputs; those that are NaN are not used.
     pub y: &'a [f64],
+    // A closure: the search for the noise sums up errors, an estimate keeps states, and neither stores the other's.
     pub each: F,
 }
 
@@ -48,8 +49,11 @@ impl<F: FnMut(usize, &[f64], &[f64])> Kernel for Filter<'_, F> {
             outputs,
             ..
         } = network.shape;
+        // Q = process P0, with P0 the covariance of the states in training: one number to choose, and the states' scales
+        // are right.
         let noise: Vec<f64> = prior.state_covariance.iter().map(|c| process * c).collect();
         let mut memory = Memory {
+            // The first state is as uncertain as one step makes it.
             covariance: noise.clone(),
             x: state.to_vec(),
             room: vec![0.0; nx * nx],
@@ -63,8 +67,11 @@ impl<F: FnMut(usize, &[f64], &[f64])> Kernel for Filter<'_, F> {
             .enumerate()
         {
             scratch.next.copy_from_slice(&memory.x);
+            // s and ds/dx at the predicted state.
             step_with_slopes::<V>(network, &mut scratch, v);
             predicted.copy_from_slice(&scratch.sums);
+            // Slopes stay those of the prediction while one output after the other counts; `moved` in `measure` takes
+            // the correction of the earlier ones along to first order.
             for (p, y) in y.iter().enumerate().filter(|(_, y)| !y.is_nan()) {
                 memory.measure(
                     network,
@@ -76,6 +83,7 @@ impl<F: FnMut(usize, &[f64], &[f64])> Kernel for Filter<'_, F> {
                 );
             }
             each(k, &predicted, &memory.x);
+            // A second step, from the corrected state: f and F there.
             scratch.next.copy_from_slice(&memory.x);
             step_with_slopes::<V>(network, &mut scratch, v);
             memory.advance(&scratch, &noise);
@@ -109,14 +117,17 @@ impl Memory {
     ) {
         let nx = self.x.len();
         let (value, steepness) = network.output.value_and_slope(scratch.sums[p]);
+        //   H = f' ds/dx,  K = P H'/S,  S = H P H' + R,  e = y - yhat - H (x - x before)
         for (j, row) in self.row.iter_mut().enumerate() {
             *row = steepness * scratch.slope((nx + p) * nx + j);
         }
+        // P H', which both the gain and the new covariance are made of.
         for (i, gain) in self.gain.iter_mut().enumerate() {
             *gain = (0..nx)
                 .map(|j| self.covariance[i * nx + j] * self.row[j])
                 .sum();
         }
+        // S: what is expected of the error's square.
         let spread = noise
             + self
                 .row
@@ -124,8 +135,11 @@ impl Memory {
                 .zip(&self.gain)
                 .map(|(r, g)| r * g)
                 .sum::<f64>();
+        // yhat is of the prediction; with the correction by the outputs before it has moved by H (x - x before).
         let moved: f64 = (0..nx).map(|j| self.row[j] * (self.x[j] - before[j])).sum();
         let innovation = (y - value - moved) / spread;
+        // x + K e and P - K S K' = P - (P H')(P H')'/S: symmetric by form, as entries (i, j) and (j, i) are the same
+        // product. R > 0 keeps S off 0.
         for i in 0..nx {
             self.x[i] += self.gain[i] * innovation;
             for j in 0..nx {
@@ -146,6 +160,7 @@ impl Memory {
             }
         }
         for q in 0..nx {
+            // (F P) F' + Q, one half of it, and that mirrored: rounding cannot make it unsymmetric.
             for r in 0..=q {
                 let sum: f64 = (0..nx)
                     .map(|j| self.room[q * nx + j] * scratch.slope(r * nx + j))
@@ -165,11 +180,13 @@ pub(super) fn process_noise(
     states: &[Vec<f64>],
     monitor: &Monitor,
 ) -> f64 {
+    // Out of range, or asked to stop: no better than anything.
     let error = |exponent: i32| match EXPONENTS.contains(&exponent) && !monitor.stopped() {
         true => one_step_error(network, prior, experiments, states, 10f64.powi(exponent)),
         false => f64::INFINITY,
     };
     let (mut at, mut least) = (FIRST_EXPONENT, error(FIRST_EXPONENT));
+    // The error has one valley over the power of ten: down from the first guess, then up from the best so far.
     for direction in [-1, 1] {
         loop {
             let next = error(at + direction);
@@ -195,6 +212,7 @@ fn one_step_error(
     } = network.shape;
     let (mut left, mut sum) = (MOST_SAMPLES, 0.0);
     for (experiment, state) in experiments.iter().zip(states) {
+        // The first 20,000 samples over all experiments.
         let samples = left.min(experiment.y.len() / outputs);
         left -= samples;
         let y = &experiment.y[..samples * outputs];
@@ -209,6 +227,7 @@ fn one_step_error(
                 for (p, s) in s.iter().enumerate() {
                     let error = y[k * outputs + p] - network.output.value(*s);
                     if !y[k * outputs + p].is_nan() {
+                        // Outputs of different units count alike: each in the variance of its residuals.
                         sum += error * error / prior.residual_variance[p];
                     }
                 }

@@ -15,12 +15,14 @@ use crate::lm::Problem;
 use crate::simd::{self, Lanes};
 
 /// A state beyond this many of its standard deviations has diverged.
+// States are scaled to unit variance on the training inputs.
 const DIVERGED: f64 = 1e3;
 
 /// One experiment in scaled units.
 #[derive(Clone, Debug)]
 pub(super) struct Experiment {
     /// Inputs, delayed by nk.
+    // Sample by sample, inputs side by side; y and its weights likewise, so that one index is a sample's output.
     pub v: Vec<f64>,
     /// Outputs, NaN where not known.
     pub y: Vec<f64>,
@@ -38,6 +40,7 @@ impl Experiment {
 /// Simulations of one point, with what the normal equations take from them.
 #[derive(Debug)]
 struct Attempt {
+    // By which the normal equations find the trial that was accepted, of the two that were simulated.
     theta: Vec<f64>,
     network: Network,
     scratch: Scratch,
@@ -46,6 +49,8 @@ struct Attempt {
 
 /// The last simulations: one, and the one beside it where two at once pay. Others may look at them between two calls.
 #[derive(Debug)]
+// In a cell: while the minimiser holds the problem, its caller is told of an accepted step and looks at the runs that led
+// there (`Referee`), without simulating them again.
 pub(super) struct Attempts(RefCell<Vec<Attempt>>);
 
 impl Attempts {
@@ -65,6 +70,7 @@ impl Attempts {
     /// The runs at these parameters, which were simulated last, experiment by experiment.
     pub fn at(&self, theta: &[f64]) -> Ref<'_, [Trajectory]> {
         Ref::map(self.0.borrow(), |attempts| {
+            // By value: parameters that are equal to the bit have equal runs.
             let same = attempts.iter().find(|attempt| attempt.theta == theta);
             same.unwrap_or(&attempts[0]).runs.as_slice()
         })
@@ -86,7 +92,9 @@ fn pays(network: &Network, experiments: &[Experiment]) -> bool {
     let Shape { nx, outputs, .. } = network.shape;
     let samples: usize = experiments.iter().map(|e| e.y.len()).sum();
     let bytes = size_of::<f64>() * (nx + 1) + size_of::<Lanes>() * network.groups();
+    // The shapes of `free_run::together`, in whose registers two runs overlap.
     let small = outputs == 1 && nx <= MOST_STATES && network.groups() <= MOST_GROUPS;
+    // With AVX2 the two runs take as long as one after the other: 16 registers hold one of them.
     small && samples * bytes <= MOST_TOGETHER && simd::level() == Ok(simd::Level::Avx512)
 }
 
@@ -108,7 +116,7 @@ pub(super) struct Training<'a> {
     monitor: &'a Monitor,
     pub network: Network,
     pub decay: Decay,
-    /// KernelPlant outputs, each by its weight.
+    /// Known outputs, each by its weight.
     samples: f64,
     attempts: &'a Attempts,
     gram: Gram,
@@ -141,6 +149,7 @@ impl<'a> Training<'a> {
             ),
             samples: experiments.iter().map(weight).sum(),
             attempts,
+            // No memory of rows: here the recursion is of states, in `Sensitivities`, and a row is a function of them.
             gram: Gram::new(columns.room, 0),
             columns: columns.of_theta(),
             buffers: Sensitivities::new(shape),
@@ -155,6 +164,7 @@ impl<'a> Training<'a> {
 
     /// Runs once more at parameters that have run before, whatever the monitor says.
     pub fn rerun(&mut self, theta: &[f64]) -> Option<()> {
+        // The runs that are kept may be those of a later trial that was rejected, or that a stop ended.
         let [cost] = self.simulate([theta], f64::INFINITY, &Monitor::default());
         cost.map(drop)
     }
@@ -167,6 +177,7 @@ impl<'a> Training<'a> {
         monitor: &Monitor,
     ) -> [Option<f64>; RUNS] {
         let (nx, own) = (self.shape().nx, self.columns.len());
+        // None is a run that has failed: handed on from experiment to experiment.
         let mut limits = thetas.map(|theta| {
             Some(Limit {
                 before: 0.0,
@@ -189,6 +200,7 @@ impl<'a> Training<'a> {
             let sums = FreeRuns {
                 runs: attempts.each_mut().map(|attempt| Run {
                     network: &attempt.network,
+                    // theta, then the initial state of each experiment.
                     state: &attempt.theta[own + i * nx..][..nx],
                     run: &mut attempt.runs[i],
                     scratch: &mut attempt.scratch,
@@ -202,6 +214,7 @@ impl<'a> Training<'a> {
             }
             .go();
             for (limit, sum) in limits.iter_mut().zip(sums) {
+                // What this experiment cost is taken off what is left for the next ones.
                 *limit = limit.zip(sum).map(|(limit, sum)| limit.after(sum));
             }
         }
@@ -219,11 +232,16 @@ impl<'a> Training<'a> {
                 at.state + i - own
             }
         };
+        // theta adds up over the experiments, each state has rows and columns of its own: J'J is full for theta, block-
+        // diagonal for the states.
         let place = |i: usize| if i < own { i } else { i + experiment * nx };
         let (sums, width) = self.gram.finish();
+        // The cost is 1/(2N) sum e^2, N being the sum of the known outputs' weights.
         let scale = 1.0 / self.samples;
         for i in 0..own + nx {
             let a = column(i);
+            // The error is the last column that counts, so that its row is below all others. Other pairs are looked up
+            // in the lower triangle, in the order of a row's columns and not of theta's.
             jte[place(i)] += sums[at.error * width + a] * scale;
             let row = &mut jtj[place(i) * n..][..n];
             for j in 0..=i {
@@ -237,6 +255,8 @@ impl<'a> Training<'a> {
     fn hold(&self, jtj: &mut [f64], jte: &mut [f64]) {
         let n = jte.len();
         for &(i, _) in &self.held {
+            // Row and column of the unit matrix and no gradient: the step is 0 under every damping, and the others do
+            // not see it. Left out, the system would be smaller, and every index another one.
             jte[i] = 0.0;
             for j in 0..n {
                 jtj[i * n + j] = 0.0;
@@ -284,12 +304,15 @@ impl Problem for Training<'_> {
                 weights: &data.weights,
                 buffers: &mut self.buffers,
                 rows: &mut self.gram,
+                // As the slopes of saturated units do not show in a sum of squares, no tanh is computed again.
                 exact: false,
                 monitor: self.monitor,
             });
             self.scatter(i, jtj, jte);
         }
         for (i, (t, decay)) in theta.iter().zip(&self.decay.0).enumerate() {
+            // Weight decay as residuals sqrt(decay) t: decay on the diagonal of J'J, -decay t in J'e; the states have
+            // none.
             jtj[i * n + i] += decay;
             jte[i] -= decay * t;
         }

@@ -3,8 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::problem::Experiment;
-use super::scaling::Scaling;
-use super::shape::Shape;
+use super::shape::{Scaling, Shape};
 use crate::lagged::Lagged;
 use crate::linear::LinearModel;
 use crate::{Error, Result};

@@ -2,8 +2,7 @@
 
 use super::output::OutputFunction;
 use super::problem::Experiment;
-use super::scaling::{Scaling, moments};
-use super::shape::Shape;
+use super::shape::{Scaling, Shape, moments};
 use crate::data::{check_weights, unless_one};
 use crate::{Error, Record, Result};
 

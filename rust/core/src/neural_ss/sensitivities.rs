@@ -52,11 +52,13 @@ pub(super) struct Columns {
 impl Columns {
     pub fn new(shape: Shape) -> Self {
         let (nx, ny, width) = (shape.nx, shape.outputs, shape.arguments());
+        //   | Wx Wu bh: width + 1 kinds | E: nx kinds | G: ny kinds | [A B] | x0 | [C D c] | error |      a kind is all hidden units
         let direct = (width + 1 + nx) * shape.hidden;
         let linear = direct + ny * shape.hidden;
         let state = linear + nx * width;
         let sums = state + nx;
         let error = sums + ny * (width + 1);
+        // The last group of [A B x0] is written whole, and may end beyond the error.
         let room = (error + 1).max(linear + (nx * width + nx).next_multiple_of(LANES));
         Self {
             shape,
@@ -78,6 +80,9 @@ impl Columns {
             hidden,
             ..
         } = self.shape;
+        // theta is A, B, E, Wx, Wu, bh, C, D, c, G; a row's columns are by what they share: for a weight of the hidden
+        // layer the argument, then the unit. So Wx of theta, unit by unit, is transposed here, and A and B are
+        // interleaved.
         let width = nx + nu;
         let mut columns = Vec::with_capacity(self.shape.parameters());
         columns.extend((0..nx).flat_map(|q| (0..nx).map(move |j| self.linear + q * width + j)));
@@ -126,8 +131,12 @@ impl Rows for Gram {
 pub(super) struct Sensitivities {
     pub(super) columns: Columns,
     /// `X` in groups of columns: for each group the rows of all states.
+    //   states   | Wx, Wu, bh by argument and group | E by row and group | [A B x0] by eights |     nx groups for each
+    // Eight columns with all their states are contiguous: what one step reads and writes of X. G and [C D c] move no
+    // state and have no X.
     pub(super) states: Vec<Lanes>,
     /// `dx+/d[A B x0]`, in groups as `states`.
+    // Zeros but for the argument in the column's own state: written over in the same places at every sample.
     pub(super) linear: Vec<Lanes>,
     /// `[E; f' G] diag(1 - h^2)`.
     pub(super) weighted: Vec<Lanes>,
@@ -165,6 +174,7 @@ impl Sensitivities {
         let first = self.states.len() - self.linear.len();
         self.states.fill(Lanes::ZERO);
         for q in 0..nx {
+            // dx(0)/dx0 = 1, in the columns behind [A B].
             let column = self.columns.state - self.columns.linear + q;
             self.states[first + column / LANES * nx + q].0[column % LANES] = 1.0;
         }
@@ -194,6 +204,7 @@ impl Kernel for Recursion<'_> {
     fn run<V: F64x8>(self) {
         self.buffers.reset();
         let Shape { nx, outputs, .. } = self.network.shape;
+        // The sizes that are trained most have the block pass; the gain stands in `super::single`.
         match (outputs, nx) {
             (1, 1) => self.blocks::<V, 1>(),
             (1, 2) => self.blocks::<V, 2>(),
@@ -235,9 +246,12 @@ impl Recursion<'_> {
                 return;
             }
             buffers.scratch.set(x, v);
+            // All that columns share, then all columns: with 155 parameters X is 18 groups of three registers, which
+            // pass through memory once a sample here. `super::single` keeps them.
             buffers.prepare::<V>(network, h, (s, y), exact);
             let count = buffers.known.len();
             let width = rows.width();
+            // A row for each output that is known: an output without a measurement costs the recursion, no row.
             let room = rows.room(count);
             buffers.advance::<V, NX>(network, h, room, width);
             if let Some(weights) = weights.get(k * outputs..(k + 1) * outputs) {
@@ -250,9 +264,11 @@ impl Recursion<'_> {
 }
 
 /// Multiplies each of the rows, `width` numbers apart, by the root of its weight.
+// Not inlined: hardly any training has weights, and the kernels stay as they are without them.
 #[inline(never)]
 pub(super) fn weigh(weights: impl Iterator<Item = f64>, rows: &mut [f64], width: usize) {
     for (row, weight) in rows.chunks_mut(width).zip(weights) {
+        // sum w j j' = sum (sqrt(w) j)(sqrt(w) j)'; X itself has no weight, as the recursion goes on from it.
         let root = weight.sqrt();
         row.iter_mut().for_each(|value| *value *= root);
     }
@@ -265,6 +281,8 @@ impl Sensitivities {
         if !k.is_multiple_of(LOOK) {
             return true;
         }
+        // What depends on the initial state decays for ever; among denormal numbers each operation would take a hundred
+        // times as long.
         for states in &mut self.states {
             states.0.iter_mut().for_each(forget);
         }
@@ -290,10 +308,13 @@ impl Sensitivities {
         self.known.clear();
         for (p, (s, y)) in s.iter().zip(y).enumerate() {
             let (value, slope) = network.output.value_and_slope(*s);
+            // f' and the error of each known output; s and f' are of the free run.
             if !y.is_nan() {
                 self.known.push((p, slope, y - value));
             }
         }
+        // 1 - h^2 loses its digits where h is near 1. A training does not see it, as such a slope is far below what its sum of
+        // squares shows; in a Jacobian that is handed out it would be wrong.
         if exact {
             network.rises::<V>(arguments, rises);
         } else {
@@ -303,9 +324,12 @@ impl Sensitivities {
         for (row, outward) in self.known.iter().zip(self.outward.chunks_exact_mut(nx)) {
             for (j, outward) in outward.iter_mut().enumerate() {
                 let at = (nx + row.0) * nx + j;
+                // Row nx + p of the slopes is ds_p/dx.
                 *outward = row.1 * slopes[at / LANES].0[at % LANES];
             }
         }
+        // E diag(1 - h^2) and f' G diag(1 - h^2): what all weights of one hidden unit share, once a sample and not once
+        // a column.
         let groups = rises.len();
         let of_outputs = self
             .known
@@ -319,6 +343,7 @@ impl Sensitivities {
                 weight.mul(V::load(&rise.0)).store(&mut weighted.0);
             }
         }
+        // Row q of [A B] moves state q by the argument: column q width + c, row q.
         for q in 0..nx {
             for (c, value) in arguments[..width].iter().enumerate() {
                 let column = q * width + c;
@@ -339,7 +364,9 @@ impl Sensitivities {
         let nx = if NX == 0 { network.shape.nx } else { NX };
         let (groups, hidden) = (h.len(), network.shape.hidden);
         let width = network.shape.arguments();
+        // [E; f' G] diag(1 - h^2): rows of the states, then of the outputs, of which those that are known are this sample's.
         let (of_states, of_outputs) = self.weighted.split_at(nx * groups);
+        // F spread over the lanes once for all columns: NX^2 registers, 16 of 32 at most.
         let mut onward = [[V::splat(0.0); NX]; NX];
         for (i, slope) in onward.as_flattened_mut().iter_mut().enumerate() {
             *slope = V::splat(self.scratch.slope(i));
@@ -352,6 +379,7 @@ impl Sensitivities {
         };
         let moved = &mut self.moved;
         let mut states = self.states.chunks_exact_mut(nx);
+        // Wx, Wu, bh: for each argument c, the last of which is 1, all units: c times the weighted rows.
         for (c, argument) in self.scratch.arguments.iter().enumerate() {
             let argument = V::splat(*argument);
             for g in 0..groups {
@@ -367,6 +395,7 @@ impl Sensitivities {
                 );
             }
         }
+        // E: unit i of row q is moved by h_i in state q alone.
         for row in 0..nx {
             for (g, h) in h.iter().enumerate() {
                 let Some(x) = states.next() else { return };
@@ -382,7 +411,10 @@ impl Sensitivities {
                 slopes.advance(x, moved, rows, place, |_| V::splat(0.0), own);
             }
         }
+        // G comes between E and [A B] in a row, and its groups write beyond their end as the others do: the order has to
+        // be kept.
         slopes.write_direct(h, rows, stride, self.columns.direct, hidden);
+        // [A B x0]: `linear` has the argument in the row of the column's own state.
         for (i, linear) in self.linear.chunks_exact(nx).enumerate() {
             let Some(x) = states.next() else { return };
             let start = self.columns.linear + i * LANES;
@@ -403,6 +435,7 @@ impl Sensitivities {
 /// The slopes of one sample.
 struct Slopes<'a, V, const NX: usize> {
     /// `dx+/dx` in registers, where the number of states is known.
+    // Empty where NX is 0: the general step reads `scratch` then.
     onward: [[V; NX]; NX],
     scratch: &'a Scratch,
     outward: &'a [f64],
@@ -423,13 +456,16 @@ impl<V: F64x8, const NX: usize> Slopes<'_, V, NX> {
         next: impl Fn(usize) -> V,
     ) {
         let nx = x.len();
+        // dy = f' (ds/dx X + ds/dtheta), with X as it is before the step.
         let outward = self.outward.chunks_exact(nx);
+        // A row of its own for each known output, `stride` numbers apart.
         for (row, ((p, ..), outward)) in self.known.iter().zip(outward).enumerate() {
             let sum = outward.iter().zip(&*x).fold(direct(*p), |sum, (slope, x)| {
                 sum.add_product(V::splat(*slope), V::load(&x.0))
             });
             sum.write(&mut rows[start + row * stride..]);
         }
+        // All states are read before one is written: the new ones go to a room of their own first.
         if NX == 0 {
             for (q, moved) in moved.iter_mut().enumerate() {
                 let sum = x.iter().enumerate().fold(next(q), |sum, (j, x)| {
@@ -468,6 +504,7 @@ impl<V: F64x8, const NX: usize> Slopes<'_, V, NX> {
         for (row, &(own, steepness, _)) in rows.chunks_exact_mut(stride).zip(self.known) {
             for p in 0..outputs {
                 for (g, h) in h.iter().enumerate() {
+                    // ds_p/dG_q = h where p = q, else 0.
                     let factor = if p == own { steepness } else { 0.0 };
                     let place = &mut row[first + p * hidden + g * LANES..];
                     V::load(&h.0).mul(V::splat(factor)).write(place);
@@ -481,6 +518,7 @@ impl<V: F64x8, const NX: usize> Slopes<'_, V, NX> {
     fn write_sums(&self, rows: &mut [f64], stride: usize, columns: &Columns) {
         let arguments = &self.scratch.arguments;
         for (row, &(own, steepness, error)) in rows.chunks_exact_mut(stride).zip(self.known) {
+            // [C D c] row by row, each as wide as the arguments with their 1.
             let sums = row[columns.sums..columns.error].chunks_exact_mut(arguments.len());
             for (p, sums) in sums.enumerate() {
                 let factor = if p == own { steepness } else { 0.0 };

@@ -45,20 +45,29 @@ const SLOPES: usize = ((MOST_STATES + 1) * MOST_STATES).div_ceil(LANES);
 #[derive(Clone, Debug)]
 pub(super) struct Block {
     /// `dx+/dx`, then `f' ds/dx`, row by row.
+    // Fixed sizes for the most states: 20 numbers in three groups a sample, 6 kB a block.
     slopes: Box<[[Lanes; SLOPES]; BLOCK]>,
     /// `1 - h^2`.
     rises: Vec<Lanes>,
     /// States, inputs and 1, one after the other.
+    // Sample after sample of one argument: a group of columns reads one of them along the block.
     arguments: Vec<[f64; BLOCK]>,
     /// `E diag(1 - h^2)`: for each group and sample the rows of all states.
+    // By group first: one group's columns pass over all samples and read nothing of the others.
     weighted: Vec<Lanes>,
     /// `f' G diag(1 - h^2)` for each group.
     direct: Vec<[Lanes; BLOCK]>,
     /// `f'` and the error.
     outputs: [(f64, f64); BLOCK],
     /// Where the sample's row begins, or that of the next one that has one.
+    // Rows of unknown outputs are not there: such a sample's row is written in the place of the next one, and by that
+    // over.
     places: [usize; BLOCK],
     /// States and inputs of a sample behind as many zeros as the columns of `[A B]` may be apart from them.
+    //   sample k   | 0 .. 0, nx width + 8 of them | x v |
+    // Of column i in the order of [A B x0], state q is moved by argument i - q width, if there is one of that number: so
+    // eight columns are one load of this, `width` numbers further left for the next state, with zeros where a column
+    // belongs to another row. What is beyond x v, x0 too, reads the zeros of the next sample.
     spaced: Vec<f64>,
     /// Numbers from one sample's states to the next one's.
     space: usize,
@@ -67,6 +76,7 @@ pub(super) struct Block {
 impl Block {
     pub fn new(shape: Shape) -> Self {
         let groups = shape.hidden.div_ceil(LANES);
+        // Zeros for nx - 1 rows before the numbers, and behind them for the rows and x0 of the sample before.
         let space = (shape.nx + 1) * shape.arguments() + LANES;
         Self {
             slopes: Box::new([[Lanes::ZERO; SLOPES]; BLOCK]),
@@ -84,6 +94,7 @@ impl Block {
     /// Takes up the states and inputs of sample `k`.
     #[inline(always)]
     fn set(&mut self, k: usize, x: &[f64], v: &[f64]) {
+        // The numbers end where sample k + 1's space begins; the zeros were written once and stay.
         let spaced = &mut self.spaced[(k + 1) * self.space - x.len() - v.len()..];
         let values = x.iter().chain(v);
         for ((value, argument), spaced) in values.zip(&mut self.arguments).zip(spaced) {
@@ -96,6 +107,8 @@ impl Block {
 /// What a group of columns takes from a sample: `f' ds/dtheta`, and `dx+/dtheta` for each state; none is zero.
 #[derive(Clone, Copy)]
 struct Gains<V, const NX: usize> {
+    // `Option`s that the compiler resolves: for a kind of columns each is always there or never, so that the code has
+    // neither a test nor a zero to add.
     direct: Option<V>,
     next: [Option<V>; NX],
 }
@@ -116,6 +129,7 @@ struct OfArgument<'a, const NX: usize> {
 impl<const NX: usize> Source<NX> for OfArgument<'_, NX> {
     #[inline(always)]
     fn gains<V: F64x8>(&self, k: usize) -> Gains<V, NX> {
+        // dx+_q/dW = E_q (1 - h^2) c, eight units at once.
         let argument = V::splat(self.argument[k]);
         let mut next = [None; NX];
         for (next, weighted) in next.iter_mut().zip(&self.weighted[k]) {
@@ -138,6 +152,7 @@ impl<const NX: usize, const Q: usize> Source<NX> for OfUnits<'_, Q> {
     #[inline(always)]
     fn gains<V: F64x8>(&self, k: usize) -> Gains<V, NX> {
         let mut next = [None; NX];
+        // Q is a constant, and with it the only state that is moved.
         if let Some(next) = next.get_mut(Q) {
             *next = Some(V::load(&self.hidden[k * self.groups].0));
         }
@@ -158,6 +173,7 @@ impl<const NX: usize> Source<NX> for OfStates<'_> {
     #[inline(always)]
     fn gains<V: F64x8>(&self, k: usize) -> Gains<V, NX> {
         let mut next = [None; NX];
+        // State NX - 1 - q: a row further up in [A B] is `width` numbers further right in the zeros.
         for (q, next) in next.iter_mut().rev().enumerate() {
             let start = k * self.space + q * self.width;
             *next = Some(V::first(&self.spaced[start..]));
@@ -171,6 +187,7 @@ impl Block {
     #[inline(always)]
     fn weigh<V: F64x8, const NX: usize>(&mut self, network: &Network, count: usize) {
         let groups = self.direct.len();
+        // [group][sample][state] as arrays of known length: no index is checked within the loops.
         let (weighted, _) = self.weighted.as_chunks_mut::<NX>();
         let (weighted, _) = weighted.as_chunks_mut::<BLOCK>();
         for (g, (weighted, direct)) in weighted.iter_mut().zip(&mut self.direct).enumerate() {
@@ -196,6 +213,7 @@ impl Block {
         let used = (NX * (NX + 1)).div_ceil(LANES);
         network.slopes_of::<V, SLOPES>(&self.rises, &mut self.slopes[..count], used);
         for (slopes, (steepness, _)) in self.slopes.iter_mut().zip(self.outputs).take(count) {
+            // The output function is the identity most often.
             if steepness != 1.0 {
                 for at in NX * NX..NX * (NX + 1) {
                     slopes[at / LANES].0[at % LANES] *= steepness;
@@ -216,7 +234,10 @@ impl Block {
     ) {
         let mut i = 0;
         // In the order of the columns: where a group has fewer than eight, it writes over the next one's first.
-        while V::TILE.0 == LANES && i + 2 <= states.len() {
+        // Counted for 3 states: a group is 12 fused operations a sample, 6 cycles on two units, but its chain of three takes
+        // 12. A second one fits into that, for 32 registers; with 16 there is no room. Where a register is worked on in
+        // halves (Zen 4) one group takes the 12 cycles by itself. A constant condition.
+        while V::TILE_ROWS == LANES && i + 2 <= states.len() {
             let sources = [source(i), source(i + 1)];
             let starts = [start(i), start(i + 1)];
             self.pass::<V, NX, 2>(count, &mut states[i..i + 2], sources, starts, rows);
@@ -238,6 +259,7 @@ impl Block {
         first: usize,
         rows: &mut [f64],
     ) {
+        // A row that this model does not have; its code is not made.
         if Q >= NX {
             return;
         }
@@ -260,6 +282,8 @@ impl Block {
         starts: [usize; GROUPS],
         rows: &mut [f64],
     ) {
+        // X of these columns: loaded once, kept in registers for 32 samples, stored once. Sample by sample each of the
+        // 18 groups of 155 parameters would go through memory at every sample.
         let mut x = [[V::splat(0.0); NX]; GROUPS];
         for (x, states) in x.iter_mut().zip(&*states) {
             for (x, state) in x.iter_mut().zip(states) {
@@ -268,12 +292,14 @@ impl Block {
         }
         for k in 0..count.min(BLOCK) {
             let slopes = &self.slopes[k];
+            // A load that is spread; all groups of columns read the same few cache lines.
             let slope = |i: usize| slopes[i / LANES].0[i % LANES];
             let mut sums = [[None; NX]; GROUPS];
             for g in 0..GROUPS {
                 let gains = sources[g].gains::<V>(k);
                 let mut sum = gains.direct;
                 for (j, x) in x[g].iter().enumerate() {
+                    // dy = direct + sum_j (f' ds/dx_j) X_j, before X moves.
                     sum = Some(plus(sum, V::splat(slope(NX * NX + j)), *x));
                 }
                 if let (Some(sum), Some(row)) = (sum, rows.get_mut(self.places[k] + starts[g]..)) {
@@ -281,6 +307,8 @@ impl Block {
                 }
                 sums[g] = gains.next;
             }
+            // X+_q = gains_q + sum_j F_qj X_j. Slopes outside, groups inside: a slope is spread once for all groups. In
+            // `sums` first, as all of X is needed until the last row is done.
             for at in 0..NX * NX {
                 let (q, j) = (at / NX, at % NX);
                 let slope = V::splat(slope(at));
@@ -331,10 +359,12 @@ impl Recursion<'_> {
         let (groups, inputs) = (network.groups(), network.shape.inputs);
         for start in (0..run.sums.len()).step_by(BLOCK) {
             let count = BLOCK.min(run.sums.len() - start);
+            // Every second block, as 32 divides 64.
             if !buffers.look(start, monitor) {
                 return;
             }
             let samples = start..start + count;
+            // What the free run left of these samples; nothing of it is computed again but 1 - h^2.
             let part = Part {
                 states: &run.states[samples.start * NX..samples.end * NX],
                 hidden: &run.hidden[samples.start * groups..samples.end * groups],
@@ -345,10 +375,12 @@ impl Recursion<'_> {
             let width = rows.width();
             let known = buffers.prepare_block::<V, NX>(network, &part, width, exact);
             let room = rows.room(count);
+            // In the order of the columns: groups write beyond their end, over what comes next.
             buffers.pass_arguments::<V, NX>(count, room);
             buffers.pass_units::<V, NX>(&part, room);
             buffers.pass_rest::<V, NX>(&part, room);
             if let Some(weights) = weights.get(samples) {
+                // Rows of unknown outputs are not there, so neither are their weights.
                 let known = weights.iter().zip(part.y).filter(|(_, y)| !y.is_nan());
                 weigh(known.map(|(w, _)| *w), room, width);
             }
@@ -382,6 +414,7 @@ impl Sensitivities {
         for (k, (s, y)) in part.sums.iter().zip(part.y).enumerate().take(BLOCK) {
             let (value, steepness) = network.output.value_and_slope(*s);
             block.outputs[k] = (steepness, y - value);
+            // The last one may be a row beyond those that are kept: `room` is for all of the block's samples.
             block.places[k] = known * width;
             known += usize::from(!y.is_nan());
         }
@@ -389,6 +422,7 @@ impl Sensitivities {
         let arguments = arguments.zip(part.v.chunks_exact(inputs));
         for (k, (x, v)) in arguments.enumerate().take(BLOCK) {
             block.set(k, x, v);
+            // Per sample, for a Jacobian that is handed out; a training takes the block's stored h at once.
             if exact {
                 scratch.set(x, v);
                 network.rises::<V>(&scratch.arguments, &mut block.rises[k * groups..][..groups]);
@@ -409,11 +443,13 @@ impl Sensitivities {
         let groups = block.direct.len();
         let (weighted, _) = block.weighted.as_chunks::<NX>();
         let (weighted, _) = weighted.as_chunks::<BLOCK>();
+        // Column groups i: argument i / groups, units of group i mod groups.
         let source = |i: usize| OfArgument {
             argument: &block.arguments[i / groups],
             weighted: &weighted[i % groups],
             direct: &block.direct[i % groups],
         };
+        // Kinds of units follow each other without gaps, so that a row is short; groups within a kind are eight apart.
         let start = |i: usize| i / groups * hidden + i % groups * LANES;
         let (states, _) = self.states.as_chunks_mut::<NX>();
         let states = &mut states[..block.arguments.len() * groups];
@@ -428,6 +464,7 @@ impl Sensitivities {
         let states = &mut states[self.block.arguments.len() * groups..];
         for (q, states) in states.chunks_exact_mut(groups).take(NX).enumerate() {
             let first = (self.block.arguments.len() + q) * self.columns.shape.hidden;
+            // The row as a constant: it is known then which state a column moves.
             match q {
                 0 => self.block.pass_row::<V, NX, 0>(part, states, first, rows),
                 1 => self.block.pass_row::<V, NX, 1>(part, states, first, rows),
@@ -446,6 +483,7 @@ impl Sensitivities {
             let steepness = V::splat(block.outputs[k].0);
             let row = &mut rows[block.places[k] + columns.direct..];
             for (g, h) in h.iter().enumerate() {
+                // ds/dG = h: no recursion, and so no pass.
                 let part = V::load(&h.0).mul(steepness);
                 part.write(&mut row[g * LANES..]);
             }
@@ -465,6 +503,7 @@ impl Sensitivities {
             let row = &mut rows[block.places[k] + columns.sums..];
             let (sums, rest) = row.split_at_mut(columns.error - columns.sums);
             for (sum, argument) in sums.iter_mut().zip(&block.arguments) {
+                // ds/d[C D c] = the arguments, the last of which is 1.
                 *sum = steepness * argument[k];
             }
             rest[0] = error;

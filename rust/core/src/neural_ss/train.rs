@@ -2,16 +2,14 @@
 
 use super::free_run::Trajectory;
 use super::friction::{self, Friction};
-use super::integrated::Speed;
-use super::leak::Leak;
+use super::integrated::{Leak, Speed};
 use super::network::Network;
 use super::output::OutputFunction;
 use super::problem::{self, Attempts, Experiment};
 use super::realisation::Realisation;
 use super::recording::{Recording, check_recordings, constant_cost, scaling};
 use super::referee::{Referee, statistics};
-use super::scaling::Scaling;
-use super::shape::Shape;
+use super::shape::{Scaling, Shape};
 use super::state::{self, Statistics};
 use super::{NeuralSS, draw, kalman};
 use crate::guard;

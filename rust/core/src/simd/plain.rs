@@ -1,6 +1,6 @@
 //! Eight numbers as the baseline of any processor has them.
 
-use super::{Arithmetic, Choice, F64x8, LANES, tanh};
+use super::{Arithmetic, F64x8, LANES, tanh};
 
 #[derive(Clone, Copy)]
 pub(super) struct Plain([f64; LANES]);
@@ -29,6 +29,8 @@ impl Plain {
 }
 
 impl Arithmetic for Plain {
+    const ALL: u8 = u8::MAX;
+
     #[inline(always)]
     fn splat(value: f64) -> Self {
         Self([value; LANES])
@@ -55,29 +57,6 @@ impl Arithmetic for Plain {
     }
 
     #[inline(always)]
-    fn add_product(self, a: Self, b: Self) -> Self {
-        // 64-bit ARM has it in its baseline; elsewhere it would be a call.
-        if cfg!(target_arch = "aarch64") {
-            return self.each(|i, v| a.0[i].mul_add(b.0[i], v));
-        }
-        self.add(a.mul(b))
-    }
-
-    #[inline(always)]
-    fn at_most(self, limit: f64) -> Self {
-        self.each(|_, v| if v > limit { limit } else { v })
-    }
-
-    #[inline(always)]
-    fn at_least(self, limit: f64) -> Self {
-        self.each(|_, v| if v < limit { limit } else { v })
-    }
-}
-
-impl Choice for Plain {
-    const ALL: u8 = u8::MAX;
-
-    #[inline(always)]
     fn load(values: &[f64; LANES]) -> Self {
         Self(*values)
     }
@@ -98,11 +77,6 @@ impl Choice for Plain {
     }
 
     #[inline(always)]
-    fn floor(self) -> Self {
-        self.each(|_, v| floor(v))
-    }
-
-    #[inline(always)]
     fn if_less(self, other: Self, yes: Self, no: Self) -> Self {
         self.each(|i, v| if v < other.0[i] { yes.0[i] } else { no.0[i] })
     }
@@ -119,7 +93,21 @@ impl Choice for Plain {
 }
 
 impl F64x8 for Plain {
-    const TILE: (usize, usize) = (2, 1);
+    const TILE_ROWS: usize = 2;
+
+    #[inline(always)]
+    fn add_product(self, a: Self, b: Self) -> Self {
+        // 64-bit ARM has it in its baseline; elsewhere it would be a call.
+        if cfg!(target_arch = "aarch64") {
+            return self.each(|i, v| a.0[i].mul_add(b.0[i], v));
+        }
+        self.add(a.mul(b))
+    }
+
+    #[inline(always)]
+    fn floor(self) -> Self {
+        self.each(|_, v| floor(v))
+    }
 
     #[inline(always)]
     fn store(self, values: &mut [f64; LANES]) {
@@ -129,13 +117,9 @@ impl F64x8 for Plain {
     #[inline(always)]
     fn sum(self) -> f64 {
         let v = self.0;
+        // The order of a register that is folded in the middle, again and again, as `x86::sum` does it: a sum has the
+        // same rounding on all levels.
         ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]))
-    }
-
-    #[inline(always)]
-    fn abs_up_to(self, limit: f64) -> Self {
-        // A comparison rather than `min`, which would turn NaN into a number.
-        self.each(|_, v| if v.abs() > limit { limit } else { v.abs() })
     }
 
     #[inline(always)]
@@ -150,11 +134,14 @@ impl F64x8 for Plain {
 
     #[inline(always)]
     fn power_of_two(self) -> Self {
+        // The lowest bits of n move into the exponent, whose bias is 1023; `wrapping`, as a negative n is there in two's
+        // complement.
         self.each(|_, v| f64::from_bits((v.to_bits() << 52).wrapping_add(1023 << 52)))
     }
 }
 
 /// Called rather than written out: eight of them in sixteen registers are hundreds of instructions, most of a kernel's.
+// It halved the code of the kernels and the time of their build.
 #[inline(never)]
 fn tanh_of(x: &Plain) -> Plain {
     tanh::tanh(*x)
@@ -172,12 +159,82 @@ const WHOLE: f64 = 4_503_599_627_370_496.0;
 #[inline(always)]
 fn floor(v: f64) -> f64 {
     let shift = WHOLE.copysign(v);
+    // Beside 2^52 a number has no bits left for a fraction, so that adding rounds to an integer and subtracting is
+    // exact. `shift` has the sign of v: the sum then grows and stays where spacing is 1 or more.
     let nearest = (v + shift) - shift;
+    // Rounded to the nearest, so at most one too high.
     let below = if nearest > v { nearest - 1.0 } else { nearest };
-    // 0 keeps the sign of what it came from
+    // 0 keeps the sign of what it came from. From 2^52 on there is nothing to round, and v + shift would round v itself.
     if v.abs() < WHOLE {
         below.copysign(v)
     } else {
         v
+    }
+}
+
+// One number in place of eight: the controllers of lanes, for a loop that runs alone. It has nothing that rounds once what
+// others round twice: so a controller gives the same bits alone, in lanes of any level, and on a microcontroller.
+
+impl Arithmetic for f64 {
+    const ALL: u8 = 1;
+
+    #[inline(always)]
+    fn splat(value: f64) -> Self {
+        value
+    }
+
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        self + other
+    }
+
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        self - other
+    }
+
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        self * other
+    }
+
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        self / other
+    }
+
+    #[inline(always)]
+    fn load(values: &[f64; LANES]) -> Self {
+        values[0]
+    }
+
+    #[inline(always)]
+    fn at_most_each(self, limits: Self) -> Self {
+        if self > limits { limits } else { self }
+    }
+
+    #[inline(always)]
+    fn at_least_each(self, limits: Self) -> Self {
+        if self < limits { limits } else { self }
+    }
+
+    #[inline(always)]
+    fn abs(self) -> Self {
+        self.abs()
+    }
+
+    #[inline(always)]
+    fn if_less(self, other: Self, yes: Self, no: Self) -> Self {
+        if self < other { yes } else { no }
+    }
+
+    #[inline(always)]
+    fn if_equal(self, other: Self, yes: Self, no: Self) -> Self {
+        if self == other { yes } else { no }
+    }
+
+    #[inline(always)]
+    fn are_less(self, other: Self) -> u8 {
+        u8::from(self < other)
     }
 }

@@ -27,9 +27,7 @@
 //! 21.86 without). It may go when that is so on the processors that the figures are kept for.
 
 #[cfg(target_arch = "x86_64")]
-pub(super) mod pieces;
-#[cfg(target_arch = "x86_64")]
-pub(super) mod sums;
+pub(super) mod tables;
 
 use sewfast_control::model::tanh::{
     self, DENOMINATOR, NEAR_DENOMINATOR, NEAR_NUMERATOR, NUMERATOR,
@@ -49,6 +47,7 @@ const NEAR: f64 = tanh::NEAR.end;
 pub(super) fn tanh<V: F64x8>(x: V) -> V {
     let (size, limit) = (x.abs(), V::splat(NEAR));
     let near = near(x);
+    // NaN is not below the limit: it takes the way of the large ones, which hands it on.
     if size.are_less(limit) == u8::MAX {
         return near;
     }
@@ -65,7 +64,9 @@ fn near<V: F64x8>(x: V) -> V {
     let scaled = |i: usize| x.mul(V::splat(NEAR_NUMERATOR[i]));
     let even = [x, scaled(2), scaled(4), scaled(6)];
     let odd = [scaled(1), scaled(3), scaled(5), scaled(7)];
+    // P's constant is 1, so that x itself stands in its place: small numbers come out as they are, and -0 as -0.
     let c = NEAR_DENOMINATOR.map(V::splat);
+    // Both need s, s2 and s4 only, so that numerator and denominator are computed at once and meet in the division.
     let numerator = eight(even, odd, s, s2, s4);
     let denominator = eight(
         [c[0], c[2], c[4], c[6]],
@@ -80,6 +81,8 @@ fn near<V: F64x8>(x: V) -> V {
 /// A polynomial of degree 7 in Estrin's form, its even and its odd coefficients apart.
 #[inline(always)]
 fn eight<V: F64x8>(even: [V; 4], odd: [V; 4], s: V, s2: V, s4: V) -> V {
+    // Chain: s, s2 and the pairs, s4 and `low`, the result; a level of the tree below each power as it becomes known.
+    // Horner's form would be seven dependent steps.
     let pair = |i: usize| even[i].add_product(odd[i], s);
     let low = pair(0).add_product(pair(1), s2);
     low.add_product(pair(2).add_product(pair(3), s2), s4)
@@ -90,6 +93,7 @@ fn eight<V: F64x8>(even: [V; 4], odd: [V; 4], s: V, s2: V, s4: V) -> V {
 /// Beyond [`SATURATED`] the quotient is held and exceeds 1 with `x`, so that the last step gives +-1.
 #[inline(always)]
 fn far<V: F64x8>(x: V) -> V {
+    // `at_most` lets NaN pass, which the quotient and the limits hand on.
     let s = x.mul(x).at_most(SATURATED * SATURATED);
     let s2 = s.mul(s);
     let s4 = s2.mul(s2);
@@ -97,9 +101,12 @@ fn far<V: F64x8>(x: V) -> V {
         Parts::of(&NUMERATOR, s, s2, s4),
         Parts::of(&DENOMINATOR, s, s2, s4),
     );
-    // x is taken into the numerator where there is time for it.
+    // x goes into the numerator's two parts while the denominator is still summed: behind the quotient it would be a
+    // product more on the chain.
     let numerator = x.mul(p.low).add_product(x.mul(s4), p.high);
     let denominator = q.low.add_product(s4, q.high);
+    // Below SATURATED, too: from |x| = 10 on rounding can leave the quotient a few units of the last place beyond 1, and
+    // sensitivities take 1 - h^2 for a slope that is not negative.
     numerator.div(denominator).at_most(1.0).at_least(-1.0)
 }
 
@@ -149,6 +156,8 @@ const TAYLOR: [f64; 12] = [
 #[inline(always)]
 pub(super) fn rise<V: F64x8>(x: V) -> V {
     let two = V::splat(2.0);
+    // exp(2|x|) + 1 from exp(2|x|) - 1: where x is small the latter has all its digits, and where it is large they are
+    // the same. With |tanh| = 1 - q, 1 - tanh^2 = (1 - |tanh|)(1 + |tanh|) = q (2 - q).
     let q = two.div(growth(x).add(two));
     q.mul(two.sub(q))
 }
@@ -157,15 +166,20 @@ pub(super) fn rise<V: F64x8>(x: V) -> V {
 #[inline(always)]
 fn growth<V: F64x8>(x: V) -> V {
     let one = V::splat(1.0);
-    let size = x.abs_up_to(FLAT);
+    // 2 * 340 * log2(e) = 981 is below 1023, so that 2^n is a normal number.
+    let size = x.abs().at_most(FLAT);
     let twice = size.add(size);
+    // 2|x| = n ln 2 + r with |r| <= ln(2)/2, and exp(2|x|) = 2^n exp(r). ROUND is 1.5 * 2^52: the sum's spacing is 1,
+    // and its lowest bits are n, which `power_of_two` takes from there without a conversion.
     let shifted = V::splat(ROUND).add_product(twice, V::splat(std::f64::consts::LOG2_E));
     let n = shifted.sub(V::splat(ROUND));
+    // The large part first: its product and the difference are exact, so that only the small part rounds.
     let r = twice
         .add_product(n, V::splat(-LN2[0]))
         .add_product(n, V::splat(-LN2[1]));
     let power = shifted.power_of_two();
     let series = r.add_product(r.mul(r), series(r));
+    // 2^n exp(r) - 1 = (2^n - 1) + 2^n (exp(r) - 1): both parts are exact or small, and for n = 0 the first is 0.
     power.sub(one).add_product(power, series)
 }
 

@@ -1,12 +1,15 @@
 //! Eight numbers in one AVX-512 register, or in two of AVX2.
 //!
-//! The intrinsics are only reached through [`wide`] and [`half`], whose callers have asked the processor.
+//! Why the `unsafe` of this file is sound, once for all: an intrinsic needs a processor that has it, and loads and stores need
+//! room for eight numbers. The types are private to `simd`, and values of them come about only in [`wide`] and [`half`], whose caller
+//! has asked the processor; the room is in the type, `[f64; LANES]`.
 
 use std::arch::x86_64::*;
 
-use super::{Arithmetic, Choice, F64x8, Kernel, LANES, Lanes, tanh};
+use super::{Arithmetic, F64x8, Kernel, LANES, Lanes, tanh};
 
 /// What is beyond the nearest quarter; half way between two of them, beyond the even one.
+// Bits 4 to 7 are the binary places to round to, two of them for quarters.
 const BEYOND_QUARTERS: i32 = 2 << 4 | _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
 
 /// Rounding to the integer below.
@@ -15,6 +18,8 @@ const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
 /// Runs a kernel in AVX-512 registers.
 #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
 pub(super) fn wide<K: Kernel>(kernel: K) -> K::Output {
+    // The kernel is compiled into this function, and by that for these features. AVX2 and FMA are named beside AVX-512,
+    // which has them, for the sums of half a register.
     kernel.run::<Wide>()
 }
 
@@ -31,6 +36,8 @@ impl Wide {
     /// Entries of a table, by the low four bits.
     #[inline(always)]
     pub(super) fn pick(self, table: &[Lanes; 2]) -> Self {
+        // A table is 16 numbers, two cache lines. Of an index the instruction takes bits 0 to 2 for the place and bit 3
+        // for the register, and ignores the rest: the sum of `QUARTERS` and a number is one as it is.
         let (low, high) = (Self::load(&table[0].0), Self::load(&table[1].0));
         // SAFETY: as `splat`.
         unsafe {
@@ -60,6 +67,7 @@ impl Wide {
     #[inline(always)]
     fn halves_swapped(self) -> Self {
         // SAFETY: as `splat`.
+        // A shuffle across the register takes three cycles, one within its 128-bit quarters (`neighbours`) one.
         unsafe { Self(_mm512_shuffle_f64x2::<0b0100_1110>(self.0, self.0)) }
     }
 
@@ -67,6 +75,7 @@ impl Wide {
     #[inline(always)]
     pub(super) fn with_sign_of(self, other: Self) -> Self {
         // SAFETY: as `splat`.
+        // Two operations of bits instead of a product with +-1: any unit does them, and they do not round.
         unsafe {
             Self(_mm512_or_pd(
                 self.0,
@@ -77,6 +86,8 @@ impl Wide {
 }
 
 impl Arithmetic for Wide {
+    const ALL: u8 = u8::MAX;
+
     #[inline(always)]
     fn splat(value: f64) -> Self {
         // SAFETY: only run where the processor has AVX-512, here and below.
@@ -108,42 +119,21 @@ impl Arithmetic for Wide {
     }
 
     #[inline(always)]
-    fn add_product(self, a: Self, b: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm512_fmadd_pd(a.0, b.0, self.0)) }
-    }
-
-    #[inline(always)]
-    fn at_most(self, limit: f64) -> Self {
-        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand.
-        unsafe { Self(_mm512_min_pd(_mm512_set1_pd(limit), self.0)) }
-    }
-
-    #[inline(always)]
-    fn at_least(self, limit: f64) -> Self {
-        // SAFETY: as `at_most`.
-        unsafe { Self(_mm512_max_pd(_mm512_set1_pd(limit), self.0)) }
-    }
-}
-
-impl Choice for Wide {
-    const ALL: u8 = u8::MAX;
-
-    #[inline(always)]
     fn load(values: &[f64; LANES]) -> Self {
+        // Unaligned by name: at an aligned address it is as fast as the aligned one, and slices may begin anywhere.
         // SAFETY: eight readable numbers; only run where the processor has AVX-512.
         unsafe { Self(_mm512_loadu_pd(values.as_ptr())) }
     }
 
     #[inline(always)]
     fn at_most_each(self, limits: Self) -> Self {
-        // SAFETY: as `at_most`.
+        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand, which is why `self` is that.
         unsafe { Self(_mm512_min_pd(limits.0, self.0)) }
     }
 
     #[inline(always)]
     fn at_least_each(self, limits: Self) -> Self {
-        // SAFETY: as `at_most`.
+        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand, which is why `self` is that.
         unsafe { Self(_mm512_max_pd(limits.0, self.0)) }
     }
 
@@ -154,13 +144,8 @@ impl Choice for Wide {
     }
 
     #[inline(always)]
-    fn floor(self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm512_roundscale_pd::<DOWN>(self.0)) }
-    }
-
-    #[inline(always)]
     fn if_less(self, other: Self, yes: Self, no: Self) -> Self {
+        // No masks here: a comparison gives all ones or all zeros, and `blendv` goes by the sign bit.
         // SAFETY: as `splat`.
         unsafe {
             let less = _mm512_cmp_pd_mask::<_CMP_LT_OQ>(self.0, other.0);
@@ -185,7 +170,19 @@ impl Choice for Wide {
 }
 
 impl F64x8 for Wide {
-    const TILE: (usize, usize) = (8, 3);
+    const TILE_ROWS: usize = 8;
+
+    #[inline(always)]
+    fn add_product(self, a: Self, b: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_fmadd_pd(a.0, b.0, self.0)) }
+    }
+
+    #[inline(always)]
+    fn floor(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_roundscale_pd::<DOWN>(self.0)) }
+    }
 
     #[inline(always)]
     fn store(self, values: &mut [f64; LANES]) {
@@ -197,18 +194,9 @@ impl F64x8 for Wide {
     fn sum(self) -> f64 {
         // SAFETY: as `splat`.
         unsafe {
+            // Lane i and i + 4 first, as in the two registers of AVX2: one order of additions on all levels.
             let low = _mm512_castpd512_pd256(self.0);
             sum(_mm256_add_pd(low, _mm512_extractf64x4_pd::<1>(self.0)))
-        }
-    }
-
-    #[inline(always)]
-    fn abs_up_to(self, limit: f64) -> Self {
-        // SAFETY: as `splat`.
-        unsafe {
-            let (size, limit) = (_mm512_abs_pd(self.0), _mm512_set1_pd(limit));
-            let larger = _mm512_cmp_pd_mask::<_CMP_GT_OQ>(size, limit);
-            Self(_mm512_mask_blend_pd(larger, size, limit))
         }
     }
 
@@ -216,6 +204,8 @@ impl F64x8 for Wide {
     fn power_of_two(self) -> Self {
         // SAFETY: as `splat`.
         unsafe {
+            // n stands in the lowest bits: shifted behind the sign it is an exponent without its bias, which the bits of
+            // 1 are.
             let exponent = _mm512_slli_epi64::<52>(_mm512_castpd_si512(self.0));
             let one = _mm512_castpd_si512(_mm512_set1_pd(1.0));
             Self(_mm512_castsi512_pd(_mm512_add_epi64(exponent, one)))
@@ -224,30 +214,37 @@ impl F64x8 for Wide {
 
     #[inline(always)]
     fn tanh_in_chain(self) -> Self {
-        tanh::pieces::tanh(self)
+        tanh::tables::in_chain(self)
     }
 
     #[inline(always)]
     fn tanh_of_four(x: [Self; 4]) -> [Self; 4] {
-        tanh::sums::of_four(x)
+        tanh::tables::of_four(x)
     }
 
     #[inline(always)]
     fn tanh_as_of_four(self) -> Self {
-        tanh::sums::of_neighbours(self)
+        tanh::tables::of_neighbours(self)
     }
 
     /// The sum is not waited for: halves are added, then neighbours, and the two sums that are left go into the arguments
     /// one by one.
     #[inline(always)]
     fn fed_back(self, second: Self, direct: Self, rest: Self, weights: Self) -> (f64, Self) {
+        // Lane i of y's sum is direct_i + second_i h_i. Folded before the products are added up: `direct` is there
+        // early, and only two products and one shuffle of h are on the chain. Lanes 4 to 7 are lanes 0 to 3 then, but for
+        // the order of the two products and so for their last bit.
         let four = direct
             .add(direct.halves_swapped())
             .add_product(second, self)
             .add_product(second.halves_swapped(), self.halves_swapped());
+        // Lanes hold p p q q p p q q, with y = p + q.
         let two = four.add(four.neighbours());
+        // q q p p q q p p, a shuffle within each half.
         // SAFETY: as `splat`.
         let others = unsafe { Self(_mm512_permutex_pd::<0b0100_1110>(two.0)) };
+        // The first product needs `two` alone and goes ahead while `others` is on its way. Each lane rounds its own p + q;
+        // what is kept and measured is that of lane 0.
         let arguments = rest.add_product(weights, two).add_product(weights, others);
         // SAFETY: as `splat`.
         let y = unsafe { _mm512_cvtsd_f64(two.0) + _mm512_cvtsd_f64(others.0) };
@@ -259,6 +256,8 @@ impl F64x8 for Wide {
 pub(super) struct Halves(__m256d, __m256d);
 
 impl Arithmetic for Halves {
+    const ALL: u8 = u8::MAX;
+
     #[inline(always)]
     fn splat(value: f64) -> Self {
         // SAFETY: only run where the processor has AVX2 and FMA, here and below.
@@ -311,35 +310,6 @@ impl Arithmetic for Halves {
     }
 
     #[inline(always)]
-    fn add_product(self, a: Self, b: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe {
-            Self(
-                _mm256_fmadd_pd(a.0, b.0, self.0),
-                _mm256_fmadd_pd(a.1, b.1, self.1),
-            )
-        }
-    }
-
-    #[inline(always)]
-    fn at_most(self, limit: f64) -> Self {
-        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand.
-        let one = |v: __m256d| unsafe { _mm256_min_pd(_mm256_set1_pd(limit), v) };
-        Self(one(self.0), one(self.1))
-    }
-
-    #[inline(always)]
-    fn at_least(self, limit: f64) -> Self {
-        // SAFETY: as `at_most`.
-        let one = |v: __m256d| unsafe { _mm256_max_pd(_mm256_set1_pd(limit), v) };
-        Self(one(self.0), one(self.1))
-    }
-}
-
-impl Choice for Halves {
-    const ALL: u8 = u8::MAX;
-
-    #[inline(always)]
     fn load(values: &[f64; LANES]) -> Self {
         let start = values.as_ptr();
         // SAFETY: eight readable numbers; only run where the processor has AVX2 and FMA.
@@ -348,7 +318,7 @@ impl Choice for Halves {
 
     #[inline(always)]
     fn at_most_each(self, limits: Self) -> Self {
-        // SAFETY: as `at_most`.
+        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand, which is why `self` is that.
         unsafe {
             Self(
                 _mm256_min_pd(limits.0, self.0),
@@ -359,7 +329,7 @@ impl Choice for Halves {
 
     #[inline(always)]
     fn at_least_each(self, limits: Self) -> Self {
-        // SAFETY: as `at_most`.
+        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand, which is why `self` is that.
         unsafe {
             Self(
                 _mm256_max_pd(limits.0, self.0),
@@ -373,12 +343,6 @@ impl Choice for Halves {
         // SAFETY: as `splat`.
         let one = |v: __m256d| unsafe { _mm256_andnot_pd(_mm256_set1_pd(-0.0), v) };
         Self(one(self.0), one(self.1))
-    }
-
-    #[inline(always)]
-    fn floor(self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm256_floor_pd(self.0), _mm256_floor_pd(self.1)) }
     }
 
     #[inline(always)]
@@ -409,13 +373,31 @@ impl Choice for Halves {
         unsafe {
             let low = _mm256_movemask_pd(_mm256_cmp_pd::<_CMP_LT_OQ>(self.0, other.0));
             let high = _mm256_movemask_pd(_mm256_cmp_pd::<_CMP_LT_OQ>(self.1, other.1));
+            // Lanes 4 to 7 are the upper register's: the order of bits is that of AVX-512's mask.
             (low | high << 4) as u8
         }
     }
 }
 
 impl F64x8 for Halves {
-    const TILE: (usize, usize) = (4, 1);
+    const TILE_ROWS: usize = 6;
+
+    #[inline(always)]
+    fn add_product(self, a: Self, b: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            Self(
+                _mm256_fmadd_pd(a.0, b.0, self.0),
+                _mm256_fmadd_pd(a.1, b.1, self.1),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn floor(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm256_floor_pd(self.0), _mm256_floor_pd(self.1)) }
+    }
 
     #[inline(always)]
     fn store(self, values: &mut [f64; LANES]) {
@@ -431,17 +413,6 @@ impl F64x8 for Halves {
     fn sum(self) -> f64 {
         // SAFETY: as `splat`.
         unsafe { sum(_mm256_add_pd(self.0, self.1)) }
-    }
-
-    #[inline(always)]
-    fn abs_up_to(self, limit: f64) -> Self {
-        // SAFETY: as `splat`.
-        let one = |v: __m256d| unsafe {
-            let size = _mm256_andnot_pd(_mm256_set1_pd(-0.0), v);
-            let limit = _mm256_set1_pd(limit);
-            _mm256_blendv_pd(size, limit, _mm256_cmp_pd::<_CMP_GT_OQ>(size, limit))
-        };
-        Self(one(self.0), one(self.1))
     }
 
     #[inline(always)]

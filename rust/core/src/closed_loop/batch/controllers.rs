@@ -4,23 +4,24 @@ use sewfast_control::{
     AnyController, Controller, Numbers, PidController, STATES, StateDesign, StateFeedback,
 };
 
-use crate::simd::{Choice, LANES};
+use crate::simd::{Arithmetic, LANES};
 
 /// A kind of controller that runs in lanes.
 pub(crate) trait InLanes: Controller<f64> {
     /// Eight of them, or a single one.
-    type Lanes<V: Choice>: LaneController<V>;
+    type Lanes<V: Arithmetic>: LaneController<V>;
 
     /// Whether this one can.
     fn fits(&self) -> bool;
 
     /// The first eight of `controllers`, at rest; missing ones are the first again.
-    fn in_lanes<V: Choice>(controllers: &[&Self]) -> Self::Lanes<V>;
+    fn in_lanes<V: Arithmetic>(controllers: &[&Self]) -> Self::Lanes<V>;
 }
 
 /// What a loop asks of the controllers in its lanes: in two parts, between which other work can be done.
 pub(crate) trait LaneController<V> {
     /// Takes measured outputs.
+    // In two because of `Decision`: filters go on while the plants of another group step.
     fn take(&mut self, first: bool, measured: V);
     /// From the reference and what was taken to the commands.
     fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V;
@@ -67,24 +68,26 @@ fn all<'a, C: InLanes>(
     within: impl Fn(&'a AnyController<f64>) -> Option<&'a C>,
 ) -> Option<Vec<&'a C>> {
     let fitting = |c: &&'a AnyController<f64>| within(c).filter(|c| c.fits());
+    // `Option<Vec>`: one that does not fit sends all of them to the scalar loop, which has the same bits.
     controllers.iter().map(fitting).collect()
 }
 
 impl InLanes for PidController<f64> {
-    type Lanes<V: Choice> = Controllers<V>;
+    type Lanes<V: Arithmetic> = Controllers<V>;
 
     fn fits(&self) -> bool {
         self.numbers().is_some()
     }
 
     #[inline(always)]
-    fn in_lanes<V: Choice>(controllers: &[&Self]) -> Controllers<V> {
+    fn in_lanes<V: Arithmetic>(controllers: &[&Self]) -> Controllers<V> {
         Controllers::new(controllers)
     }
 }
 
 /// A derivative term below this is nothing: in a loop at rest it would fade on for ever among numbers so small that processors
 /// take a hundred times as long over them.
+// Measured as a loop at rest that was slower threefold. What is dropped is beyond every digit of a command.
 const FADED: f64 = 1e-280;
 
 /// Eight of [`PidController`] with constant gains: the same operations in the same order.
@@ -92,6 +95,8 @@ pub(crate) struct Controllers<V> {
     average: Averages<V>,
     lag: V,
     /// `1 - a`, `b`, and 1 where there is an observer; `None` where no lane has one.
+    // `None` in these three is a branch that all samples take alike: a stage that no lane has is not computed. Where
+    // some have it, the others compute it with numbers that leave no trace (no ramp: an infinite change), or choose.
     observer: Option<[V; 3]>,
     /// Largest change of the reference in one sample; `None` where no lane has a ramp.
     ramp: Option<V>,
@@ -113,6 +118,8 @@ pub(crate) struct Controllers<V> {
     innovation: V,
     r: V,
     /// The derivative's input at the last sample; NaN before the first.
+    // `e - beta r` as it was, where the scalar law keeps e and r and forms it again: the same bits from the same
+    // operations, and one value less to hold.
     input: V,
     derivative: V,
     integral: V,
@@ -121,12 +128,14 @@ pub(crate) struct Controllers<V> {
     pub filtered: V,
 }
 
-impl<V: Choice> Controllers<V> {
+impl<V: Arithmetic> Controllers<V> {
     /// The first eight of `controllers`, at rest; missing ones are the first again.
     #[inline(always)]
     pub fn new(controllers: &[&PidController<f64>]) -> Self {
         let lane = |i: usize| *controllers.get(i).unwrap_or(&controllers[0]);
         let number = |i: usize| lane(i).numbers();
+        // `dyn` and not generic: this runs once a candidate, and a copy for each of sixteen settings would be most of the
+        // code.
         let each = |of: &dyn Fn(Numbers<f64>) -> f64| {
             V::load(&std::array::from_fn(|i| number(i).map_or(f64::NAN, of)))
         };
@@ -168,13 +177,14 @@ impl<V: Choice> Controllers<V> {
             input: nan,
             derivative: zero,
             integral: zero,
+            // As `Pid::reset`: slew counts from 0 or the limit next to it.
             u: zero.at_least_each(low).at_most_each(high),
             filtered: zero,
         }
     }
 }
 
-impl<V: Choice> LaneController<V> for Controllers<V> {
+impl<V: Arithmetic> LaneController<V> for Controllers<V> {
     #[inline(always)]
     fn take(&mut self, first: bool, measured: V) {
         self.filtered = self.filter(first, measured);
@@ -192,10 +202,11 @@ impl<V: Choice> LaneController<V> for Controllers<V> {
     }
 }
 
-impl<V: Choice> Controllers<V> {
+impl<V: Arithmetic> Controllers<V> {
     #[inline(always)]
     fn filter(&mut self, first: bool, x: V) -> V {
         let x = self.average.step(first, x);
+        // `first` is one flag for all lanes, since all begin at the same sample: a branch and no selection.
         let from = if first { x } else { self.lagged };
         self.lagged = from.add(self.lag.mul(x.sub(from)));
         let Some([keep, gain, on]) = self.observer else {
@@ -207,8 +218,13 @@ impl<V: Choice> Controllers<V> {
         } else {
             (self.observed, self.innovation)
         };
+        //   s(k) = (1 - a) s(k-1) + y(k) - v(k-1)        innovation
+        //   v(k) = v(k-1) + b s(k)                       observed speed
+        // as `sewfast_control::observer` derives it.
         let innovation = keep.mul(left).add(y.sub(from));
         let speed = from.add(gain.mul(innovation));
+        // A lane without an observer has keep = gain = 0 and would hold its first value: it passes its input on by
+        // choice.
         self.observed = on.if_equal(V::splat(1.0), speed, y);
         self.innovation = on.if_equal(V::splat(1.0), innovation, V::splat(0.0));
         self.observed
@@ -220,6 +236,7 @@ impl<V: Choice> Controllers<V> {
         let Some(change) = self.ramp else {
             return r;
         };
+        // A ramp begins where the machine is.
         let from = if first { self.filtered } else { self.r };
         self.r = limited(r, from.sub(change), from.add(change));
         self.r
@@ -228,9 +245,16 @@ impl<V: Choice> Controllers<V> {
     #[inline(always)]
     fn control(&mut self, r: V, y: V, feedforward: Option<f64>) -> V {
         let zero = V::splat(0.0);
+        //   u = Kp (e - alpha r) + I + D + feedforward
+        //   I = I + (Kp Ts/Ti) e
+        //   D = pole D + kd ((e - beta r) - (e - beta r) before)
+        // in the order of operations of `Pid::step_by`, and no product fused: on every level, alone and on a device, the
+        // same bits.
         let e = r.sub(y);
         let input = e.sub(self.beta.mul(r));
         let change = input.sub(self.input);
+        // NaN is not equal to itself, so that the first sample has no change; a selection, because `sound` below can put
+        // one lane back.
         let change = self.input.if_equal(self.input, change, zero);
         let derivative = self.pole.mul(self.derivative).add(self.kd.mul(change));
         let integral = self.integral.add(self.ki.mul(e));
@@ -240,6 +264,7 @@ impl<V: Choice> Controllers<V> {
             None => wanted,
             Some(added) => wanted.add(V::splat(added)),
         };
+        // Limits first, slew after: the last command was within the limits, and so is all between it and a value within.
         let mut u = limited(wanted, self.low, self.high);
         if let Some(change) = self.change {
             u = limited(u, self.u.sub(change), self.u.add(change));
@@ -247,9 +272,11 @@ impl<V: Choice> Controllers<V> {
         let fading = derivative.abs().if_less(V::splat(FADED), zero, derivative);
         let new = [u, self.kept(integral, u.sub(wanted)), fading, input];
         // 0 where both are finite, else NaN
+        // x 0 is 0 for finite x, else NaN: two products and a sum instead of two comparisons and an AND.
         let sound = wanted.mul(zero).add(input.mul(zero));
         let old = [self.u, self.integral, self.derivative, self.input];
         [self.u, self.integral, self.derivative, self.input] =
+            // Hardly ever not: four selections are saved for a branch that is foretold.
             if sound.abs().are_less(V::splat(1.0)) == V::ALL {
                 new
             } else {
@@ -267,30 +294,37 @@ impl<V: Choice> Controllers<V> {
     #[inline(always)]
     fn kept(&self, integral: V, excess: V) -> V {
         let zero = V::splat(0.0);
+        // excess = u - wanted is negative at the upper limit, and the integral's change then positive where it pushes
+        // on: their product is negative. Conditional integration holds the integral there; back-calculation moves it by
+        // Ts/Tt of the excess.
         let pushes_on = integral.sub(self.integral).mul(excess);
         let held = pushes_on.if_less(zero, self.integral, integral);
         let tracked = integral.add(self.tracking.mul(excess));
         let kept = self.conditional.if_equal(V::splat(1.0), held, tracked);
         let kept = excess.if_equal(zero, integral, kept);
+        // Without integral action there is nothing to wind up, and tracking would make an offset out of the excess that
+        // no error takes back.
         self.ki.if_equal(zero, integral, kept)
     }
 }
 
 impl InLanes for StateFeedback<f64> {
-    type Lanes<V: Choice> = StateLanes<V>;
+    type Lanes<V: Arithmetic> = StateLanes<V>;
 
     fn fits(&self) -> bool {
         true
     }
 
     #[inline(always)]
-    fn in_lanes<V: Choice>(controllers: &[&Self]) -> StateLanes<V> {
+    fn in_lanes<V: Arithmetic>(controllers: &[&Self]) -> StateLanes<V> {
         StateLanes::new(controllers)
     }
 }
 
 /// Eight of [`StateFeedback`]: the same operations in the same order.
 pub(crate) struct StateLanes<V> {
+    // Vectors of four whatever the plant's order: states that are not used have zeros, and the code no loop over a
+    // number of its own. What is used costs 16 products a sample.
     a: [V; STATES],
     b: [V; STATES],
     k: [V; STATES],
@@ -316,7 +350,7 @@ pub(crate) struct StateLanes<V> {
     observed: V,
 }
 
-impl<V: Choice> StateLanes<V> {
+impl<V: Arithmetic> StateLanes<V> {
     /// The first eight of `controllers`, at rest; missing ones are the first again.
     #[inline(always)]
     fn new(controllers: &[&StateFeedback<f64>]) -> Self {
@@ -353,12 +387,15 @@ impl<V: Choice> StateLanes<V> {
     }
 }
 
-impl<V: Choice> LaneController<V> for StateLanes<V> {
+impl<V: Arithmetic> LaneController<V> for StateLanes<V> {
     #[inline(always)]
     fn take(&mut self, first: bool, measured: V) {
+        // Nothing is asked of the measurement: the loop ends where it is not finite (`Loops::measure`), while the
+        // controller of a device has to go on.
         if first {
             self.x = self.rest.map(|x| x.mul(measured));
         }
+        // x' = x + l (y - x1): from here to the prediction in `decide` x is the corrected state.
         let innovation = measured.sub(self.x[0]);
         for (x, gain) in self.x.iter_mut().zip(self.l) {
             *x = x.add(gain.mul(innovation));
@@ -376,7 +413,9 @@ impl<V: Choice> LaneController<V> for StateLanes<V> {
         }
         let before = if first { r } else { self.r };
         let ([k1, k2, k3, k4], [x1, x2, x3, x4]) = (self.k, self.x);
+        // In pairs, as the law on a device adds them: a chain of two additions instead of three.
         let fed_back = (k1.mul(x1).add(k2.mul(x2))).add(k3.mul(x3).add(k4.mul(x4)));
+        // The reference as it will be after `lead` samples at its present rate.
         let aimed = r.add(self.lead.mul(r.sub(before)));
         let wanted = self.kr.mul(aimed).sub(fed_back).add(self.q);
         let wanted = match feedforward {
@@ -388,8 +427,11 @@ impl<V: Choice> LaneController<V> for StateLanes<V> {
             u = limited(u, self.u.sub(change), self.u.add(change));
         }
         let (excess, change) = (u.sub(wanted), self.ki.mul(r.sub(y)));
+        // The integral stands where the error pushes further beyond a limit, as `kept` above has it.
         let mut q = change.mul(excess).if_less(zero, self.q, self.q.add(change));
         let shifted = [x2, x3, x4, zero];
+        // x(k+1) = A x' + b u in observer form: A has -a in its first column and ones above the diagonal, so that the
+        // product is a shift and one multiplication a state. u as limited: the observer knows what the plant got.
         let mut x: [V; STATES] =
             std::array::from_fn(|i| shifted[i].sub(self.a[i].mul(x1)).add(self.b[i].mul(u)));
         // 0 where the command is finite, else NaN: then the observer begins again, and the command stays
@@ -414,13 +456,15 @@ impl<V: Choice> LaneController<V> for StateLanes<V> {
 
 /// The nearest value in `[low, high]`; NaN stays NaN.
 #[inline(always)]
-fn limited<V: Choice>(value: V, low: V, high: V) -> V {
+fn limited<V: Arithmetic>(value: V, low: V, high: V) -> V {
     value.at_least_each(low).at_most_each(high)
 }
 
 /// Eight of [`sewfast_control::filter::MovingAverage`].
 struct Averages<V> {
     /// Room for the longest; beyond a lane's own length there are zeros, which a sum does not feel.
+    // Slot by slot, eight loops each. In the ring's places and not in the order of age, which is the order in which the
+    // scalar average adds them: a sum's last bits depend on it.
     slots: Vec<V>,
     lengths: V,
     /// The length of all, where it is the same.
@@ -431,7 +475,7 @@ struct Averages<V> {
     nexts: V,
 }
 
-impl<V: Choice> Averages<V> {
+impl<V: Arithmetic> Averages<V> {
     #[inline(always)]
     fn new(lengths: [usize; LANES]) -> Self {
         let longest = lengths.into_iter().max().unwrap_or(1);
@@ -457,11 +501,13 @@ impl<V: Choice> Averages<V> {
                 self.slots[j] = place.if_less(self.lengths, x, V::splat(0.0));
             }
         }
+        // Formed anew each time: a running sum would drift, here as in the scalar average.
         let sum = if self.common {
             self.alike(x)
         } else {
             self.apart(x)
         };
+        // A division as there; 1/n times the sum rounds differently.
         sum.div(self.lengths)
     }
 
@@ -472,6 +518,8 @@ impl<V: Choice> Averages<V> {
         let next = self.next + 1;
         self.next = if next < self.slots.len() { next } else { 0 };
         let mut sum = V::splat(0.0);
+        // One addition after the other, as their order is part of the result; the groups of loops that take turns fill
+        // the waiting. 4 to 6 % of a candidate by this special case.
         for j in 0..self.slots.len() {
             sum = sum.add(self.slots[j]);
         }
@@ -483,6 +531,7 @@ impl<V: Choice> Averages<V> {
     fn apart(&mut self, x: V) -> V {
         let mut sum = V::splat(0.0);
         for j in 0..self.slots.len() {
+            // Each lane has its own place: every slot is offered the sample, and one lane or other takes it.
             let kept = self.nexts.if_equal(V::splat(j as f64), x, self.slots[j]);
             self.slots[j] = kept;
             sum = sum.add(kept);

@@ -1,21 +1,37 @@
-//! The hyperbolic tangent from sixteen polynomials, where a processor picks their coefficients in registers.
+//! The hyperbolic tangent where a processor picks numbers from tables in registers (AVX-512), in two ways.
+//!
+//! Both split the argument at the nearest quarter, `|x| = a + t` with `|t| <= 1/8`, and look up what belongs to `a`. The number of the
+//! quarter is found in the low bits of `|x| + QUARTERS`; `vpermi2pd` picks eight of a table's 16 numbers, which fill two registers, by
+//! them. [`in_chain`] looks up the coefficients of a polynomial of t, the shortest chain; [`of_four`] looks up `tanh(a)` alone and adds
+//! tangents, the fewest operations:
+//!
+//! ```text
+//!   A = tanh(a)  from a table of 16,        B = tanh(t) = t + t^3 p(t^2)
+//!   tanh(|x|) = (A + B) / (1 + A B)
+//! ```
+//!
+//! Because p has degree 4 only, the sum takes 20 operations; the division is shared by two results,
+//! `1/(d1 d2)` giving `d2/(d1 d2)` and `d1/(d1 d2)`, since a division takes as long as 8 products and there is one unit for it.
 
-use crate::simd::Lanes;
 use crate::simd::x86::Wide;
-use crate::simd::{Arithmetic, Choice};
+use crate::simd::{Arithmetic, F64x8, Lanes};
 
 use super::tanh as quotients;
 
 /// Adding this rounds to quarters, whose number is then found in the low bits.
-pub(super) const QUARTERS: f64 = 1_688_849_860_263_936.0;
+// 1.5 * 2^50: numbers of this size are spaced by 2^(50 - 52), a quarter. The half in front keeps the sum in that range.
+const QUARTERS: f64 = 1_688_849_860_263_936.0;
 /// Below this size [`near`] holds.
-pub(super) const NEAR: f64 = 3.875;
+// 15.5 quarters: from here on the nearest one could be the 16th, which the tables do not have.
+const NEAR: f64 = 3.875;
 
 /// `tanh(x)` at any size.
 #[inline(always)]
-pub(in crate::simd) fn tanh(x: Wide) -> Wide {
+pub(in crate::simd) fn in_chain(x: Wide) -> Wide {
     let (size, limit) = (x.abs(), Wide::splat(NEAR));
     let near = near(x);
+    // A branch and not a selection alone: a processor that foretells it goes on with the polynomial, and neither the
+    // comparison nor the quotients are on the chain.
     if size.are_less(limit) == Wide::ALL {
         return near;
     }
@@ -29,6 +45,8 @@ pub(in crate::simd) fn tanh(x: Wide) -> Wide {
 #[inline(always)]
 fn near(x: Wide) -> Wide {
     let size = x.abs();
+    // Rounded as the addition of QUARTERS rounds, to the even one of two as near: number and remainder belong together.
+    // The remainder is computed from |x| itself, so that it does not wait for the number.
     let t = size.beyond_quarters();
     let t2 = t.mul(t);
     let t4 = t2.mul(t2);
@@ -37,7 +55,10 @@ fn near(x: Wide) -> Wide {
         t,
         t2,
     };
+    //   four(i) = (c_i + c_(i+1) t) + t^2 (c_(i+2) + c_(i+3) t)
+    //   sum of c_i t^i = four(0) + t^4 (four(4) + t^4 four(8))
     let high = piece.four(4).add_product(piece.four(8), t4);
+    // Of |x|, so never negative: the sign is put on by an OR. tanh is odd to the last bit this way.
     piece.four(0).add_product(high, t4).with_sign_of(x)
 }
 
@@ -52,6 +73,7 @@ struct Piece {
 impl Piece {
     #[inline(always)]
     fn coefficient(self, power: usize) -> Wide {
+        // Only the low four bits are looked at: the sum's bits serve as an index as they are.
         self.number.pick(&PIECES[power])
     }
 
@@ -65,6 +87,145 @@ impl Piece {
     #[inline(always)]
     fn four(self, i: usize) -> Wide {
         self.pair(i).add_product(self.pair(i + 2), self.t2)
+    }
+}
+
+/// `tanh(t)/t - 1` over `t^2` up to `t = 1/8` as a polynomial of `t^2`, with a relative error of `tanh(t)` of 2.8e-17
+/// (`tests/golden/tanh_sums.py`).
+const BEYOND: [f64; 5] = [
+    -0.3333333333332524,
+    0.13333333325983435,
+    -0.05396823229463513,
+    0.021866697038365468,
+    -0.008699701918881335,
+];
+
+/// `tanh` of 0, 1/4, 1/2 ... 15/4.
+#[rustfmt::skip]
+static OF_QUARTERS: [Lanes; 2] = [
+    Lanes([
+        0.0, 0.24491866240370913, 0.46211715726000974, 0.6351489523872873,
+        0.7615941559557649, 0.8482836399575129, 0.9051482536448664, 0.9413755384972874,
+    ]),
+    Lanes([
+        0.9640275800758169, 0.9780261147388136, 0.9866142981514303, 0.9918597245682077,
+        0.9950547536867305, 0.996997635486526, 0.9981778976111987, 0.9988944427261528,
+    ]),
+];
+
+/// `tanh` of each at any size. The first two and the last two share a division.
+#[inline(always)]
+pub(in crate::simd) fn of_four(x: [Wide; 4]) -> [Wide; 4] {
+    let [a, b, c, d] = x;
+    let parts = [Parts::of(a), Parts::of(b), Parts::of(c), Parts::of(d)];
+    let [p, q, r, s] = parts;
+    // Both denominators are 1 + A B with 0 <= A < 1 and |B| < 1/8, between .87 and 1.13: their product is as good a
+    // divisor as each of them, and loses no range.
+    let (first, last) = (p.share(q), r.share(s));
+    let near = [
+        p.beside(q, first),
+        q.beside(p, first),
+        r.beside(s, last),
+        s.beside(r, last),
+    ];
+    // Where one argument of a pair is large, its lookup is of no meaning, and so is the division that both share.
+    if p.are_near() & q.are_near() & r.are_near() & s.are_near() == Wide::ALL {
+        return near;
+    }
+    [
+        p.at_any_size(q, near[0]),
+        q.at_any_size(p, near[1]),
+        r.at_any_size(s, near[2]),
+        s.at_any_size(r, near[3]),
+    ]
+}
+
+/// `tanh` at any size, to the bit what [`of_four`] gives where neighbours are its first two or its last two.
+#[inline(always)]
+pub(in crate::simd) fn of_neighbours(x: Wide) -> Wide {
+    let own = Parts::of(x);
+    // A register of hidden units, one group of a loop that runs alone, where `of_four` has four registers of loops: units
+    // 2i and 2i+1 are partners there, neighbours here. There is one division either way, so that nothing is saved; it is
+    // done for the bits, by which a search judges a loop alone as it does in lanes.
+    let other = own.of_neighbours();
+    let near = own.beside(other, own.share(other));
+    if own.are_near() == Wide::ALL {
+        return near;
+    }
+    own.at_any_size(other, near)
+}
+
+/// `tanh(x)` below [`NEAR`] before the division: `(A + B)/(1 + A B)` of the tangents `A` of the nearest quarter and `B` of
+/// what is beyond it.
+///
+/// With one division for two these are 20 operations where the quotients take 33, but a longer chain.
+#[derive(Clone, Copy)]
+struct Parts {
+    x: Wide,
+    size: Wide,
+    sum: Wide,
+    below: Wide,
+}
+
+impl Parts {
+    #[inline(always)]
+    fn of(x: Wide) -> Self {
+        let size = x.abs();
+        let quarters = size.add(Wide::splat(QUARTERS)).pick(&OF_QUARTERS);
+        let t = size.beyond_quarters();
+        let t2 = t.mul(t);
+        // Horner and not Estrin: one product less, and four of these run side by side, so that nobody waits.
+        let mut share = Wide::splat(BEYOND[4]);
+        for power in [3, 2, 1, 0] {
+            share = Wide::splat(BEYOND[power]).add_product(share, t2);
+        }
+        // t + t^3 p: t itself is exact, and what is added is at most 1/192 of it, so that its rounding does not count.
+        let beyond = t.add_product(t.mul(t2), share);
+        Self {
+            x,
+            size,
+            sum: quarters.add(beyond),
+            below: Wide::splat(1.0).add_product(quarters, beyond),
+        }
+    }
+
+    /// The parts of each lane's neighbour.
+    #[inline(always)]
+    fn of_neighbours(self) -> Self {
+        Self {
+            x: self.x.neighbours(),
+            size: self.size.neighbours(),
+            sum: self.sum.neighbours(),
+            below: self.below.neighbours(),
+        }
+    }
+
+    #[inline(always)]
+    fn are_near(self) -> u8 {
+        self.size.are_less(Wide::splat(NEAR))
+    }
+
+    /// The division that two have in common.
+    #[inline(always)]
+    fn share(self, other: Self) -> Wide {
+        Wide::splat(1.0).div(self.below.mul(other.below))
+    }
+
+    /// `tanh(x)` where both are near.
+    #[inline(always)]
+    fn beside(self, other: Self, share: Wide) -> Wide {
+        // sum / below = sum * (other.below / (below other.below)): two products for what a division of its own would be.
+        self.sum.mul(other.below.mul(share)).with_sign_of(self.x)
+    }
+
+    /// `near` where both are, else `tanh(x)` of its own.
+    #[inline(always)]
+    fn at_any_size(self, other: Self, near: Wide) -> Wide {
+        let (limit, own) = (Wide::splat(NEAR), quotients(self.x));
+        // A lane whose partner is large takes its own quotient. That depends on the partner, and not on the other lanes:
+        // these are other samples or loops, which must not matter.
+        let near = other.size.if_less(limit, near, own);
+        self.size.if_less(limit, near, own)
     }
 }
 

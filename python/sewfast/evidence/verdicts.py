@@ -1,4 +1,4 @@
-"""The questions of the report card: from evidence to lines with limits and verdicts.
+"""The lines of the report card: from evidence to figures with limits and verdicts.
 
 The limits are stated in docs/report-card.md.
 """
@@ -14,12 +14,12 @@ from ..validation import FAIR, Scores, judged
 from .card import Line, Verdict
 from .correlations import LEVEL, ResidualTest
 from .operating import OperatingRange
-from .parameters import Criteria, Knowledge, Parameters
+from .parameters import Criteria, Parameters, StoredInformation
 from .residuals import HorizonScores, Residuals, fit_text
 from .simulation_bands import Bands
 
 SMALL = 0.1
-"""Part of the rms error that a detected dependence must be worth for a failure, not a warning."""
+"""Part of the rms error above which a detected dependence is a failure, not a warning."""
 COVERAGE = (0.88, 0.99)
 LEAST_COVERAGE = 0.8
 OUTSIDE, FAR_OUTSIDE = 0.05, 0.2
@@ -30,15 +30,12 @@ GROWTH, LARGE_GROWTH = 1.5, 3.0
 _FOUND = {
     "parameters": (
         "the same kind of model with other parameters fits these data better: gain or time "
-        "constants "
-        "differ from the training data; the plant has changed, or the model is a compromise "
-        "between "
-        "regimes"
+        "constants differ from the training data; the plant has changed, or the model is a "
+        "compromise between regimes"
     ),
     "autocorrelation": (
-        "the noise model is too simple: predictions one step ahead do not use all that "
-        "past errors tell; raise "
-        "na and nb, or take model oe, which assumes nothing about the noise"
+        "the noise model is too simple: predictions one step ahead do not use all that past "
+        "errors tell; raise na and nb, or take model oe, which assumes nothing about the noise"
     ),
     "input": (
         "the input still explains part of the residual: dynamics or delay are missing; raise the "
@@ -62,9 +59,8 @@ _FOUND = {
     ),
     "product": (
         "the product of past residual and input explains part of the residual: noise acts inside "
-        "a nonlinear loop, or the gain drifts "
-        "over the "
-        "record; compare records from different times"
+        "a nonlinear loop, or the gain drifts over the record; compare records from different "
+        "times"
     ),
     "feedback": (
         "the input follows past residuals: either the data come from a closed loop, where "
@@ -86,16 +82,16 @@ _PASSED = {
 
 
 def accuracy(scores: HorizonScores, unit: str, noise: float, share: float) -> list[Line]:
-    """Free run, judged, and errors some steps ahead, which inform.
+    """Lines on the free run (judged) and on errors some steps ahead (information).
 
     Parameters
     ----------
     scores : HorizonScores
     unit : str
     noise : float
-        White measurement noise of the output; NaN where unknown.
+        White measurement noise of the output; NaN if unknown.
     share : float
-        What the moves of the input bring [%].
+        Part explained by the motion of the input [%].
     """
     free = scores.pooled["free run"]
     found = [_free_run(free, unit, judged(free.fit_percent, free.rmse, noise, share))]
@@ -155,14 +151,13 @@ def _worst(scores: HorizonScores, unit: str) -> list[Line]:
 
 
 def generalisation(here: Scores, training: Scores) -> Line:
-    """Free-run error on new data against that on the training data."""
+    """Line on the free-run error on new data compared with that on the training data."""
     ratio = here.rmse / training.rmse if training.rmse > 0.0 else math.inf
     verdict: Verdict = "ok" if ratio <= GROWTH else "warn" if ratio <= LARGE_GROWTH else "fail"
     meaning = {
         "ok": "the error is about as large as on the training data",
         "warn": "the error is larger than on the training data: these data hold something "
-        "new, or the "
-        "model has learnt noise; compare with a smaller model",
+        "new, or the model has learnt noise; compare with a smaller model",
         "fail": "the error is several times that on the training data: do not use the model here; "
         "train on data like these as well",
     }[verdict]
@@ -177,7 +172,7 @@ _OFFSET: tuple[Verdict, str] = (
 
 
 def bias(residuals: Residuals) -> Line:
-    """Mean residual, less what the initial state explains, against what chance lets it vary."""
+    """Line on the mean residual, without the initial state's effect, compared with chance."""
     ones, mean = residuals.constants, residuals.mean
     noise = residuals.noise()
     length = max(float(sum(one @ one for one in ones)), 1e-300)
@@ -207,7 +202,7 @@ def residuals_power(residuals: Residuals) -> float:
 
 
 def correlation(t: ResidualTest) -> Line:
-    """The verdict of one residual test."""
+    """Line with the verdict of one residual test."""
     limit = f"p >= {LEVEL:g}"
     if not math.isfinite(t.p_value):
         text = (
@@ -235,8 +230,8 @@ _INFORMS = {
 }
 
 
-def parameters(p: Knowledge) -> list[Line]:
-    """Samples per parameter, conditioning."""
+def parameters(p: StoredInformation) -> list[Line]:
+    """Lines on samples per parameter and conditioning."""
     ratio = p.samples / max(p.effective, 1e-12)
     enough = ratio >= SAMPLES_PER_PARAMETER
     size = Line(
@@ -274,7 +269,7 @@ def parameters(p: Knowledge) -> list[Line]:
 
 
 def looseness(p: Parameters) -> Line:
-    """Parameters that could as well be zero."""
+    """Line on parameters that could as well be zero."""
     loose = p.loose()
     shown = f"{len(loose)} of {len(p.values)}"
     named = ", ".join(loose[:5]) + (", .." if len(loose) > 5 else "")
@@ -285,7 +280,7 @@ def looseness(p: Parameters) -> Line:
 
 
 def information(c: Criteria, unit: str) -> Line:
-    """The criteria, to compare models of the same data."""
+    """Line with the criteria, for comparing models of the same data."""
     shown = f"AIC {c.aic:.6g}, BIC {c.bic:.6g}"
     squared = f"{unit}²" if unit else ""
     text = (
@@ -297,7 +292,7 @@ def information(c: Criteria, unit: str) -> Line:
 
 
 def coverage(b: Bands) -> Line:
-    """Measured coverage of the bands; its limits are the issue of honesty, not of accuracy."""
+    """Line on the measured coverage of the bands; its limits test honesty, not accuracy."""
     low, high = COVERAGE
     value = b.coverage
     limit = f"{100 * low:.0f} to {100 * high:.0f} %"
@@ -313,8 +308,7 @@ def coverage(b: Bands) -> Line:
     if value < low:
         text = (
             "fewer samples lie inside than promised: noise or operating range differ from the "
-            "training "
-            "data; do not rely on the bands here"
+            "training data; do not rely on the bands here"
         )
     elif value > high:
         text = "more samples lie inside than promised: the bands are wider than need be here"
@@ -322,7 +316,7 @@ def coverage(b: Bands) -> Line:
 
 
 def region(outside: float, farthest: float) -> Line:
-    """Share of samples unlike any in the training data; NaN where the region is not known."""
+    """Line on the share of samples unlike any in the training data; NaN without a region."""
     name, limit = "outside training region", f"<= {100 * OUTSIDE:g} %"
     if math.isnan(outside):
         text = (
@@ -344,7 +338,7 @@ def region(outside: float, farthest: float) -> Line:
 
 
 def operation(found: OperatingRange) -> list[Line]:
-    """Stability, gain and bandwidth over the operating range."""
+    """Lines on stability, gain and bandwidth over the operating range."""
     known = [p for p in found.points if p.known] or list(found.points)
     wild = [p for p in known if not p.is_stable]
     integrating = [p for p in wild if np.abs(p.poles).max(initial=0.0) < 1.0 + 1e-9]
@@ -372,7 +366,7 @@ def operation(found: OperatingRange) -> list[Line]:
 
 
 def _pole(size: float) -> str:
-    """To six digits; what would round to 1 by its distance from it."""
+    """A magnitude to six digits; one that would round to 1 as its distance from 1."""
     left = 1.0 - size
     if 1e-9 < abs(left) < 1e-5:
         return f"1 {'-' if left > 0.0 else '+'} {abs(left):.2g}"
