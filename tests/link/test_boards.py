@@ -294,7 +294,7 @@ class Talkative(EmulatedSimpleFOC):
         (simplefoc(), {"volt": 0.0}, SettingError, {"name": "volt"}),
         (simplefoc(), {"speed": np.inf}, SettingError, {"name": "speed"}),
         (odrive(), {}, SettingError, {"name": "motor", "received": "none"}),
-        (Talkative(simplefoc().motor), {}, LinkError, {"received": "goes on telling"}),
+        (Talkative(simplefoc().motor), {}, LinkError, {"received": "keeps sending"}),
     ],
 )
 def test_a_sketch_that_cannot_be_used_is_refused(

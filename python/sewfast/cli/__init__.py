@@ -143,7 +143,7 @@ def require_apart(args: argparse.Namespace) -> None:
         for other in others:
             if _is_one(path, other):
                 raise SettingError(
-                    f"{option} {path}: expected a file of its own, got {other}, which this command "
+                    f"{option} {path}: expected a separate file, got {other}, which this command "
                     "reads or writes as well; choose another name"
                 )
         others.append(path)

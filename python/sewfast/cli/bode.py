@@ -225,8 +225,8 @@ def _propose(args: argparse.Namespace, fit: ShaftFit | None, controller: Any) ->
 
     if fit is None:
         raise SettingError(
-            "--propose: expected a response that a machine can be fitted to, got one that it "
-            "cannot; excite more, or longer"
+            "--propose: expected a response to which a machine can be fitted, got one where the "
+            "fit fails; excite more, or longer"
         )
     given = {"Ms": args.Ms, "u_max": args.u_max}
     found = propose(

@@ -102,15 +102,14 @@ def command(args: argparse.Namespace) -> int | None:
     if is_port(args.on):
         # the recordings of a virtual machine can be made again
         print(
-            f"each recording lies in {args.out / FOLDER} as soon as it is taken, whatever comes "
-            "then",
+            f"each recording is saved in {args.out / FOLDER} as soon as it is complete",
             file=sys.stderr,
             flush=True,
         )
     try:
         return _kept(args)
     except KeyboardInterrupt:
-        print(f"interrupted; {args.out} is not complete, each file in it is whole", file=sys.stderr)
+        print(f"interrupted; {args.out} is incomplete, but its files are not", file=sys.stderr)
         return 130
 
 

@@ -158,7 +158,7 @@ def _settle_plant(args: argparse.Namespace) -> None:
             )
         args.on = args.plant
     if args.reference is None and (is_port(args.on) or args.host_loop is not None):
-        raise SettingError("--reference: expected what the drive is to track, received nothing")
+        raise SettingError("--reference: expected a reference to track, received nothing")
 
 
 def _show_run(
@@ -248,7 +248,7 @@ def add_host_loop(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         "on a drive, with the controller on this computer",
         "For slow plants: this computer's jitter and the link's delay are in the loop. Both are\n"
-        "measured and shown; nothing bounds them. Columns: t [s], r, u, y (speed over a period),\n"
+        "measured and shown; they are not limited. Columns: t [s], r, u, y (speed over a period),\n"
         "feedback, late [s], age [s] (of the newest sample).",
     )
     group.add_argument(

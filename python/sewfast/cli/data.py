@@ -194,8 +194,8 @@ def _require_apart(train: Dataset, held: Dataset) -> None:
         if a.start < b.start + len(b) and b.start < a.start + len(a):
             raise SettingError(
                 name="--train, --validate",
-                expected="ranges that do not overlap, as what a model was trained on says "
-                "nothing about it",
+                expected="ranges that do not overlap, as a model is not validated by the data "
+                "that it was trained on",
                 received=f"{a.range_text} and {b.range_text} of {a.name}",
                 remedy="change one of them",
             )  # fmt: skip

@@ -101,7 +101,7 @@ def fleet_command(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             print(
                 f"sewfast fleet: interrupted; {done} recordings are done and kept: the same "
-                "command goes on from there",
+                "command continues there",
                 file=sys.stderr,
             )
             return INTERRUPTED

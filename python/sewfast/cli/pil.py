@@ -121,7 +121,7 @@ def _prepare(folder: Path, overwrite: bool, *, make: bool) -> None:
     try:
         if folder.exists() and not overwrite:
             raise SettingError(
-                f"--out {folder}: expected a new folder, got one that is there; name another, or "
+                f"--out {folder}: expected a new folder, got an existing one; name another, or "
                 "--overwrite"
             )
         if make:

@@ -389,7 +389,7 @@ def pid_of(controller: SampledController, use: str) -> Controller:
         return controller
     raise SettingError(
         name="controller", expected="a PID (Controller)", received=type(controller).__name__,
-        remedy=f"{use} knows no other kind; run(controller, model) simulates it",
+        remedy=f"{use} supports no other kind; run(controller, model) simulates it",
     )  # fmt: skip
 
 

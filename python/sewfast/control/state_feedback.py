@@ -153,7 +153,8 @@ class StateFeedback(SampledController):
         gain = abs(_response(num, den, _PACE))
         if not 0.0 < gain < math.inf:
             raise SettingError(
-                name="plant", expected="one that a command moves", received=f"a gain of {gain:g}",
+                name="plant", expected="one that responds to its command",
+                received=f"a gain of {gain:g}",
                 remedy="identify it from a recording in which the command moves the output",
             )  # fmt: skip
         first = {"rho": gain**2, "noise": gain**2, "integral": _INTEGRAL / Ts}

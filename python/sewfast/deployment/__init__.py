@@ -119,8 +119,8 @@ def deploy(
     if taken or not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
         raise SettingError(
             name="name",
-            expected="lower-case letters, digits and underscores that are no word of the "
-            "language and no name of another file (_test, fmi3)",
+            expected="lower-case letters, digits and underscores that are not a word of the "
+            "language or the name of another file (_test, fmi3)",
             received=repr(name), remedy="for example drive",
         )  # fmt: skip
     writer = _WRITERS[to]

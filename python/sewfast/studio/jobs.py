@@ -40,7 +40,7 @@ LAST_WORDS = 5.0
 """Time for a step to end by itself after the server has ended [s]."""
 
 CANCELLED = "cancelled; nothing was written"
-LATE = "cancelled after its files had been written; they are whole"
+LATE = "cancelled after its files had been written; they are complete"
 
 _PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.studio.jobs import main; main()"
 
@@ -88,7 +88,7 @@ class Jobs:
         with self._lock:
             if self._ear is not None and self._ear.is_alive():
                 raise SettingError(
-                    expected="nothing else under way", received="a job that runs",
+                    expected="no other step running", received="a job that runs",
                     remedy="cancel it or wait for its end",
                 )  # fmt: skip
             self._cancelled = self._writes = self._wrote = False
