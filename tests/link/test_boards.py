@@ -255,7 +255,7 @@ def test_a_gimbal_motor_takes_volts() -> None:
     [
         ({"fw_version_minor": 6.0}, SettingError, "0.6"),
         ({"axis0.error": 64.0}, LinkError, "0x40"),
-        ({"axis0.current_state": 8.0}, LinkError, "drives"),
+        ({"axis0.current_state": 8.0}, LinkError, "in use"),
     ],
 )
 def test_an_odrive_that_cannot_be_used_is_refused(
