@@ -24,7 +24,7 @@ BUILT := $(VENV)/built.stamp
 REPORT := $(VENV)/report.stamp
 LIBRARIES := $(VENV)/libraries.stamp
 DEV := $(VENV)/dev.stamp
-MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
+MARKED := test checks lint rust-lint rust-test rust-units rust-rest no-std c-test python-lint types stubs python-test python-computes python-waits docs package
 
 .DEFAULT_GOAL := help
 .PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
@@ -40,10 +40,15 @@ $(OUT)/results.json: | $(REPORT)
 
 dev: $(DEV) ## builds and installs what the checks need (--jobs=2: in parallel)
 
-# two checks at a time: a compiler that optimises one crate keeps one processor busy
-test: $(DEV) ## every check; ends with pytest's summary
-	$(MAKE) --no-print-directory --jobs=2 $(if $(filter output-sync,$(.FEATURES)),--output-sync=target) rust-test docs lint no-std c-test package
-	$(MAKE) --no-print-directory python-test
+# Compilers and tests that compute fill both processors; tests that wait leave them idle, and the checks step back for them.
+SYNC := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
+test: ## every check; ends with pytest's summary
+	$(MAKE) --no-print-directory --jobs=3 $(SYNC) dev rust-units
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) python-waits checks
+	$(MAKE) --no-print-directory python-computes
+
+checks: $(DEV) # what runs beside tests that wait
+	nice -n 19 $(MAKE) --no-print-directory rust-rest docs lint no-std c-test counts package
 
 lint: rust-lint python-lint types stubs ## formatting, clippy, ruff, mypy, stubs
 
@@ -64,9 +69,17 @@ stubs: $(DEV)
 # the seed of every property comes from the commit: a build that passed passes again, and the next commit tries others
 SEED ?= $(shell printf '%d' "0x$$(git rev-parse HEAD 2>/dev/null | cut -c1-8 | grep . || echo 1)")
 
-rust-test: $(DEV) ## unit, property and documentation tests of the crates (SEED=N; by default of the commit)
+rust-test: rust-units rust-rest ## unit, property and documentation tests of the crates (SEED=N; by default of the commit)
+
+# What depends on the core takes it as the extension has compiled it; the core's own tests are compiled for themselves.
+WITH_CORE := sewfast-core sewfast-control
+rust-units:
 	@echo "properties with PROPTEST_RNG_SEED=$(SEED)"
-	PROPTEST_RNG_SEED=$(SEED) cargo test --workspace --profile checked --quiet
+	PROPTEST_RNG_SEED=$(SEED) cargo test $(WITH_CORE:%=--package %) --lib --profile checked --quiet
+
+rust-rest: $(DEV)
+	PROPTEST_RNG_SEED=$(SEED) cargo test --workspace $(WITH_CORE:%=--exclude %) --release --quiet
+	cargo test --workspace --doc --release --quiet
 
 fleet: $(DEV) ## 2,000 recordings on one worker, on two, and with a worker killed every 10 s
 	$(BIN)/python benches/fleet.py
@@ -151,9 +164,12 @@ firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian:
 	  arm-none-eabi-size target/bare/$$1.elf; \
 	done
 
-# first the tests that compute, then those that wait
-python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
+python-test: python-waits python-computes ## pytest, with every snippet of the documentation and every example
+
+python-computes: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not alone'
+
+python-waits: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m alone
 
 docs: $(DEV) $(OUT)/results.json ## the site, in site/index.html, its pictures drawn from demo/; works offline
@@ -225,10 +241,9 @@ drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONL
 motors: $(DEV) ## commissioning on 20 motors of MuJoCo, compared with an oracle (ONLY="3 7", SEEDS=)
 	$(BIN)/python benches/mujoco_motors.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))
 
-SOAKED := tests/system/test_soak.py tests/link/test_watchdog.py tests/recordfile/test_recordfile_kill.py tests/recordfile/test_recordfile_damage.py \
-  tests/link/test_link_connection.py tests/link/test_link_drive.py tests/link/test_link_virtual.py
+SOAKED := $(shell grep -rl --include='test_*.py' 'import FULL' tests)
 
-soak: $(DEV) ## the link's figures with full counts: hours of faults, kills, flips, hostile bytes (docs/RESULTS.md)
+soak: $(DEV) ## every case, seed and second of the tests that take a part otherwise: faults, kills, flips, hostile bytes, searches (hours)
 	SEWFAST_SOAK=1 cargo test --package sewfast-control --package sewfast-link --release --quiet
 	SEWFAST_SOAK=1 $(BIN)/python -m pytest -s $(SOAKED)
 

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import sewfast
+from effort import FULL
 from sewfast.dataset import Dataset, Diagnosis, Experiment, FloatArray
 from sewfast.errors import DataError
 
@@ -435,11 +436,13 @@ def test_open_loops_are_not_called_closed() -> None:
             clean = answer(u)
             for m, (noise, add) in enumerate(NOISES.items()):
                 y = clean + clean.std(axis=0) * add(random, u.shape)
+                if not FULL and (i + k + m) % 3:
+                    continue
                 j, records = (i + k + m) % SEEDS, records + 1
                 data = Dataset.from_arrays(u[:, j], y[:, j], TS)
                 if sewfast.diagnose(data).find("closed_loop"):
                     closed.append((signal, plant, noise))
-    assert records == 168
+    assert records == (168 if FULL else 56)
     assert len(closed) < 0.02 * records, closed
 
 

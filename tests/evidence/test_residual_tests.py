@@ -6,20 +6,19 @@
 from __future__ import annotations
 
 import math
-import os
 from functools import cache
 
 import numpy as np
 import pytest
 
 import sewfast
+from effort import FULL
 from sewfast import Dataset, NeuralOE, _core
 from sewfast.dataset import FloatArray
 from sewfast.errors import FitError
 from sewfast.evidence import Residuals, residual_tests
 
-SOAK = os.environ.get("SEWFAST_SOAK") == "1"
-TRIALS = 1000 if SOAK else 40
+TRIALS = 1000 if FULL else 40
 SAMPLES = 1500
 NOISES = {"white": (), "coloured": (1.6, -0.68), "slow": (0.97,)}
 INPUTS = ("white", "steps", "coloured")
@@ -105,7 +104,7 @@ def binomial_tail(n: int, p: float, least: int) -> float:
 JUDGES = ("input", "squared_input", "cubed_input", "output", "squares", "product", "feedback")
 
 
-@pytest.mark.parametrize(("noise", "inputs"), CASES if SOAK else CASES[::3])
+@pytest.mark.parametrize(("noise", "inputs"), CASES if FULL else CASES[::3])
 def test_false_alarms(noise: str, inputs: str) -> None:
     found = trials(noise, inputs)
     judges = JUDGES if noise != "white" else ("autocorrelation", *JUDGES)
@@ -116,7 +115,7 @@ def test_false_alarms(noise: str, inputs: str) -> None:
     assert all(a < most for a in alarms.values())
 
 
-@pytest.mark.skipif(not SOAK, reason="1,000 trials of every case: SEWFAST_SOAK=1")
+@pytest.mark.skipif(not FULL, reason="1,000 trials of every case: SEWFAST_SOAK=1")
 @pytest.mark.parametrize("name", JUDGES)
 def test_the_level_is_kept_over_all_cases(name: str) -> None:
     share = np.mean([trials(*case)[name] < 0.01 for case in CASES])

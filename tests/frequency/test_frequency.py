@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from matplotlib import pyplot
 
 import sewfast
+from effort import FULL
 from refusals import refuses
 from sewfast import VirtualMachine, bode, fit_shaft, load_response
 from sewfast.cli import main
@@ -71,14 +72,14 @@ def test_the_shaft_is_found_within_its_intervals(stiffness: float, load: float) 
     assert "two masses" in str(fit)
 
 
-@pytest.mark.parametrize("seed", [None, 1, 3, 12, 13])
+@pytest.mark.parametrize("seed", [None, 1, 3, 12, 13] if FULL else [None, 3])
 def test_a_rigid_machine_has_no_shaft(seed: int | None) -> None:
     fit = fit_shaft(bode(VirtualMachine(seed), speed=1500.0, seed=seed or 0))
     assert not fit.has_resonance
     assert "resonance_hertz" not in fit.parameters
 
 
-@pytest.mark.parametrize(("signal", "seed"), [("random", 1), ("random", 2), ("prbs", 1)])
+@pytest.mark.parametrize(("signal", "seed"), [("random", 1), ("prbs", 1)])
 def test_a_few_frequencies_of_an_ordinary_record_are_no_shaft(signal: str, seed: int) -> None:
     u = sewfast.signals.excitation(signal, seed)
     fit = fit_shaft(bode(sewfast.record(VirtualMachine(seed), u, name=signal)))

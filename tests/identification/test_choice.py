@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import sewfast
+from effort import FULL
 from plants import bent_data, linear_data
 from sewfast import Dataset, Ensemble, LinearOE, NeuralOE, NeuralSS, _core, identify, validate
 from sewfast.errors import DataError, FitError, Interrupted, SettingError
@@ -31,6 +32,7 @@ from sewfast.identification.training import Start, Structure
 from sewfast.identification.trials import Candidate, best_of_each_size, counting
 
 F = NDArray[np.float64]
+SEEDS = range(3 if FULL else 1)
 SMALL: dict[str, Any] = {"nx": 1, "nk": 1, "hidden": 4, "starts": 2, "iterations": 30}
 
 
@@ -163,7 +165,7 @@ def test_a_small_order_and_the_delay_are_found(delay: int) -> None:
     assert sorted(orders)[2] <= 2
 
 
-@pytest.mark.parametrize("delay", [12, 25])
+@pytest.mark.parametrize("delay", [12, 25] if FULL else [12])
 def test_a_dead_time_beyond_the_usual_delays_is_not_feigned_by_a_large_order(delay: int) -> None:
     for seed in range(3):
         data = first_order(seed, delay, noise=0.03)
@@ -184,7 +186,7 @@ def test_without_a_dead_time_no_long_delay_is_looked_at() -> None:
 
 
 def test_the_steady_gain_of_a_motor_is_not_lost_to_a_slow_pole() -> None:
-    for seed in range(2):
+    for seed in SEEDS:
         model = identify(first_order(seed, 1, noise=1.0), seed=seed)
         assert isinstance(model, LinearOE)
         assert model.core.dc_gain()[0] == pytest.approx(2.0, rel=0.05)
@@ -353,12 +355,12 @@ def test_what_was_second_is_kept_and_pickled_with_the_model() -> None:
 
 
 def test_a_linear_truth_stays_linear() -> None:
-    kinds = [identify(linear_data(700, seed=s, noise=0.5), seed=s).kind for s in range(3)]
-    assert kinds == ["oe"] * 3
+    kinds = [identify(linear_data(700, seed=s, noise=0.5), seed=s).kind for s in SEEDS]
+    assert set(kinds) == {"oe"}
 
 
 def test_a_linear_truth_without_noise_stays_linear() -> None:
-    for seed in range(3):
+    for seed in SEEDS:
         model = identify(linear_data(600, seed=seed))
         assert model.kind == "oe"
         np.testing.assert_allclose(model.core.dc_gain(), 10.0, rtol=1e-6)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import random
 import struct
 import sys
@@ -16,6 +15,7 @@ from hypothesis import strategies as st
 from test_link_drive import Kept
 
 import link_device as script
+from effort import FULL
 from link_device import golden
 from link_simulated import SimulatedPort, driven, linked, simulated
 from refusals import refuses
@@ -24,7 +24,6 @@ from sewfast.errors import LinkError, SewfastError
 from sewfast.link import Plan, connect, wire
 from sewfast.link.wire import Kind
 
-SOAK = bool(os.environ.get("SEWFAST_SOAK"))
 NOTHING = (HealthCheck.too_slow,)
 
 
@@ -322,7 +321,7 @@ def mutated(data: bytes, dice: random.Random) -> bytes:
     return b"\0".join(changed)
 
 
-@settings(max_examples=10_000 if SOAK else 100, deadline=None, suppress_health_check=NOTHING)
+@settings(max_examples=10_000 if FULL else 100, deadline=None, suppress_health_check=NOTHING)
 @given(st.integers(0, 2**32))
 def test_a_hostile_device_ends_a_run_with_an_outcome_or_a_link_error(seed):
     dice = random.Random(seed)
@@ -342,7 +341,7 @@ def test_a_hostile_device_ends_a_run_with_an_outcome_or_a_link_error(seed):
             assert outcome.received + listed == 200
 
 
-FRAMES = 10_000_000 if SOAK else 40_000
+FRAMES = 10_000_000 if FULL else 40_000
 CHUNK = 1000
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import link_device as script
+from effort import FULL
 from link_device import ScriptedDevice
 from link_kept import LONG, Kept, U, once
 from link_simulated import SimulatedPort, driven, linked, simulated
@@ -22,8 +23,6 @@ from sewfast import Controller, Gains
 from sewfast.errors import LinkError, SettingError
 from sewfast.link import Drive, Plan, connect
 from sewfast.link.drive import gains
-
-SOAK = bool(os.environ.get("SEWFAST_SOAK"))
 
 
 @pytest.fixture
@@ -436,7 +435,7 @@ def test_ctrl_c_stops_the_motor_within_a_tenth_of_a_second(served, where):
             drive.stream(Plan("commands", LONG), sink)
         after = [kind for at, kind in served.arrived if at > pressed[0] and kind < script.KEEP]
         assert script.STOP in after[:2]
-        if SOAK:
+        if FULL:
             assert stops(served)[0] - pressed[0] < 0.1
         assert served.state == script.IDLE
         outcome = drive.outcome

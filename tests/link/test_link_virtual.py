@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from test_link_drive import Kept, once
 
+from effort import FULL
 from sewfast import Controller, Gains, VirtualMachine, signals
 from sewfast.control import loop
 from sewfast.errors import LinkError, SettingError
 from sewfast.link import Plan, VirtualDevice, connect
 
-SOAK = bool(os.environ.get("SEWFAST_SOAK"))
 ENDPOINTS = ["pty", "tcp"]
 ONE_COUNT = 1.0
 """A command in steps differs from its decimal number in the last bit."""
@@ -152,7 +152,7 @@ FAULTS = {
 @pytest.mark.parametrize("faults", FAULTS)
 @pytest.mark.parametrize("endpoint", ENDPOINTS)
 def test_each_sample_that_a_fault_took_is_listed(endpoint, faults):
-    u = excitation(200_000 if SOAK else 10_000)
+    u = excitation(200_000 if FULL else 10_000)
     sink = Kept()
     with VirtualDevice(fast=True, endpoint=endpoint, faults=FAULTS[faults], seed=5) as device:
         outcome = run(device, Plan("commands", u), sink)

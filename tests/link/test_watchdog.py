@@ -20,11 +20,12 @@ import pytest
 
 import raw_host as raw
 from cli import environment
+from effort import FULL
 from moments import until
 from raw_host import RawHost
 from sewfast.link import VirtualDevice
 
-TRIALS = 200 if os.environ.get("SEWFAST_SOAK") == "1" else 3
+TRIALS = 200 if FULL else 3
 PERIOD = 1000
 """The control period [us], by which the output may be late."""
 SET_BACK = 1_000_000

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 import neural_ss_equations
+from effort import FULL
 from sewfast import _core
 from sewfast.control import paper_controller
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, FitError, SettingError
 from sewfast.models import NeuralSS
 
-CASES = 10_000 if os.environ.get("SEWFAST_SOAK") else 1_000
+CASES = 10_000 if FULL else 200
 NAMES = (0.01, ("u",), "speed", ("V",), "RPM")
 
 

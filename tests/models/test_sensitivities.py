@@ -6,16 +6,16 @@ the largest one of its parameter over the run: single entries may cancel to noth
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numpy as np
 import pytest
 from test_core_models import reference
 
+from effort import FULL
 from sewfast import _core
 
-COUNT = 10_000 if os.environ.get("SEWFAST_SOAK") else 1_000
+COUNT = 10_000 if FULL else 200
 SAMPLES = 25
 WORST = 1e-10
 STEP = 1e-30

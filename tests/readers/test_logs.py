@@ -23,7 +23,7 @@ from sewfast.readers import blackbox as blackbox_module
 
 RNG = np.random.default_rng(0)
 T = 10.0 + np.arange(200) * 0.002
-DAMAGED = int(os.environ.get("SEWFAST_DAMAGED", "80"))
+DAMAGED = int(os.environ.get("SEWFAST_DAMAGED", "40"))
 U, Y = RNG.normal(size=200), RNG.normal(size=200)
 SLOW_T, SLOW = T[5::20], RNG.normal(size=10)
 

@@ -18,7 +18,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recordings_made import SOAK, Made, header, make
+from effort import FULL
+from recordings_made import Made, header, make
 from refusals import refuses
 from sewfast.errors import DataError
 from sewfast.recordfile import RecordedFile, RecordWriter, read_recording
@@ -63,7 +64,7 @@ def assert_nothing_false(found: RecordedFile, whole: RecordedFile) -> None:
 
 def test_every_flipped_bit_is_found(made: Made, whole: RecordedFile) -> None:
     random = np.random.default_rng(1)
-    for bit in random.integers(0, 8 * len(made.raw), 10_000 if SOAK else 500):
+    for bit in random.integers(0, 8 * len(made.raw), 10_000 if FULL else 500):
         raw = bytearray(made.raw)
         raw[bit // 8] ^= 1 << bit % 8
         found = decode(bytes(raw))
@@ -76,7 +77,7 @@ def test_every_flipped_bit_is_found(made: Made, whole: RecordedFile) -> None:
 def test_every_bit_of_the_structure_counts(made: Made, whole: RecordedFile) -> None:
     """All bits outside of the JSON: opcodes, lengths, checksums, index."""
     heads = structure(made.raw)
-    for byte in heads if SOAK else heads[::41]:
+    for byte in heads if FULL else heads[::41]:
         for bit in range(8):
             raw = bytearray(made.raw)
             raw[byte] ^= 1 << bit
@@ -99,7 +100,7 @@ def structure(raw: bytes) -> list[int]:
 @pytest.mark.parametrize("kind", ["cut out", "put in", "zeroed", "repeated"])
 def test_damage_of_any_size(made: Made, whole: RecordedFile, kind: str) -> None:
     random = np.random.default_rng(2)
-    for _ in range(500 if SOAK else 60):
+    for _ in range(500 if FULL else 60):
         a, b = sorted(random.integers(0, len(made.raw), 2).tolist())
         noise = random.integers(0, 256, b - a, dtype=np.uint8).tobytes()
         middle = {"cut out": b"", "put in": noise, "zeroed": bytes(b - a)}.get(
@@ -117,7 +118,7 @@ def test_damage_of_any_size(made: Made, whole: RecordedFile, kind: str) -> None:
 
 def test_a_torn_tail_costs_what_is_torn(made: Made, whole: RecordedFile) -> None:
     random = np.random.default_rng(3)
-    offsets = range(len(made.raw)) if SOAK else boundaries(made.raw)
+    offsets = range(len(made.raw)) if FULL else boundaries(made.raw)
     received = 0
     for cut in sorted({*offsets, *random.integers(0, len(made.raw), 200).tolist()}):
         try:
@@ -229,7 +230,7 @@ KEYS = st.sampled_from(
 )  # fmt: skip
 
 
-@settings(max_examples=2000 if SOAK else 60, deadline=None)
+@settings(max_examples=2000 if FULL else 60, deadline=None)
 @given(
     topics=st.lists(st.tuples(st.sampled_from(Topic), st.dictionaries(KEYS, JSON)), max_size=4),
     change=st.dictionaries(KEYS, JSON, max_size=2),
@@ -252,7 +253,7 @@ def test_no_content_makes_the_reader_fail(
     assert sum(len(list(group)) for group in _groups(found)) >= 3
 
 
-@settings(max_examples=2000 if SOAK else 60, deadline=None)
+@settings(max_examples=2000 if FULL else 60, deadline=None)
 @given(st.binary(), st.binary(max_size=300))
 def test_no_bytes_make_the_reader_fail(made: Made, junk: bytes, tail: bytes) -> None:
     with pytest.raises(DataError):

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recordings_made import SOAK
+from effort import FULL
 from sewfast.recordfile import RecordedFile, read_recording
 from sewfast.recordfile.filing import MESSAGE_SAMPLES
 
@@ -38,7 +38,7 @@ RATES = {"fast": (10, 0.0005), "1 kHz": (10, 0.01), "slow": (1, 0.03), "busy": (
 @pytest.mark.parametrize("rate", ["fast", "1 kHz", "slow"])
 def test_a_killed_recorder_leaves_what_it_wrote(tmp_path: Path, rate: str) -> None:
     random = np.random.default_rng(len(rate))
-    for trial in range(67 if SOAK else 5):
+    for trial in range(67 if FULL else 5):
         path = tmp_path / f"{trial}.mcap"
         moment = float(random.uniform(0.02, 1.4 if rate == "slow" else 0.7))
         reported, killed = stopped_recorder(path, rate, moment, signal.SIGKILL)
@@ -54,7 +54,7 @@ def test_a_killed_recorder_leaves_what_it_wrote(tmp_path: Path, rate: str) -> No
 
 def test_ctrl_c_costs_no_sample(tmp_path: Path) -> None:
     random = np.random.default_rng(5)
-    for trial in range(100 if SOAK else 5):
+    for trial in range(100 if FULL else 5):
         path = tmp_path / f"{trial}.mcap"
         moment = float(random.uniform(0.02, 0.2))
         reported, _ = stopped_recorder(path, "busy", moment, signal.SIGINT)

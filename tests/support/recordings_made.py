@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 
 from sewfast.recordfile import Header, RecordWriter
 
-SOAK = os.environ.get("SEWFAST_SOAK") == "1"
 """Whether the long versions run."""
 
 COLUMNS = {"u": "V", "counts": "1", "current": "A"}

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -42,8 +42,16 @@ NEIGHBOURS = 10
 FLOOR = 0.005
 """Part of the gain that no fit has to explain: friction and dead time distort every response a
 little, which could otherwise outweigh a less visible resonance."""
-STARTS = 6
-"""Number of log-spaced frequencies, besides the peaks, at which a resonance is searched."""
+ORDERS = 2
+"""Number of rational fits that give starts: of the machine's order, and one order higher."""
+ROUNDS = 12
+"""Iterations of a rational fit, each weighted by the one before."""
+DELAYS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
+"""Delays tried for a start [samples]."""
+FASTEST, SLOWEST, FAST = 1e-2, 1e4, 0.3
+"""Least lag [samples], longest lag [periods of the lowest frequency], least lag of a start."""
+BEGIN, FINISH = 12, 4
+"""Evaluations for every start, and the number of best ones that are followed to the end."""
 LIFTED = 50.0
 """Squared errors over their mean, summed over as many lines as a shaft needs, above which a second
 shaft is searched; noise gives 16 with a standard deviation of 6."""
@@ -201,7 +209,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
     FitError
         If nothing converges, or a resonance is requested and none is found.
     """
-    usable = response.coherence > 0.5
+    usable = (response.coherence > 0.5) & (response.value != 0.0)
     if usable.sum() < LEAST:
         raise DataError(
             name="response", expected=f"at least {LEAST} frequencies with a coherence above .5",
@@ -221,13 +229,12 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
             )  # fmt: skip
         if shaft is not None and (resonance or _is_better(task, shaft[0], rigid[0])):
             best = shaft
-            second = _best_shaft(task, _second_starts(task, shaft))
-            if second is not None and _is_better(task, second[0], shaft[0]):
-                best = second
+        second = _best_shaft(task, _second_starts(task, shaft))
+        if second is not None and _is_better(task, second[0], best[0]):
+            best = second
         elif best is rigid:
             beyond = _beyond(task, rigid)
     cost, theta, covariance = best
-    theta, covariance = _in_order(theta, covariance)
     if not math.isfinite(cost):
         raise FitError(
             name="response", expected="a fit that converges", received="none",
@@ -259,10 +266,15 @@ def _shafts(theta: FloatArray) -> FloatArray:
 
 
 def _in_order(theta: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Parameters and covariance reordered, with the lowest resonance first."""
-    order = np.argsort(theta[RIGID::SHAFT], kind="stable")
-    places = [RIGID + SHAFT * k + j for k in order for j in range(SHAFT)]
-    at = np.array([*range(RIGID), *places])
+    """Reordered: the lowest resonance first, each antiresonance with the resonance above it.
+
+    The response does not depend on which pair of zeros belongs to which pair of poles.
+    """
+    at = np.arange(len(theta))
+    for first in (RIGID, RIGID + 2):  # resonances, antiresonances
+        order = np.argsort(theta[first::SHAFT], kind="stable")
+        for j in range(2):
+            at[first + j :: SHAFT] = first + j + SHAFT * order
     return theta[at], covariance[np.ix_(at, at)]
 
 
@@ -271,53 +283,59 @@ def _mark(number: int) -> str:
     return "" if number == 1 else f"_{number}"
 
 
-def _terms(
-    theta: FloatArray, Ts: float, *, counted: bool
-) -> tuple[int, float, list[tuple[complex, complex]]]:
+def _terms(theta: FloatArray, Ts: float, *, counted: bool) -> tuple[int, float, Complex, Complex]:
     """Whole samples of delay, its fraction, and poles with their residues.
 
-    For the speed, or for its integral if it is counted.
+    For the speed, or for its integral if it is counted. The factors are quadratics, so their roots
+    need no eigenvalue problem.
     """
-    num, den = _polynomials(theta)
-    if counted:
-        den = np.concatenate([den, [0.0]])
-    poles = np.roots(den).astype(np.complex128)
-    slope = np.polyder(den)
-    residues = np.polyval(num, poles) / np.polyval(slope, poles)
+    num, _ = _polynomials(theta)
+    a1, a2 = np.exp(theta[1:3])
+    shafts = _shafts(theta)
+    half = np.concatenate([[0.5 * a1 / a2], shafts[:, 1] * shafts[:, 0]])
+    square = np.concatenate([[1.0 / a2], shafts[:, 0] ** 2])
+    root = np.sqrt((half * half - square).astype(np.complex128))
+    # the smaller of two real poles comes from their product, as the difference would lose digits
+    large = -(half + np.where(root.real < 0.0, -root, root))
+    poles = np.concatenate([large, square / large, [0.0] if counted else []])
+    apart = poles[:, None] - poles
+    np.fill_diagonal(apart, 1.0)
+    residues = np.polyval(num, poles) / (a2 * apart.prod(axis=1))
     delay = max(float(theta[3]), 0.0)
     whole = math.floor(delay)
-    return whole, delay - whole, list(zip(poles, residues, strict=True))
+    return whole, delay - whole, poles, residues
 
 
-def _held(p: complex, part: float, Ts: float) -> tuple[complex, complex]:
-    """Contributions of this and the previous command to a pole's state at the sample's end."""
-    if p == 0.0:
-        return (1.0 - part) * Ts, part * Ts
-    now = np.exp(p * (1.0 - part) * Ts)
-    return (now - 1.0) / p, (np.exp(p * Ts) - now) / p
+def _held(p: Complex, part: float, Ts: float) -> tuple[Complex, Complex]:
+    """Contributions of this and the previous command to the poles' states at the sample's end."""
+    still = p == 0.0  # the limit of an integrator
+    per = np.where(still, 1.0, p)
+    now, whole = np.exp(p * (1.0 - part) * Ts), np.exp(p * Ts)
+    return (
+        np.where(still, (1.0 - part) * Ts, (now - 1.0) / per),
+        np.where(still, part * Ts, (whole - now) / per),
+    )
 
 
 def _sampled(theta: FloatArray, hertz: FloatArray, Ts: float, counted: bool) -> Complex:
     """Response of the measured quantity: speed at the samples, or its mean between them."""
-    whole, part, terms = _terms(theta, Ts, counted=counted)
+    whole, part, poles, residues = _terms(theta, Ts, counted=counted)
     step = np.exp(-2j * np.pi * hertz * Ts)
-    total: Complex = np.zeros(len(hertz), dtype=np.complex128)
-    for p, r in terms:
-        now, before = _held(p, part, Ts)
-        total += r * (now + before * step) * step / (1.0 - np.exp(p * Ts) * step)
-    total *= step**whole
+    now, before = _held(poles, part, Ts)
+    made = np.outer(residues * before, step) + (residues * now)[:, None]
+    total: Complex = (made / (1.0 - np.outer(np.exp(poles * Ts), step))).sum(axis=0)
+    total *= step ** (whole + 1)
     return total * (1.0 - step) / Ts if counted else total
 
 
 def sampled_model(theta: FloatArray, Ts: float, u_unit: str, y_unit: str) -> LinearOE:
     """G under a held command, at the samples; theta: logarithms, except the delay in samples."""
-    whole, part, terms = _terms(theta, Ts, counted=False)
-    poles = [np.exp(p * Ts) for p, _ in terms]
+    whole, part, continuous, residues = _terms(theta, Ts, counted=False)
+    poles = np.exp(continuous * Ts)
     num: Any = np.zeros(len(poles) + 2, dtype=np.complex128)
-    for j, (p, r) in enumerate(terms):
-        now, before = _held(p, part, Ts)
-        others = np.poly([q for i, q in enumerate(poles) if i != j])
-        num[1:] += r * np.convolve([now, before], np.atleast_1d(others))
+    for j, held in enumerate(zip(*_held(continuous, part, Ts), strict=True)):
+        others = np.poly(np.delete(poles, j))
+        num[1:] += residues[j] * np.convolve(held, np.atleast_1d(others))
     den = np.atleast_1d(np.poly(poles)).real
     delayed = np.concatenate([np.zeros(whole), num.real])
     return LinearOE.from_tf(delayed, den, Ts, input_units=(u_unit,), output_unit=y_unit)  # type: ignore[no-any-return]
@@ -349,19 +367,25 @@ def _smoothed(variance: FloatArray) -> FloatArray:
     return np.exp(around)
 
 
-def _solved(task: _Task, start: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+def _solved(
+    task: _Task, start: FloatArray, evaluations: int = 200
+) -> tuple[float, FloatArray, FloatArray]:
     low, high = np.full(len(start), -40.0), np.full(len(start), 40.0)
     low[3], high[3] = 0.0, 50.0
+    # a lag far below a sample, or far above all measured periods, has no effect on the residuals: a
+    # search that gets there stays there
+    low[1:3] = np.array([1.0, 2.0]) * math.log(FASTEST * task.Ts)
+    high[1:3] = np.array([1.0, 2.0]) * math.log(SLOWEST / task.hertz[0])
     try:
         found = least_squares(
-            task.residuals, start, "3-point", bounds=(low, high), max_nfev=200
+            task.residuals, start, "3-point", bounds=(low, high), max_nfev=evaluations
         )  # fmt: skip
     except DataError:  # no finite residual at the start
         return math.inf, start, np.zeros((len(start), len(start)))
     covariance = found.covariance
     if covariance is None:
         covariance = np.full((len(start), len(start)), math.nan)
-    return 2.0 * found.cost, found.x, covariance
+    return 2.0 * found.cost, *_in_order(found.x, covariance)
 
 
 def _rigid_starts(task: _Task) -> list[FloatArray]:
@@ -379,18 +403,22 @@ def _rigid_starts(task: _Task) -> list[FloatArray]:
 
 
 def _shaft_starts(task: _Task, rigid: FloatArray) -> list[FloatArray]:
-    """Starts where the response is most above the rigid machine's, and at a few more places."""
+    """Starts from rational fits, and where the response is most above the rigid machine's."""
     f = task.hertz
     ratio = np.abs(task.value) / np.abs(_sampled(rigid, f, task.Ts, task.counted))
-    places = [
-        *f[_peaks(ratio)[:4]],
-        *np.geomspace(max(2.0 * f[0], f[-1] / 60.0), 0.9 * f[-1], STARTS),
-    ]
-    return _starts_at(task, rigid, ratio, places)
+    return _rational_starts(task, 1) + _starts_at(task, rigid, ratio, f[_peaks(ratio)[:4]])
 
 
-def _second_starts(task: _Task, shaft: tuple[float, FloatArray, FloatArray]) -> list[FloatArray]:
-    """Starts where the response is above that of one shaft, over as many lines as needed."""
+def _second_starts(
+    task: _Task, shaft: tuple[float, FloatArray, FloatArray] | None
+) -> list[FloatArray]:
+    """Starts from rational fits, and where the response is above that of one shaft.
+
+    The latter over as many lines as a shaft needs.
+    """
+    starts = _rational_starts(task, 2)
+    if shaft is None:
+        return starts
     cost, theta, _ = shaft
     f, fit = task.hertz, _sampled(theta, task.hertz, task.Ts, task.counted)
     usual = cost / max(2 * len(f) - len(theta), 1)
@@ -398,7 +426,91 @@ def _second_starts(task: _Task, shaft: tuple[float, FloatArray, FloatArray]) -> 
     unexplained = np.convolve(off, np.ones(SHOWN), "same")
     ratio = np.abs(task.value) / np.abs(fit)
     peaks = _peaks(ratio)
-    return _starts_at(task, theta, ratio, f[peaks[unexplained[peaks] > LIFTED][:4]])
+    return starts + _starts_at(task, theta, ratio, f[peaks[unexplained[peaks] > LIFTED][:4]])
+
+
+def _rational_starts(task: _Task, shafts: int) -> list[FloatArray]:
+    """Starts from the poles and zeros of rational fits, which themselves need no start.
+
+    Every choice of oscillating poles and zeros in the measured range is a start, if each
+    antiresonance is below its resonance.
+    """
+    starts = []
+    for order in range(2 + 2 * shafts, 2 + 2 * shafts + ORDERS):
+        zeros, poles = (_swinging(q, task) for q in _rational(task, order))
+        for resonances, antiresonances in product(
+            combinations(poles, shafts), combinations(zeros, shafts)
+        ):
+            pairs = list(zip(resonances, antiresonances, strict=True))
+            if all(RATIOS[0] < (r[0] / a[0]) ** 2 - 1.0 < RATIOS[1] for r, a in pairs):
+                starts.append(
+                    _with_lags(task, np.concatenate([np.log([*r, *a]) for r, a in pairs]))
+                )
+    return starts
+
+
+def _with_lags(task: _Task, shafts: FloatArray) -> FloatArray:
+    """A start: these shafts, with the gain, lags and delay that fit best.
+
+    Divided by the shafts, the response is `K / (1 + a1 s + a2 s^2)`, whose inverse is linear in
+    its coefficients; a few values of the delay are tried. Holding the command delays by half a
+    sample, a mean over a sample by another half.
+    """
+    s = 2j * np.pi * task.hertz
+    shape = np.ones(len(s), dtype=np.complex128)
+    for wr, zr, wa, za in np.exp(shafts).reshape(-1, SHAFT):
+        shape *= (s * s + 2.0 * za * wa * s + wa * wa) / (s * s + 2.0 * zr * wr * s + wr * wr)
+        shape *= (wr / wa) ** 2
+    best = math.inf, np.zeros(RIGID)
+    for delay in DELAYS:
+        samples = delay + (1.0 if task.counted else 0.5)
+        inverse = shape * np.exp(-s * samples * task.Ts) / task.value
+        weight = np.abs(task.value) / (task.sigma * np.abs(inverse))
+        rows = weight[:, None] * np.stack([np.ones(len(s)), s, s * s], axis=1)
+        goal = weight * inverse
+        found, left, *_ = np.linalg.lstsq(
+            np.vstack([rows.real, rows.imag]), np.concatenate([goal.real, goal.imag]), rcond=None
+        )
+        cost = float(left[0]) if len(left) else math.inf
+        if cost < best[0] and found[0] > 0.0:
+            a1, a2 = np.maximum(found[1:] / found[0], [FAST * task.Ts, (FAST * task.Ts) ** 2])
+            best = cost, np.array([-math.log(found[0]), math.log(a1), math.log(a2), delay])
+    return np.concatenate([best[1], shafts])
+
+
+def _rational(task: _Task, order: int) -> tuple[FloatArray, FloatArray]:
+    """Numerator and denominator of a rational fit, in powers of a delay of one sample.
+
+    The equation error is linear in the coefficients. Weighted by the denominator of the fit before,
+    it approaches the output error (Sanathanan and Koerner 1963); the best iterate is returned.
+    """
+    delays = np.exp(-2j * np.pi * np.outer(task.hertz * task.Ts, np.arange(order + 3)))
+    columns = np.hstack([delays[:, 1:], -task.value[:, None] * delays[:, 1 : order + 1]])
+    weight, best = 1.0 / task.sigma, (math.inf, np.zeros(1), np.ones(1))
+    for _ in range(ROUNDS):
+        rows, goal = weight[:, None] * columns, weight * task.value
+        found, *_ = np.linalg.lstsq(
+            np.vstack([rows.real, rows.imag]), np.concatenate([goal.real, goal.imag]), rcond=None
+        )
+        num = np.concatenate([[0.0], found[: order + 2]])
+        den = np.concatenate([[1.0], found[order + 2 :]])
+        below = np.abs(delays[:, : order + 1] @ den)
+        weight = 1.0 / (task.sigma * np.maximum(below, 1e-12))
+        off = delays @ num / (delays[:, : order + 1] @ den) - task.value
+        cost = float(np.sum(np.abs(off / task.sigma) ** 2))
+        if cost < best[0]:
+            best = cost, num, den
+    return best[1], best[2]
+
+
+def _swinging(coefficients: FloatArray, task: _Task) -> list[tuple[float, float]]:
+    """Frequency [rad/s] and damping of the roots that a shaft could have, in ascending order."""
+    roots = np.roots(np.trim_zeros(coefficients, "f"))
+    roots = np.log(roots[(roots.imag > 0.0) & (np.abs(roots) > 1e-3)]) / task.Ts
+    sizes = np.abs(roots)
+    inside = (sizes > 2.0 * np.pi * task.hertz[0]) & (sizes < 2.0 * np.pi * task.hertz[-1])
+    found = [(abs(p), max(abs(p.real) / abs(p), 1e-3)) for p in roots[inside]]
+    return sorted((w, z) for w, z in found if z < DAMPED)
 
 
 def _peaks(ratio: FloatArray) -> NDArray[np.intp]:
@@ -418,7 +530,7 @@ def _starts_at(
         valley = f[left][ratio[left].argmin()] if left.any() else 0.75 * place
         for antiresonance in (valley, 0.75 * place):
             shaft = np.log([2 * math.pi * place, 0.03, 2 * math.pi * antiresonance, 0.03])
-            starts.append(np.concatenate([fit, shaft]))
+            starts.append(_with_lags(task, np.concatenate([fit[RIGID:], shaft])))
     return starts
 
 
@@ -444,13 +556,22 @@ def _best_shaft(
     task: _Task, starts: list[FloatArray]
 ) -> tuple[float, FloatArray, FloatArray] | None:
     """The best fit from these starts with plausible shafts; None if there is none."""
-    found = [s for s in (_solved(task, x) for x in starts) if _is_shaft(s[1], task.hertz)]
+    begun = sorted((_solved(task, x, BEGIN) for x in starts), key=lambda s: s[0])
+    found = [
+        s for s in (_solved(task, x) for _, x, _ in begun[:FINISH]) if _is_shaft(s[1], task.hertz)
+    ]
     return min(found, key=lambda s: s[0], default=None)
 
 
 def _is_shaft(theta: FloatArray, f: FloatArray) -> bool:
-    """Whether each pair of zeros and poles is a plausible shaft within the measured range."""
-    return all(_is_one(shaft, f) for shaft in _shafts(theta))
+    """Whether each pair of zeros and poles is a plausible shaft within the measured range.
+
+    Command and speed belong to the same mass, so antiresonances and resonances alternate. Poles
+    next to the zeros of another shaft only describe a line or two that fit badly.
+    """
+    shafts = _shafts(theta)
+    alternate = (shafts[1:, 2] / shafts[:-1, 0]) ** 2 - 1.0 > RATIOS[0]
+    return bool(alternate.all()) and all(_is_one(shaft, f) for shaft in shafts)
 
 
 def _is_one(shaft: FloatArray, f: FloatArray) -> bool:

@@ -1,12 +1,10 @@
-//! What every controller is: the interface, and the kinds behind it.
-//!
-//! A loop, a device and a search know a controller by [`Controller`]. Where one is chosen while the program runs, it is an
-//! [`AnyController`], made from an [`AnyDesign`]: enumerations rather than trait objects, as a microcontroller has no heap and
-//! a search copies designs by the million. A new kind is a file of this crate and a row in each of the two.
+//! What every controller is: the interface, the kinds behind it, and how they refuse a setting.
 
 mod state_feedback;
 
-use crate::{Design, PidController, Real, Refused};
+use core::fmt;
+
+use crate::{Design, PidController, Real};
 
 pub use state_feedback::{NUMBERS, STATES, StateDesign, StateFeedback, Weights, lqg};
 
@@ -239,3 +237,44 @@ pub(crate) fn limited<T: Real>(wanted: T, last: T, (u_min, u_max): (T, T), chang
         .limit(last - change, last + change);
     if limited.is_finite() { limited } else { last }
 }
+
+/// The setting's name, what was expected, what came.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Refused {
+    /// Name of the setting, as in docs/CONVENTIONS.md.
+    pub name: &'static str,
+    /// What is accepted.
+    pub expected: &'static str,
+    /// What came.
+    pub received: f64,
+}
+
+impl Refused {
+    /// `Ok` where `holds`, else the refusal.
+    pub(crate) fn unless(
+        holds: bool,
+        name: &'static str,
+        expected: &'static str,
+        received: f64,
+    ) -> Result<(), Self> {
+        let refused = Self {
+            name,
+            expected,
+            received,
+        };
+        if holds { Ok(()) } else { Err(refused) }
+    }
+}
+
+impl fmt::Display for Refused {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            name,
+            expected,
+            received,
+        } = self;
+        write!(f, "expected {expected} for {name}, got {received}")
+    }
+}
+
+impl core::error::Error for Refused {}

@@ -10,8 +10,8 @@ pub use plants::{LaggedPlant, StatePlant, Varied};
 
 use sewfast_control::{AnyController, Refused};
 
-use crate::encoder::Encoder;
 use crate::simd;
+use crate::speed::Encoder;
 use crate::{Error, Monitor, Result};
 use scalar::{LoopController, ScalarLoop};
 

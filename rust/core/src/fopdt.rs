@@ -1,7 +1,6 @@
 //! First-order-plus-dead-time approximation (paper Eq. 10-11) of a measured step response.
 
 mod confidence;
-mod overshoot;
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -95,7 +94,7 @@ pub fn fit_fopdt(record: Record<'_>, ts: f64, monitor: &Monitor) -> Result<Fopdt
         errors: [rise / (step.u_high - step.u_low).abs(), t * ts, l * ts],
         limited: step.used.iter().filter(|used| !**used).count(),
         moving: step.moving,
-        overshoot: overshoot::overshoot(&step, &best),
+        overshoot: confidence::overshoot(&step, &best),
     })
 }
 

@@ -1,14 +1,14 @@
 //! Nonlinear least squares with dense Jacobians: `min 1/2 |r(theta)|^2` within bounds, with an end that is checked.
 //!
-//! Levenberg-Marquardt in a trust region on the triangle of the Jacobian ([`triangle`], [`radius`]). Where a test for a
+//! Levenberg-Marquardt in a trust region on the triangle of the Jacobian ([`triangle`], [`trust`]). Where a test for a
 //! minimum holds it is confirmed ([`confirm`]) before the outcome counts as converged: the Jacobian has full rank, the
 //! Gauss-Newton steps contract and end below the tolerances. These steps are judged by their own size, since the cost
 //! cannot tell points whose parameters differ by less than the square root of rounding.
+//!
+//! To read: `point` (where the iteration stands), `triangle` (its factors), `trust` (the steps), `confirm` (the end).
 
 mod confirm;
 mod point;
-mod radius;
-mod spread;
 mod triangle;
 mod trust;
 
@@ -18,7 +18,7 @@ use std::cmp::Ordering;
 
 use crate::descent::descend;
 use crate::{Error, Monitor, Result};
-use spread::Spread;
+use point::Spread;
 use trust::TrustRegion;
 
 /// Residuals and their derivatives.

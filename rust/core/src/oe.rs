@@ -1,17 +1,13 @@
 //! Linear output error: the free run fitted by Levenberg-Marquardt with exact sensitivities and stable poles.
 
-mod excerpt;
 mod problem;
-mod restart;
 mod starts;
 
-use excerpt::excerpt;
 use problem::OutputError;
-use restart::restart_error;
+use starts::{excerpt, restart_error};
 
 use crate::lagged::{Lagged, Lags};
-use crate::linear::{LinearModel, stabilised};
-use crate::linear_fit::LinearFit;
+use crate::linear::{LinearFit, LinearModel, stabilised};
 use crate::lm::{self, Outcome, Problem, Settings, Termination};
 use crate::{Error, Monitor, Record, Result, arx};
 

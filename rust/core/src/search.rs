@@ -2,16 +2,17 @@
 //!
 //! Candidates are judged in batches over threads. Who judges what has no part in the result: a seed gives the same
 //! bits at any number of threads.
+//!
+//! To read: [`cma_es`] and [`genetic`] for the least, with the quadratic `model` that both ask, [`nsga2`] for a front.
 
-mod batch;
 pub mod cma_es;
 pub mod genetic;
 mod model;
 pub mod nsga2;
 
-pub(crate) use batch::several;
-
 use std::cmp::Ordering;
+use std::sync::atomic::{self, AtomicUsize};
+use std::thread;
 
 use crate::{Error, Monitor, Result};
 
@@ -201,7 +202,57 @@ fn run<P: Problem>(
     }
 }
 
-#[cfg(test)]
-mod functions;
+/// `work` on the items, up to `together` at once and no more than leave something for every memory; the results are in
+/// the items' order.
+pub(crate) fn several<M: Send, I: Sync, R: Send>(
+    memories: &mut [M],
+    items: &[I],
+    together: usize,
+    work: impl Fn(&mut M, &[I]) -> Vec<R> + Sync,
+) -> Vec<R> {
+    let share = items.len().div_ceil(memories.len().max(1));
+    let some: Vec<&[I]> = items.chunks(together.min(share).max(1)).collect();
+    let results = each(memories, &some, |memory, some| work(memory, some));
+    results.into_iter().flatten().collect()
+}
+
+/// `work` on every item, by as many threads as there are memories; the results are in the items' order, whichever thread
+/// computed them.
+pub(crate) fn each<M: Send, I: Sync, R: Send>(
+    memories: &mut [M],
+    items: &[I],
+    work: impl Fn(&mut M, &I) -> R + Sync,
+) -> Vec<R> {
+    if let [memory] = memories {
+        return items.iter().map(|item| work(memory, item)).collect();
+    }
+    let next = AtomicUsize::new(0);
+    let own = |memory: &mut M| {
+        let mut done = Vec::new();
+        loop {
+            let index = next.fetch_add(1, atomic::Ordering::Relaxed);
+            let Some(item) = items.get(index) else {
+                return done;
+            };
+            done.push((index, work(memory, item)));
+        }
+    };
+    let mut results = thread::scope(|scope| {
+        let workers: Vec<_> = memories
+            .iter_mut()
+            .take(items.len())
+            .map(|memory| scope.spawn(|| own(memory)))
+            .collect();
+        let mut all = Vec::with_capacity(items.len());
+        for worker in workers {
+            let done = worker.join();
+            all.extend(done.unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
+        }
+        all
+    });
+    results.sort_unstable_by_key(|(index, _)| *index);
+    results.into_iter().map(|(_, result)| result).collect()
+}
+
 #[cfg(test)]
 mod tests;

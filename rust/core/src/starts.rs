@@ -1,9 +1,8 @@
 //! Many starts of one fit: drawn until they can learn, trained until they have, over threads, in their order, ranked.
 
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
+use crate::search::each;
 use crate::{Error, Monitor, Result};
 
 /// Draws of one start before it is given up.
@@ -97,27 +96,10 @@ pub(crate) fn run_all<T: Send>(
         0 => available(),
         threads => threads,
     };
-    let (next, results) = (AtomicUsize::new(0), Mutex::new(Vec::with_capacity(starts)));
-    let work = || {
-        loop {
-            let start = next.fetch_add(1, Ordering::Relaxed);
-            if start >= starts || monitor.stopped() {
-                return;
-            }
-            let result = run(start);
-            let mut results = results.lock().unwrap_or_else(|e| e.into_inner());
-            results.push((start, result));
-        }
-    };
-    thread::scope(|scope| {
-        for _ in 1..threads.min(starts) {
-            scope.spawn(work);
-        }
-        work();
-    });
-    let mut results = results.into_inner().unwrap_or_else(|e| e.into_inner());
-    results.sort_by_key(|(start, _)| *start);
-    results.into_iter().map(|(_, result)| result).collect()
+    let (mut memories, starts) = (vec![(); threads], Vec::from_iter(0..starts));
+    let begun = |(): &mut (), &start: &usize| (!monitor.stopped()).then(|| run(start));
+    let results = each(&mut memories, &starts, begun);
+    results.into_iter().flatten().collect()
 }
 
 /// Starts with a finite score: sound ones first, each part best first.

@@ -2,17 +2,17 @@
 //!
 //! A candidate's cost is taken over every plant and every reference, with encoder, filter and limits in the loop;
 //! [`search`](crate::search) finds the least, or the front of what can be had ([`pareto`]).
+//!
+//! To read: `variable` (what is searched), `cost` (what a run costs, what it must keep to), `load` (steps of the load), `bench`
+//! (the runs of one thread), `front`.
 
-mod batch;
 mod bench;
-mod constraint;
 mod cost;
 mod front;
 mod load;
 mod variable;
 
-pub use constraint::{Constraints, Sensitivity};
-pub use cost::{Cost, Terms, Weights, terms};
+pub use cost::{Constraints, Cost, Sensitivity, Terms, Weights, terms};
 pub use front::{Front, Objective, pareto};
 pub use load::{LoadLimit, LoadStep};
 pub use variable::{Parameter, Variable};
@@ -20,10 +20,10 @@ pub use variable::{Parameter, Variable};
 use sewfast_control::{AnyDesign, Design};
 
 use crate::closed_loop::{Plant, Signals};
-use crate::encoder::Encoder;
 use crate::search::{
     Candidate, Judgement, Options, Problem, Termination, cma_es, genetic, several,
 };
+use crate::speed::Encoder;
 use crate::{Error, Monitor, Result};
 use bench::{Bench, TOGETHER};
 use variable::{designed, moved, place};

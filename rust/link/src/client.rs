@@ -27,9 +27,8 @@ use std::collections::VecDeque;
 
 use sewfast_control::link::{Body, Fields, Frame, Header, MAX_WIRE, encode};
 
-use crate::anomalies::Counters;
 use crate::bodies::{self, Beat, Greeting};
-use crate::receiver::Receiver;
+use crate::receiver::{Counters, Receiver};
 
 /// Kinds of the protocol's frames.
 pub mod kind {

@@ -1,21 +1,29 @@
-//! Bindings of the core's control: the controller, the closed loop, tuning rules, tuning.
+//! Bindings of the core's control: whatever Python calls a plant, the closed loop, the first-order-plus-dead-time fit and the
+//! tuning rules; the controller and tuning in files of their own.
 
 pub mod controller;
-mod plant;
 mod tuning;
 
+use std::sync::Arc;
+
 use numpy::PyReadonlyArray1;
+use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::{Parallel, PerSample, Refused, Standard};
-use sewfast_core::closed_loop::{self as looped, Outcome, Run, Signals};
+use sewfast_core::closed_loop::{self as looped, KernelPlant, Outcome, Plant, Run, Signals};
+use sewfast_core::fopdt::fit_fopdt as fit;
+use sewfast_core::machine::{self, SAMPLE_TIME};
 use sewfast_core::metrics::{self, Effort};
-use sewfast_core::{Error, Result};
+use sewfast_core::model::{self, ClonePlant};
+use sewfast_core::rules::{self, Costs, Outside, Rule};
+use sewfast_core::speed::Encoder;
+use sewfast_core::{Error, Record, Result};
 
-use crate::arrays::{array1, raise, slice};
-use crate::watch::watched_over;
+use crate::device::Machine;
+use crate::seam::{array1, raise, slice, watched, watched_over};
+
 pub use controller::{AnyGiven, Controller};
-use plant::Model;
 
 type Values<'py> = PyReadonlyArray1<'py, f64>;
 type Triple = (f64, f64, f64);
@@ -26,7 +34,13 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(closed_loop, module)?)?;
     module.add_function(wrap_pyfunction!(step_metrics, module)?)?;
     module.add_function(wrap_pyfunction!(effort, module)?)?;
-    tuning::register(module)
+    tuning::register(module)?;
+    module.add_function(wrap_pyfunction!(fit_fopdt, module)?)?;
+    module.add_function(wrap_pyfunction!(table_1, module)?)?;
+    module.add_function(wrap_pyfunction!(eq_12, module)?)?;
+    module.add_function(wrap_pyfunction!(eq_12_costs, module)?)?;
+    module.add_function(wrap_pyfunction!(simc, module)?)?;
+    module.add_function(wrap_pyfunction!(amigo, module)?)
 }
 
 #[pyfunction]
@@ -187,7 +201,7 @@ fn effort<'py>(
 }
 
 /// A dict of numbers by name.
-pub fn named<'py, const N: usize>(
+fn named<'py, const N: usize>(
     py: Python<'py>,
     values: [(&str, f64); N],
 ) -> PyResult<Bound<'py, PyDict>> {
@@ -196,4 +210,193 @@ pub fn named<'py, const N: usize>(
         dict.set_item(name, value)?;
     }
     Ok(dict)
+}
+
+/// The Python object's value, which work on other threads may use.
+enum Model {
+    Identified(Arc<dyn model::Model>),
+    Machine(Box<machine::Machine>),
+}
+
+impl Model {
+    fn of(object: &Bound<'_, PyAny>) -> PyResult<Self> {
+        if let Ok(model) = object.cast::<crate::models::Model>() {
+            return Ok(Self::Identified(model.get().inner.clone()));
+        }
+        if let Ok(machine) = object.cast::<Machine>() {
+            return Ok(Self::Machine(Box::new(machine.try_borrow()?.core.clone())));
+        }
+        Err(PyTypeError::new_err(format!(
+            "expected a compiled model or a Machine, got {}",
+            object.get_type().name()?
+        )))
+    }
+
+    /// This model as a plant at sample time `ts`.
+    fn plant(&self, ts: f64) -> Result<AnyPlant<'_>> {
+        match self {
+            Self::Identified(model) => Ok(AnyPlant(model.plant(ts)?)),
+            Self::Machine(_) if (ts / SAMPLE_TIME - 1.0).abs() > 1e-9 => {
+                Err(Error::setting(format!(
+                    "expected a controller with the machine's sample time of {SAMPLE_TIME} s, got {ts} s; convert its gains"
+                )))
+            }
+            Self::Machine(machine) => Ok(AnyPlant(machine.copied())),
+        }
+    }
+}
+
+/// One of the plants.
+struct AnyPlant<'a>(Box<dyn ClonePlant + 'a>);
+
+impl Clone for AnyPlant<'_> {
+    fn clone(&self) -> Self {
+        Self(self.0.copied())
+    }
+}
+
+impl Plant for AnyPlant<'_> {
+    fn reset(&mut self) {
+        self.0.reset();
+    }
+
+    fn output(&self) -> f64 {
+        self.0.output()
+    }
+
+    fn position(&self) -> f64 {
+        self.0.position()
+    }
+
+    fn advance(&mut self, u: f64) {
+        self.0.advance(u);
+    }
+
+    fn encoder(&self) -> Option<&Encoder> {
+        self.0.encoder()
+    }
+
+    fn known(&self) -> Option<KernelPlant<'_>> {
+        self.0.known()
+    }
+}
+
+#[pyfunction]
+#[pyo3(signature = (u, y, *, Ts))]
+#[expect(non_snake_case, reason = "the field's name for the sample time")]
+fn fit_fopdt<'py>(
+    py: Python<'py>,
+    u: Values<'py>,
+    y: Values<'py>,
+    Ts: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let record = Record::new(slice(&u, "u")?, 1, slice(&y, "y")?).map_err(|e| raise(py, e))?;
+    let found = watched(py, None, |monitor| fit(record, Ts, monitor))?;
+    let dict = named(
+        py,
+        [
+            ("K", found.k),
+            ("T", found.t),
+            ("L", found.l),
+            ("offset", found.offset),
+            ("u_low", found.u_low),
+            ("u_high", found.u_high),
+            ("fit_percent", found.fit_percent),
+            ("K_se", found.errors[0]),
+            ("T_se", found.errors[1]),
+            ("L_se", found.errors[2]),
+            ("overshoot_percent", 100.0 * found.overshoot),
+        ],
+    )?;
+    dict.set_item("limited", found.limited)?;
+    dict.set_item("moving", found.moving)?;
+    Ok(dict)
+}
+
+#[pyfunction]
+#[pyo3(signature = (K, T, L, *, nearest=false))]
+#[expect(non_snake_case, reason = "the field's names")]
+fn table_1(py: Python<'_>, K: f64, T: f64, L: f64, nearest: bool) -> PyResult<Bound<'_, PyDict>> {
+    let outside = if nearest {
+        Outside::Nearest
+    } else {
+        Outside::Error
+    };
+    answered(py, rules::table_1(K, T, L, outside))
+}
+
+#[pyfunction]
+#[pyo3(signature = (K, T, L, *, Ms))]
+#[expect(non_snake_case, reason = "the field's names")]
+fn eq_12(py: Python<'_>, K: f64, T: f64, L: f64, Ms: f64) -> PyResult<Bound<'_, PyDict>> {
+    let (rule, costs) = watched(py, None, |_| rules::eq_12(K, T, L, Ms))?;
+    let dict = answered(py, Ok(rule))?;
+    for (name, value) in by_name(costs) {
+        dict.set_item(name, value)?;
+    }
+    Ok(dict)
+}
+
+#[pyfunction]
+#[pyo3(signature = (ratio, *, KpK, Ti, Td, alpha, beta))]
+#[expect(non_snake_case, reason = "the field's names")]
+fn eq_12_costs(
+    py: Python<'_>,
+    ratio: f64,
+    KpK: f64,
+    Ti: f64,
+    Td: f64,
+    alpha: f64,
+    beta: f64,
+) -> PyResult<Bound<'_, PyDict>> {
+    let gains = Standard {
+        kp: KpK,
+        ti: Ti,
+        td: Td,
+    };
+    let costs = watched(py, None, |_| rules::costs(ratio, gains, alpha, beta))?;
+    named(py, by_name(costs))
+}
+
+#[pyfunction]
+#[pyo3(signature = (K, T, L, *, tau_c, derivative))]
+#[expect(non_snake_case, reason = "the field's names")]
+fn simc(
+    py: Python<'_>,
+    K: f64,
+    T: f64,
+    L: f64,
+    tau_c: f64,
+    derivative: bool,
+) -> PyResult<Bound<'_, PyDict>> {
+    answered(py, rules::simc(K, T, L, tau_c, derivative))
+}
+
+#[pyfunction]
+#[pyo3(signature = (K, T, L))]
+#[expect(non_snake_case, reason = "the field's names")]
+fn amigo(py: Python<'_>, K: f64, T: f64, L: f64) -> PyResult<Bound<'_, PyDict>> {
+    answered(py, rules::amigo(K, T, L))
+}
+
+fn by_name(costs: Costs) -> [(&'static str, f64); 3] {
+    [
+        ("disturbance_cost", costs.disturbance),
+        ("reference_cost", costs.reference),
+        ("Ms", costs.ms),
+    ]
+}
+
+fn answered(py: Python<'_>, rule: Result<Rule>) -> PyResult<Bound<'_, PyDict>> {
+    let rule = rule.map_err(|e| raise(py, e))?;
+    named(
+        py,
+        [
+            ("Kp", rule.gains.kp),
+            ("Ti", rule.gains.ti),
+            ("Td", rule.gains.td),
+            ("alpha", rule.alpha),
+            ("beta", rule.beta),
+        ],
+    )
 }

@@ -8,9 +8,8 @@ use sewfast_link::{Channel, Client};
 
 use numpy::{PyArray1, PyReadonlyArray1};
 
-use crate::arrays::{array1, slice};
 use crate::control::Controller;
-use crate::watch::watched;
+use crate::seam::{array1, slice, watched};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(host_loop, module)?)

@@ -12,7 +12,7 @@ use sewfast_link::bodies::{self, Description, Event, Greeting, Start, Status};
 use sewfast_link::client::{Client, Event as Heard};
 use sewfast_link::{Channel, Receiver, Upload};
 
-use crate::arrays::{array1, raise, slice};
+use crate::seam::{array1, raise, slice};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<LinkClient>()?;

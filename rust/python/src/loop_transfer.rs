@@ -7,9 +7,8 @@ use sewfast_control::Standard;
 use sewfast_core::Result;
 use sewfast_core::loop_transfer::{self, Loop, Path, Plant};
 
-use crate::arrays::{array1, raise, slice};
 use crate::control::controller::{Section, cascade};
-use crate::watch::watched;
+use crate::seam::{array1, raise, slice};
 
 type Values<'py> = PyReadonlyArray1<'py, f64>;
 
@@ -110,10 +109,13 @@ fn margins<'py>(
     den: Values<'py>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let (num, den) = (slice(&num, "num")?, slice(&den, "den")?);
-    let found = watched(py, None, |_| {
-        let plant = Plant::new(num, den)?;
-        Ok(loop_transfer::margins(&Loop::new(&path.0, &plant)?))
-    })?;
+    // half a millisecond, that a search asks for thousands of times: on a busy computer a thread of its own waits for longer
+    let found = py
+        .detach(|| {
+            let plant = Plant::new(num, den)?;
+            Ok(loop_transfer::margins(&Loop::new(&path.0, &plant)?))
+        })
+        .map_err(|e| raise(py, e))?;
     let dict = PyDict::new(py);
     dict.set_item("stable", found.stable)?;
     let numbers = [

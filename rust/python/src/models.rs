@@ -1,4 +1,21 @@
-//! Bindings of the core's models.
+//! Bindings of the core's models: what all kinds share, the guard, and models in the form of a microcontroller.
+
+use std::sync::Arc;
+
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::PyClass;
+use pyo3::exceptions::PyTypeError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use sewfast_core::embedded::{Embedded, Precision};
+use sewfast_core::guard::{Unsound, verdict};
+use sewfast_core::linearised::Linearised;
+use sewfast_core::{Error, Result, model};
+
+use crate::seam::{array1, array2, raise, rows, slice, watched};
+use linear::LinearModel;
+use neural::NeuralOE;
+use neural_ss::{Experiments, NeuralSS, recordings};
 
 /// The methods of a fit: those that each has, and its own. PyO3 takes one block of methods a class.
 macro_rules! fit_methods {
@@ -69,35 +86,18 @@ macro_rules! started_fit_methods {
     };
 }
 
-pub mod embedded;
-mod grey_box;
-mod guard;
-mod hammerstein;
 pub mod linear;
 pub mod neural;
 pub mod neural_ss;
 
-use std::sync::Arc;
-
-use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
-use pyo3::PyClass;
-use pyo3::prelude::*;
-use sewfast_core::Result;
-use sewfast_core::linearised::Linearised;
-use sewfast_core::model;
-
-use crate::arrays::{array1, array2, raise, rows, slice};
-use embedded::EmbeddedModel;
-
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Model>()?;
-    embedded::register(module)?;
-    grey_box::register(module)?;
-    guard::register(module)?;
-    hammerstein::register(module)?;
     linear::register(module)?;
     neural::register(module)?;
-    neural_ss::register(module)
+    neural_ss::register(module)?;
+    module.add_function(wrap_pyfunction!(guard, module)?)?;
+    module.add_class::<EmbeddedModel>()?;
+    module.add_function(wrap_pyfunction!(tanh_quotients, module)?)
 }
 
 /// A model of any kind: the class below which each kind adds its parameters.
@@ -231,9 +231,143 @@ fn matrices(py: Python<'_>, found: Result<Linearised>) -> PyResult<Matrices<'_>>
 }
 
 type RunAndJacobian<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
-type Rows<'py> = PyReadonlyArray2<'py, f64>;
-type Values<'py> = PyReadonlyArray1<'py, f64>;
+pub type Rows<'py> = PyReadonlyArray2<'py, f64>;
+pub type Values<'py> = PyReadonlyArray1<'py, f64>;
 
 fn released<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send) -> PyResult<T> {
     py.detach(work).map_err(|e| raise(py, e))
+}
+
+#[pyfunction]
+#[pyo3(signature = (model, experiments, *, linear = Vec::new()))]
+fn guard(
+    py: Python<'_>,
+    model: &Bound<'_, PyAny>,
+    experiments: Experiments<'_>,
+    linear: Vec<PyRef<'_, LinearModel>>,
+) -> PyResult<&'static str> {
+    let experiments = recordings(py, &experiments)?;
+    let linear: Vec<_> = linear.iter().map(|m| m.inner.as_ref().clone()).collect();
+    let found = if let Ok(model) = model.cast::<LinearModel>() {
+        let model = model.get().inner.as_ref();
+        watched(py, None, |m| verdict(model, &experiments, &linear, m))
+    } else if let Ok(model) = model.cast::<NeuralOE>() {
+        let model = model.get().inner.as_ref();
+        watched(py, None, |m| verdict(model, &experiments, &linear, m))
+    } else if let Ok(model) = model.cast::<NeuralSS>() {
+        let model = model.get().inner.as_ref();
+        watched(py, None, |m| verdict(model, &experiments, &linear, m))
+    } else {
+        Err(PyTypeError::new_err(format!(
+            "expected a LinearModel, a NeuralOE or a NeuralSS, got {}",
+            model.get_type().name()?
+        )))
+    };
+    Ok(found?.map_or("", Unsound::reason))
+}
+
+/// A model's coefficients by name, and its step in the arithmetic of a microcontroller.
+#[pyclass(frozen, module = "sewfast._core")]
+pub struct EmbeddedModel {
+    inner: Embedded,
+}
+
+impl EmbeddedModel {
+    pub fn of(inner: Embedded) -> Self {
+        Self { inner }
+    }
+
+    fn free_run<T: Precision>(&self, u: &[f64], state: &[f64], held: &[f64]) -> Result<Vec<f64>> {
+        self.inner.run::<T>(u, state, held)
+    }
+}
+
+#[pymethods]
+impl EmbeddedModel {
+    #[getter]
+    fn kind(&self) -> &'static str {
+        self.inner.kind
+    }
+
+    #[getter]
+    fn orders<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let (orders, found) = (self.inner.orders, PyDict::new(py));
+        found.set_item("na", orders.na)?;
+        found.set_item("nb", orders.nb)?;
+        found.set_item("nk", orders.nk)?;
+        found.set_item("inputs", orders.inputs)?;
+        Ok(found)
+    }
+
+    #[getter]
+    fn parts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let found = PyDict::new(py);
+        for (name, values) in &self.inner.parts {
+            found.set_item(name, array1(py, values.clone()))?;
+        }
+        Ok(found)
+    }
+
+    #[getter]
+    fn scaling<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
+        let Some((u_mean, u_scale, y_mean, y_scale)) = &self.inner.scaling else {
+            return Ok(None);
+        };
+        let found = PyDict::new(py);
+        found.set_item("u_mean", array1(py, u_mean.clone()))?;
+        found.set_item("u_scale", array1(py, u_scale.clone()))?;
+        found.set_item("y_mean", array1(py, vec![*y_mean]))?;
+        found.set_item("y_scale", array1(py, vec![*y_scale]))?;
+        Ok(Some(found))
+    }
+
+    #[getter]
+    fn output(&self) -> (&'static str, Vec<f64>) {
+        (self.inner.output.name(), self.inner.output.parameters())
+    }
+
+    #[pyo3(signature = (u, state, held, *, precision="f64"))]
+    fn run<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        state: Values<'py>,
+        held: Values<'py>,
+        precision: &str,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let (u, state, held) = (
+            rows(&u, "u")?.0,
+            slice(&state, "state")?,
+            slice(&held, "held")?,
+        );
+        let run = match precision {
+            "f64" => Self::free_run::<f64>,
+            "f32" => Self::free_run::<f32>,
+            other => {
+                let error =
+                    Error::setting(format!("precision: expected f32 or f64, received {other}"));
+                return Err(raise(py, error));
+            }
+        };
+        let found = py.detach(|| run(self, u, state, held));
+        Ok(array1(py, found.map_err(|e| raise(py, e))?))
+    }
+}
+
+/// The coefficients of `tanh(x) = x P(x^2)/Q(x^2)`: numerator, denominator and end of each quotient.
+#[pyfunction]
+fn tanh_quotients(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
+    use sewfast_control::model::tanh::{FAR, NEAR, SINGLE};
+    let found = PyDict::new(py);
+    for (name, q) in [("near", NEAR), ("far", FAR)] {
+        found.set_item(name, (q.numerator.to_vec(), q.denominator.to_vec(), q.end))?;
+    }
+    let wide = |values: &[f32]| values.iter().map(|v| f64::from(*v)).collect::<Vec<_>>();
+    let single = (
+        wide(SINGLE.numerator),
+        wide(SINGLE.denominator),
+        f64::from(SINGLE.end),
+    );
+    found.set_item("single", single)?;
+    Ok(found)
 }

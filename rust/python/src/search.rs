@@ -1,18 +1,23 @@
-//! The searches on functions of Python's, for whoever wants to compare them with others.
+//! The core's optimisers on functions of Python's, for whoever wants to use them alone or compare them with others: least squares
+//! with residuals and Jacobians, and the searches.
 
 use std::sync::Mutex;
 
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::exceptions::PyKeyboardInterrupt;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use sewfast_core::least_squares::{self, Residuals, Settings, Solution, Termination};
 use sewfast_core::search::nsga2::{self, Objectives, Values};
 use sewfast_core::search::{Candidate, Judgement, Options, Problem, cma_es, genetic};
 use sewfast_core::{Error, Monitor};
 
-use crate::arrays::{array1, raise};
+use crate::seam::{array1, array2, raise, rows, slice};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(search_least, module)?)?;
-    module.add_function(wrap_pyfunction!(search_front, module)?)
+    module.add_function(wrap_pyfunction!(search_front, module)?)?;
+    module.add_function(wrap_pyfunction!(least_squares_fit, module)?)
 }
 
 /// A function of Python's over the unit box; what it raises ends the search.
@@ -212,4 +217,176 @@ fn search_front<'py>(
     dict.set_item("points", points)?;
     dict.set_item("values", values)?;
     Ok(dict)
+}
+
+type Vector<'py> = PyReadonlyArray1<'py, f64>;
+
+/// Python's functions as residuals. Every call gets arrays of its own, so that a function may keep them.
+struct Functions<'a, 'py> {
+    py: Python<'py>,
+    fun: &'a Bound<'py, PyAny>,
+    jac: &'a Bound<'py, PyAny>,
+    parameters: usize,
+    residuals: usize,
+    /// Residuals at the start, which are known already.
+    first: Option<Vec<f64>>,
+    monitor: &'a Monitor,
+    raised: Option<PyErr>,
+}
+
+impl<'py> Functions<'_, 'py> {
+    fn residuals_at(&mut self, theta: &[f64], r: &mut [f64]) -> PyResult<()> {
+        self.py.check_signals()?;
+        if let Some(first) = self.first.take() {
+            r.copy_from_slice(&first);
+            return Ok(());
+        }
+        let values = self.fun.call1((PyArray1::from_slice(self.py, theta),))?;
+        let values: Vector<'py> = values.extract()?;
+        r.copy_from_slice(slice(&values, "fun")?);
+        Ok(())
+    }
+
+    fn jacobian_at(&mut self, theta: &[f64], r: &[f64], j: &mut [f64]) -> PyResult<()> {
+        self.py.check_signals()?;
+        let at = PyArray1::from_slice(self.py, theta);
+        let values = self.jac.call1((at, PyArray1::from_slice(self.py, r)))?;
+        let values: PyReadonlyArray2<'py, f64> = values.extract()?;
+        j.copy_from_slice(rows(&values, "jac")?.0);
+        Ok(())
+    }
+
+    /// An exception stops the iteration and is kept for the caller.
+    fn had(&mut self, result: PyResult<()>) -> bool {
+        let had = result.is_ok();
+        if let Err(error) = result {
+            self.monitor.request_stop();
+            self.raised = Some(error);
+        }
+        had
+    }
+}
+
+impl Residuals for Functions<'_, '_> {
+    fn parameters(&self) -> usize {
+        self.parameters
+    }
+
+    fn len(&self) -> usize {
+        self.residuals
+    }
+
+    fn residuals(&mut self, theta: &[f64], r: &mut [f64]) -> bool {
+        if self.raised.is_some() {
+            return false;
+        }
+        let result = self.residuals_at(theta, r);
+        self.had(result)
+    }
+
+    fn jacobian(&mut self, theta: &[f64], r: &[f64], j: &mut [f64]) -> bool {
+        if self.raised.is_some() {
+            return false;
+        }
+        let result = self.jacobian_at(theta, r, j);
+        self.had(result)
+    }
+}
+
+#[pyfunction]
+#[pyo3(signature = (fun, jac, x0, first, *, lower, upper, x_scale, ftol, xtol, gtol, max_nfev, precision))]
+#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+fn least_squares_fit<'py>(
+    py: Python<'py>,
+    fun: Bound<'py, PyAny>,
+    jac: Bound<'py, PyAny>,
+    x0: Vector<'py>,
+    first: Vector<'py>,
+    lower: Option<Vector<'py>>,
+    upper: Option<Vector<'py>>,
+    x_scale: Option<Vector<'py>>,
+    ftol: f64,
+    xtol: f64,
+    gtol: f64,
+    max_nfev: usize,
+    precision: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let owned = |values: Option<Vector<'py>>, name| {
+        values
+            .map(|v| slice(&v, name).map(<[f64]>::to_vec))
+            .transpose()
+    };
+    let settings = Settings {
+        ftol,
+        xtol,
+        gtol,
+        max_evaluations: max_nfev,
+        precision,
+        scale: owned(x_scale, "x_scale")?,
+        lower: owned(lower, "bounds")?,
+        upper: owned(upper, "bounds")?,
+    };
+    let (start, first) = (slice(&x0, "x0")?.to_vec(), slice(&first, "fun")?.to_vec());
+    let monitor = Monitor::default();
+    let mut functions = Functions {
+        py,
+        fun: &fun,
+        jac: &jac,
+        parameters: start.len(),
+        residuals: first.len(),
+        first: Some(first),
+        monitor: &monitor,
+        raised: None,
+    };
+    let solution = least_squares::solve(&mut functions, start, &settings, &monitor);
+    match functions.raised {
+        // Exactly this class: Ctrl-C keeps the best point, every other exception is the caller's.
+        Some(error) if !is_ctrl_c(py, &error) => Err(error),
+        _ => story(py, solution.map_err(|e| raise(py, e))?),
+    }
+}
+
+fn is_ctrl_c(py: Python<'_>, error: &PyErr) -> bool {
+    error.get_type(py).is(py.get_type::<PyKeyboardInterrupt>())
+}
+
+fn story(py: Python<'_>, solution: Solution) -> PyResult<Bound<'_, PyDict>> {
+    let n = solution.theta.len();
+    let story = PyDict::new(py);
+    story.set_item("x", array1(py, solution.theta))?;
+    story.set_item("cost", solution.cost)?;
+    story.set_item("fun", array1(py, solution.residual))?;
+    let jacobian: Bound<'_, PyArray2<f64>> = array2(py, solution.jacobian, n)?;
+    story.set_item("jac", jacobian)?;
+    story.set_item("success", solution.termination.is_converged())?;
+    story.set_item("status", status(solution.termination))?;
+    story.set_item("termination", solution.termination.name())?;
+    story.set_item("message", solution.termination.remedy())?;
+    story.set_item("nfev", solution.evaluations)?;
+    story.set_item("njev", solution.jacobians)?;
+    story.set_item("optimality", solution.optimality)?;
+    story.set_item("relative_offset", solution.cosine)?;
+    let active: Vec<i64> = solution.active.iter().map(|&v| i64::from(v)).collect();
+    story.set_item("active_mask", PyArray1::from_vec(py, active))?;
+    story.set_item("covariance", array2(py, solution.covariance, n)?)?;
+    story.set_item("condition", solution.condition)?;
+    story.set_item("rank", solution.rank)?;
+    story.set_item("trace", array1(py, solution.trace))?;
+    Ok(story)
+}
+
+/// SciPy's numbers where it has one; failures that it does not tell apart are below zero.
+fn status(termination: Termination) -> i32 {
+    match termination {
+        Termination::SmallGradient => 1,
+        Termination::SmallReduction => 2,
+        Termination::SmallStep => 3,
+        Termination::MaxEvaluations | Termination::MaxIterations => 0,
+        Termination::NotFinite => -1,
+        Termination::Interrupted => -2,
+        Termination::Stalled => -3,
+        Termination::Flat => -4,
+        Termination::RankDeficient => -5,
+        Termination::Saddle => -6,
+    }
 }

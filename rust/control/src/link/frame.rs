@@ -260,6 +260,4 @@ fn zero(bytes: &[u8]) -> Option<usize> {
 }
 
 #[cfg(test)]
-mod corruption;
-#[cfg(test)]
-mod tests;
+pub(crate) mod tests;

@@ -1,4 +1,8 @@
-//! The link between a drive and its host: frames and their fields (docs/PROTOCOL.md).
+//! The link between a drive and its host (docs/PROTOCOL.md).
+//!
+//! To read: [`frame`] with [`cobs`] and [`crc`] (bytes), [`wire`] and `command` (fields of a body), [`identity`] (what a device is),
+//! then [`device`] with what it asks: `session` (who speaks), `guard` (the motor's limits), `profile` (values to play), `stream`
+//! (what goes to the host).
 //!
 //! ```
 //! use sewfast_control::link::{Deframer, Header, MAX_WIRE, encode};
@@ -24,12 +28,7 @@ pub mod identity;
 mod profile;
 mod session;
 mod stream;
-mod transmit;
-mod watchdog;
 pub mod wire;
-
-#[cfg(test)]
-mod dice;
 
 pub use device::{Device, Measurement, Output, Reason, State};
 pub use frame::{Deframer, Frame, HEADER, Header, MAX_BODY, MAX_FRAME, MAX_WIRE, Rejected, encode};

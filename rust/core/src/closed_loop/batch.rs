@@ -35,9 +35,9 @@ mod tests;
 use super::kernel_plant::{BatchPlant, KernelPlant};
 use super::{Outcome, RUNAWAY, Signals, WATCHED};
 use crate::Monitor;
-use crate::encoder::Encoder;
 use crate::neural::{Meanwhile, Nothing};
 use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
+use crate::speed::Encoder;
 pub(super) use controllers::Controllers;
 pub(crate) use controllers::{InLanes, LaneController, WithKind, are_of_a_kind, of_a_kind};
 

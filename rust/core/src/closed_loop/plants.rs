@@ -1,9 +1,9 @@
 //! Plants to close a loop around: identified models, variations for robust tuning.
 
 use super::{KernelPlant, Plant};
-use crate::encoder::Encoder;
 use crate::lagged::{Form, Lagged, Lags};
 use crate::neural_ss::{NeuralSS, Shape, Stepper};
+use crate::speed::Encoder;
 use crate::{Error, Result};
 
 /// A lagged model as a plant: its regressor is kept from sample to sample.

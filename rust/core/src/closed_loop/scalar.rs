@@ -11,8 +11,8 @@ use super::batch::{Controllers, InLanes, LaneController};
 use super::kernel_plant::{AnyOrder, KernelPlant, ScalarPlant, SecondOrder};
 use super::{Plant, Run, Signals};
 use crate::Monitor;
-use crate::encoder::Encoder;
 use crate::simd::{F64x8, Kernel};
+use crate::speed::Encoder;
 
 /// What a loop asks of its controller.
 pub(super) trait LoopController {

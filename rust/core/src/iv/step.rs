@@ -2,10 +2,9 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::run::{Point, Run, best_run, responses};
+use super::{Point, Run, best_run, responses};
 use crate::lagged::Lags;
-use crate::linear::{LinearModel, is_stable, stabilised};
-use crate::linear_fit::{soften, spread};
+use crate::linear::{LinearModel, is_stable, soften, spread, stabilised};
 use crate::monitor::look;
 use crate::{Monitor, Record};
 

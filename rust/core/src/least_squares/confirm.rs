@@ -5,8 +5,7 @@
 //! must be positive definite. The steps are compared with the parameters and their standard errors, not by the cost.
 
 use super::Residuals;
-use super::point::Point;
-use super::spread::{Spread, nonzero};
+use super::point::{Point, Spread, nonzero};
 use super::triangle::Triangle;
 use super::trust::TrustRegion;
 use crate::descent::{Method, Outcome, Termination};

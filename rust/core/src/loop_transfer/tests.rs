@@ -4,8 +4,8 @@ use sewfast_control::{AnyController, Biquad, Cascade, Design, PidController, Set
 
 use crate::Monitor;
 use crate::closed_loop::{LaggedPlant, Run};
-use crate::encoder::Encoder;
 use crate::linear::LinearModel;
+use crate::speed::Encoder;
 
 const TS: f64 = 1e-3;
 
@@ -154,7 +154,7 @@ fn a_long_dead_time_has_its_noise_gain_from_the_locus() {
     assert!(margins_of(&path, &long).stable && margins_of(&path, &long).noise_gain.is_finite());
     path.filter_samples = 6;
     let closed = Loop::new(&path, &short).unwrap();
-    let found = margins::noise_on(&closed, &curve::Curve::of(&closed).points);
+    let found = margins::noise_on(&closed, &margins::Curve::of(&closed).points);
     let exact = margins_of(&path, &short).noise_gain;
     assert!((found / exact - 1.0).abs() < 1e-5, "{found} {exact}");
 }
@@ -317,7 +317,7 @@ proptest! {
         num.extend([0.06 * (1.0 - fast), 0.04 * (1.0 - fast)]);
         let plant = Plant::new(&num, &[1.0, -slow - fast, slow * fast]).unwrap();
         let closed = Loop::new(&path, &plant).unwrap();
-        let pole = states::States::of(&closed).unwrap().largest_pole();
+        let pole = States::of(&closed).unwrap().largest_pole();
         prop_assume!((pole - 1.0).abs() > 1e-6);
         let found = margins(&closed);
         prop_assert_eq!(found.stable, pole < 1.0);

@@ -12,13 +12,14 @@
 //! `1000/L`, where alpha and beta agree best with Table 1. The integral of `E_d` converges.
 
 mod locus;
-mod search;
+
+use nalgebra::Complex;
+use sewfast_control::Standard;
 
 use super::Rule;
 use crate::error::shown;
 use crate::{Error, Result};
-use locus::Locus;
-use sewfast_control::Standard;
+use locus::{Locus, Node};
 
 /// The range of `L/T` that the rule is made for.
 const RATIOS: (f64, f64) = (0.01, 2.0);
@@ -104,6 +105,212 @@ pub fn costs(ratio: f64, gains: Standard<f64>, alpha: f64, beta: f64) -> Result<
     }
     let (locus, reference) = (Locus::up_to(ratio, TOP.0), Locus::up_to(ratio, TOP.1));
     Ok(locus.costs(&reference, gains, alpha, beta))
+}
+
+// The gains of the least cost: without a limit of `max |S|`, and on its boundary.
+
+impl Locus {
+    /// `ln` of `Kp`, `Ti` and `Td` near the least cost, from which it is searched.
+    fn start(&self) -> [f64; 3] {
+        let l = self.l;
+        [
+            1.22 / l,
+            2.6 * l / (1.0 + 0.92 * l),
+            0.41 * l / (1.0 + 0.15 * l),
+        ]
+        .map(f64::ln)
+    }
+
+    /// The gains of the least cost.
+    pub(super) fn free(&self) -> Standard<f64> {
+        let gains = |x: &[f64; 3]| Standard {
+            kp: x[0].exp(),
+            ti: x[1].exp(),
+            td: x[2].exp(),
+        };
+        let best = minimised(self.start(), 0.1, |x| self.disturbance(gains(x)).ln());
+        gains(&best)
+    }
+
+    /// The gains of the least cost on the boundary `max |S| = ms`.
+    pub(super) fn bounded(&self, ms: f64) -> Option<Standard<f64>> {
+        let gains = |x: &[f64; 2]| self.largest(x[0].exp(), x[1].exp(), ms);
+        let [_, ti, td] = self.start();
+        let cost = |x: &[f64; 2]| gains(x).map_or(f64::INFINITY, |g| self.integral(g).ln());
+        gains(&minimised([ti, td + 0.8_f64.ln()], 0.2, cost))
+    }
+
+    /// The largest `Kp` with these times of a stable loop with `max |S|` of `ms`; none where only `Kp = 0` has it.
+    ///
+    /// With `L = Kp x` a frequency forbids what lies between the roots of `1 + 2 Kp Re x + Kp^2 |x|^2 = 1/ms^2`, neighbours
+    /// together forbid one range, and high frequencies all above `Kp Td = 1 - 1/ms`. Between the ranges nothing meets -1, so that
+    /// all gains there are stable or none is.
+    pub(super) fn largest(&self, ti: f64, td: f64, ms: f64) -> Option<Standard<f64>> {
+        let beyond = 1.0 - 1.0 / (ms * ms);
+        let mut ranges = self.forbidden(|n| n.forbids(ti, td, beyond));
+        ranges.push(Range {
+            low: (1.0 - 1.0 / ms) / td,
+            high: f64::INFINITY,
+            lowest: None,
+        });
+        ranges.sort_by(|a, b| a.low.total_cmp(&b.low));
+        let with = |kp: f64| Standard { kp, ti, td };
+        let (mut below, mut best) = (0.0_f64, None);
+        for range in &ranges {
+            if range.low > below && self.is_stable(with(0.5 * (below + range.low))) {
+                best = Some(range);
+            }
+            below = below.max(range.high);
+        }
+        let lower_root = |n: &Node| n.forbids(ti, td, beyond).map_or(f64::INFINITY, |r| r.0);
+        best.map(|range| {
+            with(
+                range
+                    .lowest
+                    .map_or(range.low, |i| self.lowest_near(i, lower_root)),
+            )
+        })
+    }
+
+    /// What runs of neighbouring frequencies forbid together.
+    fn forbidden(&self, of: impl Fn(&Node) -> Option<(f64, f64)>) -> Vec<Range> {
+        let mut ranges: Vec<Range> = Vec::new();
+        let mut running = false;
+        for (i, node) in self.nodes.iter().enumerate() {
+            let own = of(node);
+            match (own, ranges.last_mut()) {
+                (Some((low, high)), Some(range)) if running => {
+                    if low < range.low {
+                        (range.low, range.lowest) = (low, Some(i));
+                    }
+                    range.high = range.high.max(high);
+                }
+                (Some((low, high)), _) => ranges.push(Range {
+                    low,
+                    high,
+                    lowest: Some(i),
+                }),
+                (None, _) => {}
+            }
+            running = own.is_some();
+        }
+        ranges
+    }
+}
+
+/// Gains that some frequencies forbid.
+struct Range {
+    low: f64,
+    high: f64,
+    /// The node that forbids the lowest of them; none where it is the limit of high frequencies.
+    lowest: Option<usize>,
+}
+
+impl Node {
+    /// `F_1 G` with `Kp = 1`.
+    fn unit_loop(&self, ti: f64, td: f64) -> Complex<f64> {
+        let s = Complex::new(0.0, self.omega);
+        (s + s * s * td + 1.0 / ti) / self.p[0]
+    }
+
+    /// Between which gains this frequency's `|S|` is too large.
+    fn forbids(&self, ti: f64, td: f64, beyond: f64) -> Option<(f64, f64)> {
+        let x = self.unit_loop(ti, td);
+        let discriminant = x.re * x.re - x.norm_sqr() * beyond;
+        (x.re < 0.0 && discriminant >= 0.0).then(|| {
+            let root = discriminant.sqrt();
+            (beyond / (root - x.re), (root - x.re) / x.norm_sqr())
+        })
+    }
+}
+
+// The simplex search of Nelder and Mead, for a few parameters and a function that is cheap.
+
+/// Evaluations before the search starts again from its best point, and how often it does.
+const EVALUATIONS: usize = 400;
+const ROUNDS: usize = 2;
+/// A simplex of this extent is a point.
+const SMALL: f64 = 1e-6;
+
+/// Where `cost` is least near `start`; the first simplex has edges of `step`.
+///
+/// (J. A. Nelder, R. Mead, *Computer Journal* 7, 1965.)
+fn minimised<const N: usize>(
+    start: [f64; N],
+    step: f64,
+    cost: impl Fn(&[f64; N]) -> f64,
+) -> [f64; N] {
+    let mut best = start;
+    for round in 0..ROUNDS {
+        best = descended(best, step / if round == 0 { 1.0 } else { 20.0 }, &cost);
+    }
+    best
+}
+
+fn descended<const N: usize>(
+    start: [f64; N],
+    step: f64,
+    cost: &impl Fn(&[f64; N]) -> f64,
+) -> [f64; N] {
+    let mut corners: Vec<(f64, [f64; N])> = (0..=N)
+        .map(|i| {
+            let mut x = start;
+            if i > 0 {
+                x[i - 1] += step;
+            }
+            (cost(&x), x)
+        })
+        .collect();
+    for _ in 0..EVALUATIONS {
+        corners.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let extent = |x: &[f64; N]| {
+            (0..N)
+                .map(|i| (x[i] - corners[0].1[i]).abs())
+                .fold(0.0, f64::max)
+        };
+        if corners.iter().map(|c| extent(&c.1)).fold(0.0, f64::max) < SMALL {
+            break;
+        }
+        replace_worst(&mut corners, cost);
+    }
+    corners.sort_by(|a, b| a.0.total_cmp(&b.0));
+    corners[0].1
+}
+
+fn replace_worst<const N: usize>(
+    corners: &mut [(f64, [f64; N])],
+    cost: &impl Fn(&[f64; N]) -> f64,
+) {
+    let (best, second, worst) = (corners[0], corners[N - 1], corners[N]);
+    let centre: [f64; N] =
+        std::array::from_fn(|i| corners[..N].iter().map(|c| c.1[i]).sum::<f64>() / N as f64);
+    let along = |factor: f64| {
+        let x = std::array::from_fn(|i| centre[i] + factor * (centre[i] - worst.1[i]));
+        (cost(&x), x)
+    };
+    let reflected = along(1.0);
+    let candidate = if reflected.0 < best.0 {
+        let expanded = along(2.0);
+        if expanded.0 < reflected.0 {
+            expanded
+        } else {
+            reflected
+        }
+    } else if reflected.0 < second.0 {
+        reflected
+    } else {
+        let contracted = along(if reflected.0 < worst.0 { 0.5 } else { -0.5 });
+        if contracted.0 < reflected.0.min(worst.0) {
+            contracted
+        } else {
+            for corner in &mut corners[1..] {
+                corner.1 = std::array::from_fn(|i| 0.5 * (corner.1[i] + best.1[i]));
+                corner.0 = cost(&corner.1);
+            }
+            return;
+        }
+    };
+    corners[N] = candidate;
 }
 
 #[cfg(test)]
@@ -255,6 +462,16 @@ mod tests {
                     0.0
                 )
                 .is_err()
+        );
+    }
+
+    #[test]
+    fn finds_the_minimum_of_a_bent_valley() {
+        let cost = |x: &[f64; 2]| (1.0 - x[0]).powi(2) + 100.0 * (x[1] - x[0] * x[0]).powi(2);
+        let found = minimised([-1.0, 1.0], 0.3, cost);
+        assert!(
+            (found[0] - 1.0).abs() < 1e-4 && (found[1] - 1.0).abs() < 1e-4,
+            "{found:?}"
         );
     }
 }

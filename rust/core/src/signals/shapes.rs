@@ -1,6 +1,7 @@
-//! Step, staircase and trapezoid.
+//! Step, staircase, trapezoid; and large jumps that drive a motor into its current limit while its speed stays within a range.
 
-use super::check::{MAX_SAMPLES, finite, not_negative, samples};
+use super::{MAX_SAMPLES, finite, not_negative, ordered, samples};
+use crate::random::Random;
 use crate::{Error, Result};
 
 /// `low` before time `at`, `high` from then on.
@@ -110,6 +111,116 @@ impl Trapezoid {
     }
 }
 
+/// Random speeds, each reached by a pulse of high command and then held by the command that holds it.
+///
+/// The pulse lasts `|change of speed| / acceleration`, as long as a drive that accelerates at its current limit
+/// needs; the level between pulses is `speed / gain`. The signal is planned open loop, so a real drive comes near the
+/// speeds, not to them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Jumps {
+    /// Length of the signal (s).
+    pub duration: f64,
+    /// Lowest speed aimed at.
+    pub speed_low: f64,
+    /// Highest speed aimed at.
+    pub speed_high: f64,
+    /// Smallest change of speed from one pulse to the next.
+    pub change_min: f64,
+    /// Smallest magnitude of a pulse.
+    pub level_min: f64,
+    /// Largest magnitude of a pulse.
+    pub level_max: f64,
+    /// Shortest hold between pulses (s).
+    pub hold_min: f64,
+    /// Longest hold between pulses (s).
+    pub hold_max: f64,
+    /// How long the rise to a pulse and the fall from it take (s); 0 gives rectangular pulses.
+    pub ramp: f64,
+    /// Steady speed per unit of command.
+    pub gain: f64,
+    /// Acceleration at the current limit (speed/s).
+    pub acceleration: f64,
+}
+
+impl Jumps {
+    /// The sampled signal for `seed`.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for values that are not finite, out of order or not above zero where they divide, a
+    /// smallest change that does not fit twice into the range of speed, or a length outside 1 to
+    /// [`super::MAX_SAMPLES`] samples.
+    pub fn generate(&self, ts: f64, seed: u64) -> Result<Vec<f64>> {
+        let n = samples("duration", self.duration, ts)?;
+        self.check(ts)?;
+        let mut random = Random::new(seed);
+        let mut signal = Vec::with_capacity(n);
+        let (mut speed, mut command) = (0.0, 0.0);
+        while signal.len() < n {
+            let next = self.next_speed(&mut random, speed);
+            let pulse = random.between(self.level_min, self.level_max) * (next - speed).signum();
+            let held = next / self.gain;
+            let top = ((next - speed).abs() / self.acceleration - self.ramp).max(0.0);
+            let hold = random.between(self.hold_min, self.hold_max);
+            let mut ramp = |from: f64, to: f64, seconds: f64| {
+                let count = (seconds / ts).round() as usize;
+                let count = count.min(n - signal.len());
+                let share = |k: usize| (k + 1) as f64 * ts / seconds;
+                signal.extend((0..count).map(|k| from + (to - from) * share(k).min(1.0)));
+            };
+            ramp(command, pulse, self.ramp);
+            ramp(pulse, pulse, top);
+            ramp(pulse, held, self.ramp);
+            ramp(held, held, hold);
+            (speed, command) = (next, held);
+        }
+        Ok(signal)
+    }
+
+    /// A speed at least `change_min` away, uniform over what that leaves of the range.
+    fn next_speed(&self, random: &mut Random, speed: f64) -> f64 {
+        let below = (speed - self.change_min - self.speed_low).max(0.0);
+        let above = (self.speed_high - speed - self.change_min).max(0.0);
+        let place = random.between(0.0, below + above);
+        if place < below {
+            self.speed_low + place
+        } else {
+            self.speed_high - above + (place - below)
+        }
+    }
+
+    fn check(&self, ts: f64) -> Result<()> {
+        ordered(
+            ("speed_low", self.speed_low),
+            ("speed_high", self.speed_high),
+        )?;
+        ordered(("level_min", self.level_min), ("level_max", self.level_max))?;
+        ordered(("hold_min", self.hold_min), ("hold_max", self.hold_max))?;
+        samples("hold_min", self.hold_min, ts)?;
+        not_negative(&[
+            ("speed_low", self.speed_low),
+            ("change_min", self.change_min),
+            ("level_min", self.level_min),
+            ("ramp", self.ramp),
+        ])?;
+        finite(&[("gain", self.gain), ("acceleration", self.acceleration)])?;
+        if self.gain <= 0.0 || self.acceleration <= 0.0 {
+            return Err(Error::setting(format!(
+                "expected gain and acceleration above 0, got {} and {}; give those of the drive",
+                self.gain, self.acceleration
+            )));
+        }
+        let range = self.speed_high - self.speed_low;
+        if 2.0 * self.change_min > range {
+            return Err(Error::setting(format!(
+                "expected change_min of at most half the range of speed ({}), got {}; lower it or widen the range",
+                0.5 * range,
+                self.change_min
+            )));
+        }
+        Ok(())
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -151,5 +262,78 @@ mod tests {
         assert!(staircase(0.1, &[], 1.0).is_err());
         assert!(staircase(0.1, &[1.0], 0.01).is_err());
         assert!(staircase(1e-3, &[0.0; 200_000], 1.0).is_err());
+    }
+
+    const JUMPS: Jumps = Jumps {
+        duration: 20.0,
+        speed_low: 200.0,
+        speed_high: 4500.0,
+        change_min: 800.0,
+        level_min: 14.0,
+        level_max: 20.0,
+        hold_min: 0.1,
+        hold_max: 0.5,
+        ramp: 0.0,
+        gain: 490.0,
+        acceleration: 25_000.0,
+    };
+
+    #[test]
+    fn jumps_to_its_levels_and_holds_its_speeds() {
+        let u = JUMPS.generate(1e-3, 4).unwrap();
+        assert_eq!(u.len(), 20_000);
+        let pulses = u.iter().filter(|v| v.abs() >= 14.0).count();
+        assert!((1_000..8_000).contains(&pulses), "{pulses}");
+        let held = |v: &&f64| v.abs() < 14.0;
+        assert!(
+            u.iter()
+                .filter(held)
+                .all(|v| (200.0 / 490.0..=4500.0 / 490.0).contains(v))
+        );
+        assert!(u.iter().all(|v| v.abs() <= 20.0));
+    }
+
+    #[test]
+    fn slants_its_pulses() {
+        let slanted = Jumps {
+            ramp: 0.02,
+            ..JUMPS
+        };
+        let u = slanted.generate(1e-3, 4).unwrap();
+        let steepest = u
+            .windows(2)
+            .map(|w| (w[1] - w[0]).abs())
+            .fold(0.0, f64::max);
+        assert!(steepest <= 30.0 / 20.0, "{steepest}");
+    }
+
+    #[test]
+    fn refuses_what_has_no_next_speed_or_would_not_end() {
+        let bad = [
+            Jumps {
+                change_min: 2_200.0,
+                ..JUMPS
+            },
+            Jumps {
+                hold_min: 0.0,
+                ..JUMPS
+            },
+            Jumps { gain: 0.0, ..JUMPS },
+            Jumps {
+                acceleration: f64::NAN,
+                ..JUMPS
+            },
+            Jumps {
+                level_min: 21.0,
+                ..JUMPS
+            },
+            Jumps {
+                ramp: -0.1,
+                ..JUMPS
+            },
+        ];
+        for jumps in bad {
+            assert!(jumps.generate(1e-3, 0).is_err(), "{jumps:?}");
+        }
     }
 }

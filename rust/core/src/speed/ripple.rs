@@ -7,7 +7,7 @@
 
 use std::f64::consts::TAU;
 
-use super::search::{golden, grid};
+use super::kalman::{golden, grid};
 
 /// Samples of the tape that the backward pass reads: bounds the memory whatever the length.
 const CHUNK: usize = 8_192;

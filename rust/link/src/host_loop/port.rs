@@ -8,7 +8,7 @@ use rustix::io::{Errno, read, write};
 use rustix::time::{ClockId, clock_gettime};
 use sewfast_core::Monitor;
 
-use super::outcome::Outcome;
+use super::Outcome;
 use super::tick::HostLoop;
 use crate::ready::{Interest, wait};
 

@@ -1,17 +1,14 @@
-//! The loop without port or clock: time and bytes in, at most one frame out.
+//! The loop without port or clock: time and bytes in, at most one frame out; and what it makes of what the device says.
 
 use sewfast_control::PidController;
-use sewfast_control::link::Body;
+use sewfast_control::link::{Body, Fields};
 use sewfast_core::Result;
 
-use super::age::Age;
-use super::history::History;
-use super::outcome::Outcome;
-use super::settings::Settings;
-use super::ticks::{Tick, Ticks};
-use crate::anomalies::Counters;
-use crate::bodies::{self, Status};
-use crate::client::{Client, kind};
+use super::history::{Age, History};
+use super::{Outcome, Settings, Tick, Ticks};
+use crate::bodies::{self, Beat, Status};
+use crate::client::{Client, Event, Reply, kind};
+use crate::receiver::Counters;
 use crate::samples::Channel;
 
 /// How long after the usual arrival of samples a tick comes \[us\]: what their delay may vary by.
@@ -22,7 +19,7 @@ const ARMED_SILENCE: u64 = 250_000;
 
 /// What the loop is waiting for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Phase {
+enum Phase {
     Arming,
     Starting,
     Running,
@@ -35,24 +32,24 @@ pub(super) enum Phase {
 #[derive(Debug)]
 pub struct HostLoop {
     pub(super) client: Client,
-    pub(super) settings: Settings,
-    pub(super) controller: PidController<f64>,
-    pub(super) reference: Vec<f64>,
-    pub(super) phase: Phase,
-    pub(super) outcome: Option<Outcome>,
-    pub(super) fed: u64,
-    pub(super) start: i64,
-    pub(super) deadline: u64,
-    pub(super) next: usize,
-    pub(super) newest: Option<i64>,
-    pub(super) used: Option<i64>,
-    pub(super) heard: u64,
-    pub(super) age: Age,
-    pub(super) round_trip: Option<u64>,
-    pub(super) stopped: bool,
-    pub(super) status: Option<Status>,
-    pub(super) history: History,
-    pub(super) ticks: Ticks,
+    settings: Settings,
+    controller: PidController<f64>,
+    reference: Vec<f64>,
+    phase: Phase,
+    outcome: Option<Outcome>,
+    fed: u64,
+    start: i64,
+    deadline: u64,
+    next: usize,
+    newest: Option<i64>,
+    used: Option<i64>,
+    heard: u64,
+    age: Age,
+    round_trip: Option<u64>,
+    stopped: bool,
+    status: Option<Status>,
+    history: History,
+    ticks: Ticks,
 }
 
 impl HostLoop {
@@ -205,7 +202,7 @@ impl HostLoop {
         &[]
     }
 
-    pub(super) fn give_up(&mut self, command: u8) {
+    fn give_up(&mut self, command: u8) {
         match self.phase {
             Phase::Arming | Phase::Starting => self.stop(Outcome::Unanswered(command)),
             _ => self.phase = Phase::Done,
@@ -288,7 +285,7 @@ impl HostLoop {
 
     /// Sets the grid of deadlines shortly after the first samples, so that all ticks find fresh ones; without samples it begins
     /// when half the watchdog time is over.
-    pub(super) fn set_grid(&mut self, now: u64, sampled: bool) {
+    fn set_grid(&mut self, now: u64, sampled: bool) {
         self.deadline = if sampled {
             now + (self.settings.period() / 16).min(MARGIN)
         } else {
@@ -297,7 +294,7 @@ impl HostLoop {
     }
 
     /// START of mode 2, at the next sample; the host stops it before it ends by itself.
-    pub(super) fn start_body(&self) -> Body {
+    fn start_body(&self) -> Body {
         let s = &self.settings;
         let start = bodies::Start {
             mode: 2,
@@ -311,9 +308,177 @@ impl HostLoop {
     }
 
     /// Most samples of the device in the run: the reference, the batch before its first tick, and a period for what is late.
-    pub(super) fn length(&self) -> u32 {
+    fn length(&self) -> u32 {
         let periods = self.reference.len() as u64 + 1;
         let samples = periods * u64::from(self.settings.ratio) + u64::from(self.settings.batch);
         u32::try_from(samples).unwrap_or(u32::MAX)
+    }
+}
+
+/// States of the device, by the protocol's numbers.
+const BOOT: u8 = 0;
+const IDLE: u8 = 1;
+const TRIPPED: u8 = 4;
+
+/// Events of the protocol that end a run.
+const FINISHED: u8 = 4;
+const DISARMED: u8 = 5;
+const TRIP: u8 = 6;
+
+impl HostLoop {
+    /// Takes what the device says and the samples in `received`.
+    fn listen(&mut self, now: u64, received: &[u8]) {
+        self.client.receive(now, received);
+        while let Some(event) = self.client.event() {
+            match event {
+                Event::Reply(reply) => self.reply(now, &reply),
+                Event::Happened(event, _) => self.happened(&event),
+                Event::Beat(beat) => self.beat(&beat),
+                Event::Reset => self.reset(),
+            }
+        }
+        if self.phase == Phase::Starting && self.client.heard() == Some(now) {
+            self.heard = now;
+        }
+        self.client.receiver().append_to(&mut self.history.columns);
+        self.take(now);
+    }
+
+    /// Looks at the samples that have come; those of an earlier run are dropped.
+    fn take(&mut self, now: u64) {
+        if matches!(self.phase, Phase::Arming) {
+            self.history.keep(i64::MAX, 0);
+        }
+        let newest = self.history.newest();
+        if newest == self.newest {
+            return;
+        }
+        if self.newest.is_none() && self.phase == Phase::Running && self.ticks.run.is_empty() {
+            self.set_grid(now, true);
+        }
+        self.newest = newest;
+        self.heard = now;
+        if let Some(newest) = newest {
+            self.age.arrived(now, newest);
+        }
+        if self.history.times().len() > self.length() as usize {
+            self.history.keep(self.start, self.length() as usize);
+        }
+    }
+
+    fn reply(&mut self, now: u64, reply: &Reply) {
+        if let Some(trip) = reply.round_trip {
+            self.round_trip = Some(self.round_trip.map_or(trip, |least| least.min(trip)));
+        }
+        if reply.result != 0 {
+            return self.refused(reply);
+        }
+        let mut fields = Fields::new(reply.body.bytes().unwrap_or_default());
+        // a body too short for its kind is as good as none: it would come again as it is
+        if self.done_with(now, &mut fields).is_none() {
+            self.give_up(reply.kind);
+        }
+    }
+
+    fn done_with(&mut self, now: u64, fields: &mut Fields<'_>) -> Option<()> {
+        match self.phase {
+            Phase::Arming => {
+                self.phase = Phase::Starting;
+                self.heard = now;
+                let body = self.start_body();
+                self.client.begin(kind::START, body);
+            }
+            Phase::Starting => {
+                let (_run, start) = bodies::started(fields)?;
+                self.begin(now, start);
+            }
+            Phase::Stopping => {
+                self.stopped = true;
+                self.phase = Phase::Asking;
+                self.client.begin(kind::STATUS, Body::new());
+            }
+            Phase::Asking => {
+                self.conclude(Status::of(fields)?);
+            }
+            Phase::Running | Phase::Done => {}
+        }
+        Some(())
+    }
+
+    fn begin(&mut self, now: u64, start: u64) {
+        self.phase = Phase::Running;
+        self.start = i64::try_from(start).unwrap_or(i64::MAX);
+        self.history.keep(self.start, self.length() as usize);
+        self.heard = now;
+        self.set_grid(now, false);
+    }
+
+    fn refused(&mut self, reply: &Reply) {
+        match self.phase {
+            Phase::Arming | Phase::Starting => self.stop(Outcome::Refused {
+                command: reply.kind,
+                result: reply.result,
+                detail: reply.detail,
+            }),
+            _ => self.phase = Phase::Done,
+        }
+    }
+
+    /// The device's own count says whether a run that it ended was whole.
+    fn conclude(&mut self, status: Status) {
+        self.phase = Phase::Done;
+        self.status = Some(status);
+        if self.outcome == Some(Outcome::Ended) && status.samples >= self.length() {
+            self.outcome = None;
+            self.finished();
+        }
+        // a trip whose event was lost; STOP leaves a tripped device tripped, so that the host may have taken it for the end
+        let ended = matches!(self.outcome, Some(Outcome::Ended | Outcome::Completed));
+        if ended && status.state == TRIPPED {
+            let (reason, value) = (status.reason, f32::NAN);
+            self.outcome = Some(Outcome::Tripped { reason, value });
+        }
+    }
+
+    /// The device has run to the end, before which the last ticks were due.
+    fn finished(&mut self) {
+        self.ticks.missed += (self.reference.len() - self.next) as u64;
+        self.next = self.reference.len();
+        self.stop(Outcome::Completed);
+    }
+
+    fn tripped(&mut self, reason: u8, value: f32) {
+        if self.outcome == Some(Outcome::Ended) {
+            self.outcome = None;
+        }
+        self.stop(Outcome::Tripped { reason, value });
+    }
+
+    fn happened(&mut self, event: &bodies::Event) {
+        if self.phase == Phase::Running {
+            match event.code {
+                FINISHED => self.finished(),
+                DISARMED => self.stop(Outcome::Ended),
+                TRIP => self.tripped(event.reason, event.value),
+                _ => {}
+            }
+        }
+    }
+
+    /// Said while not running, so that an event that was lost is noticed.
+    fn beat(&mut self, beat: &Beat) {
+        if self.phase == Phase::Running {
+            match beat.state {
+                TRIPPED => self.tripped(beat.reason, f32::NAN),
+                BOOT | IDLE => self.stop(Outcome::Ended),
+                _ => {}
+            }
+        }
+    }
+
+    /// A device that has reset is safe, and knows nothing of this session.
+    fn reset(&mut self) {
+        self.stop(Outcome::Reset);
+        self.phase = Phase::Done;
     }
 }

@@ -1,7 +1,7 @@
 //! Every drop, repeat, late frame and reset is flagged, and no sample enters twice, whatever the link does.
 
 use super::*;
-use crate::anomalies::LISTED;
+use crate::receiver::LISTED;
 use std::ops::RangeInclusive;
 
 use sewfast_control::link::{Body, Header, MAX_WIRE, encode};

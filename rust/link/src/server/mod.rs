@@ -2,44 +2,38 @@
 //!
 //! A [`Server`] owns a thread that serves the drive until it is stopped. Time is real, or advances by the host's credit; faults
 //! and the rate of a serial line lie between device and port.
+//!
+//! To read: `rig` (the device), `port` and `pty` (where a host connects), `line` and `faults` (what lies between), `serving` (the
+//! loop that moves bytes), `trace` (its account of the output).
 
-mod bucket;
-mod clock;
 mod faults;
-mod gate;
 mod line;
-mod log;
 mod port;
 #[cfg(unix)]
 mod pty;
 mod rig;
 mod serving;
-mod shared;
-mod tcp;
 mod trace;
 
 use std::io;
 use std::path::PathBuf;
-use std::sync::atomic::Ordering;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use sewfast_core::machine::Machine;
 
-pub use faults::{Fault, Faults, KINDS};
-pub use line::Direction;
-pub use log::Counts;
-pub use rig::{CAPACITY, PERIOD};
-pub use shared::Statistics;
-pub use trace::{Entry, Happening, Heartbeat};
-
-use log::FaultLog;
+use faults::FaultLog;
 use port::{Port, explained};
 use rig::Rig;
 use serving::Serving;
-use shared::{Order, Shared};
 use trace::Trace;
+
+pub use faults::{Counts, Fault, Faults, KINDS};
+pub use line::Direction;
+pub use rig::{CAPACITY, PERIOD};
+pub use trace::{Entry, Happening, Heartbeat};
 
 /// Where the drive is served.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -197,7 +191,7 @@ fn opened(endpoint: &Endpoint) -> io::Result<Box<dyn Port>> {
             io::ErrorKind::Unsupported,
             "this system has no pseudo-terminals; serve on TCP",
         )),
-        Endpoint::Tcp { address, anyone } => Ok(Box::new(tcp::Tcp::listen(address, *anyone)?)),
+        Endpoint::Tcp { address, anyone } => Ok(Box::new(port::Tcp::listen(address, *anyone)?)),
     }
 }
 
@@ -217,4 +211,131 @@ fn first_boot() -> u32 {
     let mixed = (time.as_nanos() as u64 ^ u64::from(std::process::id()) << 32)
         .wrapping_mul(0x9e37_79b9_7f4a_7c15);
     (mixed >> 32) as u32 | 1
+}
+
+/// Entries of the account kept in memory; the oldest go first.
+const KEPT: usize = 1 << 16;
+
+/// What the owner may ask for while the drive is served.
+#[derive(Clone, Copy, Debug)]
+enum Order {
+    /// One fault now, or with the next frame from the device; with a duration of its own.
+    Fault(Fault, Option<Duration>),
+}
+
+/// How serving went so far.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Statistics {
+    /// Samples taken.
+    pub samples: u64,
+    /// Samples that were taken a period or more after they were due.
+    pub late: u64,
+    /// The latest sample [us].
+    pub latest_us: u64,
+    /// How often the clock was set back because catching up was hopeless.
+    pub set_back: u64,
+    /// Bytes that went to hosts.
+    pub bytes_to_host: u64,
+    /// Hosts that were sent away because one was there.
+    pub refused: u64,
+}
+
+#[derive(Debug, Default)]
+struct Report {
+    port: String,
+    statistics: Statistics,
+    faults: Counts,
+    entries: Vec<Entry>,
+    problem: Option<String>,
+    orders: Vec<Order>,
+    ended: bool,
+}
+
+/// Flags and the last report.
+#[derive(Debug, Default)]
+struct Shared {
+    /// Set to end serving.
+    stop: AtomicBool,
+    ordered: AtomicBool,
+    report: Mutex<Report>,
+    end: Condvar,
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, Report> {
+        self.report.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes the orders that have come.
+    fn orders(&self) -> Vec<Order> {
+        match self.ordered.swap(false, Ordering::Acquire) {
+            true => std::mem::take(&mut self.lock().orders),
+            false => Vec::new(),
+        }
+    }
+
+    /// Adds an order.
+    fn order(&self, order: Order) {
+        self.lock().orders.push(order);
+        self.ordered.store(true, Ordering::Release);
+    }
+
+    /// The port's name, now.
+    fn renamed(&self, port: String) {
+        self.lock().port = port;
+    }
+
+    /// The port's name.
+    fn port(&self) -> String {
+        self.lock().port.clone()
+    }
+
+    /// Publishes how serving goes.
+    fn report(&self, statistics: &Statistics, log: &FaultLog, trace: &mut Trace) {
+        let mut report = self.lock();
+        report.statistics = *statistics;
+        report.faults = log.counts();
+        report.entries.extend(trace.fresh());
+        let excess = report.entries.len().saturating_sub(KEPT);
+        report.entries.drain(..excess);
+        if report.problem.is_none() {
+            let problem = log.broken.as_ref().or(trace.broken.as_ref());
+            report.problem = problem.cloned();
+        }
+    }
+
+    /// How serving went so far.
+    fn statistics(&self) -> Statistics {
+        self.lock().statistics
+    }
+
+    /// Counts of faults so far.
+    fn faults(&self) -> Counts {
+        self.lock().faults
+    }
+
+    /// The account so far.
+    fn entries(&self) -> Vec<Entry> {
+        self.lock().entries.clone()
+    }
+
+    /// Why a log file ended early.
+    fn problem(&self) -> Option<String> {
+        self.lock().problem.clone()
+    }
+
+    /// Says that serving has ended.
+    fn ended(&self) {
+        self.lock().ended = true;
+        self.end.notify_all();
+    }
+
+    /// Waits for the end of serving, at most for `timeout`; whether it has come.
+    fn wait(&self, timeout: Duration) -> bool {
+        let report = self.lock();
+        let waited = self
+            .end
+            .wait_timeout_while(report, timeout, |report| !report.ended);
+        waited.unwrap_or_else(PoisonError::into_inner).0.ended
+    }
 }

@@ -3,16 +3,12 @@
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use super::Settings;
-use super::clock::Clock;
-use super::faults::{Fault, Faults};
-use super::gate::Gate;
+use super::faults::{Fault, FaultLog, Faults};
 use super::line::{Direction, Line};
-use super::log::FaultLog;
-use super::port::Port;
-use super::rig::{PERIOD, Rig};
-use super::shared::{Order, Shared, Statistics};
+use super::port::{Gate, Port};
+use super::rig::{Clock, PERIOD, Rig};
 use super::trace::{Happening, Trace};
+use super::{Order, Settings, Shared, Statistics};
 use crate::ready::Interest;
 
 /// How long a stop request may go unheard.

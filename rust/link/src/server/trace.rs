@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use sewfast_control::link::{Deframer, Fields, State};
 
-use super::clock::Clock;
+use super::rig::Clock;
 
 /// What happened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

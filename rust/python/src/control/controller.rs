@@ -8,7 +8,7 @@ use sewfast_control::{
 };
 use sewfast_core::Error;
 
-use crate::arrays::raise;
+use crate::seam::raise;
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Controller>()?;

@@ -12,8 +12,7 @@ use sewfast_core::{Error, Result};
 
 use super::controller::AnyGiven;
 use super::{Values, named};
-use crate::arrays::{array1, raise, slice};
-use crate::watch::watched;
+use crate::seam::{array1, raise, slice, watched};
 use task::{Asked, Given};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -1,22 +1,27 @@
-//! Bindings of the linear model and its fits.
+//! Bindings of the linear model, of the Hammerstein-Wiener model around it, and of their fits.
 
 use std::sync::Arc;
 
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
-use sewfast_core::lagged::Lagged;
-use sewfast_core::{Error, arx, iv, linear, linear_fit, oe};
+use pyo3::types::PyDict;
+use sewfast_core::hammerstein::{self, Knots};
+use sewfast_core::lagged::{Lagged, Lags};
+use sewfast_core::output_error::Fit;
+use sewfast_core::{Error, arx, iv, linear, oe};
 
 use super::{Kind, Model, Rows, Values};
-use crate::arrays::{Experiments, array1, array2, raise, records, rows, samples, slice};
-use crate::watch::watched;
+use crate::seam::{Experiments, array1, array2, raise, records, rows, samples, slice, watched};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<LinearModel>()?;
     module.add_class::<LinearFit>()?;
     module.add_function(wrap_pyfunction!(fit_arx, module)?)?;
     module.add_function(wrap_pyfunction!(fit_iv, module)?)?;
-    module.add_function(wrap_pyfunction!(fit_oe, module)?)
+    module.add_function(wrap_pyfunction!(fit_oe, module)?)?;
+    module.add_class::<HammersteinWiener>()?;
+    module.add_class::<HammersteinWienerFit>()?;
+    module.add_function(wrap_pyfunction!(fit_hammerstein_wiener, module)?)
 }
 
 /// A linear difference equation with offset.
@@ -99,7 +104,7 @@ impl LinearModel {
 /// A fitted linear model with the story of its fit.
 #[pyclass(frozen, module = "sewfast._core")]
 pub struct LinearFit {
-    inner: linear_fit::LinearFit,
+    inner: linear::LinearFit,
 }
 
 fit_methods!(LinearFit {
@@ -195,4 +200,140 @@ fn fit_iv(
         iv::fit(&records, na, nb, nk, offset, max_iterations, monitor)
     })?;
     Ok(LinearFit { inner })
+}
+
+/// A linear difference equation between static characteristics.
+#[pyclass(frozen, extends = Model, module = "sewfast._core")]
+pub struct HammersteinWiener {
+    inner: Arc<hammerstein::HammersteinWiener>,
+}
+
+impl Kind for HammersteinWiener {
+    type Inner = hammerstein::HammersteinWiener;
+
+    fn of(inner: Arc<Self::Inner>) -> Self {
+        Self { inner }
+    }
+}
+
+#[pymethods]
+impl HammersteinWiener {
+    #[new]
+    #[pyo3(signature = (*, na, nb, nk, input_low, input_high, input_pieces, x_low, x_high, output_pieces, theta))]
+    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+    fn new(
+        py: Python<'_>,
+        na: usize,
+        nb: usize,
+        nk: usize,
+        input_low: Values<'_>,
+        input_high: Values<'_>,
+        input_pieces: usize,
+        x_low: f64,
+        x_high: f64,
+        output_pieces: usize,
+        theta: Values<'_>,
+    ) -> PyResult<PyClassInitializer<Self>> {
+        let (low, high) = (
+            slice(&input_low, "input_low")?,
+            slice(&input_high, "input_high")?,
+        );
+        let of_inputs = |(low, high): (&f64, &f64)| Knots {
+            low: *low,
+            high: *high,
+            pieces: input_pieces,
+        };
+        let inputs: Vec<Knots> = low.iter().zip(high).map(of_inputs).collect();
+        let output = Knots {
+            low: x_low,
+            high: x_high,
+            pieces: output_pieces,
+        };
+        let theta = slice(&theta, "theta")?.to_vec();
+        Lags::new(na, nb, nk, low.len().max(high.len()))
+            .and_then(|lags| hammerstein::HammersteinWiener::new(lags, &inputs, output, theta))
+            .map(Self::wrapped)
+            .map_err(|e| raise(py, e))
+    }
+
+    #[getter]
+    fn settings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let (lags, inputs, output) = (
+            self.inner.lags(),
+            self.inner.input_knots(),
+            self.inner.output_knots(),
+        );
+        let ends = |of: fn(&Knots) -> f64| array1(py, inputs.iter().map(of).collect());
+        let settings = PyDict::new(py);
+        settings.set_item("na", lags.na)?;
+        settings.set_item("nb", lags.nb)?;
+        settings.set_item("nk", lags.nk)?;
+        settings.set_item("input_low", ends(|k| k.low))?;
+        settings.set_item("input_high", ends(|k| k.high))?;
+        settings.set_item("input_pieces", inputs[0].pieces)?;
+        settings.set_item("x_low", output.low)?;
+        settings.set_item("x_high", output.high)?;
+        settings.set_item("output_pieces", output.pieces)?;
+        Ok(settings)
+    }
+
+    fn input_curve<'py>(
+        &self,
+        py: Python<'py>,
+        input: usize,
+        u: Values<'py>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        Ok(array1(py, self.inner.input_curve(input, slice(&u, "u")?)))
+    }
+
+    fn output_curve<'py>(
+        &self,
+        py: Python<'py>,
+        x: Values<'py>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        Ok(array1(py, self.inner.output_curve(slice(&x, "x")?)))
+    }
+}
+
+/// A fitted Hammerstein-Wiener model and how the fit went.
+#[pyclass(frozen, module = "sewfast._core")]
+pub struct HammersteinWienerFit {
+    inner: Fit<hammerstein::HammersteinWiener>,
+}
+
+fit_methods!(HammersteinWienerFit {
+    #[getter]
+    fn model(&self, py: Python<'_>) -> PyResult<Py<HammersteinWiener>> {
+        HammersteinWiener::object(py, self.inner.model.clone())
+    }
+
+    #[getter]
+    fn initial_states<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let states = self.inner.initial_states.concat();
+        array2(py, states, self.inner.model.lags().na)
+    }
+});
+
+#[pyfunction]
+#[pyo3(signature = (
+    experiments, *, na, nb, nk, input_pieces, output_pieces, max_iterations = 100, progress = None
+))]
+#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+fn fit_hammerstein_wiener(
+    py: Python<'_>,
+    experiments: Experiments<'_>,
+    na: usize,
+    nb: usize,
+    nk: usize,
+    input_pieces: usize,
+    output_pieces: usize,
+    max_iterations: usize,
+    progress: Option<Bound<'_, PyAny>>,
+) -> PyResult<HammersteinWienerFit> {
+    let records = records(py, &experiments)?;
+    let pieces = (input_pieces, output_pieces);
+    let inner = watched(py, progress.as_ref(), |monitor| {
+        hammerstein::fit(&records, na, nb, nk, pieces, max_iterations, monitor)
+    })?;
+    Ok(HammersteinWienerFit { inner })
 }

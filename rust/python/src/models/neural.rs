@@ -11,8 +11,7 @@ use sewfast_core::{Error, Result};
 
 use super::linear::LinearModel;
 use super::{Kind, Model, Rows, Values};
-use crate::arrays::{Experiments, array1, array2, raise, records, rows, slice};
-use crate::watch::watched;
+use crate::seam::{Experiments, array1, array2, raise, records, rows, slice, watched};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<NeuralOE>()?;

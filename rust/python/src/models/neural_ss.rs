@@ -12,8 +12,7 @@ use sewfast_core::{Error, Result};
 
 use super::linear::LinearModel;
 use super::{Kind, Model, Rows, Values};
-use crate::arrays::{Experiment, array1, array2, raise, rows, slice};
-use crate::watch::watched;
+use crate::seam::{Experiment, array1, array2, raise, rows, slice, watched};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<NeuralSS>()?;

@@ -6,17 +6,15 @@ use numpy::{Complex64, PyReadonlyArray1};
 use pyo3::prelude::*;
 use sewfast_control::AnyDesign;
 use sewfast_core::closed_loop::{Varied, encoder};
-use sewfast_core::loop_transfer as linear;
 use sewfast_core::tune::{
     self as tuning, Aggregate, Constraints, Cost, LoadLimit, LoadStep, Parameter, Sensitivity,
     Task, Variable,
 };
-use sewfast_core::{Error, Monitor, Result};
+use sewfast_core::{Error, Monitor, Result, loop_transfer as linear};
 
-use super::super::Values;
 use super::super::controller::AnyGiven;
-use super::super::plant::{AnyPlant, Model};
-use crate::arrays::{raise, slice};
+use super::super::{AnyPlant, Model, Values};
+use crate::seam::{raise, slice};
 
 /// A variable by its name, with its bounds unless they are the usual ones.
 type Wanted = (String, Option<(f64, f64)>);

@@ -2,7 +2,7 @@
 
 use super::rig::*;
 use crate::Biquad;
-use crate::link::dice::{Dice, trials};
+use crate::link::frame::tests::{Dice, trials};
 use crate::link::identity::capability as can;
 use crate::link::{Deframer, Identity, MAX_BODY, Measurement, Reason, State};
 use std::vec::Vec;
