@@ -61,7 +61,7 @@ def test_a_model_that_runs_away_is_a_row() -> None:
     alone = sewfast.compare(unstable(), long)
     assert (alone.best, alone.to_json()["best"]) == ("", None)
     pytest.importorskip("matplotlib", reason="needs the report extra")
-    with pytest.raises(SettingError, match="run away"):
+    with pytest.raises(SettingError, match="all diverge"):
         alone.plot()
 
 

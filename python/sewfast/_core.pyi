@@ -32,7 +32,7 @@ def random_steps(
     *, duration: float, Ts: float, low: float, high: float, hold_min: float, hold_max: float,
     smoothing: float, seed: int, start: float | None = None,
 ) -> _F:
-    """Half-cosine changes of ``smoothing`` seconds; with ``start`` the signal comes from there."""
+    """Half-cosine changes of ``smoothing`` seconds; with ``start`` the signal begins there."""
 def prbs(*, duration: float, Ts: float, low: float, high: float, hold: float, seed: int) -> _F:
     """Maximum length sequence of the shortest register whose period covers the signal."""
 def multisine(
@@ -59,7 +59,7 @@ class Machine:
     """
 
     def __new__(cls, parameters: Mapping[str, float] | None = None) -> Machine:
-        """Names left out keep their defaults."""
+        """Parameters by name; others keep their defaults."""
     @staticmethod
     def default_parameters() -> dict[str, float]: ...
     @staticmethod
@@ -70,13 +70,13 @@ class Machine:
     def parameters(self) -> dict[str, float]: ...
     def reset(self) -> None: ...
     def set_load(self, torque: float) -> None:
-        """A constant load torque [N m] from now on, through resets as well; 0 takes it off."""
+        """Apply a constant load torque [N m] from now on, also after resets; 0 removes it."""
     def step(self, u: float) -> tuple[float, float]:
         """Hold ``u`` [V] for one sample; counts and true speed [RPM] at its end."""
     def run(self, u: _F) -> tuple[_F, _F]:
         """Counts and true speed [RPM] at the instants at which u(k) starts to act: entry 0 is before u[0] acts.
 
-        Goes on from the present state: call ``reset`` for a run from rest.
+        Continues from the present state: call ``reset`` for a run from rest.
         """
     def linearise(self, speed_rpm: float) -> dict[str, float]:
         """Small signals about a steady speed: command [V], current [A], gain [RPM/V], T1 and T2 [s]."""
@@ -97,9 +97,9 @@ def speed_kalman(
     counts: _F, *, Ts: float, counts_per_unit: float, process_noise: float | None = None,
     ripple_orders: Sequence[int] = ..., counts_per_rev: float = 1.0,
 ) -> _F:
-    """RTS smoother; the process noise [unit^2/s^3] is found by maximum likelihood where None.
+    """RTS smoother; the process noise [unit^2/s^3] is estimated by maximum likelihood if None.
 
-    With ``ripple_orders`` a load that repeats over the turn is modelled too, where that is likelier.
+    With ``ripple_orders`` a load that repeats over the turn is modelled too, if that is more likely.
     """
 def unwrap_counts(counts: _F, *, bits: int) -> _F: ...
 
@@ -132,7 +132,7 @@ class Tracker:
     def reset(self) -> None: ...
     def step(self, u: float, y: float) -> None: ...
     def run(self, u: _F, y: _F) -> tuple[_F, NDArray[np.bool_]]:
-        """Estimates and what has moved after each sample, (N, 4)."""
+        """Estimates, and whether each has moved, after each sample, (N, 4)."""
     @property
     def estimate(self) -> list[float]: ...
     @property
@@ -157,7 +157,7 @@ class EmbeddedModel:
 
     @property
     def parts(self) -> dict[str, _F]:
-        """Coefficients by the names of the Rust crate's ``model``; matrices row by row."""
+        """Coefficients by their names in the Rust crate's ``model``; matrices row by row."""
 
     @property
     def scaling(self) -> dict[str, _F] | None:
@@ -181,7 +181,7 @@ class Model:
     def theta(self) -> _F:
         """All parameters (docs/CONVENTIONS.md, Models)."""
     def rest_state(self) -> _F:
-        """Of a drive at rest."""
+        """State of a drive at rest."""
     def simulate(self, u: _F, state: _F) -> _F: ...
     def predict(self, u: _F, y: _F, state: _F, horizon: int) -> _F: ...
     def estimate_initial_state(self, u: _F, y: _F) -> _F:
@@ -195,7 +195,7 @@ class Model:
         input after the other [v(k-1) .. v(k-nb+1)]: n = na + nu (nb - 1). That of a state-space model is its own.
         """
     def embedded(self, *, scaled: bool = False) -> EmbeddedModel:
-        """For a microcontroller: in the data's units where ``simulate`` is, or ``scaled``."""
+        """Step for a microcontroller, in the data's units like ``simulate``, or ``scaled``."""
 
 @final
 class LinearModel(Model):
@@ -256,12 +256,12 @@ class NeuralSS(Model):
     @property
     def nk(self) -> int: ...
     def slowed(self, factor: float) -> NeuralSS:
-        """The same steady states, reached a factor more slowly."""
+        """The model with the same steady states, reached more slowly by a factor."""
     def grown(self, nx: int, hidden: int, seed: int) -> NeuralSS:
-        """The same model with more states and hidden units, from which a larger one is trained.
+        """The same model with more states and hidden units, as the start of a larger one.
 
-        It keeps all weights; what is new acts on the rest with weights of about 1e-3, so that the free run hardly
-        changes. New states come after the old ones, before an integrated one. Smaller sizes are a SettingError.
+        It keeps all weights; new units act on the rest with weights of about 1e-3, so that the free run hardly
+        changes. New states come after the old ones, before an integrated one. Smaller sizes raise a SettingError.
         """
     def states(self, u: _F, state: _F) -> _F:
         """States of the free run, (N, nx)."""
@@ -276,7 +276,7 @@ GREYBOX_UNITS: int
 
 @final
 class GreyBox(Model):
-    """A motor's equations and a network for what they leave; theta = [free parameters, (b, p, q, c) of each unit]."""
+    """A motor's equations with a network for the rest; theta = [free parameters, (b, p, q, c) of each unit]."""
 
     def __new__(
         cls, *, values: _F, free: Sequence[int], Ts: float, steps: int, mean: bool, unit: float,
@@ -309,7 +309,7 @@ class HammersteinWiener(Model):
 
 @final
 class HammersteinWienerFit:
-    """A fitted Hammerstein-Wiener model and how the fit went."""
+    """A fitted Hammerstein-Wiener model with the record of its fit."""
 
     @property
     def model(self) -> HammersteinWiener: ...
@@ -330,7 +330,7 @@ class HammersteinWienerFit:
 
 @final
 class LinearFit:
-    """A fitted linear model with the story of its fit."""
+    """A fitted linear model with the record of its fit."""
 
     @property
     def model(self) -> LinearModel: ...
@@ -352,7 +352,7 @@ class LinearFit:
     def covariance(self) -> _F:
         """Of [a, b input by input, offset] for white measurement noise, (n_theta, n_theta).
 
-        Zero for an offset that was not estimated; inf where the data do not fix the parameters.
+        Zero for an offset that was not estimated; inf if the data do not determine the parameters.
         """
     @property
     def standard_errors(self) -> _F:
@@ -360,7 +360,7 @@ class LinearFit:
 
 @final
 class NeuralFit:
-    """A trained network with the story of its training."""
+    """A trained network with the record of its training."""
 
     @property
     def model(self) -> NeuralOE: ...
@@ -373,7 +373,7 @@ class NeuralFit:
     def iterations(self) -> int: ...
     @property
     def trials(self) -> int:
-        """Steps that the chosen start tried."""
+        """Steps tried by the chosen start."""
     @property
     def termination(self) -> str: ...
     @property
@@ -383,7 +383,7 @@ class NeuralFit:
     def trace(self) -> _F: ...
     @property
     def start(self) -> int:
-        """Which of the starts was chosen."""
+        """Index of the chosen start."""
     @property
     def start_costs(self) -> _F:
         """J that each start was judged by: on validation data, else on training data; inf: failed."""
@@ -395,7 +395,7 @@ class NeuralFit:
         """Models of all starts with a finite cost, sound ones first, then by cost: an ensemble."""
     @property
     def sound(self) -> bool:
-        """The model passes the guard on the training data (see `guard`); else no start's does."""
+        """Whether the model passes the guard on the training data (see `guard`); if not, no start does."""
     @property
     def initial_states(self) -> _F:
         """Past outputs before the first simulated sample of each training experiment, newest first, (n_experiments, na)."""
@@ -411,7 +411,7 @@ def fit_iv(
 
 @final
 class NeuralSSFit:
-    """A trained state-space model with the story of its training."""
+    """A trained state-space model with the record of its training."""
 
     @property
     def model(self) -> NeuralSS: ...
@@ -431,7 +431,7 @@ class NeuralSSFit:
     def trace(self) -> _F: ...
     @property
     def start(self) -> int:
-        """Which of these starts was chosen, counted from 0."""
+        """Index of the chosen one of these starts, from 0."""
     @property
     def start_costs(self) -> _F:
         """J that each start was judged by: on validation data, else on training data; inf: failed."""
@@ -443,13 +443,13 @@ class NeuralSSFit:
         """Models of all starts with a finite cost, sound ones first, then by cost: an ensemble."""
     @property
     def start_models(self) -> list[NeuralSS | None]:
-        """The model of each start, in the order of the starts; None: failed, or not begun before Ctrl-C."""
+        """The model of each start, in order; None: failed, or not begun before Ctrl-C."""
     @property
     def sounds(self) -> list[bool]:
-        """Whether each start's model passes the guard on the training data; all True where it was not asked."""
+        """Whether each start's model passes the guard on the training data; all True if it was not applied."""
     @property
     def sound(self) -> bool:
-        """The same of the chosen model; else no start's does."""
+        """The same for the chosen model; if False, no start passes."""
     @property
     def initial_states(self) -> _F:
         """State of each training experiment, (n_experiments, nx)."""
@@ -462,9 +462,9 @@ def fit_oe(
     experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool = True,
     max_iterations: int = 100, initial: LinearModel | None = None, progress: _Progress = None,
 ) -> LinearFit:
-    """Output error. ``initial``, of these orders, takes the place of the search over many starts.
+    """Output error. ``initial``, of these orders, replaces the search over many starts.
 
-    Ctrl-C gives the best model so far as "interrupted"; its initial states and cost may then be those of an excerpt.
+    Ctrl-C gives the best model so far as "interrupted"; its initial states and cost can then be those of an excerpt.
     """
 def fit_neural_oe(
     experiments: _Experiments, validation: _Experiments, *, na: int, nb: int, nk: int, hidden: int,
@@ -473,13 +473,13 @@ def fit_neural_oe(
     weight_decay: float, max_iterations: int, starts: int, seed: int, threads: int,
     initial_theta: _F | None = None, progress: _Progress = None,
 ) -> NeuralFit:
-    """Train in free run; chosen by J on ``validation``, without it by J on the training data.
+    """Train in free run; the start is chosen by J on ``validation``, or on the training data without it.
 
     With ``linear``, of the same orders, the network gets a bypass and starts exactly there; without, small random
     weights and no bypass. ``saturate`` widens the training output's range by that fraction (half at each end) and
-    clips the output there, without slope outside; None leaves it linear. ``threads = 0`` takes all; the bits do not
+    clips the output there, without slope outside; None leaves it linear. ``threads = 0`` uses all; the bits do not
     depend on it. ``initial_state`` 'measured' starts each run after its first na samples.
-    ``initial_theta``, in scaled units, is where the starts begin instead of a draw, (starts, n_theta).
+    ``initial_theta``, in scaled units, replaces the random starts, (starts, n_theta).
     """
 
 def fit_neural_ss(
@@ -494,22 +494,22 @@ def fit_neural_ss(
     y is (N,) or (N, ny); NaN in it has no weight. Scaled units are means and standard deviations of the training data;
     with output 'abs' y_mean is 0 and y_scale the root mean square. ``linear`` has na = nx, nb <= nx + 1 and the same nk;
     without it a start begins with random states. Start i of the seed is ``first_start + i`` here: starts spread over
-    several calls, or over threads (0 takes all), have the same bits. With ``initial`` nothing is drawn: start i trains
+    several calls, or over threads (0 uses all), have the same bits. With ``initial`` nothing is drawn: start i trains
     the i-th of these models further, in their scaling; they are of one shape and as many as ``starts``.
-    ``guard`` asks `guard` of each start's model on these experiments, with ``linear``; short pieces of records say
-    little there, so that a search on pieces leaves it out and asks it of whole records itself.
+    ``guard`` applies `guard` to each start's model on these experiments, with ``linear``; on short pieces of records it
+    has little power, so that a search on pieces leaves it out and applies it to whole records.
     """
 
 def guard(
     model: LinearModel | NeuralOE | NeuralSS, experiments: _Experiments, *, linear: Sequence[LinearModel] = ...,
 ) -> str:
-    """Why the model is not sound on these whole records, in words that follow "the model"; "" where it is.
+    """The reason why the model is not sound on these whole records, to follow "the model"; "" for a sound one.
 
-    It must have a finite free run, keep within a width of the output's range on inputs a quarter larger, forget its
-    initial state, stay near the range with its inputs' blocks in another order, and then be where it was in the
-    record's order (8 blocks of 100 samples or more). Where the ``linear`` models of the same records do more of
-    these, 1.5 times of what they do is allowed. An integrator is asked the first two only; it has to move at speeds
-    like its record's. Of an experiment the first 20,000 samples count. Ctrl-C raises KeyboardInterrupt.
+    It must have a finite free run, stay within a width of the output's range on inputs a quarter larger, forget its
+    initial state, stay near the range with its inputs' blocks in another order, and then agree with the run in the
+    record's order (8 blocks of 100 samples or more). If the ``linear`` models of the same records deviate more, 1.5
+    times their deviation is allowed. An integrator only has to pass the first two tests, and to move at speeds like
+    its record's. Of an experiment the first 20,000 samples count. Ctrl-C raises KeyboardInterrupt.
     """
 
 # --- least_squares.rs --------------------------------------------------------------------------------------
@@ -519,7 +519,7 @@ def least_squares_fit(
     lower: _F | None, upper: _F | None, x_scale: _F | None, ftol: float, xtol: float, gtol: float,
     max_nfev: int, precision: float,
 ) -> dict[str, Any]:
-    """``first`` is fun(x0); jac gets x and fun(x). Ctrl-C ends it as "interrupted", other exceptions pass."""
+    """``first`` is fun(x0); jac gets x and fun(x). Ctrl-C ends it as "interrupted"; other exceptions propagate."""
 
 # --- control.rs -------------------------------------------------------------------------------------------
 
@@ -531,7 +531,7 @@ def convert_gains(
 
 @final
 class SingleController:
-    """The controller's arithmetic in single precision, as a microcontroller has it."""
+    """The controller's arithmetic in single precision, as on a microcontroller."""
 
     def step(self, r: float, y: float, feedforward: float = 0.0) -> float: ...
     def set_design(self, other: SingleController) -> None:
@@ -546,7 +546,7 @@ class SingleController:
     def filtered(self) -> float: ...
     @property
     def numbers(self) -> dict[str, Any]:
-        """What the step computes with: as ``Controller.numbers``, in single precision."""
+        """The constants of the step: as ``Controller.numbers``, in single precision."""
 
 def biquad(kind: str, numbers: Sequence[float], *, Ts: float) -> tuple[float, float, float, float]:
     """c0, c1, a1, a2 of 1 + (1 - q)(c0 + c1 q)/(1 + a1 q + a2 q^2), q = 1/z: a ``notch`` (frequency [Hz], depth, width), ``low_pass``
@@ -568,10 +568,10 @@ class Controller:
 
     def step(self, r: float, y: float, feedforward: float = 0.0) -> float: ...
     def set_design(self, other: Controller) -> None:
-        """Take over the other one's settings without a bump; its sample time must be this one's."""
+        """Adopt the other controller's settings without a bump; both need the same sample time."""
 
     def set_manual(self, u: float) -> None:
-        """From the next sample on the command is ``u``, within the limits."""
+        """Make the command ``u`` from the next sample on, within the limits."""
 
     def set_automatic(self) -> None: ...
     @property
@@ -586,7 +586,7 @@ class Controller:
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What the step computes with: gains per sample, filters, limits; ``rows`` of the schedule have speed, Kp,
+        """The constants of the step: gains per sample, filters, limits; ``rows`` of the schedule have speed, Kp,
         Kp Ts/Ti, Td and one over the distance to the next."""
 
 @final
@@ -614,17 +614,17 @@ class StateFeedback:
     def reset(self) -> None: ...
     @property
     def filtered(self) -> float:
-        """The output as observed, at the last step."""
+        """The observer's output at the last step."""
 
     def single(self) -> SingleStateFeedback:
         """The same gains, rounded to single precision; at rest."""
 
     def sent(self) -> list[float]:
-        """The numbers that a device is sent."""
+        """The numbers sent to a device."""
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What the step computes with: num, den, K, L, rest (the states at an output of 1), Kr, Ki, lead."""
+        """The constants of the step: num, den, K, L, rest (the states at an output of 1), Kr, Ki, lead."""
 
 _Controller: TypeAlias = Controller | StateFeedback
 
@@ -639,7 +639,7 @@ def closed_loop(
     ``feedforward`` is added to the command before its limits, ``disturbance`` behind them; both (N,) [u].
 
     ``counts_per_unit`` is counts per (output unit x second); 0 feeds the plant's output back unquantised.
-    A virtual machine brings its own encoder. The controller passed in is not stepped. A loop that diverges
+    A virtual machine uses its own encoder. The controller passed in is not stepped. A loop that diverges
     is a FitError.
     """
 
@@ -651,7 +651,7 @@ def cost_terms(
 _Variable: TypeAlias = tuple[str, tuple[float, float] | None]
 
 class _Limits(TypedDict):
-    """Ms of the linear plants, overshoot [%], |u|, recovery [ms], load [y]; a controller stands for what it does on each plant as it is."""
+    """Ms of the linear plants, overshoot [%], |u|, recovery [ms], load [y]; a controller stands for its own figures on each plant."""
 
     Ms: float | None
     overshoot: float | None
@@ -660,10 +660,10 @@ class _Limits(TypedDict):
     load: float | _Controller | None
 
 class _Task(TypedDict):
-    """What is tuned on what.
+    """A tuning problem: controller, plants, references, cost and variables.
 
-    Every plant is taken in every variation (gain, extra delay in samples). Load steps are (reference, disturbance, band [y],
-    samples of the mean). ``variables`` are (name, bounds or None); none at all stands for the usual ones. Weights left out of ``cost``
+    Every plant is used in every variation (gain, extra delay in samples). Load steps are (reference, disturbance, band [y],
+    samples of the mean). ``variables`` are (name, bounds or None); an empty list means the usual ones. Weights missing from ``cost``
     keep their defaults. ``linear_plants`` are (num, den) in powers of z^-1, ``measured`` ones
     (omega [rad/s], responses, radii of their circles, whether the output was counted). ``disturbances`` are commands behind the limits, one
     for each reference or none at all.
@@ -709,7 +709,7 @@ def pareto(
 def fit_fopdt(u: _F, y: _F, *, Ts: float) -> dict[str, Any]:
     """K, T [s], L [s], offset, u_low, u_high, fit_percent, from a step response (paper Eq. 10-11).
 
-    K_se, T_se, L_se: standard errors; limited: samples on a limit of the output; moving: not from rest.
+    K_se, T_se, L_se: standard errors; limited: samples on a limit of the output; moving: whether it did not start at rest.
     """
 
 def table_1(K: float, T: float, L: float, *, nearest: bool = False) -> dict[str, float]:
@@ -736,10 +736,10 @@ def amigo(K: float, T: float, L: float) -> dict[str, float]:
 
 @final
 class LoopPath:
-    """What of a controller lies in the loop: gains in standard form, derivative filter, feedback filters.
+    """The parts of a controller within the loop: gains in standard form, derivative filter, feedback filters.
 
-    ``encoder``: the output is measured as a mean over the sample before. ``slope`` [u/y] is added to the
-    proportional gain: what a gain schedule makes of ``-Kp alpha r``.
+    ``encoder``: the output is measured as a mean over the previous sample. ``slope`` [u/y] is added to the
+    proportional gain: the effect of a gain schedule on ``-Kp alpha r``.
     """
 
     def __new__(
@@ -773,25 +773,25 @@ def search_least(
     function: Callable[[_F], float], dimensions: int, *, method: str, evaluations: int, seed: int,
     start: Sequence[float] | None = None, tolerance: float = 1e-8,
 ) -> dict[str, Any]:
-    """x, value, trace of the least value of a function over the unit box; what it raises ends the search."""
+    """x, value, trace of the least value of a function over the unit box; an exception of it ends the search."""
 
 def search_front(
     function: Callable[[_F], Sequence[float]], dimensions: int, objectives: int, *, size: int, evaluations: int,
     seed: int,
 ) -> dict[str, Any]:
-    """points and values of a front of least values over the unit box (NSGA-II)."""
+    """points and values of a Pareto front of least values over the unit box (NSGA-II)."""
 
 # --- link.rs: see docs/PROTOCOL.md ------------------------------------------------------------------------
 
 def link_frame(kind: int, tag: int, sequence: int, time: int, body: bytes) -> bytes:
-    """A frame as it is sent, with its closing zero; a body of more than 231 bytes is a SettingError."""
+    """A frame as sent, with its closing zero; a body of more than 231 bytes raises a SettingError."""
 
 @final
 class LinkBodies:
     """The bodies of a host's frames, and of a device's replies (docs/PROTOCOL.md).
 
-    Numbers beyond single precision become infinite. A body of more than 231 bytes is a SettingError.
-    What reads a reply returns None where that is too short, or no such thing.
+    Numbers beyond single precision become infinite. A body of more than 231 bytes raises a SettingError.
+    Functions that read a reply return None if it is too short or of another kind.
     """
 
     VERSION: int
@@ -811,7 +811,7 @@ class LinkBodies:
     def credit(watchdog: int, until: int) -> bytes: ...
     @staticmethod
     def limits(values: Sequence[float]) -> bytes:
-        """Volt, speed, acceleration, current; zeros ask for those in force."""
+        """Volt, speed, acceleration, current; zeros query the present ones."""
     @staticmethod
     def upload(table: int, offset: int, values: bytes) -> bytes: ...
     @staticmethod
@@ -831,10 +831,10 @@ class LinkBodies:
     def start(mode: int, watchdog: int, at: int, length: int, mask: int, batch: int) -> bytes: ...
     @staticmethod
     def reply(body: bytes) -> tuple[int, int, bytes] | None:
-        """Sequence, result, and what is behind them."""
+        """Sequence, result, and the rest of the body."""
     @staticmethod
     def detail(rest: bytes) -> int | None:
-        """Of a refusal."""
+        """Detail of a refusal."""
     @staticmethod
     def greeting(
         body: bytes,
@@ -878,48 +878,48 @@ _Anomaly: TypeAlias = Literal[
 class LinkClient:
     """A session with a device as bytes and times: it has neither port nor clock (docs/PROTOCOL.md).
 
-    Times of the host are in microseconds of a clock that does not run backwards. Feed it what came, see what expired, write
+    Times of the host are in microseconds of a monotonic clock. Feed it received bytes, ask it for expired commands, and write
     what it transmits, by ``due`` at the latest. Samples, counters and anomalies are those of ``LinkReceiver``.
     """
 
     def __new__(cls, session: int) -> LinkClient: ...
     def set_watchdog(self, us: int) -> None:
-        """For how long the device may go on without a heartbeat; STOP is repeated for as long at least."""
+        """Time for which the device continues without a heartbeat; STOP is repeated for at least as long."""
     def receive(
         self, now_us: int, data: bytes
     ) -> tuple[list[tuple[int, int, int, bytes, int, int]], list[tuple[int, int, int, int, int, float, int]], bool]:
         """Replies (kind, result, detail, body, device's time, when the command was sent first), events (code, state, reason,
         run, samples, value, device's time), and whether all that came is of the boot that was greeted."""
     def greet(self, patience_us: int) -> None:
-        """Puts HELLO under way, before anything else, for so long."""
+        """Starts sending HELLO, before anything else, for this time."""
     def end_greeting(self) -> None: ...
     def begin(self, kind: int, body: bytes) -> None:
-        """Puts a command under way; SettingError for a body of more than 231 bytes."""
+        """Starts sending a command; SettingError for a body of more than 231 bytes."""
     def forget(self) -> None:
-        """Ends the command under way."""
+        """Ends the pending command."""
     def expire(self, now_us: int) -> tuple[int, int, int, int] | None:
-        """Kind, attempts, microseconds waited and other frames that came, of what was repeated in vain."""
+        """Kind, attempts, microseconds waited and other received frames, for a command without a reply."""
     def transmit(self, now_us: int) -> bytes:
-        """The frame under way, where it is new or to be repeated; empty otherwise."""
+        """The pending frame, if it is new or due for repetition; empty otherwise."""
     def keep(self, now_us: int) -> bytes:
         """A heartbeat."""
     def drive(self, now_us: int, u: float) -> bytes:
-        """The command of a direct run [V]; a heartbeat too."""
+        """The command of a direct run [V]; also a heartbeat."""
     def grant(self, now_us: int, until_us: int) -> bytes:
-        """The time of a device on credit may advance so far; a heartbeat too."""
+        """Lets the time of a device on credit advance to this value; also a heartbeat."""
     def go_on(self, command: int, heartbeat: int) -> None:
-        """Goes on after these numbers, which somebody else has reached; what came meanwhile is not missing."""
+        """Continues after these numbers, reached by another client; frames received meanwhile are not missing."""
     @property
     def is_busy(self) -> bool: ...
     @property
     def due(self) -> int | None:
-        """When ``transmit`` or ``expire`` is to be called at the latest; None while nothing is under way."""
+        """Latest time for calling ``transmit`` or ``expire``; None if nothing is pending."""
     @property
     def newest(self) -> int:
-        """Greatest time that any of the device's frames carried [us]."""
+        """Largest time in any of the device's frames [us]."""
     @property
     def heard(self) -> int | None:
-        """When any of its frames came last."""
+        """Time of its last received frame."""
     @property
     def sequences(self) -> tuple[int, int]:
         """Numbers of the last command and of the last heartbeat."""
@@ -933,7 +933,7 @@ class LinkClient:
 class LinkReceiver:
     """Receives what a device sends. Damaged, repeated and late frames are counted, listed and not used.
 
-    What is kept for a caller that takes nothing is bounded: 131,072 samples and 16,384 anomalies.
+    At most 131,072 samples and 16,384 anomalies are kept until the caller takes them.
     """
 
     def __new__(cls) -> LinkReceiver: ...
@@ -942,12 +942,12 @@ class LinkReceiver:
     def feed(self, data: bytes) -> list[tuple[int, int, int, int, bytes]]:
         """Whole frames in order, as kind, tag, sequence, time [us], body.
 
-        Samples are not among them, save before ``expect``.
+        Samples are not among them, except before ``expect``.
         """
     def take(self) -> tuple[NDArray[np.int64], list[_F]]:
         """Device times [us] (N,) and one column per channel (N,), in its unit, since the last call.
 
-        Counts go on beyond 32 bits; they start anew after a reset of the device.
+        Counts continue beyond 32 bits; they restart after a reset of the device.
         """
     @property
     def counters(self) -> dict[str, int]:
@@ -969,19 +969,19 @@ class LinkUpload:
 
     @staticmethod
     def commands(values: _F, steps_per_unit: int, limit: float) -> LinkUpload:
-        """Rounded to steps of the device's command channel, and not beyond ``limit`` after that."""
+        """Rounded to steps of the device's command channel, then limited to ``limit``."""
     @staticmethod
     def references(values: _F, limit: float) -> LinkUpload:
-        """In single precision, and not beyond ``limit``."""
+        """In single precision, limited to ``limit``."""
     @property
     def end(self) -> int:
-        """How many values the device has."""
+        """Number of values on the device."""
     @property
     def is_whole(self) -> bool: ...
     def piece(self, room: int) -> bytes | None:
-        """Body of the next UPLOAD, where a full frame or the rest has room."""
+        """Body of the next UPLOAD, if there is room for a full frame or the rest."""
     def answered(self, result: int, detail: int, body: bytes) -> bool:
-        """Takes the reply to an UPLOAD: its end, or where the device wants to go on. False where it refuses the values."""
+        """Processes the reply to an UPLOAD: its end, or the device's next position. False if it refuses the values."""
 
 # --- host_loop.rs -----------------------------------------------------------------------------------------
 
@@ -1011,8 +1011,8 @@ class DeviceServer:
         baud: int | None, faults: str, seed: int, once: bool, duration: float | None, fault_log: Path | None,
         trace: Path | None,
     ) -> DeviceServer:
-        """Opens the port; raises LinkError where it cannot. ``link`` is of a pty, ``address`` of TCP,
-        ``anyone`` lets it be one that other computers reach."""
+        """Opens the port; raises LinkError if that fails. ``link`` is for a pty, ``address`` for TCP;
+        ``anyone`` allows an address that other computers can reach."""
     @property
     def port(self) -> str: ...
     def wait(self, timeout: float) -> bool:

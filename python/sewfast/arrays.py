@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import DataError
+from .errors import DataError, SettingError
 from .units import spelled
 
 # --- Names and units of columns -------------------------------------------------------------------
@@ -52,10 +52,23 @@ def in_unit(number: str, unit: str) -> str:
     return f"{number} {unit}" if unit else number
 
 
-# --- What a caller hands over -> read-only columns of float64 -------------------------------------
+# --- Arguments -> read-only columns of float64 ----------------------------------------------------
 
 
 FloatArray: TypeAlias = NDArray[np.float64]
+
+
+def is_whole(value: object) -> TypeGuard[int]:
+    """Whether a value is a whole number of Python or NumPy; True and False are none."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def require_whole(name: str, value: object, low: int, high: int) -> None:
+    """Raise `SettingError` for anything but an `int` from `low` to `high`."""
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise SettingError(
+            name=name, expected=f"a whole number from {low} to {high}", received=repr(value)
+        )
 
 
 def as_float(values: ArrayLike, what: str) -> FloatArray:

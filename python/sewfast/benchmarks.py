@@ -14,8 +14,6 @@ from .dataset import Dataset, Experiment
 from .errors import DataError, SettingError, not_installed
 
 PACKAGE = "nonlinear_benchmarks"
-TESTED_VERSION = "1.0.1"
-"""Version of the package with the windows of docs/BENCHMARKS.md."""
 
 _NAMES = {
     "coupled_drives": "CED",

@@ -90,7 +90,7 @@ class Comparison(Plotted):
     def drawing(self) -> Drawing:
         """Draw the measured output, every free run over it, and their errors below."""
         if not self._scored:
-            raise SettingError("expected a model that stays bounded on these data; all run away")
+            raise SettingError("expected a model that stays bounded on these data; all diverge")
         found = {name: self[name] for name in self._scored}
         first = found[self._scored[0]]
         panels = fit_panels(
@@ -124,7 +124,7 @@ class Comparison(Plotted):
     def _caption(self) -> str:
         scored = next((v for v in self.validations if v is not None), None)
         if scored is None:
-            return "every model runs away on these data"
+            return "every model diverges on these data"
         data = ", ".join(f"{e.name} [{e.range_text}]" for e in scored.experiments)
         several = "model" if len(self) == 1 else "models"
         return f"{len(self)} {several} on {data}, {scored.n} samples scored"

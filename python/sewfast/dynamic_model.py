@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import storage
+from .arrays import is_whole
 from .dataset import (
     Dataset,
     Experiment,
@@ -52,8 +53,7 @@ class FreeRunJacobian(NamedTuple):
 
 def require_init(init: int) -> None:
     """Raise a `SettingError` unless `init` is a whole number of samples."""
-    whole = isinstance(init, (int, np.integer)) and not isinstance(init, bool)
-    if not whole or init < 0:
+    if not is_whole(init) or init < 0:
         raise SettingError(f"init: expected a whole number of 0 or more, received {init!r}")
 
 
@@ -84,22 +84,8 @@ class Core(Protocol):
 class DynamicModel(ABC):
     """A model of one plant that can run, in the units of the data it was identified from.
 
-    The interface for validation and evidence; users have a `sewfast.Model`, which builds on them.
-
-    Parameters
-    ----------
-    core : compiled model
-        The compiled arithmetic; `sewfast.run` and `sewfast.tune` use it as a plant.
-    Ts : float
-        Sample time [s].
-    input_names, input_units, output_name, output_unit
-        As in the data set.
-    counts : tuple (column, counts_per_rev) or None
-        Set if the output is a speed computed from encoder counts.
-    training : mapping
-        Provenance: data, settings, cost with its horizon, termination. JSON values only.
-    alternatives : tuple of Model
-        The next choices of `identify`, best first; not written to the model's file.
+    The interface for validation and evidence; users have a `sewfast.Model`, which builds on them
+    and documents the parameters.
     """
 
     core: Any
@@ -209,7 +195,7 @@ class DynamicModel(ABC):
         SettingError
             For an initial state together with a data set, whose outputs determine it.
         FitError
-            Where the model is unstable on this input.
+            If the model is unstable on this input.
 
         Examples
         --------
@@ -410,7 +396,7 @@ class DynamicModel(ABC):
         Raises
         ------
         ModelFileError
-            Where the file cannot be written.
+            If the file cannot be written.
         """
         storage.write(path, FORMAT, VERSION, self.to_dict())
 
@@ -473,7 +459,7 @@ def _require_no_state(initial_state: ArrayLike | None) -> None:
         )
 
 
-# --- Why `identify` chose the model, as a table for `print` ---------------------------------------
+# --- The choice of `identify` as a table for `print` ----------------------------------------------
 
 
 _COLUMNS = 5

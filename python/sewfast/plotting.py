@@ -109,7 +109,7 @@ def style() -> Iterator[None]:
     """The look of figures drawn and saved inside the `with` block."""
     import matplotlib
 
-    # only the latest matplotlib has a type of its own for the keys
+    # only the latest matplotlib has a type for the keys
     settings: Any = _STYLE | {"svg.hashsalt": "sewfast"}
     with matplotlib.rc_context(settings):
         yield

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import _core
-from .arrays import FloatArray
+from .arrays import FloatArray, is_whole
 from .errors import SettingError
 
 #: Sample time of every named signal [s].
@@ -370,6 +370,6 @@ def _named(table: Mapping[str, Signal], kind: str, name: str) -> Signal:
 
 
 def _checked(seed: int) -> int:
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**64:
+    if not is_whole(seed) or not 0 <= seed < 2**64:
         raise SettingError(f"expected a seed of 0 to 2^64 - 1, got {seed!r}; give a whole number")
     return int(seed)

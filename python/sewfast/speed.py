@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import _core
-from .arrays import FloatArray, runs
+from .arrays import FloatArray, is_whole, runs
 from .errors import DataError, SettingError
 from .units import counts_per_unit
 
@@ -216,7 +216,7 @@ def _column(values: ArrayLike, name: str = "counts") -> FloatArray:
 
 
 def _whole(name: str, value: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+    if not is_whole(value):
         raise SettingError(f"expected {name} as a whole number, got {value!r}; give an int")
     if not 0 <= value < 2**32:
         raise SettingError(f"expected {name} of 0 to 2^32 - 1, got {value}; see the docstring")

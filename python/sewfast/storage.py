@@ -203,7 +203,7 @@ def _parse(path: str | os.PathLike[str], text: str) -> Any:
         )
     except (ValueError, RecursionError) as error:
         raise ModelFileError(
-            f"{path}: expected a whole JSON file, got a damaged one ({error}); save it again"
+            f"{path}: expected a complete JSON file, got a damaged one ({error}); save it again"
         ) from error
 
 

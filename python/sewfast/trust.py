@@ -31,24 +31,24 @@ from .gains import real
 from .models import Model
 from .units import revolutions_per_second
 
-# --- Disagreement: how far members of an ensemble part under one controller and reference ---------
+# --- Disagreement of an ensemble's members under one controller and reference ---------------------
 
 
 @dataclass(frozen=True)
 class Disagreement:
-    """Members on one reference.
+    """Disagreement of the plants on one reference.
 
     Attributes
     ----------
     reference, plant : str
         The reference, and the member farthest from the median.
     plants : int
-        How many were compared.
+        Number of plants compared.
     rms : float
-        Rms distance of that member's output from the median of all, sample by sample [y]; of two
-        it is half of their distance.
+        Rms distance of that member's output from the median of all, sample by sample [y]; for two
+        plants, half of their distance.
     span : float
-        Of the reference [y].
+        Span of the reference [y].
     """
 
     reference: str
@@ -64,12 +64,12 @@ class Disagreement:
 
 
 def disagreements(runs: Sequence[ClosedLoopRun]) -> tuple[Disagreement, ...]:
-    """Runs of one controller over the same reference on several plants, compared.
+    """Compare runs of one controller over the same reference on several plants.
 
     Parameters
     ----------
     runs : sequence of ClosedLoopRun
-        Those that stand alone are not compared.
+        Single runs without another to compare with are ignored.
     """
     groups: dict[tuple[SampledController, str, bytes], list[ClosedLoopRun]] = {}
     for run in runs:
@@ -93,31 +93,31 @@ def _of(group: list[ClosedLoopRun]) -> Disagreement:
     )
 
 
-# --- `Oscillation`: does a loop swing by itself where its reference is constant? ------------------
+# --- `Oscillation`: self-excited oscillation at constant reference --------------------------------
 
 
 SETTLING = 0.4
-"""Part of a constant stretch that belongs to what came before."""
+"""Share of a constant stretch that counts as settling after the change before it."""
 LEAST_SAMPLES = 100
-"""Of what is judged of a stretch: less says nothing about what lasts."""
+"""Least samples of the rest of a stretch."""
 LEAST_PERIODS = 5.0
 LASTING = 0.5
-"""Second half over first half [rms] from which on an oscillation does not die away."""
+"""Least rms of the second half relative to the first for an oscillation that does not decay."""
 SHAFT_ORDERS = (1, 2, 3, 4)
 LEAST_TURNS = 3.0
-"""Periods of an order within a stretch from which on it can be told from a trend."""
+"""Least periods of an order within a stretch: fewer cannot be distinguished from a trend."""
 
 
 @dataclass(frozen=True)
 class Oscillation:
-    """What a loop does at constant reference, at the stretch where it swings most.
+    """The oscillation of a loop at constant reference, on the stretch where it is largest.
 
     Attributes
     ----------
     command, output : float
-        Rms about a straight line, without what repeats with the shaft's turn [u], [y].
+        Rms about a straight line, without the shaft's orders [u], [y].
     swing : float
-        `command` over half the command's range (where it has none: over its largest size).
+        `command` over half the command's range (without limits: over its largest magnitude).
     ripple : float
         `output` over the largest reference.
     level : float
@@ -138,13 +138,13 @@ class Oscillation:
 
 
 def oscillation(run: ClosedLoopRun) -> Oscillation | None:
-    """The worst oscillation of a run at constant reference; None where no stretch is long enough.
+    """The worst oscillation of a run at constant reference; None if no stretch is long enough.
 
-    A limit cycle is an oscillation of the loop's own making that lasts: neither the way to a new
-    level, nor a swing that dies away, nor the answer to a load that repeats with the shaft's turn.
-    So the first `SETTLING` of each constant stretch is left out, the rest is freed of a straight
-    line and, where the output is a speed, of the shaft's orders `SHAFT_ORDERS`. What the encoder's
-    steps and noise put into the command stays in: it is told from a limit cycle by its size.
+    A limit cycle is a lasting oscillation caused by the loop itself: not the transition to a new
+    level, not a decaying oscillation, and not the response to a load over the shaft's turn. So the
+    first `SETTLING` of each constant stretch is left out, and a straight line is removed from the
+    rest and, if the output is a speed, the shaft's orders `SHAFT_ORDERS`. The effect of the
+    encoder's steps and of noise stays in: it is smaller than a limit cycle.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def oscillation(run: ClosedLoopRun) -> Oscillation | None:
 
 
 def _constant(run: ClosedLoopRun) -> Iterator[slice]:
-    """The judged parts of the stretches of constant reference without missing samples."""
+    """The stretches of constant reference without missing samples, after settling."""
     known = np.isfinite(run.u) & np.isfinite(run.y)
     still = np.concatenate([[False], np.diff(run.r) == 0.0]) & known
     still[1:] &= known[:-1]
@@ -183,7 +183,7 @@ def _oscillation_of(run: ClosedLoopRun, part: slice) -> Oscillation:
 
 
 def _forced(run: ClosedLoopRun, part: slice) -> FloatArray:
-    """What may be taken off, as columns: a straight line and the shaft's orders, shape (n, c)."""
+    """Columns of the regressors to remove: a straight line and the shaft's orders, shape (n, c)."""
     n = part.stop - part.start
     columns = [np.ones(n), np.linspace(-1.0, 1.0, n)]
     per_unit = revolutions_per_second(run.units["y"])
@@ -212,7 +212,7 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-# --- `Limits`: the bounds that loops are judged by ------------------------------------------------
+# --- `Limits` of the judgement --------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -253,7 +253,7 @@ class Limits:
             object.__setattr__(self, each.name, value)
 
 
-# --- `Judgement`: what speaks against a set of closed loops, one line per guard -------------------
+# --- `Judgement`: doubts about a set of closed loops, one line per check --------------------------
 
 
 FORMAT = "sewfast.judgement"
@@ -262,18 +262,18 @@ VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class JudgedRun:
-    """One run and what was seen in it.
+    """One run with its figures.
 
     Attributes
     ----------
     run : ClosedLoopRun
     outside, farthest : float
-        Share of the samples outside the training region, and the largest distance over the
-        region's radius; NaN where no region is known.
+        Share of the samples outside the training region, and the largest distance relative to the
+        region's radius; NaN without a known region.
     saturated : float
         Share of the samples with the command at a limit.
     oscillation : Oscillation or None
-        None where no stretch of constant reference is long enough.
+        None if no stretch of constant reference is long enough.
     """
 
     run: ClosedLoopRun
@@ -324,7 +324,7 @@ class Judgement(VerdictTable):
 
     @property
     def title(self) -> str:
-        """How many runs of which references."""
+        """Number of runs, and their references."""
         names = ", ".join(dict.fromkeys(r.run.reference for r in self.runs))
         return f"{len(self.runs)} run{'s' if len(self.runs) > 1 else ''} of {names}"
 
@@ -346,7 +346,7 @@ class Judgement(VerdictTable):
         }
 
 
-# --- The lines of a judgement: from what was seen in runs to limits, verdicts and sentences -------
+# --- The lines of a judgement: verdicts and sentences from the figures and limits -----------------
 
 
 FAR = 0.2
@@ -425,7 +425,7 @@ def limit_cycle(runs: Sequence[JudgedRun], limits: Limits) -> Line:
 
 
 def disagreement(found: Sequence[Disagreement], limits: Limits, unit: str) -> Line:
-    """Do models of the same plant promise the same?"""
+    """Do models of the same plant predict the same?"""
     name, limit = "disagreement", f"<= {100 * limits.disagreement:g} % of the reference's span"
     if not found:
         text = "one plant alone does not show how far its prediction may be off; tune on several"
@@ -444,11 +444,11 @@ def disagreement(found: Sequence[Disagreement], limits: Limits, unit: str) -> Li
     return Line(name, worst.share, shown, limit, "fail", text)
 
 
-# --- judge: closed loops held against limits; a refusal where members of an ensemble disagree -----
+# --- judge ----------------------------------------------------------------------------------------
 
 
 class HasController(Protocol):
-    """What came with a controller, as from `tune` or `commission`."""
+    """A result with a controller, as from `tune` or `commission`."""
 
     @property
     def controller(self) -> SampledController | None: ...
@@ -468,33 +468,32 @@ def judge(
     seed: int = 0,
     refuse: bool = True,
 ) -> Judgement:
-    """Hold simulated or measured closed loops against limits.
+    """Compare simulated or measured closed loops with limits.
 
-    - `training region`: the share of samples unlike any that the model was trained on. A measured
-      run is placed by its command: where would it lead the model?
+    - `training region`: the share of samples outside the model's training region. A measured run is
+      located by the response of the model to its command.
     - `saturation`: the share of samples with the command at a limit.
-    - `limit cycle`: a lasting oscillation of the loop's own making at constant reference
+    - `limit cycle`: a lasting oscillation caused by the loop itself at constant reference
       (`sewfast.trust.oscillation`).
-    - `disagreement`: how far plants part that ran the same reference under the same controller.
+    - `disagreement`: the distance between plants on the same reference under the same controller.
 
     Parameters
     ----------
     what : ClosedLoopRun, sequence of them, Controller, TuningResult or Commissioning
-        Runs as they are; a controller, or what `tune` or `commission` found, is run on every plant
-        of `on`.
+        Runs are judged as they are; a controller, or that of a result, is run on every plant of
+        `on`.
     on : Model, VirtualMachine or sequence of them, optional
-        The plants of a controller, every member of an ensemble one of them; of a commissioning its
-        own models, unless others are given. With runs: the models in whose training region they
-        are to lie.
+        The plants for a controller, including every member of an ensemble; by default the models of
+        a commissioning. With runs: the models whose training region applies.
     references : str, array of shape (N,), or sequence of them, optional
-        Of a controller; `REFERENCES` by default, which is the same shapes over the first plant's
-        recorded range where the catalogue does not suit it.
+        References for a controller; by default `REFERENCES`, or the same shapes over the first
+        plant's recorded range if the catalogue does not suit it.
     limits : Limits, optional
         The bounds.
     seed : int
         Chooses named random references.
     refuse : bool
-        Whether to raise where members disagree; else the line `disagreement` fails.
+        Whether to raise if members disagree; otherwise the line `disagreement` fails.
 
     Returns
     -------
@@ -503,10 +502,10 @@ def judge(
     Raises
     ------
     FitError
-        Where members of an ensemble disagree by more than the bound, or one runs away.
+        If members of an ensemble disagree by more than the bound, or one diverges.
     SettingError
-        For arguments that are none of these, a controller without plants, or models whose sample
-        time or units are not the runs'.
+        For other arguments, a controller without plants, or models with another sample time or
+        other units than the runs.
     """
     if not (limits is None or isinstance(limits, Limits)):
         raise SettingError(
@@ -563,7 +562,7 @@ def _runs(
 
 
 def _with_model(runs: list[_Run], models: list[Model]) -> list[_Run]:
-    """Each run with the model whose region it is to lie in, if there is one."""
+    """Each run with the model whose training region applies, if there is one."""
     given = models[0] if models else None
     return [(r, plant if isinstance(plant, Model) else given) for r, plant in runs]
 
@@ -575,7 +574,7 @@ def _judged(found: ClosedLoopRun, model: Any) -> JudgedRun:
 
 
 def _outside(found: ClosedLoopRun, model: Model | None) -> tuple[float, float]:
-    """Share of samples outside, farthest distance; NaN where no region is known."""
+    """Share of samples outside, largest distance; NaN without a known region."""
     if model is None or not len(found.u):
         return math.nan, math.nan
     check_fits(found.controller, model)

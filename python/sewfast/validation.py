@@ -284,13 +284,11 @@ class Validation(Plotted):
         ]
         if len(self.experiments) > 1:
             lines += [
-                _row(f"  {i + 1}, free run", e.simulation_scores) for i, e in self._numbered()
+                _row(f"  {i + 1}, free run", e.simulation_scores)
+                for i, e in enumerate(self.experiments)
             ]
         notes = [f"note: {n}" for n in self.notes]
         return "\n".join([*lines, *notes, f"verdict: {self.verdict}"])
-
-    def _numbered(self) -> list[tuple[int, ExperimentErrors]]:
-        return list(enumerate(self.experiments))
 
 
 def noise_of(outputs: Sequence[FloatArray]) -> float:

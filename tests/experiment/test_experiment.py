@@ -18,7 +18,7 @@ from sewfast.control import Controller, Gains, load_controller
 from sewfast.errors import DataError, SettingError
 from sewfast.experiment import STAGES, loops, run_demo
 from sewfast.experiment import demo as experiment
-from sewfast.experiment.loops import rig
+from sewfast.experiment.loops import drive_of
 from sewfast.machine import VirtualMachine
 from sewfast.models import load_model
 from sewfast.readers import read, read_table
@@ -115,7 +115,7 @@ def test_a_saved_model_scores_what_the_results_say(
 
 def test_the_saved_controller_gives_the_saved_run_again(demo: Path) -> None:
     controller = load_controller(demo / "controllers" / "tuned.json")
-    with rig(VirtualMachine()) as bench:
+    with drive_of(VirtualMachine()) as bench:
         again = bench.run(controller, "random", seed=3)
     saved = read_table(demo / "runs" / "random_machine.npz")
     np.testing.assert_array_equal(again.u, saved["u"])
@@ -238,7 +238,7 @@ def test_the_drive_is_commissioned_beside_the_papers_way(
 
 
 def test_the_papers_gains_track_on_their_plant_and_chatter_on_the_machine() -> None:
-    with rig(VirtualMachine()) as bench:
+    with drive_of(VirtualMachine()) as bench:
         runs = loops.paper_runs(bench)
     numbers = loops.paper_numbers(runs)
     assert numbers["eq8"]["rise_time_ms"] == pytest.approx(186.0, abs=5.0)
@@ -256,7 +256,7 @@ def test_only_per_sample_gains_on_rpm_track_on_the_papers_plant() -> None:
 
 
 def test_the_closed_loop_recording_is_the_loop_itself() -> None:
-    with rig(VirtualMachine()) as bench:
+    with drive_of(VirtualMachine()) as bench:
         step = bench.record(signals.excitation("step"), "step")
         controller = loops.coarse_controller(
             loops.first_order(step), Ts=bench.Ts, counts_per_rev=bench.counts_per_rev
@@ -280,7 +280,7 @@ def test_the_experiment_went_over_the_link(results: dict[str, Any]) -> None:
 def test_the_link_changes_no_measured_figure(seed: int) -> None:
     """What the machine does behind the port is what it does in the same process."""
     controller = load_coarse()
-    with rig(VirtualMachine()) as bench:
+    with drive_of(VirtualMachine()) as bench:
         behind = bench.run(controller, "random", seed=seed)
     direct = loops.run(controller, VirtualMachine(), "random", seed=seed)
     assert np.sqrt(np.mean((behind.y - direct.y) ** 2)) < 2.0

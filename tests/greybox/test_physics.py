@@ -198,7 +198,7 @@ def test_a_wrong_sign_is_named() -> None:
         ({"volts": -1.0}, SettingError, "volts"),
         ({"current": "amps"}, DataError, "amps"),
         ({"current": np.zeros(3)}, DataError, "current"),
-        ({"current": -linear()[0]}, DataError, "turn its sign"),
+        ({"current": -linear()[0]}, DataError, "reverse its sign"),
     ],
 )
 def test_what_tells_nothing_is_refused(change: Any, error: type, says: str) -> None:

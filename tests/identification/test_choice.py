@@ -498,7 +498,7 @@ def test_a_network_that_runs_away_on_other_data_asks_for_what_can_be_given() -> 
     with pytest.raises(FitError) as refused:
         identify(other, model=model)
     assert refused.value.expected == "data on which the model's free run is finite"
-    assert "identify anew" in str(refused.value.remedy)
+    assert "identify again" in str(refused.value.remedy)
 
 
 @pytest.mark.parametrize("reached", [0, 2])

@@ -255,7 +255,7 @@ def test_a_gimbal_motor_takes_volts() -> None:
     [
         ({"fw_version_minor": 6.0}, SettingError, "0.6"),
         ({"axis0.error": 64.0}, LinkError, "0x40"),
-        ({"axis0.current_state": 8.0}, LinkError, "drives"),
+        ({"axis0.current_state": 8.0}, LinkError, "in use"),
     ],
 )
 def test_an_odrive_that_cannot_be_used_is_refused(
@@ -294,7 +294,7 @@ class Talkative(EmulatedSimpleFOC):
         (simplefoc(), {"volt": 0.0}, SettingError, {"name": "volt"}),
         (simplefoc(), {"speed": np.inf}, SettingError, {"name": "speed"}),
         (odrive(), {}, SettingError, {"name": "motor", "received": "none"}),
-        (Talkative(simplefoc().motor), {}, LinkError, {"received": "goes on telling"}),
+        (Talkative(simplefoc().motor), {}, LinkError, {"received": "keeps sending"}),
     ],
 )
 def test_a_sketch_that_cannot_be_used_is_refused(

@@ -204,7 +204,7 @@ def test_what_cannot_be_read_may_be_of_a_drive(tmp_path: Path) -> None:
     torn, empty = tmp_path / "torn.mcap", tmp_path / "empty.mcap"
     torn.write_bytes(press(tmp_path / "press.mcap")[:60])
     empty.touch()
-    with pytest.raises(SettingError, match="may be one"):
+    with pytest.raises(SettingError, match="can be one"):
         export(tmp_path / "a.mcap", torn)
     export(tmp_path / "a.mcap", empty)
     export(tmp_path / "a.mcap", torn, overwrite=True)

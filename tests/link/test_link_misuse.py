@@ -144,7 +144,9 @@ def test_a_watchdog_trip_says_how_to_give_it_more_time(tmp_path: Path) -> None:
             return False
 
         device.intercept = trip
-        with refuses(LinkError, received="heard nothing for 5000 ms", remedy="--watchdog 10000 "):
+        with refuses(
+            LinkError, received="received nothing for 5000 ms", remedy="--watchdog 10000 "
+        ):
             record(drive, np.ones(3000))
 
 

@@ -369,7 +369,7 @@ def text(a: Analysis) -> str:
     ]
     table += [[w.name, *_cells(w.score)] for w in a.what_if]
     lines += [*rows(table), ""]
-    lines.append(str(a.judgement) if a.judgement is not None else "a loop runs away")
+    lines.append(str(a.judgement) if a.judgement is not None else "a loop diverges")
     return "\n".join(lines)
 
 
@@ -455,7 +455,7 @@ def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> li
     Raises
     ------
     SettingError
-        Where matplotlib is not installed or the folder cannot be written to.
+        If matplotlib is not installed or the folder cannot be written to.
     """
     drawn = a.figures()
     from ..plotting import style, svg

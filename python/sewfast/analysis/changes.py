@@ -163,9 +163,9 @@ def with_delay(model: Model, samples: int) -> Model:
 def with_time_constants(model: Model, factor: float) -> Model:
     """The model with the same steady states, reached more slowly by a factor.
 
-    Linear: every pole p becomes p^(1/factor); the steady gain, or an integrator's rate times the
-    factor, is kept. State space: every step is 1/factor as large. Grey box: inertia and lag are
-    multiplied. A lagged network has no explicit time constants to change.
+    Linear: every pole p becomes p^(1/factor); the steady gain is kept, an integrator's rate is
+    divided by the factor. State space: every step is 1/factor as large. Grey box: inertia and lag
+    are multiplied. A lagged network has no explicit time constants to change.
 
     Raises
     ------

@@ -21,7 +21,7 @@ from ..models import Model
 from ..models.conversion import StateSpace
 from ..models.linear import LinearDifference
 
-# --- PlantPoint: a plant as a linear system about a steady output ---------------------------------
+# --- PlantPoint: a plant as a linear system at a steady output ------------------------------------
 
 
 SHARES = (0.1, 0.5, 0.9)
@@ -187,7 +187,7 @@ def to_json(point: PlantPoint) -> dict[str, Any]:
     }
 
 
-# --- LoopBode: L, S and T of every plant over frequency, about one operating point, with margins --
+# --- LoopBode: L, S and T of every plant at one operating point, with margins ---------------------
 
 
 FREQUENCIES = 240

@@ -95,7 +95,7 @@ def each_change(changes: Any) -> Sequence[Change] | None:
     return given
 
 
-# --- A load on the virtual machine's shaft while a controller holds its speed ---------------------
+# --- Runs with a load on the virtual machine's shaft ----------------------------------------------
 
 
 def run_under_load(

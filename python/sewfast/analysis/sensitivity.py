@@ -22,7 +22,7 @@ from ..tuning.objective import Cost, terms
 from .changes import ON_MACHINES, ON_MODELS, Change
 from .points import PlantPoint, plant_points
 
-# --- Score: what a controller costs on plants over references, and how near to instability it is --
+# --- Score: cost and margin of a controller on plants and references ------------------------------
 
 
 J = TypeVar("J")
@@ -111,7 +111,7 @@ def each(function: Callable[[J], R], jobs: Sequence[J], threads: int | None) -> 
         return list(pool.map(function, jobs))
 
 
-# --- GainSensitivity: what a gain that is a little off costs --------------------------------------
+# --- GainSensitivity: scores for changed settings -------------------------------------------------
 
 
 FACTORS = (0.75, 0.9, 1.1, 1.25)
@@ -194,7 +194,7 @@ def _scaled(gains: Gains, name: str, factor: float) -> Gains:
     return Gains.standard(**values, u_unit=g.u_unit, y_unit=g.y_unit)
 
 
-# --- WhatIf: the controller on plants that are not as identified ----------------------------------
+# --- WhatIf: the controller on changed plants -----------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The command line: `main`, its exit codes and what becomes of an exception."""
+"""The command line: `main`, its exit codes and its treatment of exceptions."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _carried_out(args: argparse.Namespace) -> int:
             args.out = args.out_of(args)
         require_apart(args)
         code: int | None = args.command(args)
-        if sys.stdout is not None:  # as it is where it was closed before the start
+        if sys.stdout is not None:  # None if it was closed before the start
             sys.stdout.flush()
         return code or DONE
     except SewfastError as e:
@@ -58,13 +58,13 @@ def _carried_out(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         return _say(f"sewfast {args.name}: {_interrupted(args, began)}", INTERRUPTED)
     except BrokenPipeError:
-        # the reader of the pipe has seen enough; the interpreter must not flush into it again
+        # the reader closed the pipe; the interpreter must not flush into it again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as e:
         if e.errno not in (errno.ENOSPC, errno.EDQUOT):
             return _fault(args, e)
-        # what is still buffered must not raise again when the interpreter flushes it
+        # the buffered rest must not raise again when the interpreter flushes it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _say(
             f"sewfast {args.name}: expected room for the output, received "
@@ -76,12 +76,12 @@ def _carried_out(args: argparse.Namespace) -> int:
 
 
 def _parsed(argv: Sequence[str] | None) -> tuple[argparse.Namespace, project.Project]:
-    """The command line, and the project whose settings stand in for what it leaves out."""
+    """The parsed command line, and the project with defaults for it."""
     parser = build_parser()
     try:
         found = project.find()
     except SewfastError:
-        # help is to be had with a faulty file, too; any command then says what is wrong with it
+        # show help even with a faulty file; every command then reports the fault
         parser.parse_args(argv)
         raise
     found.relax(parser)
@@ -89,7 +89,7 @@ def _parsed(argv: Sequence[str] | None) -> tuple[argparse.Namespace, project.Pro
 
 
 def _interrupted(args: argparse.Namespace, began: float) -> str:
-    """What is left of a command that was interrupted again while it closed its recording."""
+    """The message of an interrupted command, with its recording if one was written."""
     out = getattr(args, "out", None)
     place = out.with_suffix(".mcap") if isinstance(out, Path) and out.name else None
     try:
@@ -112,12 +112,12 @@ def _fault(args: argparse.Namespace, e: Exception) -> int:
 
 
 def _say(message: str, code: int) -> int:
-    # a message holds names of files, ports and columns, which must not steer the terminal
+    # names of files, ports and columns in the message must not control the terminal
     print("\n".join(map(printable, message.split("\n"))), file=sys.stderr)
     return code
 
 
-# --- What a command reads is not what it writes ---------------------------------------------------
+# --- The files that a command writes differ from those that it reads ------------------------------
 
 
 _WRITTEN = {
@@ -127,7 +127,7 @@ _WRITTEN = {
     "trace": "--trace",
     "fault_log": "--fault-log",
 }
-"""Attributes that name files to be written, and their options."""
+"""Attributes that name output files, and their options."""
 
 
 def require_apart(args: argparse.Namespace) -> None:
@@ -136,14 +136,14 @@ def require_apart(args: argparse.Namespace) -> None:
     Raises
     ------
     SettingError
-        Where two of its files are one.
+        If two of its files are the same.
     """
     others = [place for place in _read(args) if _is_file(place)]
     for option, path in _written(args):
         for other in others:
             if _is_one(path, other):
                 raise SettingError(
-                    f"{option} {path}: expected a file of its own, got {other}, which this command "
+                    f"{option} {path}: expected a separate file, got {other}, which this command "
                     "reads or writes as well; choose another name"
                 )
         others.append(path)
@@ -156,7 +156,7 @@ def _written(args: argparse.Namespace) -> Iterator[tuple[str, Path]]:
             yield option, path
     out = getattr(args, "out", None)
     if isinstance(out, Path) and out.suffix not in ("", ".mcap") and _is_recorded(args):
-        # what a drive does is recorded in the table's folder
+        # the recording of a drive goes into the same folder as the table
         yield "-o", out.with_suffix(".mcap")
 
 

@@ -1,4 +1,4 @@
-"""Arguments that commands share, and the makers of commands."""
+"""Arguments that several commands share, and `add_command`."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ RECORDINGS = (*TABLES, ".mcap")
 
 
 class Help(argparse.RawDescriptionHelpFormatter):
-    """Help that keeps its line breaks."""
+    """A help formatter that keeps line breaks."""
 
 
 def add_command(
     commands: Commands, name: str, command: Command, *, summary: str, text: str, examples: str
 ) -> argparse.ArgumentParser:
-    """A command with its help: a line for the list, a text above, examples below the options."""
+    """Add a command: a summary for the list, a text above and examples below its options."""
     parser = commands.add_parser(
         name, help=summary, description=text, epilog=examples, formatter_class=Help
     )
@@ -40,15 +40,15 @@ def add_command(
     )
     level.add_argument(
         "-v", "--verbose", action="count", default=0,
-        help="log what is read and what work takes; -vv: what is written, too",
+        help="log the files read and the time of the work; -vv: the files written, too",
     )  # fmt: skip
-    parser.add_argument("--debug", action="store_true", help="show where a fault comes from")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of a fault")
     parser.set_defaults(command=command, out_of=None)
     return parser
 
 
 def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
-    """Which columns of a recording are input and output, and how it is sampled."""
+    """Options for input, output and sample time of a recording."""
     parser.set_defaults(columns_of="model" if from_model else "file")
     default = "; default: as stored in the model" if from_model else ""
     parser.add_argument(
@@ -62,7 +62,7 @@ def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
         "1 %%, uneven ones are resampled to it",
     )  # fmt: skip
     parser.add_argument(
-        "--time", metavar="COL", help="column of time, where its name does not say so"
+        "--time", metavar="COL", help="column of time, if its name does not show it"
     )
     parser.add_argument(
         "--counts", metavar="COL",
@@ -72,24 +72,24 @@ def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
         "--counts-per-rev",
         type=float,
         metavar="N",
-        help="encoder counts per revolution; a recording (.mcap) states them itself",
+        help="encoder counts per revolution; a recording (.mcap) contains them",
     )
 
 
 def add_weights(parser: argparse.ArgumentParser) -> None:
-    """How much each sample counts, for the commands that look at it."""
+    """`--weights`, for the commands that fit or judge samples."""
     parser.add_argument(
         "--weights", metavar="COL",
-        help="column of weights: how much the squared error of each sample counts, 0 not at all",
+        help="column of weights of the samples' squared errors; 0 leaves a sample out",
     )  # fmt: skip
 
 
 def add_view(parser: argparse._ActionsContainer) -> None:
-    """How a running record or run is watched: `args.live` is a `sewfast.live.Kind`."""
+    """`--live`: the view of a running record or run, a `sewfast.live.Kind`."""
     parser.add_argument(
         "--live", metavar="KIND", type=_kind, default="auto",
         help="watch it run: terminal, none, plotjuggler[:HOST:PORT], foxglove[:PORT]; auto (the "
-        "default) is a status line where standard error is a terminal",
+        "default) is a status line if standard error is a terminal",
     )  # fmt: skip
 
 
@@ -105,7 +105,7 @@ def _kind(text: str) -> Kind:
 def add_split(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--split-at-gaps", action="store_true",
-        help="take the pieces between samples that are missing as experiments of their own",
+        help="use the pieces between missing samples as separate experiments",
     )  # fmt: skip
 
 
@@ -116,9 +116,9 @@ def add_output(
 
 
 def add_named_output(parser: argparse.ArgumentParser, what: str, source: str, help: str) -> None:
-    """An output that is named after the first file of an argument: `run.csv` -> `run-WHAT.json`.
+    """An output named after the first file of an argument: `run.csv` -> `run-WHAT.json`.
 
-    It lies in the working folder, wherever that file does. A model's own `-model` goes.
+    It is in the working folder, wherever that file is. The ending `-model` of a model is dropped.
     """
 
     def named(args: argparse.Namespace) -> Path:
@@ -132,25 +132,20 @@ def add_named_output(parser: argparse.ArgumentParser, what: str, source: str, he
 
 
 def add_overwrite(parser: argparse._ActionsContainer) -> None:
-    """Whether what cannot be had again may be written over."""
+    """`--overwrite`, for files that cannot be made again."""
     parser.add_argument(
         "--overwrite", action="store_true",
-        help="replace even what a drive did, which cannot be had again",
+        help="replace even a recording of a drive, which cannot be made again",
     )  # fmt: skip
 
 
 def add_plot(parser: argparse._ActionsContainer, what: str) -> None:
-    """`--plot FILE`, the same for every command that has something to show."""
+    """`--plot FILE`, the same for every command with a figure."""
     parser.add_argument("--plot", metavar="FILE", type=Path, help=f"{what}: PNG, SVG or PDF")
 
 
 def require_plot(path: Path | None) -> None:
-    """Refuse a figure that could not be drawn or written, before the work is done.
-
-    Raises
-    ------
-    SettingError
-    """
+    """Raise `SettingError` before the work if its figure cannot be drawn or written."""
     from ..plotting import FILES, require_matplotlib
 
     if path is not None:
@@ -159,12 +154,12 @@ def require_plot(path: Path | None) -> None:
 
 
 def require_place(path: Path | None, suffixes: tuple[str, ...], *, option: str = "-o") -> None:
-    """Refuse an output file that could not be written, before the work is done.
+    """Refuse an output file that cannot be written, before the work.
 
     Raises
     ------
     SettingError
-        For an extension that stands for no format, or a folder that does not exist.
+        For an extension without a format, or a folder that does not exist.
     """
     if path is None:
         return

@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 BODE = """\
 The Bode plot of a drive, with error bars, and the resonance of its shaft. A machine (--on) is
-brought to a working speed and shaken there by sines of random phases, which separates noise from
-distortion. Of a record, spectra are averaged, or (--method local) what it shows of before its
-beginning is told from the response. Two masses and a shaft, or a rigid machine, are fitted to it.
+brought to a working speed and excited there by sines of random phases, which separates noise from
+distortion. For a record, spectra are averaged, or (--method local) the response is separated from
+the transients at its beginning and end. Two masses and a shaft, or a rigid machine, are fitted.
 
 The machine turns at --speed, a little faster and slower, for a minute or less; at several speeds
-one after the other. Under a controller (--controller) the reference is shaken instead, and the
-loop's margins are printed as measured. Of a drive that trips meanwhile, what its samples show until
-then is kept and marked; the exit code is 2.
+one after the other. Under a controller (--controller) the reference is excited instead, and the
+loop's measured margins are printed. If a drive trips, the response of its samples until then is
+kept and marked; the exit code is 2.
 """
 
 EXAMPLES = """\
@@ -46,7 +46,7 @@ examples:
   sewfast bode --on virtual --speed 500,1000,2000 -o speeds.json --plot speeds.png
   sewfast bode run.csv --input u --output y --reference r     a record under feedback
   sewfast bode chirp.csv --input u --output y --method local  a chirp that began in motion
-  sewfast bode response.json --controller controller.json     margins on what was measured
+  sewfast bode response.json --controller controller.json     margins on the measured response
   sewfast bode response.json --propose new.json --u-max 10 --counts-per-rev 1572
 """
 
@@ -70,10 +70,10 @@ def add(commands: Commands) -> None:
         text=BODE, examples=EXAMPLES,
     )  # fmt: skip
     parser.add_argument(
-        "data", metavar="DATA", nargs="?", help="recording, or a response that -o wrote"
+        "data", metavar="DATA", nargs="?", help="recording, or a response written by -o"
     )
     parser.add_argument(
-        "--on", metavar="virtual[:SEED]|FILE.fmu?volt=V|PORT", help="shake this machine instead"
+        "--on", metavar="virtual[:SEED]|FILE.fmu?volt=V|PORT", help="excite this machine instead"
     )
     parser.add_argument(
         "--speed",
@@ -83,30 +83,31 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--amplitude", type=float, metavar="V",
-        help="peak of what shakes it (six tenths of what the command has left); with --controller "
-        "of the reference [RPM] (a twentieth of the speed)",
+        help="peak of the multisine (six tenths of the command left at that speed); with "
+        "--controller of the reference [RPM] (a twentieth of the speed)",
     )  # fmt: skip
     parser.add_argument(
         "--controller", metavar="FILE.json",
-        help="shake the reference of this loop; print its margins on the response",
+        help="excite the reference of this loop; print its margins on the response",
     )  # fmt: skip
-    parser.add_argument("--period", type=float, metavar="S", help="of the multisine (2)")
+    parser.add_argument("--period", type=float, metavar="S", help="period of the multisine (2)")
     parser.add_argument(
-        "--realisations", type=int, metavar="N", help="multisines with other phases (4)"
+        "--realisations", type=int, metavar="N", help="multisines with different phases (4)"
     )
     parser.add_argument("--periods", type=int, metavar="N", help="repetitions of each (4)")
     parser.add_argument("--f-min", type=float, metavar="HZ", help="lowest frequency (1)")
     parser.add_argument(
-        "--f-max", type=float, metavar="HZ", help="highest one (four tenths of the sample rate)"
-    )
-    parser.add_argument("--seed", type=int, metavar="N", help="of the phases (0)")
+        "--f-max", type=float, metavar="HZ",
+        help="highest frequency (four tenths of the sample rate)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, metavar="N", help="seed of the phases (0)")
     parser.add_argument(
-        "--reference", metavar="COL", help="column of a record that its controller followed"
+        "--reference", metavar="COL", help="column of a record with the controller's reference"
     )
     parser.add_argument(
         "--method", choices=("segments", "local"),
-        help="of a record: spectra averaged over segments (the default), or local polynomials, "
-        "which take the leakage of its beginning and end out",
+        help="for a record: spectra averaged over segments (the default), or local polynomials, "
+        "which remove the leakage of its beginning and end",
     )  # fmt: skip
     parser.add_argument(
         "--segment", type=int, metavar="N", help="samples of a record's segments (a ninth of it)"
@@ -115,7 +116,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--propose", metavar="FILE.json", type=Path,
         help="write a controller for the machine: PID gains of the largest bandwidth, with a notch "
-        "where that pays; limits and filters of --controller, if given",
+        "if that pays; limits and filters of --controller, if given",
     )  # fmt: skip
     parser.add_argument(
         "--Ms", type=float, metavar="MS", help="largest sensitivity of --propose (1.7)"
@@ -174,7 +175,7 @@ def command(args: argparse.Namespace) -> int | None:
 
 
 def _tripped(responses: Iterable[FrequencyResponse]) -> int | None:
-    """The exit code, and a line on standard error, of a machine that broke off."""
+    """The exit code, and a line on standard error, if a drive tripped."""
     for response in responses:
         if why := response.provenance.get("incomplete"):
             print(f"sewfast bode: {why}; what came until then is kept", file=sys.stderr)
@@ -213,19 +214,19 @@ def _over_speeds(
 
 
 def _propose(args: argparse.Namespace, fit: ShaftFit | None, controller: Any) -> None:
-    """Write a controller, and say what it does.
+    """Write a controller and print its loop.
 
     Raises
     ------
     SettingError
-        Without a fit to make it for.
+        Without a fitted machine.
     """
     from ..frequency import propose
 
     if fit is None:
         raise SettingError(
-            "--propose: expected a response that a machine can be fitted to, got one that it "
-            "cannot; excite more, or longer"
+            "--propose: expected a response to which a machine can be fitted, got one where the "
+            "fit fails; excite more, or longer"
         )
     given = {"Ms": args.Ms, "u_max": args.u_max}
     found = propose(

@@ -1,4 +1,4 @@
-"""`sewfast check`, `compare` and `analyse`: whether to trust a model, and a controller on it."""
+"""`sewfast check`, `compare` and `analyse`: checks of models, and of a controller on them."""
 
 from __future__ import annotations
 
@@ -101,13 +101,13 @@ def check_command(args: argparse.Namespace) -> None:
         print(f"written to {path}")
 
 
-# --- `sewfast analyse`: what a controller does on models, and what it would do on slightly others -
+# --- `sewfast analyse`: a controller on models ----------------------------------------------------
 
 
 ANALYSE = """\
 A controller on models (every member of an ensemble) or on the virtual machine: margins over the
-operating range, steps of the reference and of a disturbance, what gains that are a little off and
-plants that are not as identified would cost, and doubts about the simulated loops.
+operating range, steps of the reference and of a disturbance, sensitivity of the cost to gains and
+plants, and doubts about the simulated loops.
 """
 
 ANALYSE_EXAMPLES = """\
@@ -128,7 +128,7 @@ def add_analyse(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument("controller", metavar="CONTROLLER.json", help="file that tune wrote")
     parser.add_argument(
-        "plants", metavar="MODEL.json|virtual[:SEED]", nargs="+", help="what to analyse it on"
+        "plants", metavar="MODEL.json|virtual[:SEED]", nargs="+", help="plants to analyse it on"
     )
     parser.add_argument(
         "--speed", action="append", type=float, metavar="Y",
@@ -139,12 +139,10 @@ def add_analyse(commands: Commands) -> None:
     parser.add_argument(
         "--disturbance", type=float, metavar="U", help="size of the step at the plant's input"
     )
-    parser.add_argument(
-        "--seconds", type=float, metavar="S", help="how long the steps are looked at"
-    )
+    parser.add_argument("--seconds", type=float, metavar="S", help="duration of the steps")
     parser.add_argument(
         "--reference", action="append", metavar="FILE|NAME",
-        help="what the cost is taken over; may repeat (trapezoid, random)",
+        help="reference of the cost; may repeat (trapezoid, random)",
     )  # fmt: skip
     add_plot(parser, "draw steps, loop transfer and sensitivities")
     parser.add_argument(

@@ -18,14 +18,15 @@ if TYPE_CHECKING:
     from ..commissioning import Commissioning
 
 TEXT = """\
-Do what an engineer does to a drive: find out which command moves it, record its step response,
-take first gains by rule, record a closed loop under these and pulses up to the command's limit,
-train an ensemble of networks, tune the gains on all of them, run them on the machine and report
-prediction and measurement together. It stops with a reason where the evidence is not good enough.
+Follow an engineer's procedure for a drive: find the command that moves it, record its step
+response, compute first gains by rule, record a closed loop under these and pulses up to the
+command's limit, train an ensemble of networks, tune the gains on all of them, run them on the
+machine and report prediction and measurement together. It stops with a reason if the evidence is
+not good enough.
 
 The machine turns freely up to a quarter more than the top speed (--speed), again and again, each
-time from rest. DIR holds recordings, models, controllers, runs and report.html; Ctrl-C stops the
-motor and keeps what there is.
+time from rest. DIR gets recordings, models, controllers, runs and report.html; Ctrl-C stops the
+motor and keeps the results so far.
 """
 
 EXAMPLES = """\
@@ -46,11 +47,14 @@ def add(commands: Commands) -> None:
         "--on",
         required=True,
         metavar="virtual[:SEED]|FILE.fmu?volt=V|PORT",
-        help="what to commission: virtual machine, FMU of another tool, or drive",
+        help="machine to commission: virtual machine, FMU of another tool, or drive",
     )
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder to fill")
     parser.add_argument(
-        "--u-max", type=float, metavar="V", help="largest command to either side (the machine's)"
+        "--u-max",
+        type=float,
+        metavar="V",
+        help="largest command in either direction (the machine's)",
     )
     parser.add_argument(
         "--speed", type=float, metavar="RPM",
@@ -58,7 +62,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--reference", action="append", metavar="NAME",
-        help="a named reference to tune for and to verify on (`sewfast signals`); may repeat",
+        help="a named reference for tuning and verification (`sewfast signals`); may repeat",
     )  # fmt: skip
     parser.add_argument("--members", type=int, default=4, metavar="N", help="networks (4)")
     parser.add_argument(
@@ -66,7 +70,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--load", type=float, metavar="V",
-        help="load in volts of command that the loop is to bear no worse than Eq. 12's "
+        help="load in volts of command, from which the loop must recover as fast as Eq. 12's "
         "(a tenth of --u-max; 0: not required)",
     )  # fmt: skip
     parser.add_argument(
@@ -77,11 +81,11 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N",
-        help="of the random signals, the networks and the search (0)",
+        help="seed of the random signals, the networks and the search (0)",
     )  # fmt: skip
     parser.add_argument(
         "--resume", action="store_true",
-        help="go on from what an attempt with the same settings has left in DIR",
+        help="continue from the recordings of an attempt with the same settings in DIR",
     )  # fmt: skip
     add_overwrite(parser)
     add_drive(parser)
@@ -96,22 +100,21 @@ def command(args: argparse.Namespace) -> int | None:
     require_own(args.out, overwrite=args.overwrite or args.resume)
     prepare(args.out)
     if is_port(args.on):
-        # what a virtual machine did can be had again
+        # the recordings of a virtual machine can be made again
         print(
-            f"each recording lies in {args.out / FOLDER} as soon as it is taken, whatever comes "
-            "then",
+            f"each recording is saved in {args.out / FOLDER} as soon as it is complete",
             file=sys.stderr,
             flush=True,
         )
     try:
         return _kept(args)
     except KeyboardInterrupt:
-        print(f"interrupted; {args.out} is not complete, each file in it is whole", file=sys.stderr)
+        print(f"interrupted; {args.out} is incomplete, but its files are not", file=sys.stderr)
         return 130
 
 
 def _kept(args: argparse.Namespace) -> int | None:
-    """Commission, and leave what came of it in the folder."""
+    """Commission, and write the result into the folder, however it ends."""
     from ..commissioning import Refusal
 
     try:
@@ -159,19 +162,19 @@ def _commissioned(args: argparse.Namespace) -> Commissioning:
         return commission(machine_of(args.on), **options)
 
 
-# --- `sewfast demo`, `sewfast report`: the whole experiment and its page --------------------------
+# --- `sewfast demo`, `sewfast report`: the paper's experiment and its page ------------------------
 
 
 DEMO = """\
 Carry out the paper's experiment on the virtual sewing machine: excite, record, identify, validate,
 tune, run, report. Takes about a minute.
 
-DIR/report.html is the page to look at; DIR/results.json holds its numbers. Recordings, models and
-the controller are written with them, ready for the other commands.
+DIR/report.html is the page to look at; DIR/results.json has its numbers. Recordings, models and the
+controller are written as well, ready for the other commands.
 """
 
 REPORT = """\
-Write DIR/report.html anew from what `sewfast demo` left in DIR; nothing is computed again.
+Write DIR/report.html again from the files of `sewfast demo` in DIR; nothing is computed again.
 """
 
 
@@ -214,7 +217,7 @@ def demo_command(args: argparse.Namespace) -> None:
 
 
 def _summarise(results: Mapping[str, Any]) -> None:
-    """The headline: free-run errors on records never trained on, and the trapezoid."""
+    """Print free-run errors on records not used for training, and the trapezoid."""
     head = ["free-run error [RPM rms]", "paper", "neural_oe", "oe_all", "oe", "arx"]
     found = results["identification"]
     rows = [

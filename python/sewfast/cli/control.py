@@ -1,4 +1,4 @@
-"""`sewfast run`: the loop that a controller closes, on a device or on this computer."""
+"""`sewfast run`: a controller in closed loop with a model, a machine or a drive."""
 
 from __future__ import annotations
 
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from ..control.controller import Controller, SampledController
     from ..control.loop import ClosedLoopRun, Plant
     from ..dataset import FloatArray
-    from ..evidence import Line
     from ..link import HostLoopRun
 
 RUN = """\
@@ -46,7 +45,7 @@ Close the loop around a model, a virtual machine or a drive, with the same contr
 Columns: t [s], r, u, y (the plant's true output; of a real drive the speed estimated from its
 counts), feedback (y after encoder and filter).
 
-On a drive the controller runs on the device; the run is written as MCAP while it lasts, and
+On a drive the controller runs on the device; the run is written as MCAP while it runs, and
 a file with another ending is made from it afterwards. Ctrl-C stops the motor and keeps the file.
 """
 
@@ -71,21 +70,23 @@ def add(commands: Commands) -> None:
     parser.add_argument("controller", metavar="CONTROLLER.json", help="file that tune wrote")
     parser.add_argument(
         "plant", nargs="?", metavar="MODEL.json|virtual[:SEED]",
-        help="what to run on, where it is no drive; both files in any order",
+        help="model or virtual machine to run on; both files in any order",
     )  # fmt: skip
     parser.add_argument(
-        "--on", metavar="MODEL.json|virtual[:SEED]|FILE.fmu?volt=V|PORT", help="what to run on"
+        "--on",
+        metavar="MODEL.json|virtual[:SEED]|FILE.fmu?volt=V|PORT",
+        help="plant or drive to run on",
     )
     parser.add_argument(
         "--reference", metavar="FILE|NAME",
-        help="what to track; default: a trapezoid over the recorded range of the model (a drive "
-        "has to be given one)",
+        help="reference to track; default: a trapezoid over the recorded range of the model (none "
+        "for a drive)",
     )  # fmt: skip
     add_output(
         parser, "OUT",
-        "CSV, .npz, .mat or Parquet, of a drive .mcap too; default: CSV to standard output",
+        "CSV, .npz, .mat or Parquet, for a drive also .mcap; default: CSV to standard output",
     )  # fmt: skip
-    add_plot(parser, "draw output, error and command; with --host-loop its times as well")
+    add_plot(parser, "draw output, error and command; with --host-loop also its timing")
     add_overwrite(parser)
     add_drive(parser)
     add_host_loop(parser)
@@ -129,13 +130,13 @@ def run_command(args: argparse.Namespace) -> int | None:
 
 
 def _settle_plant(args: argparse.Namespace) -> None:
-    """One plant in `args.on`, the controller in `args.controller`, however they were given.
+    """Put the plant into `args.on` and the controller into `args.controller`.
 
     Raises
     ------
     SettingError
-        For no plant or two, or for a drive without a reference or without --on: a motor is not
-        moved by a slip.
+        For no plant or two, and for a drive without a reference or without --on: a slip must not
+        move a motor.
     """
     from .. import storage
     from ..control.controller import FORMAT
@@ -157,14 +158,18 @@ def _settle_plant(args: argparse.Namespace) -> None:
             )
         args.on = args.plant
     if args.reference is None and (is_port(args.on) or args.host_loop is not None):
-        raise SettingError("--reference: expected what the drive is to track, received nothing")
+        raise SettingError("--reference: expected a reference to track, received nothing")
 
 
 def _show_run(
     args: argparse.Namespace, found: ClosedLoopRun, place: Path | None, plant: Plant | None = None
 ) -> None:
-    """The columns and what they say; `place` already holds those of a drive."""
-    warnings = _warnings(found, plant)
+    """Write the columns, unless `place` already has those of a drive, and print a summary."""
+    from ..models import Model
+    from ..trust import judge
+
+    # a model knows the region that it was trained in
+    warnings = judge(found, plant if isinstance(plant, Model) else None).warnings
     summary: dict[str, Any] = {"plant": found.plant, "reference": found.reference}
     summary |= {"unit": found.units["y"], "n": len(found.t), "Ts": found.Ts, **found.metrics()}
     summary["warnings"] = [line.to_json() for line in warnings]
@@ -179,16 +184,8 @@ def _show_run(
     )  # fmt: skip
 
 
-def _warnings(found: ClosedLoopRun, plant: Plant | None) -> tuple[Line, ...]:
-    """What speaks against a run; a model knows where it has been trained."""
-    from ..models import Model
-    from ..trust import judge
-
-    return judge(found, plant if isinstance(plant, Model) else None).warnings
-
-
 def plant_of(text: str) -> Plant:
-    """`virtual`, `virtual:SEED`, `virtual?NAME=VALUE`, a motor's twin, else a model file."""
+    """The plant named by a text: `virtual[:SEED][?NAME=VALUE]`, a motor's file, or a model's."""
     from .. import storage
     from ..greybox.motor import FORMAT, load_motor
     from ..machine import VirtualMachine
@@ -202,7 +199,7 @@ def plant_of(text: str) -> Plant:
 
 
 def _wanted(args: argparse.Namespace, controller: SampledController) -> Any:
-    """The reference of a run; None for the plant's usual one."""
+    """The reference of a run; None for the plant's default."""
     if args.reference is None:
         return None
     return reference_of(args.reference, controller.Ts, controller.y_unit)
@@ -214,7 +211,7 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
     Raises
     ------
     SettingError, DataError
-        For a text that is neither, a file without r, one at another sample time or in another unit.
+        For any other text, and a file without r or with another sample time or unit.
     """
     from ..readers import read
     from ..signals import REFERENCES
@@ -247,19 +244,19 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
 
 
 def add_host_loop(parser: argparse.ArgumentParser) -> None:
-    """Options of a controller that runs here and not on the drive."""
+    """Options of a controller that runs on this computer."""
     group = parser.add_argument_group(
         "on a drive, with the controller on this computer",
         "For slow plants: this computer's jitter and the link's delay are in the loop. Both are\n"
-        "measured and shown; nothing bounds them. Columns: t [s], r, u, y (speed over a period),\n"
+        "measured and shown; they are not limited. Columns: t [s], r, u, y (speed over a period),\n"
         "feedback, late [s], age [s] (of the newest sample).",
     )
     group.add_argument(
         "--host-loop", nargs="?", const=0.0, type=float, metavar="MS",
-        help="decide each command here, every MS ms (the controller's own sample time)",
+        help="compute each command here, every MS ms (the controller's own sample time)",
     )  # fmt: skip
     group.add_argument(
-        "--samples", type=Path, metavar="FILE", help="keep what the drive sent, at its own period"
+        "--samples", type=Path, metavar="FILE", help="write the drive's samples at its own period"
     )
     group.add_argument(
         "--real-time", action="store_true",
@@ -273,7 +270,7 @@ def at_loops_period(args: argparse.Namespace, controller: Controller) -> Control
     Raises
     ------
     SettingError
-        For what cannot be, before anything moves.
+        Before anything moves, for options that do not go together.
     """
     from ..link import at_period
     from ..recordfile.writer import require_free
@@ -296,13 +293,12 @@ def at_loops_period(args: argparse.Namespace, controller: Controller) -> Control
 def run_host_loop(
     args: argparse.Namespace, controller: Controller, reference: str | FloatArray
 ) -> int | None:
-    """Run it, write its files, and say how it ended.
+    """Run the loop, write its files, and print its outcome.
 
     Returns
     -------
     int or None
-        2 where the run did not complete, 130 where it was interrupted; the files are written
-        then too.
+        2 if the run did not complete, 130 if it was interrupted; the files are written even then.
     """
     from ..link import run_on_host
 

@@ -1,4 +1,4 @@
-"""DATA arguments -> `Dataset`, prepared; `sewfast look`."""
+"""Reading and preparing the data of the DATA arguments; `sewfast look`."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) 
 
 
 def _with_notes(data: Dataset) -> Dataset:
-    """The data; what was done in reading them goes to standard error."""
+    """The data, after printing the notes of reading them to standard error."""
     for text in data.notes:
         note(text)
     return data
 
 
 def _references(table: Table, taken: tuple[str | None, ...]) -> list[str]:
-    """Columns that are named as a reference: they show that a record was made in closed loop."""
+    """Columns with the name of a reference: they show that a record was made in closed loop."""
     from ..dataset import is_reference
 
     used = {table.resolve(name) for name in taken if name and name in table}
@@ -75,7 +75,7 @@ def _references(table: Table, taken: tuple[str | None, ...]) -> list[str]:
 def _of_recording(
     table: Table, inputs: tuple[str, ...] | None, output: str | None, counts: str | None
 ) -> tuple[tuple[str, ...] | None, str | None]:
-    """Inputs and counts of a recording, which has columns `u` and `counts` of its own."""
+    """Inputs and counts of a recording, by default its columns `u` and `counts`."""
     if not inputs and "u" in table:
         inputs = ("u",)
     if counts is None and output is None and "counts" in table:
@@ -95,7 +95,7 @@ def _unnamed(table: Table, what: str, remedy: str) -> SettingError:
 def read_for_model(
     source: str, model: Model, args: argparse.Namespace, *, needs_output: bool = True
 ) -> tuple[Dataset, Table]:
-    """One DATA argument with the model's columns, unless the command line names others."""
+    """The data of one DATA argument, with the model's columns unless others are named."""
     from ..readers import parse_source, read, read_table
 
     path, inputs, output = parse_source(source)
@@ -114,7 +114,7 @@ def read_for_model(
 def _output_columns(
     output: str | None, args: argparse.Namespace, stored: dict[str, Any]
 ) -> dict[str, Any]:
-    """What the command line says about the output; counts stay only where it says nothing."""
+    """The output of the command line; the model's counts apply only without one."""
     if args.counts is not None or args.counts_per_rev is not None:
         return {
             "output": output or stored["output"],
@@ -129,7 +129,7 @@ def _output_columns(
 def _recorded_columns(
     table: Table, columns: dict[str, Any], args: argparse.Namespace, *, chosen: str | None
 ) -> dict[str, Any]:
-    """What a recording knows better than the model: its encoder, and its counts for its speed."""
+    """The recording's own encoder and counts, which replace the model's."""
     if table.counts_per_rev is None or args.counts_per_rev is not None:
         return {}
     if columns["counts"]:
@@ -148,20 +148,20 @@ def _has_output(table: Table, columns: dict[str, Any]) -> bool:
 
 
 def _sample_time(given: float | None, table: Table, model: Model) -> float | None:
-    """The model's own sample time where neither the caller nor the file says another."""
+    """The given sample time; the model's if neither the caller nor the file has one."""
     from ..readers.timebase import time_column
 
-    says = table.Ts is not None or time_column(table) is not None
-    return given if given is not None or says else model.Ts
+    has_time = table.Ts is not None or time_column(table) is not None
+    return given if given is not None or has_time else model.Ts
 
 
 def split(data: Dataset, train: str | None, held_out: str | None) -> tuple[Dataset, Dataset | None]:
-    """Training data and what is held out of it; without `train` that is all but the held-out part.
+    """Training data and held-out data; without `train` the former is all but the latter.
 
     Raises
     ------
     SettingError, DataError
-        Where a range is none, leaves a file, or both overlap.
+        For a range that is invalid or outside a file, and for two that overlap.
     """
     held = None if held_out is None else data.slice(held_out)
     if train is None:
@@ -173,7 +173,7 @@ def split(data: Dataset, train: str | None, held_out: str | None) -> tuple[Datas
 
 
 def _without(data: Dataset, held: Dataset) -> Dataset:
-    """What lies before and after the held-out part of each experiment."""
+    """The parts before and after the held-out part of each experiment."""
     from dataclasses import replace
 
     pieces = []
@@ -194,23 +194,23 @@ def _require_apart(train: Dataset, held: Dataset) -> None:
         if a.start < b.start + len(b) and b.start < a.start + len(a):
             raise SettingError(
                 name="--train, --validate",
-                expected="ranges that do not overlap, as what a model was trained on says "
-                "nothing about it",
+                expected="ranges that do not overlap, as a model is not validated by the data "
+                "that it was trained on",
                 received=f"{a.range_text} and {b.range_text} of {a.name}",
                 remedy="change one of them",
             )  # fmt: skip
 
 
-# --- Options that prepare data before they are used, in the order in which they act ---------------
+# --- Options that prepare data, in the order in which they are applied ----------------------------
 
 
-def add_preparation(parser: argparse.ArgumentParser, *, detrend: bool = True) -> None:
-    """`--mask` to `--resample` and, where a model may come of it, `--detrend`."""
+def add_preparation(parser: argparse.ArgumentParser) -> None:
+    """`--mask`, `--hold-inputs`, `--differentiate`, `--resample` and `--detrend`."""
     group = parser.add_argument_group("preparation, in this order")
     group.add_argument(
         "--mask", action="append", metavar="A:B", default=[],
-        help="outputs of each file to take out: no weight, no score; repeat it for several ranges; "
-        "outliers: those that stand out from their neighbours",
+        help="outputs of each file to leave out: no weight, no score; repeat it for several "
+        "ranges; outliers: those that stand out from their neighbours",
     )  # fmt: skip
     add_hold(group)
     group.add_argument(
@@ -219,13 +219,12 @@ def add_preparation(parser: argparse.ArgumentParser, *, detrend: bool = True) ->
     )  # fmt: skip
     group.add_argument(
         "--resample", type=float, metavar="TS",
-        help="new sample time [s]; the output is filtered, inputs are averaged as held ones",
+        help="new sample time [s]; the output is filtered, inputs are averaged",
     )  # fmt: skip
-    if detrend:
-        group.add_argument(
-            "--detrend", choices=("0", "1", "steady"),
-            help="take off 0: the mean, 1: a straight line, steady: the level before inputs move",
-        )  # fmt: skip
+    group.add_argument(
+        "--detrend", choices=("0", "1", "steady"),
+        help="remove 0: the mean, 1: a straight line, steady: the level before inputs move",
+    )  # fmt: skip
 
 
 def add_hold(parser: argparse._ActionsContainer) -> None:
@@ -236,36 +235,36 @@ def add_hold(parser: argparse._ActionsContainer) -> None:
 
 
 def held(data: Dataset, args: argparse.Namespace) -> Dataset:
-    """The data with missing inputs held, where an option selects that."""
+    """The data, with missing inputs held if that option is given."""
     before = len(data.notes)
     data = data.fill_inputs("hold") if args.hold_inputs else data
-    _tell(data, before)
+    _note_new(data, before)
     return data
 
 
 def masked(data: Dataset, args: argparse.Namespace) -> Dataset:
-    """The data without the outputs that are masked: ranges are of whole files."""
+    """The data without the masked outputs; ranges refer to whole files."""
     before = len(data.notes)
     for text in args.mask:
         if text == "outliers":
             data = data.mask(data.mark_outliers(), why="stand out")
         else:
             data = data.mask(text)
-    _tell(data, before)
+    _note_new(data, before)
     return data
 
 
 def prepared(
     data: Dataset, args: argparse.Namespace, *, like: Dataset | None = None, cut: bool = False
 ) -> Dataset:
-    """The data behind every option; what was done goes to standard error.
+    """The data after all preparing options; notes on them go to standard error.
 
     Parameters
     ----------
     like : Dataset or None
-        Training data: the mean that was taken off them comes off these as well.
+        Training data: the same mean is removed as from these.
     cut : bool
-        The data were cut out of masked files already: leaves the mask out.
+        Whether the data were cut from masked files: then they are not masked again.
     """
     data = data if cut else masked(data, args)
     data = held(data, args)
@@ -276,37 +275,33 @@ def prepared(
         data = data.differentiate()
     if args.resample is not None:
         data = data.resample(args.resample)
-    data = _detrended(data, getattr(args, "detrend", None), like)
-    _tell(data, before)
+    if args.detrend == "0":
+        data = data.detrend(0, like=like)
+    elif args.detrend is not None:
+        data = data.detrend("steady" if args.detrend == "steady" else 1)
+    _note_new(data, before)
     return data
 
 
-def _tell(data: Dataset, before: int) -> None:
+def _note_new(data: Dataset, before: int) -> None:
+    """Print the notes after the first `before`."""
     for text in data.notes[before:]:
         note(text)
 
 
-def _detrended(data: Dataset, order: str | None, like: Dataset | None) -> Dataset:
-    if order is None:
-        return data
-    if order == "0":
-        return data.detrend(0, like=like)
-    return data.detrend("steady" if order == "steady" else 1)
-
-
-# --- `sewfast look`: what is in recordings before anything is identified from them ----------------
+# --- `sewfast look`: recordings before identification ---------------------------------------------
 
 
 LOOK_TEXT = """\
-Show what you should know about recordings before you identify a model from them: samples, gaps,
-range, trend, quantisation, time at limits, noise, the excited band, and what to do about each.
+Show the properties of recordings that matter for identification: samples, gaps, range, trend,
+quantisation, time at limits, noise, the excited band, with advice on each.
 
 Without --input and --output it lists every column of a file, so that you can choose the two.
 """
 
 LOOK_EXAMPLES = """\
 examples:
-  sewfast look run.csv                                    which columns are there
+  sewfast look run.csv                                    its columns
   sewfast look run.csv --input u --output speed
   sewfast look run.csv --input u --output speed --plot look.png
   sewfast look run.csv:u:speed other.csv:volt:rpm --json
@@ -317,7 +312,7 @@ examples:
 def add_look(commands: Commands) -> None:
     parser = add_command(
         commands, "look", look_command,
-        summary="what is in recordings", text=LOOK_TEXT, examples=LOOK_EXAMPLES,
+        summary="properties of recordings", text=LOOK_TEXT, examples=LOOK_EXAMPLES,
     )  # fmt: skip
     parser.add_argument("data", nargs="+", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
     add_plot(parser, "draw columns and spectra")
@@ -330,7 +325,7 @@ def look_command(args: argparse.Namespace) -> None:
 
     require_plot(args.plot)
     tables = [] if args.input or args.output or args.counts else _unnamed_columns(args)
-    # a picture is of input and output; columns that show which is which need not be named for it
+    # a plot needs input and output: named, or recognised by their names and units
     if tables and not (args.plot is not None and all(roles(t) is not None for t in tables)):
         _show_columns(tables, args)
         return
@@ -341,7 +336,7 @@ def look_command(args: argparse.Namespace) -> None:
 
 
 def _unnamed_columns(args: argparse.Namespace) -> list[Table]:
-    """The files, where none says which column is what."""
+    """The tables, if neither an argument nor a file names input and output."""
     from ..readers import parse_source, read_table
 
     sources = [parse_source(source) for source in args.data]

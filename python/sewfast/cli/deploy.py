@@ -10,9 +10,9 @@ from .output import print_json
 
 DEPLOY = """\
 Write a model or a controller as code: C99 without heap, C library or global state; IEC 61131-3
-structured text; a co-simulation FMU (FMI 3.0); a model also as ONNX. Beside the C lie a test that
-compares its results with those of sewfast, bit by bit, and what CMake, PlatformIO and Zephyr ask
-for.
+structured text; a co-simulation FMU (FMI 3.0); a model also as ONNX. C comes with a test that
+compares its results with those of sewfast bit by bit, and with files for CMake, PlatformIO and
+Zephyr.
 """
 
 EXAMPLES = """\
@@ -44,11 +44,13 @@ def add(commands: Commands) -> None:
         help="C99, structured text, FMU or ONNX (c99)",
     )
     parser.add_argument(
-        "--precision", choices=("f32", "f64"), help="of the arithmetic (f32; f64 for fmi, onnx)"
+        "--precision",
+        choices=("f32", "f64"),
+        help="precision of the arithmetic (f32; f64 for fmi, onnx)",
     )
     parser.add_argument(
         "--name", dest="prefix", metavar="NAME",
-        help="with which all names in the code begin; default: controller or model",
+        help="prefix of all names in the code; default: controller or model",
     )  # fmt: skip
     parser.add_argument(
         "--changeable", action="store_true",

@@ -10,7 +10,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from ..errors import LinkError, SettingError
@@ -26,9 +25,9 @@ if TYPE_CHECKING:
 PORT_HELP = "serial port, socket://HOST:PORT or udp://HOST:PORT"
 
 PORTS = """\
-List the serial ports of this computer, with what speaks against opening one.
+List the serial ports of this computer, with known problems of opening one.
 
-None is opened: that alone would restart many boards.
+They are not opened: opening alone would restart many boards.
 """
 
 
@@ -75,17 +74,17 @@ def _row(port: PortInfo) -> tuple[str, ...]:
     return port.path, usb, port.serial_number or "", usable, port.description
 
 
-# --- `sewfast doctor`: what is wrong with a port and the device behind it -------------------------
+# --- `sewfast doctor`: diagnosis of a port and the device behind it -------------------------------
 
 
 DOCTOR = """\
-Examine a port and the device behind it: may it be opened and who else has it open, does a device
-answer, how fast and how reliably, does its clock agree, how is it. Each finding has a verdict, a
-figure and, where something is wrong, a remedy.
+Examine a port and the device behind it: permission, other programs that use the port, answers of
+the device, speed and reliability of the link, clock, state. Each finding has a verdict, a figure
+and, if something is wrong, a remedy.
 
-The motor is never moved. The device is greeted anew, which ends a run of another host.
+The motor is never moved. Connecting opens a new session, which ends a run of another host.
 
-Exit code 0 where nothing fails (there may be warnings), 2 where something does.
+Exit code 0 if nothing fails (there may be warnings), 2 if something does.
 """
 
 DOCTOR_EXAMPLES = """\
@@ -99,7 +98,7 @@ examples:
 def add_doctor(commands: Commands) -> None:
     parser = add_command(
         commands, "doctor", doctor_command,
-        summary="what is wrong with a port", text=DOCTOR, examples=DOCTOR_EXAMPLES,
+        summary="diagnosis of a port", text=DOCTOR, examples=DOCTOR_EXAMPLES,
     )  # fmt: skip
     parser.add_argument("port", metavar="PORT", help=PORT_HELP)
     parser.add_argument(
@@ -107,7 +106,7 @@ def add_doctor(commands: Commands) -> None:
     )
     parser.add_argument(
         "--echoes", type=int, default=200, metavar="N",
-        help="messages to and fro, short ones and as many long ones (200)",
+        help="short messages to send back and forth, and as many long ones (200)",
     )  # fmt: skip
 
 
@@ -122,7 +121,7 @@ def doctor_command(args: argparse.Namespace) -> int | None:
     return 2 if found.verdict == "fail" else None
 
 
-# --- What commands share that run on a drive behind a port; `sewfast stop`, `sewfast clear` -------
+# --- Options and checks for a drive behind a port; `sewfast stop`, `sewfast clear` ----------------
 
 
 LIMITS = {
@@ -160,19 +159,19 @@ def _add_baud(parser: argparse._ActionsContainer) -> None:
 
 
 def add_drive(parser: argparse.ArgumentParser) -> None:
-    """Options that matter on a drive only."""
+    """Options for a drive behind a port."""
     group = parser.add_argument_group(f"on a drive (PORT: {PORT_HELP})")
     _add_baud(group)
     group.add_argument(
         "--limits", metavar="LIST",
-        help="what the drive may do, as volt=10,speed=3500,acceleration=30000,current=15 [V, RPM, "
-        "RPM/s, A]; it stops when it does more. inf: none. A virtual drive has limits by default; "
-        "a virtual machine without a port has none to set",
+        help="limits of the drive, as volt=10,speed=3500,acceleration=30000,current=15 [V, RPM, "
+        "RPM/s, A]; it stops beyond them. inf: no limit. A virtual drive has limits by default; a "
+        "virtual machine without a port has none",
     )  # fmt: skip
     group.add_argument(
         "--watchdog", type=float, metavar="MS",
-        help="the drive stops when it has not heard from here for this long (100; 250 of its own "
-        "time where that runs by credit)",
+        help="the drive stops without a frame from this computer for this time (100; 250 of its "
+        "own time if that runs on credit)",
     )  # fmt: skip
     add_view(group)
 
@@ -185,11 +184,12 @@ def is_port(text: str) -> bool:
 
 
 def machine_of(text: str) -> VirtualMachine | Machine:
-    """What `--on` names where it is no port: `virtual[:SEED]`, a motor's twin, or an FMU.
+    """The machine that `--on` names: `virtual[:SEED]`, a motor's twin, or an FMU.
 
     Raises
     ------
     SettingError, ModelFileError
+        For any other text, and for a file that cannot be used.
     """
     from ..commissioning.fmu import fmu_of, is_fmu
     from ..machine import VirtualMachine
@@ -209,17 +209,17 @@ def machine_of(text: str) -> VirtualMachine | Machine:
 
 
 def _named(machine: str) -> str:
-    """The name of a virtual machine, also of a motor's twin."""
+    """The name of a virtual machine, which can be a motor's twin."""
     return machine_of(machine).name if machine.endswith(".json") else machine
 
 
 def require_no_drive_options(args: argparse.Namespace) -> None:
-    """Refuse settings that only a drive behind a port has, where `--on` names none.
+    """Refuse a drive's options for another machine: a user could rely on limits that do not apply.
 
     Raises
     ------
     SettingError
-        Rather than a run that somebody believes to be within limits.
+        If one of them was given.
     """
     given = {
         "--limits": args.limits is not None,
@@ -237,7 +237,7 @@ def require_no_drive_options(args: argparse.Namespace) -> None:
 
 @contextmanager
 def opened(args: argparse.Namespace) -> Iterator[Drive]:
-    """The drive behind `args.on`, with its limits set; it is stopped when the block ends."""
+    """The drive behind `args.on` with its limits set; the end of the block stops it."""
     from ..link import connect
 
     limits = _limits(args.limits) if args.limits else None
@@ -253,19 +253,16 @@ def opened(args: argparse.Namespace) -> Iterator[Drive]:
                 "and machine stand: --limits volt=10,speed=3500,acceleration=30000,current=15"
             )
         _require_untripped(args.on, drive)
-        # limits that an earlier command has left must not stay in force unnoticed
-        drive.set_limits(**(limits or _ceilings(drive)))
-        with _ended_by_signals():
+        # limits of an earlier command must not stay in force unnoticed
+        ceilings = dict(zip(LIMITS.values(), drive.limits().ceilings, strict=True))
+        drive.set_limits(**(limits or ceilings))
+        with _signals_as_interrupts():
             yield drive
 
 
-def _ceilings(drive: Drive) -> dict[str, float]:
-    return dict(zip(LIMITS.values(), drive.limits().ceilings, strict=True))
-
-
 @contextmanager
-def _ended_by_signals() -> Iterator[None]:
-    """A run that receives SIGTERM, or whose terminal is closed, ends as by Ctrl-C: motor first."""
+def _signals_as_interrupts() -> Iterator[None]:
+    """SIGTERM, and SIGHUP of a closed terminal, act as Ctrl-C, which stops the motor first."""
     numbers = [getattr(signal, name, None) for name in ("SIGTERM", "SIGHUP")]
     before = {n: signal.signal(n, signal.default_int_handler) for n in numbers if n is not None}
     try:
@@ -276,12 +273,7 @@ def _ended_by_signals() -> Iterator[None]:
 
 
 def _require_untripped(port: str, drive: Drive) -> None:
-    """Say why a drive does not take limits, rather than that it does not.
-
-    Raises
-    ------
-    LinkError
-    """
+    """Raise `LinkError` with the reason of a trip, as a tripped drive refuses limits without it."""
     status = drive.status()
     if status.state == "tripped":
         raise LinkError(
@@ -296,7 +288,7 @@ def _limits(text: str) -> dict[str, float]:
     Raises
     ------
     SettingError
-        Where a limit is missing, unknown, repeated or no number.
+        If a limit is missing, unknown, repeated or not a number.
     """
     parts = [part.partition("=") for part in text.split(",")]
     names = [name.strip() for name, _, _ in parts]
@@ -312,13 +304,12 @@ def _limits(text: str) -> dict[str, float]:
 
 
 def recording_place(out: Path | None, *, overwrite: bool) -> Path:
-    """Where the recording of a drive goes: the output itself, or `.mcap` in the same folder.
+    """The file of a drive's recording: the output itself, or `.mcap` in the same folder.
 
     Raises
     ------
     SettingError
-        Without an output, what a drive did cannot be had again; nor can what another one has done,
-        which is kept.
+        Without an output, and for an existing recording of a drive, as neither can be made again.
     """
     from ..recordfile.writer import require_free, require_replaceable
 
@@ -335,7 +326,7 @@ def recording_place(out: Path | None, *, overwrite: bool) -> Path:
 
 
 def say_interrupted(count: int, place: Path) -> int:
-    """What a run has left that Ctrl-C ended; the exit code."""
+    """Report the recording of an interrupted run; return the exit code."""
     left = f"{count} samples are in {place}" if count else "nothing had been recorded"
     print(f"interrupted; {left}", file=sys.stderr)
     return 130
@@ -373,13 +364,13 @@ def _send(args: argparse.Namespace, what: str) -> None:
 
 
 DEVICE = """\
-Serve the virtual sewing machine on a port, as a real drive would be there.
+Serve the virtual sewing machine on a port, like a real drive.
 
 The first line on standard output is `port NAME`; record, run and doctor take that name. Ctrl-C
 ends it.
 
-A pty is named by a symbolic link, which comes back with it after a fault `unplug`. TCP takes one
-host at a time.
+A pty has a symbolic link as its name, which comes back with it after a fault `unplug`. TCP takes
+one host at a time.
 """
 
 DEVICE_EXAMPLES = """\
@@ -391,12 +382,12 @@ examples:
 
 FAULTS = """\
 KIND=RATE or KIND=RATE:SECONDS, separated by commas; rates are per frame, in both directions.
-drop, flip (a bit), duplicate, reorder, delay (.02 s), stall (both ways, .2 s), reset (the
-device boots anew), unplug (the port is gone, .3 s)
+drop, flip (a bit), duplicate, reorder, delay (.02 s), stall (both directions, .2 s), reset (the
+device reboots), unplug (the port vanishes, .3 s)
 """
 
 _LOOK = 0.05
-"""Time between two looks at signals [s]."""
+"""Longest delay of a signal [s]."""
 
 
 def add_device(commands: Commands) -> None:
@@ -407,7 +398,7 @@ def add_device(commands: Commands) -> None:
     place = parser.add_mutually_exclusive_group()
     place.add_argument(
         "--link", type=Path, metavar="PATH",
-        help="serve on a pty with this name; default: one in a temporary folder",
+        help="serve on a pty with this name (one in a temporary folder)",
     )  # fmt: skip
     place.add_argument(
         "--tcp", nargs="?", const="127.0.0.1:0", metavar="HOST:PORT",
@@ -415,22 +406,27 @@ def add_device(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--anyone", action="store_true",
-        help="--tcp may name an address that other computers reach, and start the motor from",
+        help="allow --tcp an address that other computers can reach: they can start the motor",
     )  # fmt: skip
     parser.add_argument(
         "--machine", default="virtual", metavar="virtual[:SEED]|MOTOR.json",
-        help="the machine (virtual); a file of `sewfast physics -o` is its twin",
+        help="the machine (virtual), or the twin of a motor in a file of `sewfast physics -o`",
     )  # fmt: skip
     parser.add_argument(
         "--fast", action="store_true",
         help="as fast as the port allows: time advances only by the host's credit",
     )  # fmt: skip
     parser.add_argument(
-        "--baud", type=int, metavar="N", help="carry N bits a second each way, 10 for a byte"
+        "--baud",
+        type=int,
+        metavar="N",
+        help="limit to N bits a second in each direction, 10 per byte",
     )
     parser.add_argument("--faults", default="", metavar="LIST", help=FAULTS)
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the faults (0)")
-    parser.add_argument("--once", action="store_true", help="end when the first host has gone")
+    parser.add_argument(
+        "--once", action="store_true", help="end when the first host has disconnected"
+    )
     parser.add_argument(
         "--for", dest="duration", type=float, metavar="S", help="end after S seconds"
     )
@@ -439,7 +435,7 @@ def add_device(commands: Commands) -> None:
     )
     parser.add_argument(
         "--trace", type=Path, metavar="FILE",
-        help="a line of JSON for each change of the output and of who is there",
+        help="a line of JSON for each change of the output and of the connection",
     )  # fmt: skip
 
 
@@ -497,24 +493,8 @@ def _say_result(device: VirtualDevice, *, as_json: bool) -> None:
 
 
 def _say(line: str) -> None:
-    """Print at once; whoever listened may have gone without ending the device."""
+    """Print immediately; a reader that has ended must not end the device."""
     try:
         print(line, flush=True)
     except (BrokenPipeError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-@contextmanager
-def _signals_as_interrupts() -> Iterator[None]:
-    """SIGTERM, and SIGHUP where there is one, end the device as Ctrl-C does."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    numbers = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
-    before = {number: signal.signal(number, interrupt) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

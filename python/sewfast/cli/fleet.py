@@ -1,4 +1,4 @@
-"""`sewfast fleet`: many machines, a row each."""
+"""`sewfast fleet`: many machines, one row each."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from .arguments import Commands, add_command, add_plot, require_plot
 from .output import DONE, INTERRUPTED, print_json
 
 FLEET = """\
-Identify and check every recording of a folder, or of a manifest (CSV with a column file and, where
-they differ, inputs, output, Ts), on all cores or on a Dask cluster. A recording that cannot be used
-costs its own row and no other. The same command goes on where it was interrupted, and works only on
-what is new or changed. With --before, machines whose gain, residence time or noise has moved beyond
-its band are named.
+Identify and check every recording of a folder, or of a manifest (CSV with a column file and, if
+they differ, inputs, output, Ts), on all cores or on a Dask cluster. An unusable recording fails in
+its own row only. The same command continues after an interruption, and processes only new or
+changed recordings. With --before, it names the machines whose gain, residence time or noise has
+moved beyond its band.
 """
 
 EXAMPLES = """\
 examples:
   sewfast fleet recordings -o results.parquet
   sewfast fleet machines.csv --input u --output speed -o october.csv
-  sewfast fleet november -o november.csv --before october.csv           what has drifted
+  sewfast fleet november -o november.csv --before october.csv           machines that drifted
   sewfast fleet recordings -o gains.csv --controller template.json      a controller for each
   sewfast fleet recordings -o results.csv --scheduler tcp://host:8786   on a cluster
 """
@@ -33,7 +33,7 @@ examples:
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "fleet", fleet_command,
-        summary="many recordings, a row each", text=FLEET, examples=EXAMPLES,
+        summary="many recordings, one row each", text=FLEET, examples=EXAMPLES,
     )  # fmt: skip
     parser.add_argument("recordings", metavar="FOLDER|MANIFEST", help="recordings, or their list")
     parser.add_argument(
@@ -44,7 +44,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--output", metavar="COL",
-        help="column of the output; default: both as their names and units show",
+        help="column of the output; default: both by their names and units",
     )  # fmt: skip
     parser.set_defaults(columns_of="file", counts=None)
     parser.add_argument(
@@ -55,17 +55,17 @@ def add(commands: Commands) -> None:
         help="kind of model (oe)",
     )  # fmt: skip
     parser.add_argument(
-        "--controller", metavar="FILE.json", help="tune it anew for every recording's model"
+        "--controller", metavar="FILE.json", help="tune this controller for every model"
     )
     parser.add_argument("--before", metavar="FILE", help="an earlier table, to find drift")
-    add_plot(parser, "gain, residence time and noise of every machine")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster")
+    add_plot(parser, "draw gain, residence time and noise of every machine")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="scheduler of a Dask cluster")
     parser.add_argument(
         "--workers", type=int, metavar="N",
         help="processes on this computer (its cores); 0: in this process, without Dask",
     )  # fmt: skip
-    parser.add_argument("--memory", default="500MB", metavar="SIZE", help="of each of them (500MB)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of every search (0)")
+    parser.add_argument("--memory", default="500MB", metavar="SIZE", help="of each worker (500MB)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of searches (0)")
 
 
 def fleet_command(args: argparse.Namespace) -> int:
@@ -101,7 +101,7 @@ def fleet_command(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             print(
                 f"sewfast fleet: interrupted; {done} recordings are done and kept: the same "
-                "command goes on from there",
+                "command continues there",
                 file=sys.stderr,
             )
             return INTERRUPTED

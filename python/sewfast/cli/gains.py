@@ -23,9 +23,9 @@ N = 10.0
 TEXT = """\
 First gains for a drive, from a recorded step response or from K, T and L of K e^(-sL)/(1 + sT).
 
-A rule gives gains, alpha and beta; printed are the gains in all three forms and the margins of the
-sampled loop with hold, derivative filter, feedback filter and encoder in it. What hold, filter and
-encoder add to the dead time is added to L before the rule is applied.
+A rule gives gains, alpha and beta. The gains are printed in all three forms, with the margins of
+the sampled loop including hold, derivative filter, feedback filter and encoder. The delays of hold,
+filter and encoder are added to L before the rule is applied.
 """
 
 EXAMPLES = """\
@@ -50,13 +50,13 @@ def add(commands: Commands) -> None:
     parser.add_argument("--rule", choices=RULES, default="eq-12", help="tuning rule (eq-12)")
     parser.add_argument(
         "--Ms", type=float, metavar="MS",
-        help="eq-12: largest sensitivity that is allowed (2.0); inf: the paper's optimum",
+        help="eq-12: largest allowed sensitivity (2.0); inf: the paper's optimum",
     )  # fmt: skip
     parser.add_argument(
         "--tau-c", type=float, metavar="S", help="simc: time constant of the closed loop [s]"
     )
     parser.add_argument(
-        "--nearest", action="store_true", help="table-1: the end row where L/T is outside .1 to 1"
+        "--nearest", action="store_true", help="table-1: use the end row for L/T outside .1 to 1"
     )
     parser.add_argument(
         "--filter", type=int, default=FILTER, metavar="N",
@@ -66,8 +66,12 @@ def add(commands: Commands) -> None:
         "--N", type=float, default=N, metavar="N",
         help="the derivative is filtered with Td/N (10); inf: not",
     )  # fmt: skip
-    parser.add_argument("--u-min", type=float, default=-20.0, metavar="V", help="(-20)")
-    parser.add_argument("--u-max", type=float, default=20.0, metavar="V", help="(20)")
+    parser.add_argument(
+        "--u-min", type=float, default=-20.0, metavar="V", help="least command (-20)"
+    )
+    parser.add_argument(
+        "--u-max", type=float, default=20.0, metavar="V", help="largest command (20)"
+    )
     parser.add_argument(
         "--form", choices=[f.replace("_", "-") for f in FORMS], default="standard",
         help="form of the gains in the controller's file (standard)",

@@ -1,4 +1,4 @@
-"""`sewfast orders`, `identify`, `validate`, `simulate`: to a model, and what it says."""
+"""`sewfast orders`, `identify`, `validate`, `simulate`: models from recordings."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ ORDERS_TEXT = """\
 Estimate the delay of each input, then try linear models of every order and print the table.
 
 Every model is judged in free run on the last part of each recording, which it was not fitted to.
-The choice is the smallest model that does as well there as the best one; the table says why.
+The choice is the smallest model that is as good there as the best one; the table gives the reason.
 """
 
 ORDERS_EXAMPLES = """\
@@ -73,7 +73,7 @@ def add_orders(commands: Commands) -> None:
     parser.add_argument("--na", type=int, default=4, metavar="N", help="past outputs up to (4)")
     parser.add_argument("--nb", type=int, default=4, metavar="N", help="past inputs up to (4)")
     parser.add_argument(
-        "--nk", type=int, metavar="N", help="delay [samples]; default: 1 and what is plausible"
+        "--nk", type=int, metavar="N", help="delay [samples]; default: 1 and plausible ones"
     )
     parser.add_argument(
         "--held-out", type=float, default=0.3, metavar="PART",
@@ -111,10 +111,10 @@ several files are several experiments of one drive.
 FILE:IN:OUT names the columns of one file, IN1+IN2 several inputs.
 
 The default, auto, fits linear output error of several orders, then networks that start from it, and
-keeps a network only if it does credibly better in free run on samples that it was not fitted to.
-Every candidate is printed with its error; the last lines say whether the model is good enough to
+keeps a network only if it is credibly better in free run on samples that it was not fitted to.
+Every candidate is printed with its error; the last lines tell whether the model is good enough to
 tune a controller on, and what to do next. Without --input and --output both are recognised by
-their names and units, if there is no doubt.
+their names and units, if these are clear.
 """
 
 EXAMPLES = """\
@@ -138,7 +138,7 @@ examples:
       two experiments whose columns have different names
 
   sewfast identify run.csv --input u --output y --mask 700:720 --resample 0.005 -o drive.json
-      two hundredths of a second without weight, a longer sample time; sewfast look says what helps
+      20 samples without weight, a longer sample time; sewfast look gives such advice
 
   sewfast identify run.mat --input u --output y --ts 0.02 --model oe -o linear.json
       a file without a time column; linear output error alone
@@ -147,10 +147,10 @@ examples:
       a picture of the free run on the samples held out
 
   sewfast identify run.csv --input u --output y --time-budget 30 -o drive.json
-      the best model that is found in half a minute
+      the best model found in half a minute
 
   sewfast identify run.csv --input u --output y --alternatives -o drive.json
-      also what would have been chosen next: drive-alternative-1.json and so on
+      also the next best models: drive-alternative-1.json and so on
 
   sewfast identify today.csv --input u --output y --further drive.json -o drive2.json
       the model in drive.json, trained further on today's recording
@@ -174,8 +174,8 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--validate", metavar="A:B",
-        help="samples of each file that are held out: they choose, and are scored; default: the "
-        "last fifth is held out to choose, and learned from in the end",
+        help="samples of each file to hold out, for the choice and the score; default: the last "
+        "fifth is held out for the choice, and used for training in the end",
     )  # fmt: skip
     add_plot(parser, "draw the free run on the data held out, else on the training data")
     add_named_output(parser, "model", "data", "model file to write")
@@ -185,7 +185,7 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model", choices=[spelled(kind) for kind in KINDS], default="auto",
         help="; ".join(f"{spelled(kind)}: {text}" for kind, text in TEXTS.items())
-        + "; auto (default): oe or a network, whichever does better",
+        + "; auto (default): oe or a network, whichever is better",
     )  # fmt: skip
     parser.add_argument(
         "--preset", choices=("paper",),
@@ -195,28 +195,28 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
     add_argument = parser.add_argument
     add_argument("--na", **whole, help="past outputs of a lagged model (2)")
     add_argument("--nb", **whole, help="past inputs of a lagged model (2)")
-    add_argument("--nk", **whole, help="delay [samples] (1; auto, neural-ss: found)")
-    add_argument("--nx", **whole, help="states of neural-ss (found)")
-    add_argument("--hidden", **whole, help="hidden units (found; neural-oe: 8)")
+    add_argument("--nk", **whole, help="delay [samples] (1; auto, neural-ss: from the data)")
+    add_argument("--nx", **whole, help="states of neural-ss (from the data)")
+    add_argument("--hidden", **whole, help="hidden units (from the data; neural-oe: 8)")
     add_argument(
         "--output-function", choices=("linear", "saturation", "abs"),
-        help="output function of neural-ss: abs for a sensor that does not see the sign (found)",
+        help="output function of neural-ss: abs for a sensor without the sign (from the data)",
     )  # fmt: skip
     add_argument("--starts", **whole, help="random starts (by the amount of data)")
     add_argument("--seed", **whole, default=0, help="seed of the starts (0)")
     add_argument(
         "--time-budget", type=float, metavar="S",
-        help="seconds for everything; the best model until then is kept (none)",
+        help="total time [s]; the best model until then is kept (no limit)",
     )  # fmt: skip
     add_argument(
         "--no-select", dest="select", action="store_false",
         help="neural-oe: hold nothing out, train to the last iteration; to compare methods",
     )  # fmt: skip
-    add_argument("--further", metavar="MODEL.json", help="a model to train further, as it is")
+    add_argument("--further", metavar="MODEL.json", help="a model to train further")
     add_argument(
         "--alternatives", action="store_true",
-        help="also write what would have been chosen next, to MODEL-alternative-1.json and so on, "
-        "in place of those of an earlier MODEL.json",
+        help="also write the next best models, to MODEL-alternative-1.json and so on, in place of "
+        "those of an earlier MODEL.json",
     )  # fmt: skip
 
 
@@ -247,14 +247,14 @@ def identify_command(args: argparse.Namespace) -> int | None:
 
 
 def _save_alternatives(args: argparse.Namespace, model: Model) -> list[Path]:
-    """Files in the model's folder, the best alternative first; none of an earlier model is left."""
+    """Write the alternatives beside the model, the best first; delete those of older models."""
     out = Path(args.out)
     numbered = (out.with_name(f"{out.stem}-alternative-{i}{out.suffix}") for i in count(1))
     paths = []
     for other in model.alternatives:
         paths.append(next(numbered))
         other.save(paths[-1])
-    # a model that is trained further has none, and may be one of these files itself
+    # a model that is trained further has no alternatives, and can be one of these files itself
     for old in takewhile(Path.is_file, () if args.further else numbered):
         old.unlink()
     return paths
@@ -331,15 +331,15 @@ def _show(
     print(f"written to {args.out}; score it on another recording: sewfast validate {args.out} DATA")
 
 
-# --- `sewfast validate`, `sewfast simulate`: what a model says about a recording ------------------
+# --- `sewfast validate`, `sewfast simulate`: a model on a recording -------------------------------
 
 
 VALIDATE = """\
 Score a model on a recording that it was not trained on, in free run and one step ahead.
 
-Free run is what counts: the model starts once and depends on its own outputs, as it does when a
-controller is tuned on it. One step ahead starts from the measured output at every sample: that
-looks good for models that are useless on their own, and bad if the outputs are noisy.
+Free run is what counts: the model starts once and then uses its own outputs, as in the tuning of a
+controller. One step ahead starts from the measured output at every sample: that looks good for
+models that are useless on their own, and bad if the outputs are noisy.
 """
 
 VALIDATE_EXAMPLES = """\
@@ -445,7 +445,7 @@ def simulate_command(args: argparse.Namespace) -> None:
 
 
 def _time(table: Table, data: Dataset) -> FloatArray:
-    """The recording's own time where it is in seconds, else counted from 0."""
+    """The recording's own time if it is in seconds, else multiples of the sample time."""
     import numpy as np
 
     for name in table.names:
@@ -456,7 +456,7 @@ def _time(table: Table, data: Dataset) -> FloatArray:
 
 
 def _inputs(data: Dataset) -> dict[str, FloatArray]:
-    """`u` for one input; several keep their names, apart from those of the other columns."""
+    """`u` for one input; several keep their names, prefixed if another column has the same."""
     names = tuple(f"u_{n}" if n in ("t", "y_hat") else n for n in data.input_names)
     labels = ("u",) if data.n_inputs == 1 else names
     return dict(zip(labels, data.experiments[0].u.T, strict=True))

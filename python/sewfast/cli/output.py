@@ -1,4 +1,4 @@
-"""Results on standard output: JSON, tables, columns as CSV."""
+"""Output of the commands: JSON, tables, columns as CSV, notes."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ DONE, FAULT, REFUSED, INTERRUPTED = 0, 1, 2, 130
 
 
 LOG = logging.getLogger(__package__)
-"""Notes of the commands; the package's own logger is the one above it."""
+"""Logger for the notes of the commands; its parent is the package's logger."""
 
 
 def note(text: str) -> None:
-    """A note on standard error, which `--quiet` leaves out."""
+    """Print a note to standard error, except with `--quiet`."""
     LOG.info("%s", text)
 
 
@@ -41,7 +41,7 @@ def logging_to_stderr(*, quiet: bool = False, verbose: int = 0) -> Iterator[None
     package = LOG.parent
     assert package is not None
     if any(isinstance(handler, _ToStderr) for handler in package.handlers):
-        # a stage of another command, which has set all this
+        # a stage of another command, which has set this up already
         yield
         return
     before = [(logger, logger.level) for logger in (LOG, package)]
@@ -58,7 +58,7 @@ def logging_to_stderr(*, quiet: bool = False, verbose: int = 0) -> Iterator[None
 
 
 def print_json(value: Any) -> None:
-    """Strict JSON: what is not finite becomes null."""
+    """Print strict JSON, with null for NaN and infinity."""
     print(json.dumps(_finite(value), indent=1, allow_nan=False))
 
 
@@ -73,7 +73,7 @@ def _finite(value: Any) -> Any:
 
 
 def print_result(result: Any, args: Any, *, plot: Path | None = None) -> None:
-    """A result with `to_json` and `str`, and where its figure has been written."""
+    """Print a result by its `to_json` or `str`, and the file of its figure."""
     if args.json:
         print_json(result.to_json() | ({"plot": str(plot)} if plot is not None else {}))
         return
@@ -83,7 +83,7 @@ def print_result(result: Any, args: Any, *, plot: Path | None = None) -> None:
 
 
 def print_rows(rows: Sequence[Sequence[str]]) -> None:
-    """Columns of text, as wide as they need to be; the last one runs free."""
+    """Print rows as aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = (cell.ljust(w) for cell, w in zip(row, widths, strict=True))
@@ -101,7 +101,7 @@ def write_columns(
     header: Header | None = None,
     written: Path | None = None,
 ) -> None:
-    """Columns to `out` and what they say to standard output; without `out` the columns themselves.
+    """Write columns to `out` and print the result; without `out` print the columns as CSV.
 
     Parameters
     ----------
@@ -113,9 +113,9 @@ def write_columns(
     lines : sequence of str
         The result as text.
     header : Header or None
-        What an `.mcap` file says of itself.
+        Header of an `.mcap` file.
     written : Path or None
-        A file that holds the columns already: the recording of a drive.
+        A file that contains the columns already: the recording of a drive.
     """
     if out is not None:
         if out != written:

@@ -57,15 +57,15 @@ results go to standard output, progress and messages to standard error
 exit codes:
   0    done
   1    a fault in sewfast itself; --debug shows where
-  2    refused: the message says what was expected, what came and what to do
+  2    refused: the message says what was expected, what was received and what to do
   130  interrupted by Ctrl-C; the best result so far is kept
 """
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that suggests what was probably meant; without a command it shows its help.
+    """A parser that suggests the nearest name for a typo; without a command it shows its help.
 
-    argparse makes the parsers of the commands of the same class.
+    argparse uses the same class for the parsers of the commands.
     """
 
     def parse_args(  # type: ignore[override]
@@ -103,20 +103,20 @@ class Parser(argparse.ArgumentParser):
 
 
 def meant(given: Iterable[str], known: Sequence[str]) -> str:
-    """A question after the nearest names, empty where none is near."""
+    """A question with the nearest names; empty without any."""
     near = [difflib.get_close_matches(g.split("=")[0], known, n=1, cutoff=0.6) for g in given]
     names = [name for some in near for name in some]
     return f"; did you mean {' '.join(names)}?" if names else ""
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The whole command line; a parsed command holds its function as `command`."""
+    """The parser of the command line; a parsed command has its function as `command`."""
     parser = Parser(prog="sewfast", description=DESCRIPTION, epilog=EPILOG, formatter_class=Help)
     parser.add_argument("--version", action=_Version, help="print the version and exit")
     commands: Commands = parser.add_subparsers(  # type: ignore[assignment]
         title="commands", metavar="COMMAND", dest="name"
     )
-    # in the order in which the help shows them
+    # in the order of the help
     makers = (
         project.add,
         commission.add_demo,
@@ -151,7 +151,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 class _Version(argparse.Action):
-    """Prints the version; it lies in the compiled module, which `--help` need not load."""
+    """Prints the version, which is in the compiled module that `--help` need not load."""
 
     def __init__(self, option_strings: list[str], dest: str, help: str | None = None) -> None:
         super().__init__(option_strings, dest=argparse.SUPPRESS, nargs=0, help=help)
@@ -163,7 +163,7 @@ class _Version(argparse.Action):
         parser.exit(0)
 
 
-# --- `sewfast completion`: commands, options and files after a press of Tab -----------------------
+# --- `sewfast completion`: commands, options and files by the Tab key -----------------------------
 
 
 COMPLETION = """\
@@ -178,7 +178,7 @@ examples:
 """
 
 _FILES = re.compile(r"FILE|DATA|OUT|\.json|\.mcap|DIR|PORT|virtual", re.IGNORECASE)
-"""What stands in the name of an argument that is a file, or may be one."""
+"""Matches the metavar of an argument that is or can be a file."""
 
 
 def add_completion(commands: Commands) -> None:
@@ -205,7 +205,7 @@ def completion_command(args: argparse.Namespace) -> None:
 
 
 def _complete_files(parser: argparse.ArgumentParser, files: object) -> None:
-    """Let arguments that name files be completed by files, in every command."""
+    """Complete the file arguments of every command by file names."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for command in action.choices.values():

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from ..dataset import Dataset
 
 PHYSICS = """\
-What is my motor: the command that it takes per speed, per acceleration and against friction, its
-lags, what varies over a turn, each with a 95 % interval. With a measured current also resistance,
-and with the volts on the winding R, Ke, J and friction in SI units. What the record cannot tell is
-named, with what would tell it, and not printed as a number.
+The constants of a motor: command per speed, per acceleration and against friction, lags, loads over
+a turn, each with a 95 % interval. With a measured current also the resistance, and with the volts
+on the winding R, Ke, J and friction in SI units. Constants that the record does not determine are
+not printed as numbers but named, with the measurement that would determine them.
 """
 
 EXAMPLES = """\
@@ -51,7 +51,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--structure", default="dcmotor", metavar="LIST",
-        help="dcmotor (the usual terms, those that are not shown go), or terms: lag,delay,coulomb,"
+        help="dcmotor (the usual terms that the record shows), or terms: lag,delay,coulomb,"
         "offset,drop,stribeck,load_1,load_2,inertia_2,cogging,torque_ripple,limit; dcmotor,sag "
         "adds one of stribeck_difference,sag,eccentricity",
     )  # fmt: skip
@@ -60,7 +60,7 @@ def add(commands: Commands) -> None:
         help="95 %% intervals by the curvature of the cost, or as profile likelihood (seconds)",
     )  # fmt: skip
     parser.add_argument(
-        "--speed-unit", metavar="UNIT", help="of the output: rpm, rad/s, rev/s, deg/s"
+        "--speed-unit", metavar="UNIT", help="unit of the output: rpm, rad/s, rev/s, deg/s"
     )
     parser.add_argument(
         "--export", nargs=2, metavar=("TARGET", "FILE"),
@@ -68,8 +68,8 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--winding", choices=("line", "q"),
-        help="for --export: volts and amperes between two terminals (line), or amplitudes along "
-        "the q axis, as boards log them (q)",
+        help="for --export: volts and amperes are between two terminals (line), or amplitudes "
+        "along the q axis, as logged by boards (q)",
     )  # fmt: skip
     parser.add_argument(
         "--gear", type=float, default=1.0, metavar="N",
@@ -77,10 +77,10 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--model", metavar="FILE.json", type=Path,
-        help="write the turning motor as a linear model, to tune on",
+        help="write the turning motor as a linear model for tuning",
     )  # fmt: skip
     add_output(parser, "FILE.json", "write the motor")
-    add_plot(parser, "draw the free run and what it takes to hold a speed")
+    add_plot(parser, "draw the free run and the command over the speed")
     add_columns(parser, from_model=False)
 
 
@@ -130,7 +130,7 @@ def command(args: argparse.Namespace) -> None:
 
 
 def _data(args: argparse.Namespace) -> Dataset:
-    """The records, of counts their differences: a smoothed speed has lost what friction does."""
+    """The records, with differences of counts as speed: smoothing hides the effect of friction."""
     from ..commissioning import unsmoothed
     from ..dataset import Dataset
     from .data import read_training

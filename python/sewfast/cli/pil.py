@@ -17,15 +17,15 @@ from .output import note, print_json
 
 PIL = """\
 Processor in the loop: compile the example firmware for a Cortex-M4 or M7, start it in the emulator
-QEMU, connect to its serial port and do what one does with a drive: examine it, record a chirp, run
-a controller, commission it. The motor is computed on the emulated processor too.
+QEMU, connect to its serial port and use it like a drive: examine it, record a chirp, run a
+controller, commission it. The motor is computed on the emulated processor too.
 
-At the end it says how many instructions a control period takes, how deep the stack was used and
-how large the code is. QEMU counts instructions, not cycles.
+At the end it prints the instructions per control period, the deepest use of the stack and the size
+of the code. QEMU counts instructions, not cycles.
 
 It needs a source checkout and, on Debian, make, cargo-web and
   gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm rustc-web rust-web-src
-or a firmware that is built already, and qemu-system-arm alone.
+or a built firmware, and qemu-system-arm alone.
 """
 
 EXAMPLES = """\
@@ -38,7 +38,7 @@ examples:
 """
 
 LIMITS = "volt=10,speed=8000,acceleration=90000,current=inf"
-"""What the computed motor may do."""
+"""Limits of the computed motor."""
 
 
 def add(commands: Commands) -> None:
@@ -53,24 +53,26 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     place.add_argument(
         "--firmware", type=Path, metavar="FILE.elf",
-        help="built already, for either board; it says which",
+        help="a built firmware for either board",
     )  # fmt: skip
     parser.add_argument(
         "--board", choices=("mps2-an386", "mps2-an500"),
-        help="what to build for: a Cortex-M4 or a Cortex-M7 (mps2-an386)",
+        help="board to build for: a Cortex-M4 or a Cortex-M7 (mps2-an386)",
     )  # fmt: skip
     parser.add_argument(
-        "--out", type=Path, default=Path("pil"), metavar="DIR", help="folder for what it did (pil)"
+        "--out", type=Path, default=Path("pil"), metavar="DIR", help="folder for the results (pil)"
     )
     parser.add_argument(
         "--clock", choices=("credit", "real"), default="credit",
-        help="the board's time: what the host grants, or the computer's (credit)",
+        help="the board's time: granted by the host, or the computer's (credit)",
     )  # fmt: skip
     parser.add_argument(
         "--watchdog", type=float, metavar="MS",
-        help="the board stops when it has not heard from here for this long (as `record` has it)",
+        help="the board stops without a frame from this computer for this time (as for `record`)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of commissioning (0)")
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="seed of the commissioning (0)"
+    )
     parser.add_argument(
         "--no-commission", dest="commission", action="store_false", help="leave commissioning out"
     )
@@ -115,11 +117,11 @@ def command(args: argparse.Namespace) -> int:
 
 
 def _prepare(folder: Path, overwrite: bool, *, make: bool) -> None:
-    """The folder for the results: looked at before a compiler runs, made when a board does."""
+    """Check the folder for the results before compiling; create it when the board runs."""
     try:
         if folder.exists() and not overwrite:
             raise SettingError(
-                f"--out {folder}: expected a new folder, got one that is there; name another, or "
+                f"--out {folder}: expected a new folder, got an existing one; name another, or "
                 "--overwrite"
             )
         if make:
@@ -134,7 +136,7 @@ def _prepare(folder: Path, overwrite: bool, *, make: bool) -> None:
 
 
 def _stages(args: argparse.Namespace, port: str) -> Iterator[tuple[str, list[str]]]:
-    """The commands, as a user would type them."""
+    """The commands of the stages."""
     out = args.out
     drive = ["--limits", LIMITS, "--live", "none"]
     if args.watchdog is not None:
@@ -153,7 +155,7 @@ def _stages(args: argparse.Namespace, port: str) -> Iterator[tuple[str, list[str
 
 
 def _carried_out(args: argparse.Namespace, words: list[str]) -> tuple[int, Any]:
-    """One stage: its exit code, and with --json what it printed."""
+    """Run one stage; return its exit code, and with --json its output."""
     from . import main
 
     note(f"$ sewfast {' '.join(words)}")

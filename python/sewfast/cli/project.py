@@ -1,7 +1,7 @@
-"""`sewfast init`, and the project file `sewfast.toml`: settings that need not be repeated.
+"""`sewfast init`, and the project file `sewfast.toml` with defaults for the commands.
 
-The file is looked for in the working folder and in those above it. Whatever is given on the command
-line wins, and so do the columns that a model was made from.
+The file is searched in the working folder and in those above it. Options on the command line take
+precedence, and so do the columns stored in a model.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import importlib
 import math
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,7 +37,7 @@ _TOP = ("port", "columns", "units", "limits")
 
 @dataclass(frozen=True)
 class Project:
-    """What a project file says; each field is empty where it says nothing.
+    """The content of a project file; a field without a setting is empty.
 
     Attributes
     ----------
@@ -48,9 +48,9 @@ class Project:
     columns : mapping
         `input` (a list), `output`, `time`, `counts`, `counts_per_rev`, `ts`, `weights`.
     units : mapping of str to str
-        Of columns whose file states none.
+        Units of columns whose file states none.
     limits : mapping of str to float
-        What the drive enforces: volt, speed, acceleration, current; all four or none.
+        Limits enforced by the drive: volt, speed, acceleration, current; all four or none.
     command : mapping of str to float
         `u_min` and `u_max`, the range of a controller's command.
     """
@@ -63,7 +63,7 @@ class Project:
     command: Mapping[str, float] = field(default_factory=dict)
 
     def relax(self, parser: argparse.ArgumentParser) -> None:
-        """Let commands do without the port that the file states."""
+        """Make the port optional in all commands if the file names one."""
         if self.port is None:
             return
         for action in parser._actions:
@@ -76,14 +76,17 @@ class Project:
                 action.required, action.nargs = False, "?"
 
     def fill(self, args: argparse.Namespace) -> None:
-        """Put what the file says in place of what the command line leaves out, and say so."""
+        """Fill in the settings of the file that the command line leaves out, with a note."""
         args.units = dict(self.units)
         taken: dict[str, Any] = {}
-        self._fill_port(args, taken)
+        if args.name in ("record", "commission", "run") and getattr(args, "plant", None) is None:
+            self._take(args, taken, "on", self.port)
+        if args.name in ("doctor", "stop", "clear"):
+            self._take(args, taken, "port", self.port)
         if getattr(args, "columns_of", None) == "file":
             self._fill_columns(args, taken)
         elif hasattr(args, "time"):
-            # a model knows its columns, but not which one was the time
+            # a model stores its columns, but not that of the time
             self._take(args, taken, "time", self.columns.get("time"))
         port = getattr(args, "on", None) or getattr(args, "port", None)
         if self.limits and isinstance(port, str) and is_port(port):
@@ -96,16 +99,10 @@ class Project:
             shown = printable(", ".join(f"{name} = {value}" for name, value in taken.items()))
             note(f"from {self.path}: {shown}")
 
-    def _fill_port(self, args: argparse.Namespace, taken: dict[str, Any]) -> None:
-        if args.name in ("record", "commission", "run") and getattr(args, "plant", None) is None:
-            self._take(args, taken, "on", self.port)
-        if args.name in ("doctor", "stop", "clear"):
-            self._take(args, taken, "port", self.port)
-
     def _fill_columns(self, args: argparse.Namespace, taken: dict[str, Any]) -> None:
         names = dict(self.columns)
         if args.counts is not None or args.output is not None:
-            # one output on the command line is not to meet another one from the file
+            # an output on the command line replaces any in the file
             for name in ("output", "counts", "counts_per_rev"):
                 names.pop(name, None)
         for name, value in names.items():
@@ -123,29 +120,25 @@ def find(folder: Path | None = None) -> Project:
     Raises
     ------
     SettingError
-        Where the file cannot be read or says something that is not understood.
+        If the file cannot be read or has invalid content.
     """
     try:
         folder = Path.cwd() if folder is None else folder
-        found = next((p for p in _places(folder) if p.is_file()), None)
+        places = (place / NAME for place in (folder, *folder.parents))
+        found = next((p for p in places if p.is_file()), None)
         if found is None:
             return Project()
         if not _is_trusted(found):
             print(f"{found} belongs to another user and is left out; copy it", file=sys.stderr)
             return Project()
     except OSError:
-        # a folder that is gone, or one above that may not be looked into
+        # a folder that was deleted, or one above that this user cannot read
         return Project()
     return load(found)
 
 
-def _places(folder: Path) -> Iterator[Path]:
-    for place in (folder, *folder.parents):
-        yield place / NAME
-
-
 def _is_trusted(path: Path) -> bool:
-    """Whether a file is the user's own or the system's: limits of a drive are nobody else's."""
+    """Whether a file is the user's or the system's: nobody else may set the limits of a drive."""
     if not hasattr(os, "getuid"):
         return True
     return path.stat().st_uid in (os.getuid(), 0)
@@ -271,7 +264,7 @@ def with_units(table: Table, args: argparse.Namespace) -> Table:
     Raises
     ------
     SettingError
-        Where the file states another one: one of the two is wrong, and no rule says which.
+        If the file states another unit: one of the two is wrong.
     """
     units: dict[str, str] = getattr(args, "units", {})
     known = {name: unit for name, unit in units.items() if name in table}
@@ -295,11 +288,11 @@ def with_units(table: Table, args: argparse.Namespace) -> Table:
 
 
 INIT = """\
-Lay out a folder for one drive: sewfast.toml with limits, columns, units and port, a folder for
-recordings and a README with the commands in their order. Files that are there stay as they are.
+Set up a folder for one drive: sewfast.toml with limits, columns, units and port, a folder for
+recordings and a README with the commands in their order. Existing files stay unchanged.
 
-Every command reads sewfast.toml from the working folder or from one above it. What is given on the
-command line wins. On Python 3.10 reading it needs tomli (pip install tomli).
+Every command reads sewfast.toml from the working folder or from one above it. Options on the
+command line take precedence. On Python 3.10 reading it needs tomli (pip install tomli).
 """
 
 EXAMPLES = """\
@@ -310,22 +303,22 @@ examples:
 
 _TOML = """\
 # Settings of this drive, for every sewfast command that runs in this folder or below it.
-# Take the # away from what you want to set. What is given on the command line wins.
+# Remove the # before a setting to use it. Options on the command line take precedence.
 
 # port = "/dev/ttyUSB0"       # or "COM3", or "socket://localhost:5000"
 
 [columns]
 {columns}
-[units]                       # of columns whose file states none
+[units]                       # for columns whose file states none
 {units}
 [limits]
-# What the drive enforces; it stops when it does more. All four or none; inf: no limit.
+# Limits enforced by the drive, which stops beyond them. All four or none; inf: no limit.
 # volt = 10.0                 # V
 # speed = 3500.0              # RPM
 # acceleration = 30000.0      # RPM/s
 # current = 15.0              # A
 
-# Range of a controller's command; without it, what the drive was recorded with.
+# Range of a controller's command; by default the recorded range.
 # u_min = -10.0
 # u_max = 10.0
 """
@@ -334,9 +327,9 @@ _COLUMNS = """\
 # input = "u"                 # or a list: ["u", "load"]
 # output = "speed"
 # counts = "encoder"          # encoder counts instead of an output, and
-# counts_per_rev = 4096       # how many make one turn
-# time = "clock"              # where its name does not say that it is the time
-# ts = 0.001                  # s, where a file has no time column
+# counts_per_rev = 4096       # counts of one turn
+# time = "clock"              # if its name does not show that it is the time
+# ts = 0.001                  # s, for a file without a time column
 """
 
 _UNITS = """\
@@ -347,9 +340,9 @@ _UNITS = """\
 _README = """\
 # {name}
 
-Recordings lie in `recordings/`; what is the same for all of them stands in `sewfast.toml`.
+Recordings are in `recordings/`; settings common to all of them are in `sewfast.toml`.
 
-    sewfast look recordings/one.csv                       # what is in it, and what to mend
+    sewfast look recordings/one.csv                       # its properties, with advice
     sewfast identify recordings/one.csv -o drive.json     # a model
     sewfast validate drive.json recordings/two.csv        # on a recording it has never seen
     sewfast tune drive.json -o controller.json            # a controller, on the model alone
@@ -394,7 +387,7 @@ def init_command(args: argparse.Namespace) -> None:
             path.write_text(texts[path], encoding="utf-8")
     except OSError as e:
         raise unwritable(SettingError, folder, e) from e
-    load(place)  # what is written here can be read here
+    load(place)  # check that it can be read
     if args.json:
         print_json({"folder": str(folder), "files": [str(path) for path in made]})
         return
@@ -409,7 +402,7 @@ def _described(recording: str) -> tuple[str, str]:
     Raises
     ------
     SettingError
-        Where its columns do not show which is the input and which the output.
+        If its columns do not show which is the input and which the output.
     """
     from ..readers import read_table, roles
 
@@ -426,7 +419,7 @@ def _described(recording: str) -> tuple[str, str]:
 
 
 def _quoted(text: str) -> str:
-    """A TOML string; names from files hold whatever they like."""
+    """A TOML string; a name from a file can contain any character."""
     import json
 
     return json.dumps(text)

@@ -33,16 +33,16 @@ if TYPE_CHECKING:
     from ..recording import Recording
 
 RECORD = """\
-Excite a machine with a signal and record what its encoder says.
+Excite a machine with a signal and record its encoder.
 
 A signal is a named one (`sewfast signals`), made for the sewing machine, or a file with columns
 t [s], u [V] at the machine's sample time. --scale 0.2 makes any of them gentle.
 
-Columns: t [s], u [V], counts, y [RPM] (the speed estimated from the counts) and, of a virtual
-machine, speed_true [RPM], which no experiment could measure; it is there for scoring.
+Columns: t [s], u [V], counts, y [RPM] (the speed estimated from the counts) and, for a virtual
+machine, speed_true [RPM], which no experiment could measure, for scores.
 virtual:SEED is another machine of the same type.
 
-On a drive the recording is written as MCAP while it runs, so nothing that arrived is lost; a file
+On a drive the recording is written as MCAP while it runs, so no sample that arrived is lost; a file
 with another ending is made from it afterwards. Ctrl-C stops the motor and keeps the file.
 """
 
@@ -121,7 +121,7 @@ def _name(args: argparse.Namespace) -> str:
 
 
 def _settings(args: argparse.Namespace) -> dict[str, Any]:
-    """What is needed to record it again."""
+    """The settings needed to repeat the recording."""
     return {"signal": args.signal, "seed": args.seed, "scale": args.scale}
 
 
@@ -131,8 +131,7 @@ def _excitation(args: argparse.Namespace) -> tuple[FloatArray, float]:
     Raises
     ------
     SettingError, DataError
-        For a text that is neither a name nor a file, a file without u, or a factor that is no
-        number.
+        For a text that is neither a name nor a file, a file without u, or an invalid factor.
     """
     from ..readers import read
     from ..signals import EXCITATIONS, TS, excitation
@@ -148,12 +147,7 @@ def _excitation(args: argparse.Namespace) -> tuple[FloatArray, float]:
 
 
 def _require_period(args: argparse.Namespace, given: float, machine: float) -> None:
-    """A signal played at another rate would be another signal.
-
-    Raises
-    ------
-    SettingError
-    """
+    """Raise `SettingError` for a signal with another sample time than the machine's."""
     if abs(given - machine) > 0.01 * machine:
         raise SettingError(
             f"--signal {args.signal}: expected samples every {machine:g} s, the machine's, got one "
@@ -173,7 +167,7 @@ def _record_virtual(args: argparse.Namespace, u: FloatArray, Ts: float) -> None:
 
 
 def _write(args: argparse.Namespace, made: Recording, machine: str, place: Path | None) -> None:
-    """The columns and what they say; `place` already holds those of a drive."""
+    """Write the columns, unless `place` already has those of a drive, and print a summary."""
     from ..recording import UNITS
 
     summary, line = _summary(made, machine)
@@ -185,7 +179,7 @@ def _write(args: argparse.Namespace, made: Recording, machine: str, place: Path 
 
 
 def _summary(made: Recording, machine: str) -> tuple[dict[str, Any], str]:
-    """A recording in numbers and in a line."""
+    """A summary of a recording as values and as a line."""
     import numpy as np
 
     speed = made.y if made.speed_true is None else made.speed_true
@@ -240,25 +234,25 @@ def signals_command(args: argparse.Namespace) -> None:
     print_rows([head, *((s.name, g, s.unit, f"{s.duration_s:g}", s.description) for g, s in rows)])
 
 
-# --- `sewfast show`, `sewfast export`: what is in a recording, and its columns in another format --
+# --- `sewfast show`, `sewfast export`: the content of a recording, and another format -------------
 
 
 SHOW = """\
-Say what is in a recording (.mcap): how much of it is there, gaps, events, damage, the device and
-its settings. A recording whose recorder was killed reads up to that moment ("torn").
+Show the content of a recording (.mcap): its length, gaps, events, damage, the device and its
+settings. A recording whose recorder was killed is readable up to that moment ("torn").
 """
 
 EXPORT = """\
-Write the columns of a recording (.mcap) with their time t to a file that other programs read.
-Rows in gaps are not a number. Events, settings and the device's identity go into .mcap only, which
-has one message a sample, so that PlotJuggler and Foxglove draw curves.
+Write the columns of a recording (.mcap) with their time t to a file for other programs. Rows in
+gaps are NaN. Events, settings and the device's identity go only into .mcap, with one message a
+sample, so that PlotJuggler and Foxglove draw curves.
 """
 
 
 def add_files(commands: Commands) -> None:
     parser = add_command(
         commands, "show", show_command,
-        summary="what is in a recording", text=SHOW, examples="example:\n  sewfast show run.mcap",
+        summary="content of a recording", text=SHOW, examples="example:\n  sewfast show run.mcap",
     )  # fmt: skip
     parser.add_argument("recording", metavar="RECORDING.mcap", help="recording")
     parser = add_command(
@@ -270,7 +264,7 @@ def add_files(commands: Commands) -> None:
     parser.add_argument("recording", metavar="RECORDING.mcap", help="recording")
     add_output(parser, "OUT", "CSV, .npz, .mat, Parquet or .mcap", required=True)
     parser.add_argument(
-        "--compress", action="store_true", help="of .mcap: compress it by zstd (sewfast[zstd])"
+        "--compress", action="store_true", help="compress .mcap by zstd (sewfast[zstd])"
     )
     add_overwrite(parser)
 

@@ -11,10 +11,10 @@ from .output import print_json
 STUDIO = """\
 Open a page in the browser: look at recordings, identify a model, validate it, draw Bode plots,
 tune a controller, record, run and commission a drive.
-Every step can be copied as Python or as commands, and its result is a file that the command line
-reads (model.json, controller.json).
+Every step can be copied as Python or as commands, and its result is a file for the command line
+(model.json, controller.json).
 It needs the package websockets: pip install "sewfast[studio]". Only this computer can reach the
-page, and only with the address that is printed; nothing is loaded from the network.
+page, and only with the printed address; nothing is loaded from the network.
 """
 
 EXAMPLES = """\
@@ -23,8 +23,8 @@ examples:
   sewfast studio recordings/run.csv         one of them first
   sewfast studio drive.json                 sliders for the controller of a model
   sewfast studio /dev/ttyUSB0               a drive, with this folder for its recordings
-  sewfast studio --demo                     the same with a computed machine, in a folder that
-                                            is gone afterwards
+  sewfast studio --demo                     the same with a virtual machine, in a folder that
+                                            is deleted afterwards
   sewfast studio --no-browser --port 8377   with ssh -L 8377:127.0.0.1:8377 from elsewhere
 """
 
@@ -60,7 +60,7 @@ def studio_command(args: argparse.Namespace) -> None:
     if args.demo and args.place is not None:
         raise SettingError(f"--demo: expected no folder, received {args.place}; leave one out")
     with contextlib.ExitStack() as left, contextlib.suppress(KeyboardInterrupt):
-        # a closed terminal or a shutdown leaves as little behind as Ctrl-C
+        # clean up after a closed terminal or a shutdown, too
         for name in ("SIGTERM", "SIGHUP"):
             number = getattr(signal, name, None)
             if number is not None and signal.getsignal(number) == signal.SIG_DFL:
@@ -82,7 +82,7 @@ def studio_command(args: argparse.Namespace) -> None:
 
 
 def _end(number: int, _: object) -> None:
-    """Take a signal as Ctrl-C; the second that a shell sends must not end the clearing up."""
+    """Treat a signal as Ctrl-C; a second one, as sent by a shell, must not stop the clean-up."""
     import signal
 
     signal.signal(number, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""`sewfast tune`: a controller for a model, or the front of what can be had."""
+"""`sewfast tune`: a controller for a model, or a Pareto front of controllers."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ FIGURES = (".png", ".svg", ".pdf")
 
 TUNE = """\
 Tune a 2-DOF PID, or state feedback with an observer (--controller), on identified models, by
-simulating the loop with the encoder, the feedback filter and the command's limits in it. The
-models alone are used; no machine is touched. Several models are plants that one controller has to
-serve; of an ensemble every member is one.
+simulating the loop with the encoder, the feedback filter and the command's limits. It uses only the
+models and no machine. Several models are plants that one controller has to suit, and so are all
+members of an ensemble.
 
 Nothing but the model is needed. References cover the range that the drive was recorded over, at
 the pace of its step response; the command's limits are the recorded range of the input, with 0;
 the feedback is filtered over 8 ms, at most a tenth of the time constant; an encoder is in the
-loop if the model's speed comes from counts. If the drive can do more than it was recorded with,
-say so with --u-min and --u-max.
+loop if the model's speed comes from counts. If the drive can take more than its recorded commands,
+give --u-min and --u-max.
 
 A reference is a named one (`sewfast signals`) or a CSV with columns t [s], r [output unit].
 Named ones are signals in RPM at 1 ms; on any other drive the same shapes over its own range.
@@ -51,9 +51,9 @@ Several references are tuned for together.
 
 The cost of a run is a weighted sum of tracking [y], chatter [u], effort [u], overshoot [%], rise
 [ms], lag [ms], saturation (a share), and under load steps (--load) recovery [ms] and load (rms
-deviation); --cost NAME=WEIGHT sets the weight of one, overshoot_limit what overshoot is free.
+deviation); --cost NAME=WEIGHT sets a weight, overshoot_limit the overshoot without a cost.
 --constraint sets limits that come first: Ms, overshoot, u, recovery, load. --pareto OBJECTIVES
-searches for the front of what can be had instead, and takes its knee.
+searches for a Pareto front instead, and picks its knee.
 """
 
 TUNE_EXAMPLES = """\
@@ -89,7 +89,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--u-max", type=float, metavar="V", help="largest command (as recorded)")
     parser.add_argument(
         "--limits-of", metavar="RECORDING.mcap",
-        help="take the volt limit that a drive had in a recording, both ways, for those not given",
+        help="take the volt limit of a recording's drive in both directions, for those not given",
     )  # fmt: skip
     parser.add_argument(
         "--counts-per-rev", type=float, metavar="N",
@@ -101,42 +101,42 @@ def add(commands: Commands) -> None:
         "tenth of the time constant",
     )  # fmt: skip
     parser.add_argument(
-        "--unit", metavar="UNIT", help="of the output, where the model states none: RPM, rad/s, .."
+        "--unit", metavar="UNIT", help="unit of the output, if the model has none: RPM, rad/s, .."
     )
     parser.add_argument(
         "--controller", default="pid", metavar="KIND",
-        help="kind of the controller where there is no --start, as state-feedback (pid)",
+        help="kind of the controller without --start, such as state-feedback (pid)",
     )  # fmt: skip
     parser.add_argument(
         "--start", metavar="CONTROLLER.json",
-        help="what the search begins with, its limits, encoder and filters included; default: "
-        "Table 1 on the first model's step response",
+        help="start of the search, with its limits, encoder and filters; default: Table 1 on the "
+        "first model's step response",
     )  # fmt: skip
     parser.add_argument(
         "--notch", action="append", metavar="HZ[:DEPTH[:WIDTH]]",
-        help="a notch to begin with, searched together with the gains; may repeat (depth .1, width "
-        ".5; sewfast bode names it)",
+        help="a notch to start with, tuned together with the gains; may repeat (depth .1, width "
+        ".5; sewfast bode suggests one)",
     )  # fmt: skip
     parser.add_argument(
         "--response", metavar="RESPONSE.json",
-        help="what sewfast bode measured: Ms is taken on its bands as well; needs "
+        help="a response measured by sewfast bode, for whose bands Ms must hold as well; needs "
         "--constraint Ms=..",
     )  # fmt: skip
     parser.add_argument(
         "--rival", metavar="MODEL.json",
-        help="a model of another kind of the same drive, for a second opinion on the gains: a "
-        "linear one next to a network",
+        help="another kind of model of the same drive, for a second opinion on the gains: a linear "
+        "one for a network",
     )  # fmt: skip
     _add_search(parser)
-    add_plot(parser, "draw the tuned loop and the start's; of --pareto the front")
+    add_plot(parser, "draw the loops of the result and the start; with --pareto the front")
     add_named_output(parser, "controller", "model", "controller file to write")
 
 
 def _add_search(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--variables", metavar="NAME[=LOW:HIGH],..",
-        help="what to search (Kp,Ti,Td,alpha,beta,N; of state feedback rho,integral,noise,weight,"
-        "lead); also Tt, filter_samples, filter_time, observer_time, r_rate, notches",
+        help="variables of the search (Kp,Ti,Td,alpha,beta,N; for state feedback rho,integral,"
+        "noise,weight,lead); also Tt, filter_samples, filter_time, observer_time, r_rate, notches",
     )  # fmt: skip
     parser.add_argument(
         "--cost", action="append", metavar="NAME=WEIGHT", help="weight of a term; may repeat"
@@ -147,19 +147,19 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--speed", type=float, metavar="Y",
-        help="output about which networks are linearised for --constraint Ms=..",
+        help="output about which to linearise networks for --constraint Ms=..",
     )  # fmt: skip
     parser.add_argument(
         "--load", action="append", metavar="LEVEL:COMMAND",
-        help="a load step to bear: a level that is held and a command behind the limits that comes "
-        "on, as in 1500:-2; may repeat",
+        help="a load step: the level held and the command added after the limiter, as in 1500:-2; "
+        "may repeat",
     )  # fmt: skip
     parser.add_argument(
         "--aggregate", choices=("mean", "worst"), default="mean", help="over the plants (mean)"
     )
     parser.add_argument(
         "--method", choices=("genetic", "cma-es"), default="genetic",
-        help="how to search (genetic)",
+        help="search method (genetic)",
     )  # fmt: skip
     parser.add_argument(
         "--evaluations", type=int, metavar="N",
@@ -167,9 +167,9 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--time-budget", type=float, metavar="S",
-        help="time of the search, after which the best so far is taken (no limit)",
+        help="time of the search, after which the best so far is used (no limit)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the search (0)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search (0)")
     parser.add_argument(
         "--pareto", metavar="NAME,NAME",
         help="objectives of a front: tracking, chatter, effort, overshoot, rise, lag, saturation, "
@@ -234,7 +234,7 @@ def tune_command(args: argparse.Namespace) -> int | None:
 
 
 def _settings(args: argparse.Namespace) -> dict[str, Any]:
-    """What both searches take."""
+    """The settings of both searches."""
     settings: dict[str, Any] = {
         "variables": variables(args.variables),
         "cost": cost(args.cost),
@@ -279,7 +279,7 @@ def _on_response(
 
 
 def _about(args: argparse.Namespace, constraints: Constraints, models: list[Any]) -> Constraints:
-    """Ms on every model, or every member of an ensemble, about the speed that is given.
+    """Ms on every model, or every member of an ensemble, about the given speed.
 
     Raises
     ------
@@ -295,7 +295,7 @@ def _about(args: argparse.Namespace, constraints: Constraints, models: list[Any]
 
 
 def _started(args: argparse.Namespace, models: list[Any]) -> dict[str, Any]:
-    """`_first` with the notches that the options name."""
+    """`_first` with the notches of the options."""
     first = _first(args)
     given = notches(args.notch)
     if not given:
@@ -307,12 +307,12 @@ def _started(args: argparse.Namespace, models: list[Any]) -> dict[str, Any]:
 
 
 def _pid(start: SampledController, option: str) -> Controller:
-    """The start of what is for PIDs only.
+    """The start as a PID, for an option that needs one.
 
     Raises
     ------
     SettingError
-        For a controller of another kind.
+        For another kind of controller.
     """
     from ..control.controller import Controller
 
@@ -325,7 +325,7 @@ def _pid(start: SampledController, option: str) -> Controller:
 
 
 def _first(args: argparse.Namespace) -> dict[str, Any]:
-    """The controller to begin with, or limits, encoder and filter of the one to be found.
+    """The controller to start with, or limits, encoder and filter of the first one.
 
     Raises
     ------
@@ -356,7 +356,7 @@ def _first(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _loop(args: argparse.Namespace) -> dict[str, Any]:
-    """Limits, encoder and filter of the first controller, where they are stated."""
+    """Limits, encoder and filter of the first controller, if given."""
     u_min, u_max = command_limits(args)
     return {
         "u_min": u_min,
@@ -488,7 +488,7 @@ def forms_of(controller: Controller) -> list[Gains]:
 
 
 def gain_row(gains: Gains) -> list[str]:
-    """Form, then each number with its unit."""
+    """The form, then each gain with its unit."""
     values = gains.to_dict()
     cells = [f"{name} = {values[name]:.6g} {unit}" for name, unit in gains.units.items()]
     cells += [""] * (4 - len(cells))

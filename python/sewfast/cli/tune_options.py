@@ -1,4 +1,4 @@
-"""What the options of `sewfast tune` say: weights, limits, load steps, variables, notches."""
+"""Parsing of the options of `sewfast tune`: weights, limits, load steps, variables, notches."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def _pairs(given: list[str] | None, option: str) -> dict[str, float]:
-    """NAME=NUMBER of every time that an option was given."""
+    """NAME=NUMBER of every occurrence of an option."""
     pairs = {}
     for text in given or ():
         name, equals, number = text.partition("=")
@@ -61,7 +61,7 @@ def loads(given: list[str] | None) -> list[LoadStep]:
 
 
 def _known(pairs: dict[str, float], option: str, names: tuple[str, ...]) -> dict[str, Any]:
-    """The pairs, if all have names that there are."""
+    """The pairs, if all names are known."""
     for name in pairs:
         if name not in names:
             raise SettingError(f"{option} {name}: expected one of {', '.join(names)}")
@@ -95,7 +95,7 @@ def variables(text: str | None) -> list[Wanted] | None:
 
 
 def command_limits(args: argparse.Namespace) -> tuple[float | None, float | None]:
-    """Least and largest command [V]: as given, else of a recording's drive, else as recorded.
+    """Least and largest command [V]: as given, else a recording's volt limit, else None.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def command_limits(args: argparse.Namespace) -> tuple[float | None, float | None
 
 
 def _volt_limit(path: str) -> float:
-    """Of the drive that a recording was made on [V]."""
+    """Volt limit of the drive that a recording was made on [V]."""
     from ..recordfile.reader import read_header
 
     limits = read_header(path).settings.get("limits")
@@ -126,12 +126,12 @@ def _volt_limit(path: str) -> float:
 
 
 def notches(given: list[str] | None) -> list[Biquad]:
-    """Of every --notch.
+    """Notches of every --notch.
 
     Raises
     ------
     SettingError
-        For what is not HZ[:DEPTH[:WIDTH]].
+        For anything but HZ[:DEPTH[:WIDTH]].
     """
     from ..control.biquad import Biquad
 

@@ -33,7 +33,7 @@ STAGES = (
 )
 
 FOLDER = "unfinished"
-"""A folder of its own, so that a killed commissioning never mixes with an earlier complete one."""
+"""A separate folder, so that a killed commissioning never mixes with an earlier complete one."""
 _MARK = "commissioning"
 """The setting by which these files are recognised."""
 

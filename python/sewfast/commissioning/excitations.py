@@ -164,8 +164,8 @@ def step_response(machine: Machine, demands: Demands, motion: Motion) -> Fopdt:
         return fopdt
     raise Refusal(
         f"expected a speed that settles within {DURATIONS[-1]:g} s at {u:.3g} V, it did not "
-        f"({reason}); see what varies: a load that comes and goes, a drive with a controller of "
-        "its own, a machine that integrates"
+        f"({reason}); see what varies: a changing load, a controller inside the drive, a "
+        "machine that integrates"
     ) from reason
 
 

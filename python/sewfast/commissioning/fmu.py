@@ -1,6 +1,6 @@
 """A co-simulation FMU as a machine: a plant from Modelica, Simulink or any other tool.
 
-FMPy loads it, in a process of its own. An FMU is a program: it runs with the user's rights.
+FMPy loads it, in a separate process. An FMU is a program: it runs with the user's rights.
 """
 
 from __future__ import annotations

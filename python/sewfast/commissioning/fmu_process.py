@@ -31,7 +31,7 @@ _FAREWELL = 5.0
 
 
 class FmuProcess:
-    """An FMU in a process of its own, advanced by requests.
+    """An FMU in a separate process, advanced by requests.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class FmuProcess:
             if kind == b"s"
             else "export it again, with its binary for this system"
         )
-        self._fail(what, said.strip() or "an error without words", remedy)
+        self._fail(what, said.strip() or "an error without a message", remedy)
 
     def _fail(self, what: str, received: str, remedy: str) -> NoReturn:
         self._process.kill()
@@ -137,7 +137,7 @@ class FmuProcess:
             name=str(self.path),
             expected=what,
             received=received[:400],
-            remedy=f"{remedy}; or try the FMU in the tool that it comes from",
+            remedy=f"{remedy}; or try the FMU in the tool that exported it",
         )
         raise self._ended
 

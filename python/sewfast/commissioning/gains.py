@@ -542,12 +542,12 @@ def _chatter(
 
 def cause(swing: Swing, small: SmallSignal | None) -> str:
     """The likely cause of an oscillation, and its remedy."""
-    remedy = "stiffen the shaft or the coupling, take the play out of it, or ask for less speed"
+    remedy = "stiffen the shaft or the coupling, remove its play, or demand less speed"
     if small is not None and small.resonance is not None:
         return f"the machine has {small.resonance}; {remedy}"
     if swing.frequency > 15.0:
-        return f"a shaft or coupling that gives, play in it, or a belt; {remedy}"
+        return f"an elastic shaft or coupling, play in it, or a belt; {remedy}"
     return (
         "friction, play, or a delay that the step response does not show; see the recording, and "
-        "look for play and for a drive with a filter or a controller of its own"
+        "look for play and for a filter or a controller inside the drive"
     )

@@ -314,7 +314,7 @@ class _Plan:
         if realisations * periods < 2:
             raise SettingError(
                 name="periods", expected="at least two in all", received="one",
-                remedy="nothing tells noise",
+                remedy="noise is estimated from repetitions",
             )  # fmt: skip
         highest = HIGHEST / Ts if f_max is None else real("f_max", f_max)
         if not 0.0 < real("f_min", f_min) < highest <= 0.5 / Ts:
@@ -523,8 +523,8 @@ def _response(
         )
     if found.coherence.max() < 0.5:
         raise DataError(
-            name="amplitude", expected="an answer to the multisine in the counts",
-            received="none that stands out from their rounding and of the load",
+            name="amplitude", expected="a response to the multisine in the counts",
+            received="none that stands out from their rounding and the load",
             remedy="raise amplitude or periods",
         )  # fmt: skip
     return found

@@ -138,7 +138,7 @@ def predict(
     Parameters
     ----------
     pushes : sequence of array, optional
-        For each reference, a command added behind the limits: the load over the turn.
+        For each reference, a command added after the limiter: the load over the turn.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def predict(
             comparison.disagreement <= DISAGREE * comparison.span,
             f"expected members that agree on {name!r} within {100 * DISAGREE:g} % of its span, one "
             f"is {comparison.disagreement:.3g} RPM rms from the median; record longer, so that "
-            "they know this reference's world, or demand less of it",
+            "the recording covers this reference's range, or demand less of it",
         )
         found.append(comparison)
     return tuple(found)
@@ -329,7 +329,7 @@ def require_alike(c: Comparison) -> None:
         f"expected the machine within {100 * APART:g} % of the span from the prediction on "
         f"{c.reference!r}, it was {c.apart:.3g} RPM rms apart; the controller is not verified: "
         "see both in the report; the machine may have changed since it was recorded, or the "
-        "reference goes where it was not",
+        "reference leaves the range of the recording",
     )
 
 

@@ -1,10 +1,10 @@
 """The controller and its loop.
 
-Read in this order: `biquad` (notches and the like), `controller` (what a controller of
-any kind is; the PID), `state_feedback` (the second kind), `files` (`load_controller`),
-`loop` (`run`: on a model or a machine), `machine` (`Machine`: all that is known of one; `record`),
-`defaults` (what is taken for a drive where nothing is stated), `margins` (of the linear loop),
-`systems` (the linear loop as state space), `forms` (a PID as MATLAB's and python-control's).
+Read in this order: `biquad` (notches and other filters), `controller` (the base class of all kinds;
+the PID), `state_feedback` (the second kind), `files` (`load_controller`), `loop` (`run`: on a model
+or a machine), `machine` (`Machine`, the protocol of machines; `record`), `defaults` (limits, filter
+and references of a drive by default), `margins` (of the linear loop), `systems` (the linear loop as
+state space), `forms` (a PID as MATLAB's and python-control's).
 """
 
 from ..gains import Form, Gains, vector

@@ -1,9 +1,9 @@
-"""Biquads: notches, low passes and lead-lags of a controller, for machines whose shaft swings.
+"""Biquads: notches, low passes and lead-lags of a controller, for machines with resonances.
 
-Up to four act one after the other on the reference and on the filtered feedback, which is to the
-loop what a filter of the command is: the PID is linear in both. Each has gain 1 at standstill and
-is sampled by the bilinear transform with its frequencies kept (prewarping); the arithmetic and its
-equations are those of `sewfast_control::biquad`.
+Up to four act one after the other on the reference and on the filtered feedback. For the loop this
+equals a filter of the command, as the PID is linear in both. Each has gain 1 at zero frequency and
+is sampled by the bilinear transform with prewarping; for arithmetic and equations see
+`sewfast_control::biquad`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..errors import SettingError
 from ..gains import real
 
 MOST = 4
-"""Biquads of a controller."""
+"""Most biquads of a controller."""
 
 NUMBERS: Mapping[str, tuple[str, ...]] = {
     "notch": ("frequency", "depth", "width"),
@@ -30,12 +30,12 @@ NUMBERS: Mapping[str, tuple[str, ...]] = {
     "lead_lag": ("zero", "pole"),
     "resonance": ("zero_frequency", "zero_damping", "pole_frequency", "pole_damping"),
 }
-"""What each kind is made from, in the order of its constructor."""
+"""Arguments of each kind, in the order of its constructor."""
 
 
 @dataclass(frozen=True)
 class Biquad:
-    """A second-order filter of gain 1 at standstill; make it with one of its constructors.
+    """A second-order filter with gain 1 at zero frequency; make it with one of its constructors.
 
     Attributes
     ----------

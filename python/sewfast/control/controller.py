@@ -1,4 +1,4 @@
-"""Controllers: `Controller` with its files."""
+"""`SampledController`, the base class of controllers, and the PID `Controller`."""
 
 from __future__ import annotations
 
@@ -21,12 +21,11 @@ NOTCH_NAMES = ("notch_frequency", "notch_depth", "notch_width")
 SETTINGS = (
     "alpha", "beta", "N", "Tt", "filter_samples", "filter_time", "observer_time", "r_rate",
 )  # fmt: skip
-"""What can be searched by name beside the gains of a schedule's points and of notches."""
+"""Variables of a search besides the gains, those of a schedule's points and the notches."""
 
 FORMAT = "sewfast.controller"
 VERSION = 3
-"""Of the files that are written; version 1 had no observer, ramp or schedule, version 2 no biquads.
-"""
+"""Version of the files; version 1 had no observer, ramp or schedule, version 2 no biquads."""
 
 _UNBOUNDED = {
     "N": math.inf,
@@ -36,7 +35,7 @@ _UNBOUNDED = {
     "slew": math.inf,
     "r_rate": math.inf,
 }
-"""What null means in a file, where JSON has no infinity."""
+"""Meaning of null in a file, as JSON has no infinity."""
 _FIRST_REALS = ("Ts", "alpha", "beta", "N", "Tt", "u_min", "u_max", "slew", "filter_time")
 _REALS = (*_FIRST_REALS, "observer_time", "r_rate")
 _OTHERS = ("version", "gains", "u_unit", "y_unit", "filter_samples", "counts_per_rev", "notes")
@@ -46,18 +45,19 @@ _Kind = TypeVar("_Kind", bound="SampledController")
 
 
 class SampledController:
-    """What `run`, `tune` and a drive ask of a controller; the base of all kinds.
+    """Base class of all kinds of controllers, for `run`, `tune` and drives.
 
-    A kind has its settings as fields, and the members that raise NotImplementedError here.
+    A kind has its settings as fields, and implements the members that raise NotImplementedError
+    here.
     """
 
     KIND: ClassVar[str]
     """Its name in files."""
     VERSION: ClassVar[int] = 4
-    """Of its files."""
+    """Version of its files."""
 
     if TYPE_CHECKING:
-        # declared as properties: the fields of a frozen dataclass cannot be set
+        # declared as properties, as the fields of a frozen dataclass are read-only
         @property
         def Ts(self) -> float: ...
         @property
@@ -82,15 +82,15 @@ class SampledController:
 
     @property
     def pace(self) -> float:
-        """A time constant for a plant of which only its controller is known [s]."""
+        """An estimate of the plant's time constant from the controller alone [s]."""
         raise NotImplementedError
 
     def core(self) -> _core._Controller:
-        """The arithmetic itself, at rest."""
+        """The compiled controller, at rest."""
         raise NotImplementedError
 
     def sent(self) -> tuple[int, list[float]]:
-        """Number of the kind and its own numbers, as a device is sent them (docs/PROTOCOL.md)."""
+        """Number of the kind and its parameters, as sent to a device (docs/PROTOCOL.md)."""
         raise NotImplementedError
 
     @classmethod
@@ -106,7 +106,7 @@ class SampledController:
 
     @classmethod
     def first(cls, plant: Any, **settings: Any) -> SampledController:
-        """What a search on a model begins with.
+        """The start of a search on a model.
 
         Settings are limits, encoder, units, the length of a filter or None, the middle of the
         recorded output or None, and notes.
@@ -114,12 +114,12 @@ class SampledController:
         Raises
         ------
         SettingError
-            For a plant or a setting that the kind cannot have.
+            For a plant or a setting that does not suit the kind.
         """
         raise NotImplementedError
 
     def with_values(self: _Kind, values: Mapping[str, float], notes: str) -> _Kind:
-        """The same with values that were searched, by name."""
+        """The same controller with values of a search, by name."""
         raise NotImplementedError
 
     def to_dict(self) -> dict[str, Any]:
@@ -255,12 +255,12 @@ class Controller(SampledController):
 
     @property
     def pace(self) -> float:
-        """A time constant for a plant of which only its controller is known [s]."""
+        """An estimate of the plant's time constant from the controller alone [s]."""
         Ti = self.gains.to("standard").Ti
         return Ti if math.isfinite(Ti) else 50.0 * self.Ts
 
     def core(self) -> _core.Controller:
-        """The arithmetic itself, at rest: `step(r, y, feedforward)` gives the command of a sample.
+        """The compiled controller, at rest: `step(r, y, feedforward)` gives a sample's command.
 
         `set_design(other.core())` changes its settings and `set_manual(u)`, `set_automatic()` its
         mode during a run, without a bump. `core().single()` is the same in single precision, bit
@@ -287,7 +287,7 @@ class Controller(SampledController):
         return [biquad.coefficients(self.Ts) for biquad in self.biquads]
 
     def with_values(self, values: Mapping[str, float], notes: str) -> Controller:
-        """The same with values that were searched, by name; its gains in standard form."""
+        """The same controller with values of a search, by name; its gains in standard form."""
         changes: dict[str, Any] = {name: values[name] for name in SETTINGS if name in values}
         if "filter_samples" in changes:
             changes["filter_samples"] = int(changes["filter_samples"])
@@ -360,7 +360,7 @@ class Controller(SampledController):
 
 
 def _notch(own: Biquad, k: int, values: Mapping[str, float]) -> Biquad:
-    """Biquad number `k` with the values that are its own."""
+    """Biquad number `k` with its values replaced by those of the search."""
     names = [f"{name}[{k}]" for name in NOTCH_NAMES]
     if not any(name in values for name in names):
         return own
@@ -370,7 +370,7 @@ def _notch(own: Biquad, k: int, values: Mapping[str, float]) -> Biquad:
 
 
 def _standard(own: Gains, values: Mapping[str, float], names: Sequence[str]) -> Gains:
-    """The gains in standard form, with the values that have one of the names."""
+    """The gains in standard form, with those replaced that have a value under their name."""
     standard = own.to("standard")
     kept = (standard.Kp, standard.Ti, standard.Td)
     Kp, Ti, Td = (values.get(name, own) for name, own in zip(names, kept, strict=True))
@@ -378,18 +378,18 @@ def _standard(own: Gains, values: Mapping[str, float], names: Sequence[str]) -> 
 
 
 def pid_of(controller: SampledController, use: str) -> Controller:
-    """A controller where only a PID will do; `use` says what for.
+    """The controller as a PID, for code that supports no other kind; `use` names it.
 
     Raises
     ------
     SettingError
-        For one of another kind.
+        For another kind.
     """
     if isinstance(controller, Controller):
         return controller
     raise SettingError(
         name="controller", expected="a PID (Controller)", received=type(controller).__name__,
-        remedy=f"{use} knows no other kind; run(controller, model) simulates it",
+        remedy=f"{use} supports no other kind; run(controller, model) simulates it",
     )  # fmt: skip
 
 
@@ -427,7 +427,7 @@ def _gains_to_dict(gains: Gains) -> dict[str, Any]:
 
 
 def _points(schedule: Any) -> tuple[tuple[float, Gains], ...]:
-    """The schedule as pairs of a speed and gains; anything else is refused."""
+    """The schedule as pairs of a speed and gains; raise for anything else."""
     try:
         points = [(speed, gains) for speed, gains in schedule]
     except (TypeError, ValueError) as error:
@@ -445,7 +445,7 @@ def _points(schedule: Any) -> tuple[tuple[float, Gains], ...]:
 
 
 def _sections(biquads: Any) -> tuple[Biquad, ...]:
-    """The biquads as a tuple; anything else is refused."""
+    """The biquads as a tuple; raise for anything else."""
     given = (biquads,) if isinstance(biquads, Biquad) else biquads
     if not isinstance(given, (tuple, list)) or not all(isinstance(b, Biquad) for b in given):
         raise SettingError(
@@ -458,14 +458,14 @@ def _sections(biquads: Any) -> tuple[Biquad, ...]:
 
 
 def unbounded(fields: Fields, name: str, infinite: Mapping[str, float]) -> float:
-    """The number of a field; where that is null, the infinity that it stands for."""
+    """The number of a field, or infinity for null."""
     if name in infinite and fields.any(name) is None:
         return infinite[name]
     return fields.number(name)
 
 
 def bounded(value: Any) -> Any:
-    """None for what JSON has no number for."""
+    """The value, or None for infinity, which JSON lacks."""
     return None if isinstance(value, float) and math.isinf(value) else value
 
 

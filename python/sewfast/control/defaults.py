@@ -1,8 +1,8 @@
-"""What is taken for a drive where nothing is stated: limits, feedback filter and references.
+"""Defaults for a drive: limits, feedback filter and references.
 
-All of it comes from the model and from what it stores of its record: the range of the input, the
-range of the output, the sample time, and the step response. The catalogue of `sewfast.signals` is
-made for one drive, in RPM at 1 ms; here its shapes are drawn anew for any other.
+They come from the model and the data stored with it: the ranges of input and output, the sample
+time, and the step response. The catalogue of `sewfast.signals` is made for one drive, in RPM at
+1 ms; here its shapes are scaled to any other.
 """
 
 from __future__ import annotations
@@ -27,47 +27,47 @@ from ..units import spelled
 from .controller import SampledController
 
 NAMES = ("trapezoid", "trapezoids", "random")
-"""References to tune on unless others are given."""
+"""Default references for tuning."""
 FILTER_TIME = 0.008
-"""Length of the moving average in the feedback, where the drive is slow enough for it [s]."""
+"""Length of the moving average in the feedback for a slow drive [s]."""
 _FILTER_SHARE = 0.1
-"""Its longest length in shares of the time constant."""
+"""Its longest length as a share of the time constant."""
 _MOST_FILTERED = 64
-"""Samples of the moving average that a controller has room for."""
+"""Longest moving average of a controller [samples]."""
 _STEP_SHARES = (0.25, 0.5, 0.1)
-"""Shares of the larger limit that the step response is looked for at."""
+"""Sizes of the step response to try, as shares of the larger limit."""
 _STEP_SAMPLES = (4_000, 16_000)
 _MOVES_ON = 0.15
-"""Share of a step's response in the second half of the longest one, above which it is a motion: a
-lag that settles in time has less there, so that every model is either."""
+"""Share of a step's response in the second half of the longest one, above which the output
+integrates: a lag that settles in time has less there, so every model is one or the other."""
 _TRAVEL, _TRAVEL_SAMPLES = 10.0, 500
-"""Longest way of a position: what it goes at the limit in so many time constants, or in so many
-samples where a drive has hardly a time constant."""
+"""Longest travel of a position: that at the limit in so many time constants, or in so many samples
+for a drive with hardly a time constant."""
 _RATE_USED = 0.4
-"""Rate of a position's ramps in shares of its rate at the limit: the rest starts and stops it."""
+"""Rate of a position's ramps as a share of its rate at the limit: the rest starts and stops it."""
 _REACHED = 0.7
-"""Top of the references in shares of the steady output at the limit: the rest accelerates."""
+"""Top of the references as a share of the steady output at the limit: the rest accelerates."""
 _RECORDED = 0.9
-"""Top of the references in shares of the recorded output, beyond which the model is a guess."""
+"""Top of the references as a share of the recorded output, beyond which the model extrapolates."""
 _SLOW_RUN = 0.3
-"""Lowest level in shares of the top for a drive that cannot brake: it coasts down to that."""
+"""Lowest level as a share of the top for a drive that cannot brake: it coasts down to that."""
 _HELD = 0.95
-"""Distance of a level that is held from the record's mean, in shares of the region's bound."""
+"""Largest distance of a held level from the record's mean, as a share of the region's bound."""
 _MARGIN = 0.1
 """Share of the output at the limit that the ramps leave to the controller."""
 _EDGES = 8
-"""Edges that a random reference is shortened to at most."""
+"""Edges of a shortened random reference."""
 _MOST_SAMPLES = 20_000
-"""Samples of the random reference from which on it is shortened to `_EDGES`: tuning runs it
-thousands of times."""
+"""A random reference with more samples is shortened to `_EDGES`: tuning runs it thousands of
+times."""
 _MOST_TUNED = 60_000
-"""Samples from which on a reference is left out of those to tune on."""
+"""A reference with more samples is not used for tuning."""
 
 
 def recorded_limits(models: Sequence[Any]) -> tuple[float, float] | None:
     """Least and largest command that the models were identified on, 0 included; None if unknown.
 
-    0 is the command of a drive at rest, which a controller has to be able to give.
+    0 is the command of a drive at rest, which a controller must be able to give.
     """
     known = [r[0] for m in models if isinstance(m, Model) for r in _stored(m, "input_range")]
     ends = [float(end) for pair in known for end in pair]
@@ -77,7 +77,7 @@ def recorded_limits(models: Sequence[Any]) -> tuple[float, float] | None:
 
 
 def _stored(model: Model, name: str) -> list[Any]:
-    """A range that a model stores of its training data; of an ensemble without, its members'."""
+    """A range of the training data stored in a model, or in the members of an ensemble."""
     own = model.training.get(name)
     return [own] if own else [m.training[name] for m in model.members if m.training.get(name)]
 
@@ -91,13 +91,13 @@ def _output_range(model: Model) -> tuple[float, float] | None:
 def command_limits(
     models: Sequence[Any], u_min: float | None, u_max: float | None
 ) -> tuple[float, float, str]:
-    """Limits of the command [u]: as stated, else as recorded; and what to say of them.
+    """Limits of the command [u], as given or as recorded, and a note on them.
 
     Raises
     ------
     SettingError
-        Where one is not stated and the models do not know what they were identified on: a limit
-        must not be made up.
+        If one is not given and the models do not store the range of their inputs: a limit must not
+        be guessed.
     """
     recorded = recorded_limits(models)
     missing = [name for name, value in (("u_min", u_min), ("u_max", u_max)) if value is None]
@@ -116,7 +116,7 @@ def command_limits(
 
 
 def beyond_record(models: Sequence[Any], u_min: float, u_max: float) -> str:
-    """What to say of limits that the drive has not been recorded at; empty where it has."""
+    """A note on limits beyond the recorded input; empty otherwise."""
     recorded = recorded_limits(models)
     if recorded is None:
         return ""
@@ -129,7 +129,7 @@ def beyond_record(models: Sequence[Any], u_min: float, u_max: float) -> str:
 def filter_length(Ts: float, time_constant: float) -> int:
     """Samples of the feedback's moving average: 8 ms, at most a tenth of the time constant.
 
-    It is 1, no filter, where the sample time is longer than that.
+    It is 1, no filter, if the sample time is longer than that.
     """
     wanted = min(FILTER_TIME, _FILTER_SHARE * time_constant) / Ts
     return int(min(max(1, round(wanted)), _MOST_FILTERED))
@@ -146,7 +146,7 @@ class DriveStep:
     rest : float
         Output at a command of 0 [y].
     slowest : float
-        The time constant that counts [s]: of a response that swings, a third of the time until it
+        The dominant time constant [s]: for a response with overshoot, a third of the time until it
         stays within 5 %.
     """
 
@@ -164,7 +164,7 @@ def require_one_input(model: Model) -> None:
         )  # fmt: skip
 
 
-# the start of a search asks for it, and so does what its references ask for
+# both the start of a search and its default references need it
 @lru_cache(maxsize=8)
 def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
     """The step response at the first size and length at which it settles.
@@ -172,9 +172,9 @@ def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
     Raises
     ------
     SettingError
-        For a model with several inputs, or limits that are no size.
+        For a model with several inputs, or limits that are not finite or both 0.
     FitError
-        Where no step settles.
+        If no step settles.
     """
     require_one_input(model)
     size = u_max if u_max >= -u_min else u_min
@@ -207,12 +207,12 @@ def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
 def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
     """The step response of the output's rate [y/s], for a model that integrates; None for others.
 
-    A position moves on for as long as the command acts; its speed settles.
+    A position keeps moving as long as the command acts; its rate settles.
 
     Raises
     ------
     FitError
-        Where that of no step does.
+        If the rate settles after no step.
     """
     size = u_max if u_max >= -u_min else u_min
     pole = integrating_pole(model)
@@ -226,7 +226,7 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
             u[at:] = share * size
             y = model.core.simulate(u[:, None], model.core.rest_state())
             try:
-                # what a pole a little below 1 forgets is no part of the rate
+                # exclude the decay of a pole slightly below 1 from the rate
                 rate = (y[1:] - y[0] - pole * (y[:-1] - y[0])) / model.Ts
                 fopdt = fit_fopdt(u[1:], rate, Ts=model.Ts)
             except (DataError, FitError) as error:
@@ -247,7 +247,7 @@ def _slowest(fopdt: Fopdt, y: FloatArray, Ts: float) -> float:
 
 
 def moves_on(model: Model, u_min: float, u_max: float) -> bool:
-    """Whether the output moves for as long as a command acts, so that no step settles."""
+    """Whether the output keeps moving as long as a command acts, so that no step settles."""
     size = u_max if u_max >= -u_min else u_min
     return (
         bool(np.isfinite(size))
@@ -257,13 +257,13 @@ def moves_on(model: Model, u_min: float, u_max: float) -> bool:
 
 
 def _moves_on(model: Model, size: float) -> bool:
-    """Whether a step is still felt as much at its end as before.
+    """Whether the response still changes in the second half of a long step.
 
-    A pole at 1 that a zero all but cancels is no integrator.
+    A pole at 1 that a zero nearly cancels does not integrate.
     """
     samples = _STEP_SAMPLES[-1]
     u = np.zeros((samples, 1))
-    # not from the first sample on, which would be taken for the command before the step
+    # after some samples, as the model's rest state assumes the first command before the start
     u[samples // 20 :] = size
     y = model.core.simulate(u, model.core.rest_state())
     return bool(abs(y[-1] - y[samples // 2]) > _MOVES_ON * abs(y[-1] - y[0]))
@@ -271,7 +271,7 @@ def _moves_on(model: Model, size: float) -> bool:
 
 @dataclass(frozen=True)
 class _Span:
-    """Levels that references use [y], seen from rest, and the time of their fastest edge [s]."""
+    """Levels of the references [y], and the time of their fastest edge [s]."""
 
     rest: float
     low: float
@@ -281,9 +281,9 @@ class _Span:
 
 
 def catalogue_fits(model: Any, u_min: float, u_max: float, unit: str) -> bool:
-    """Whether the references of `sewfast.signals` suit a drive: its unit, sample time and range.
+    """Whether the references of `sewfast.signals` suit a drive's unit, sample time and range.
 
-    A plant that stores no range of its record is taken for one that they suit.
+    A plant without a stored range is assumed to suit them.
     """
     if spelled(unit) != "rpm" or not math.isclose(model.Ts, signals.TS, rel_tol=1e-9):
         return False
@@ -306,11 +306,10 @@ def drive_references(
     """The shapes of the catalogue of references over a drive's own range, at its own pace.
 
     The top is .9 of the recorded output or .7 of the steady output at the limit of the command,
-    whichever is less; the fastest edge takes what the command has left, and at least half a
-    time constant and ten dead times. Where the command cannot brake (limits on one side of 0), the
-    references stay above .3 of the top, and as high as the model's training region asks of a level
-    that is held, and fall no faster than the drive coasts. Where the record
-    goes both ways, `random` does as well.
+    whichever is less. The fastest edge uses the rest of the command, and takes at least half a time
+    constant and ten dead times. If the command cannot brake (limits on one side of 0), the
+    references stay above .3 of the top and within the model's training region, and fall no faster
+    than the drive coasts. If the record has both directions, `random` has both, too.
 
     Parameters
     ----------
@@ -332,7 +331,7 @@ def drive_references(
     Raises
     ------
     SettingError, FitError
-        Where the model tells too little: neither a step response that settles nor a record.
+        If the model has neither a step response that settles nor a stored range of its record.
     """
     return _shapes(_span(model, u_min, u_max, pace), model.Ts, seed)
 
@@ -348,7 +347,7 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
     except FitError:
         if pace is None or not math.isfinite(high - low):
             raise
-        # nothing is known of what holds a level: the record alone says where to go
+        # the command that holds a level is unknown: use the recorded range alone
         top = _RECORDED * (high if abs(high) >= abs(low) else low)
         return _Span(0.0, 0.0, top, 0.0, 4.0 * pace)
     fopdt, rest = step.fopdt, step.rest
@@ -366,7 +365,7 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
     slow = 0.0
     if weak <= 0.25 * x:
         slow = max(_SLOW_RUN * x, _lowest_held(model, fopdt, rest, sign))
-    # a record that never came near rest: no lower than it went
+    # for a record that never came near rest: not below its lowest output
     floor = (low - rest if sign > 0 else rest - high) + 0.1 * (high - low)
     slow = min(max(slow, floor), 0.6 * x) if math.isfinite(floor) else slow
     upward = max(strong - x - _MARGIN * strong, 0.05 * strong)
@@ -382,9 +381,9 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
 
 
 def _lowest_held(model: Model, fopdt: Fopdt, rest: float, sign: float) -> float:
-    """The lowest level above rest at which the model's training region has been for long [y].
+    """The lowest level above rest at which a held reference stays within the training region [y].
 
-    A record of steps comes by every level and stays at the lowest ones for less time than a
+    A record of steps passes every level, but stays at the lowest ones for less time than a
     reference does.
     """
     region = stored_region(model)
@@ -396,7 +395,7 @@ def _lowest_held(model: Model, fopdt: Fopdt, rest: float, sign: float) -> float:
 
 
 def _way(step: DriveStep, u_min: float, u_max: float, low: float, high: float, Ts: float) -> _Span:
-    """Levels of a position: within the record, and no farther than a few time constants go."""
+    """Levels of a position: within the record, and within the travel of a few time constants."""
     fopdt, rest = step.fopdt, step.rest
     rates = [fopdt.K * u + fopdt.offset for u in (u_min, u_max)]
     slower = min(max(rates), -min(rates))
@@ -435,10 +434,10 @@ def _finite_limits(model: Model, u_min: float, u_max: float) -> tuple[float, flo
 
 
 def _shapes(span: _Span, Ts: float, seed: int) -> dict[str, FloatArray]:
-    """The catalogue's shapes; its fastest edge, .15 s of the trapezoid, takes `span.edge`."""
+    """The catalogue's shapes; its fastest edge, .15 s of the trapezoid, becomes `span.edge`."""
     pace = span.edge / 0.15
     most = _MOST_SAMPLES * Ts
-    # rates are kept: the way from rest is longer than that from the slow run
+    # keep the rates: the rise from rest is longer than that from the slow run
     height = span.top - span.low
     first = span.edge * (span.top - span.rest) / height
     begin = span.edge * abs(span.low - span.rest) / abs(height)
@@ -474,7 +473,7 @@ def _shapes(span: _Span, Ts: float, seed: int) -> dict[str, FloatArray]:
     between = sorted((span.other if span.other != span.rest else span.low, span.top))
     lowest = between[0] + (0.1 * (between[1] - between[0]) if between[0] == span.rest else 0.0)
     highest = between[1] - (0.1 * (between[1] - between[0]) if between[1] == span.rest else 0.0)
-    # a change over both directions is longer than the catalogue's, and so is what follows it
+    # a change over both directions is longer than the catalogue's, and so are the holds after it
     wider = max(1.0, (between[1] - between[0]) / abs(height))
     holds = 0.25 * pace * wider, 0.9 * pace * wider
     usual = 10.0 * pace * wider
@@ -500,10 +499,10 @@ def _shapes(span: _Span, Ts: float, seed: int) -> dict[str, FloatArray]:
 def default_references(
     plant: Any, controller: SampledController, names: Sequence[str] = NAMES
 ) -> list[str | FloatArray]:
-    """References for a controller on a plant that nobody gave any for: names, or samples [y].
+    """Default references for a controller on a plant: names, or samples [y].
 
-    The names where the catalogue suits the plant, else the same shapes over its own range; of
-    these the longer ones are left out where they take too many samples to tune on.
+    They are names if the catalogue suits the plant, else the same shapes over its own range,
+    without those that have too many samples for tuning.
 
     Raises
     ------

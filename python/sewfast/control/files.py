@@ -1,4 +1,4 @@
-"""Controller files: `load_controller`, and the kinds that it knows."""
+"""Controller files: `load_controller`, and the table of the kinds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .state_feedback import StateFeedback
 KINDS: dict[str, type[SampledController]] = {
     kind.KIND: kind for kind in (Controller, StateFeedback)
 }
-"""The kinds by name. A file without a kind, as all of versions 1 to 3, is a PID."""
+"""The kinds by name. A file of versions 1 to 3 has no kind and is a PID."""
 _VERSIONS = (1, 2, 3, 4)
 
 
@@ -39,12 +39,12 @@ def load_controller(path: str | os.PathLike[str]) -> SampledController:
 
 
 def load_pid(path: str | os.PathLike[str]) -> Controller:
-    """`load_controller` where only a PID will do.
+    """`load_controller` for code that supports only PIDs.
 
     Raises
     ------
     ModelFileError
-        As there, or for a controller of another kind.
+        As `load_controller`, or for a controller of another kind.
     """
     found = load_controller(path)
     if not isinstance(found, Controller):

@@ -1,4 +1,4 @@
-"""A controller's PID as MATLAB's objects and python-control's, and back from them."""
+"""Conversion of a PID to and from the objects of MATLAB and python-control."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from .controller import Controller
 from .loop import require_controller
 from .systems import beside, gain, measurement, pid, series
 
-# --- PIDs out of python-control's objects: the one set of gains that a fraction in z can have -----
+# --- From python-control: the unique gains of a fraction in z -------------------------------------
 # With `p = Tf/(Tf + Ts)`, `Tf = Td/N`, the controller is
 #
 #     C(z) = Kp + Ki z/(z - 1) + kd (z - 1)/(z - p),    Ki = Kp Ts/Ti,    kd = Kp Td/(Tf + Ts)
 #
-# so that the poles say what there is and the residues how much of it: nothing is left to guess.
+# The poles determine its terms and the residues their gains, so nothing has to be guessed.
 
 
 _SAME = 1e-9
-"""Relative difference up to which numbers of one object are one number."""
+"""Relative difference up to which two numbers of an object count as equal."""
 _ROUNDING = 1e-12
-"""Share of a denominator's coefficients below which its value at z = 1 is 0."""
+"""Share of a denominator's coefficients below which its value at z = 1 counts as 0."""
 _NOTHING = 1e-13
-"""Share of all gains below which one is what rounding left."""
+"""Share of all gains below which one counts as a rounding error."""
 
 
 @dataclass(frozen=True)
 class _Terms:
-    """Gains per sample and the derivative's pole; NaN where no pole is seen."""
+    """Gains per sample and the derivative's pole; NaN without such a pole."""
 
     Kp: float
     Ki: float
@@ -50,26 +50,26 @@ def from_control(
     Parameters
     ----------
     system : control.TransferFunction or control.StateSpace
-        From the error to the command, or from `[r, y]` to the command; two inputs that are labelled
-        r and y may have either order. Its poles are 1 (integral) and one of 0 to 1 (derivative with
-        its filter), or one of them, or none.
+        From the error to the command, or from `[r, y]` to the command; two inputs labelled r and y
+        can have either order. Its poles are 1 (integral) and one from 0 to 1 (derivative with its
+        filter), or one of them, or none.
     Ts : float, optional
-        Sample time [s], where the object does not state it (`dt` is True or None).
+        Sample time [s], if the object does not state it (`dt` is True or None).
     u_unit, y_unit : str
         Units of command and output, which python-control does not keep.
 
     Returns
     -------
     Controller
-        Gains in standard form; without limits and feedback filters, which
-        `dataclasses.replace` sets.
+        Gains in standard form, without limits and feedback filters, which can be set by
+        `dataclasses.replace`.
 
     Raises
     ------
     SettingError
-        For what is no such PID: continuous time, other poles (a feedback filter, another formula
-        than the backward difference), a measured output that does not enter as `-C y`, gains of
-        different signs.
+        For anything else: continuous time, other poles (a feedback filter, another formula than the
+        backward difference), a measured output that does not enter as `-C y`, gains of different
+        signs.
     """
     control = require_control()
     if not isinstance(system, (control.TransferFunction, control.StateSpace)):
@@ -143,14 +143,14 @@ def _levelled(num: FloatArray, den: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def _terms(num: FloatArray, den: FloatArray) -> _Terms:
-    """What the poles and their residues say."""
+    """The gains by the poles and their residues."""
     order = len(den) - 1
     if order > 2:
         raise _other(den)
     integrates = order > 0 and bool(abs(den.sum()) <= _ROUNDING * np.abs(den).sum())
     if order == 2 and not integrates:
         raise _other(den)
-    # the product of the poles: beside 1 it is the other one
+    # the product of the poles: if one is 1, it is the other one
     pole = math.nan
     if order == 2:
         pole = float(den[2])
@@ -181,7 +181,7 @@ def _other(den: FloatArray) -> SettingError:
 
 
 def _weights(of_r: _Terms, own: _Terms) -> tuple[float, float]:
-    """Alpha and beta; the other terms of both ways must agree."""
+    """Alpha and beta; the other terms of both inputs must agree."""
     size = abs(own.Kp) + abs(own.Ki) + abs(own.kd)
     same_pole = not (of_r.kd and own.kd) or abs(of_r.pole - own.pole) <= _SAME
     if abs(of_r.Ki - own.Ki) > _SAME * size or not same_pole:
@@ -213,8 +213,8 @@ def _controller(
     return Controller(gains, Ts, alpha=alpha, beta=beta, N=N, notes="from python-control")
 
 
-# --- A controller's PID as MATLAB's objects and python-control's, and back from them --------------
-# MATLAB's discrete PID with both formulas `BackwardEuler` is this package's, term by term:
+# --- To and from MATLAB, and to python-control ----------------------------------------------------
+# MATLAB's discrete PID with both formulas `BackwardEuler` equals this package's, term by term:
 #
 #     C = Kp + Ki Ts z/(z - 1) + Kd/(Tf + Ts z/(z - 1)),  Tf = Td/N, b = 1 - alpha, c = 1 - beta
 
@@ -228,7 +228,7 @@ _NAMES = {
     "pidstd": ("Kp", "Ti", "Td", "N"),
     "pidstd2": ("Kp", "Ti", "Td", "N", "b", "c"),
 }
-"""Numbers of each object, in the order of its constructor."""
+"""Arguments of each object, in the order of its constructor."""
 
 
 def to_matlab(controller: Controller, form: Object = "pid2") -> dict[str, Any]:
@@ -237,14 +237,14 @@ def to_matlab(controller: Controller, form: Object = "pid2") -> dict[str, Any]:
     Parameters
     ----------
     controller : Controller
-        Limits, filters of the feedback, ramp and schedule have no place there.
+        Limits, feedback filters and ramp are left out.
     form : "pid", "pid2", "pidstd" or "pidstd2"
         `pid` and `pidstd` have one degree of freedom: alpha and beta must be 0.
 
     Raises
     ------
     SettingError
-        For another form, weights that it cannot hold, a gain schedule, or biquads.
+        For another form, weights that it does not have, a gain schedule, or biquads.
     """
     require_controller(controller, None, "to_matlab(controller, form)")
     _require_form(form)
@@ -283,7 +283,7 @@ def to_matlab(controller: Controller, form: Object = "pid2") -> dict[str, Any]:
 
 
 def matlab_code(controller: Controller, form: Object = "pid2") -> str:
-    """The line that makes the object in MATLAB, every digit kept."""
+    """The line of code for the object in MATLAB, with every digit."""
     numbers = to_matlab(controller, form)
     texts = [_number(numbers[name]) for name in (*_NAMES[form], "Ts")]
     return f"C = {form}({', '.join(texts)}, 'IFormula', '{FORMULA}', 'DFormula', '{FORMULA}');"
@@ -304,11 +304,11 @@ def from_matlab(
     Parameters
     ----------
     form : "pid", "pid2", "pidstd" or "pidstd2"
-        What the object is: `class(C)` in MATLAB.
+        Class of the object: `class(C)` in MATLAB.
     Ts : float
         Its sample time [s].
     IFormula, DFormula : str
-        Its formulas; both must be `BackwardEuler`, the only ones that are this controller's.
+        Its formulas; both must be `BackwardEuler`, as in this controller.
     u_unit, y_unit : str
         Units of command and output, which MATLAB does not keep.
     **numbers : float
@@ -317,13 +317,13 @@ def from_matlab(
     Returns
     -------
     Controller
-        Without limits and feedback filters; `dataclasses.replace` sets them.
+        Without limits and feedback filters, which can be set by `dataclasses.replace`.
 
     Raises
     ------
     SettingError
-        For another form or formula, continuous time, a number that is missing or does not belong
-        there, or gains that the standard form cannot express.
+        For another form or formula, continuous time, a missing or unknown number, or gains that the
+        standard form cannot express.
     """
     _require_form(form)
     if not (real("Ts", Ts) > 0.0):
@@ -360,14 +360,14 @@ def from_matlab(
 def to_control(controller: Controller) -> Any:
     """`control.StateSpace` from `[r, y]` to `u`, feedback filters included, dt = Ts.
 
-    Equal to the controller itself where no limit, ramp or schedule acts and the run begins at
-    zero. `control.tf(...)` of it is a pair of transfer functions; `from_control` reads it back
-    where there is no feedback filter.
+    It equals the controller as long as no limit, ramp or schedule acts and the run begins at zero.
+    `control.tf(...)` of it is a pair of transfer functions; without feedback filters,
+    `from_control` converts it back.
 
     Raises
     ------
     SettingError
-        Where python-control is not installed, or for a gain schedule.
+        If python-control is not installed, or for a gain schedule.
     """
     require_controller(controller, None, "to_control(controller)")
     if controller.schedule:

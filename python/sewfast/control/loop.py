@@ -1,4 +1,4 @@
-"""A controller on a model or on the virtual machine: `run`."""
+"""`run`: a controller in closed loop with a model or a machine."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Plant: TypeAlias = Model | VirtualMachine
 
 SMOOTHING = 0.005
-"""Centred moving average of the true output before rise time and overshoot are taken [s]."""
+"""Centred moving average of the true output before rise time and overshoot are computed [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ class ClosedLoopRun:
         Parameters
         ----------
         ax, file
-            As for `Drawing.plot`. One shows the output, further ones the error and the command.
+            As for `Drawing.plot`. One axes shows the output; further axes show error and command.
         others : sequence of ClosedLoopRun
             Other runs over the same reference, such as one predicted by a model.
         """
@@ -132,7 +132,7 @@ class ClosedLoopRun:
             for run, look in zip((self, *others), itertools.cycle(looks), strict=False)
         ]
         limits = (self.controller.u_min, self.controller.u_max)
-        # the others are drawn over this one, whose line is wider
+        # draw the others over this one, whose line is wider
         return loop_drawing(traces[::-1], self.units["y"], self.units["u"], limits).plot(ax, file)
 
     def _repr_html_(self) -> str:
@@ -163,7 +163,7 @@ class ClosedLoopRun:
 
 
 class HasMetrics(Protocol):
-    """A run of a closed loop, whoever has carried it out."""
+    """A closed-loop run of any kind."""
 
     @property
     def units(self) -> dict[str, str]: ...
@@ -171,7 +171,7 @@ class HasMetrics(Protocol):
 
 
 def run_html(found: HasMetrics, caption: str) -> str:
-    """What a controller did, as a table for a notebook."""
+    """A run as a table for a notebook."""
     m, u, y = found.metrics(), found.units["u"], found.units["y"]
     saturated = m["saturated"]
 
@@ -220,22 +220,22 @@ def run(
         On a model that is not in RPM at 1 ms a name is the same shape over the model's recorded
         range. By default a trapezoid that suits the plant; a drive needs an explicit one.
     feedforward : array, shape (N,), optional
-        A command that is added before the limits [u]; not for a drive.
+        A command added before the limits [u]; not for a drive.
     disturbance : array, shape (N,), optional
-        Of a model: a command that is added behind the limits, unseen by the controller [u]. A
-        virtual machine has `set_load`.
+        For a model: a command added after the limiter, unknown to the controller [u]. A virtual
+        machine has `set_load`.
     seed : int
         Chooses a named random reference.
     name : str, optional
         Name of the reference in messages and reports.
     file : path, optional
-        Of a drive: MCAP recording to write while it runs.
+        For a drive: MCAP recording to write while it runs.
     live : str
-        Of a drive: see `sewfast.live.open_view`.
+        For a drive: see `sewfast.live.open_view`.
     overwrite : bool
         Whether `file` may replace a recording of a drive, which cannot be repeated exactly.
     cancel : threading.Event, optional
-        Of a drive: set in another thread, it ends the run as Ctrl-C does.
+        For a drive: set it in another thread to end the run as Ctrl-C does.
 
     Returns
     -------
@@ -252,10 +252,10 @@ def run(
     FitError
         If the loop diverges.
     LinkError
-        If the port or the drive failed or tripped; the motor is stopped, `recording` holds what
-        came.
+        If the port or the drive failed or tripped; the motor is stopped, `recording` holds the
+        samples so far.
     Interrupted
-        On Ctrl-C or `cancel`, of a drive; the motor is stopped, `best` is the run up to there.
+        On Ctrl-C or `cancel` with a drive; the motor is stopped, `best` is the run so far.
     """
     require_controller(controller, on, "run(controller, plant, reference)", SampledController)
     if reference is None:
@@ -287,7 +287,7 @@ def run(
 
 
 def _usual_reference(on: Any, controller: SampledController) -> str | FloatArray:
-    """A trapezoid for a plant whose range is known; a motor does not move without being asked."""
+    """A trapezoid for a model or a virtual machine; a real motor needs an explicit reference."""
     if not isinstance(on, (Model, VirtualMachine)):
         raise SettingError(
             name="reference", expected="one for a drive", received="none",
@@ -300,7 +300,7 @@ def _usual_reference(on: Any, controller: SampledController) -> str | FloatArray
 def _given(
     on: Any, feedforward: ArrayLike | None, disturbance: ArrayLike | None
 ) -> dict[str, FloatArray]:
-    """The signals other than the reference that were given."""
+    """The given signals other than the reference."""
     given = {"feedforward": feedforward, "disturbance": disturbance}
     signals = {name: vector(name, v) for name, v in given.items() if v is not None}
     if "disturbance" in signals and not isinstance(on, Model):
@@ -319,12 +319,7 @@ def _given(
 def require_controller(
     controller: Any, plant: Any, call: str, kind: type[SampledController] = Controller
 ) -> None:
-    """Refuse what is no controller, such as the plant in its place, or one of another kind.
-
-    Raises
-    ------
-    SettingError
-    """
+    """Raise `SettingError` for anything but a controller of this kind, such as a swapped plant."""
     if isinstance(controller, kind):
         return
     if isinstance(controller, SampledController):
@@ -359,18 +354,18 @@ def _on_machine(
 def reference_samples(
     reference: str | ArrayLike, controller: SampledController, seed: int = 0, *, plant: Any = None
 ) -> FloatArray:
-    """The samples of a reference given by name or as they are, shape (N,), never the caller's own.
+    """The samples of a reference given by name or as samples, shape (N,), as a copy.
 
-    A name is the signal of the catalogue for a controller in RPM at 1 ms; with a model the same
-    shape over the model's recorded range (`sewfast.control.defaults.drive_references`) otherwise.
+    A name is the signal of the catalogue for a controller in RPM at 1 ms; otherwise, with a model,
+    the same shape over the model's recorded range (`sewfast.control.defaults.drive_references`).
 
     Raises
     ------
     SettingError
-        For an unknown name, or a name where the controller is not in RPM at 1 ms and no model with
-        one input says what range to draw it over.
+        For an unknown name, and for a name with a controller that is not in RPM at 1 ms, unless
+        there is a model with one input.
     DataError
-        For samples that are no vector of numbers.
+        For samples that are not a vector of numbers.
     """
     if not isinstance(reference, str):
         return vector("reference", reference).copy()
@@ -392,13 +387,7 @@ def reference_samples(
 
 
 def check_fits(controller: SampledController, plant: Any) -> None:
-    """Refuse a plant whose sample time or units are not the controller's.
-
-    Raises
-    ------
-    SettingError
-        Naming both.
-    """
+    """Raise `SettingError` for a plant with another sample time or units than the controller's."""
     if not isinstance(plant, (Model, VirtualMachine)):
         raise SettingError(
             name="plant", expected="a Model or a VirtualMachine", received=type(plant).__name__,
@@ -413,13 +402,7 @@ def check_fits(controller: SampledController, plant: Any) -> None:
 
 
 def require_units(gains: Gains | SampledController, units: tuple[str, str]) -> None:
-    """Refuse gains in other units than those of a plant's input and output; empty is unknown.
-
-    Raises
-    ------
-    SettingError
-        Naming both.
-    """
+    """Raise `SettingError` for gains in other units than a plant's; empty units are unknown."""
     own = (gains.u_unit, gains.y_unit)
     for what, theirs, ours in zip(("input", "output"), units, own, strict=True):
         if theirs and ours and spelled(theirs) != spelled(ours):
@@ -430,25 +413,25 @@ def require_units(gains: Gains | SampledController, units: tuple[str, str]) -> N
 
 
 def plant_units(plant: Plant) -> tuple[str, str]:
-    """Units of a plant's first input and of its output; empty where unknown."""
+    """Units of a plant's first input and of its output; empty if unknown."""
     if isinstance(plant, VirtualMachine):
         return "V", "RPM"
     return plant.input_units[0], plant.output_unit
 
 
 def single_core(plant: Plant) -> Any:
-    """The compiled plant of one run: of an ensemble its first member, which did best."""
+    """The compiled plant of one run: for an ensemble its first member, the best one."""
     return plant.members[0].core if isinstance(plant, Ensemble) else plant.core
 
 
 def plant_name(plant: Plant) -> str:
-    """What to call a plant: the machine's name, or the model's kind."""
+    """The name of a plant: the machine's name, or the model's kind."""
     if isinstance(plant, Ensemble):
         return f"{plant.kind}, first member"
     return plant.name if isinstance(plant, VirtualMachine) else plant.kind
 
 
-# --- Plants and references as they are given, one by one: members, titles, samples ----------------
+# --- Lists of plants and references: members, titles, samples -------------------------------------
 
 
 Plants: TypeAlias = Plant | Sequence[Plant]
@@ -456,12 +439,12 @@ References: TypeAlias = str | ArrayLike | Sequence[str | ArrayLike] | None
 
 
 def each_plant(on: Plants | None) -> list[Plant]:
-    """Every plant by itself: of an ensemble its members.
+    """A list of single plants: an ensemble is replaced by its members.
 
     Raises
     ------
     SettingError
-        For what is neither model nor virtual machine.
+        For anything but models and virtual machines.
     """
     if on is None:
         return []
@@ -476,7 +459,7 @@ def each_plant(on: Plants | None) -> list[Plant]:
 
 
 def titles(plants: Sequence[Plant]) -> list[str]:
-    """What to call each."""
+    """A title for each plant."""
     names = [p.name if isinstance(p, VirtualMachine) else p.kind for p in plants]
     if len(plants) == 1:
         return names
@@ -484,12 +467,12 @@ def titles(plants: Sequence[Plant]) -> list[str]:
 
 
 def each_reference(references: Any, default: Sequence[str]) -> list[Any]:
-    """The references one by one: a name or a vector is one, a sequence of those is several.
+    """A list of references: a name or a vector is one, a sequence of those is several.
 
     Raises
     ------
     SettingError
-        For what is none of these.
+        For anything else.
     """
     if references is None:
         return list(default)
@@ -516,7 +499,7 @@ def trial(
     Raises
     ------
     FitError
-        Where the loop runs away; the plant is named.
+        If the loop diverges; the error names the plant.
     """
     try:
         return replace(run(controller, plant, reference, seed=seed), plant=title)

@@ -1,7 +1,7 @@
-"""`Machine`: all that recording, running and commissioning know of any machine; `record`.
+"""`Machine`, the protocol of machines for recording, running and commissioning; `record`.
 
 Read in this order: the protocol, `record`, then the machines of this process: the virtual one and
-any that is advanced sample by sample. A drive behind a port is a `Machine` by itself
+any that is advanced sample by sample. A drive behind a port is itself a `Machine`
 (`sewfast.link.Drive`).
 """
 
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RecordedRun(ClosedLoopRun):
-    """A closed loop on a machine, scored by the true speed where the machine is a virtual one.
+    """A closed loop on a machine; for a virtual machine, `y` is the true speed.
 
     Attributes
     ----------
     recording : Recording
-        The same with what its encoder saw: what may be learned from.
+        The run as measured by the encoder, for identification.
     """
 
     recording: Recording
@@ -54,16 +54,16 @@ class RecordedRun(ClosedLoopRun):
     def of_recording(
         cls, recording: Recording, controller: SampledController, r: FloatArray, *, plant: str
     ) -> RecordedRun:
-        """The run of which a rig has logged commands and counts.
+        """The run from commands and counts logged by a test rig.
 
-        What a log does not have, the feedback, is what the controller makes of the counts.
+        The feedback, which a log does not contain, is computed by the controller from the counts.
 
         Parameters
         ----------
         recording : Recording
-            As of `Recording.of_counts`; its name becomes the reference's.
+            From `Recording.of_counts`; its name becomes the reference's.
         controller : Controller
-            What computed the commands.
+            The controller that computed the commands.
         r : array, shape (N,)
             Reference [RPM].
         plant : str
@@ -72,9 +72,9 @@ class RecordedRun(ClosedLoopRun):
         Raises
         ------
         SettingError
-            For a controller of another sample time.
+            For a controller with another sample time.
         DataError
-            For a reference of another length, or one that is not finite.
+            For a reference with another length, or one that is not finite.
         """
         _require_fit(controller, r, recording.Ts)
         if len(r) != len(recording):
@@ -97,17 +97,17 @@ class RecordedRun(ClosedLoopRun):
 
     @property
     def run(self) -> ClosedLoopRun:
-        """Itself; there was a pair of run and recording before."""
+        """The run itself, for code that expects a pair of run and recording."""
         return self
 
 
 def Followed(run: ClosedLoopRun, recording: Recording) -> RecordedRun:
-    """`RecordedRun.of`, by the name that machines written so far know."""
+    """Earlier name of `RecordedRun.of`."""
     return RecordedRun.of(run, recording)
 
 
 def _require_fit(controller: SampledController, r: FloatArray, Ts: float) -> None:
-    """Refuse a controller of another sample time, and a reference that is not finite."""
+    """Refuse a controller with another sample time, and a reference that is not finite."""
     if not math.isclose(controller.Ts, Ts, rel_tol=0.01):
         raise SettingError(
             name="controller", expected=f"the machine's sample time of {Ts} s",
@@ -117,10 +117,10 @@ def _require_fit(controller: SampledController, r: FloatArray, Ts: float) -> Non
 
 
 Watch: TypeAlias = Callable[[int, FloatArray, FloatArray], object]
-"""Looks at a run as it goes on: called with the number of a sample, and with the commands [V] and
-counts from it on. What it raises ends the run, and the motor is stopped."""
+"""Watches a run: called with the number of a sample, and the commands [V] and counts from it on. An
+exception from it ends the run and stops the motor."""
 WATCHED = 20
-"""Samples that a machine of this process hands to a watch at a time."""
+"""Samples per call of a watch by a machine of this process."""
 
 
 class Machine(Protocol):
@@ -130,12 +130,12 @@ class Machine(Protocol):
     behind a port, an FMU, a model of MuJoCo, your own test rig. A `VirtualMachine` has them all.
     Every run, even an interrupted one, ends with no command on the motor. If its `follow` also
     accepts a `watch` (`Watch`), a run that goes wrong is ended early. `Recording.of_counts` and
-    `RecordedRun.of_recording` make the results from what a rig has logged.
+    `RecordedRun.of_recording` make the results from the log of a test rig.
     """
 
     @property
     def name(self) -> str:
-        """Of the machine, for messages and files."""
+        """Its name, for messages and files."""
 
     @property
     def Ts(self) -> float:
@@ -151,7 +151,7 @@ class Machine(Protocol):
 
     @property
     def speed(self) -> float:
-        """Speed beyond which it stops on its own [RPM]; inf if there is none."""
+        """Speed above which it stops on its own [RPM]; inf if there is none."""
 
     def excite(self, u: FloatArray, name: str) -> Recording:
         """Apply commands [V], shape (N,), one per sample."""
@@ -161,10 +161,10 @@ class Machine(Protocol):
 
 
 class Streaming(Machine, Protocol):
-    """A machine whose samples arrive while it runs, as a drive's: it fills files and views itself.
+    """A machine whose samples arrive during a run, such as a drive, and which writes files itself.
 
     Its `excite` and `follow` take `file`, `live`, `overwrite` and `cancel` as `record` and `run`
-    do, `excite` `method` and `settings` as well.
+    do, `excite` also `method` and `settings`.
     """
 
     def excite(self, u: FloatArray, name: str, **options: Any) -> Recording: ...
@@ -175,7 +175,7 @@ class Streaming(Machine, Protocol):
 
 
 def is_streaming(machine: object) -> TypeGuard[Streaming]:
-    """Whether a machine's samples arrive while it runs."""
+    """Whether a machine's samples arrive during a run."""
     return hasattr(machine, "stream")
 
 
@@ -188,16 +188,16 @@ MEMBERS = ("name", "Ts", "counts_per_rev", "volt", "speed", "excite", "follow")
 
 
 def machine_of(on: object) -> Machine:
-    """What is given as a machine: a virtual one with the members that it lacks, others as they are.
+    """The argument as a `Machine`: a virtual machine is wrapped, others are returned as they are.
 
     Raises
     ------
     SettingError
-        For anything else; the message names the members that are missing.
+        For anything else; the message names the missing members.
     """
     if isinstance(on, VirtualMachine):
         return MachineBench(on)
-    # a property is looked up at its class: asking a drive for its limits would be a question to it
+    # look properties up in the class: reading a drive's limits would send it a command
     missing = [m for m in MEMBERS if not hasattr(type(on), m) and not hasattr(on, m)]
     if missing:
         lacking = "" if len(missing) == len(MEMBERS) else f" without {', '.join(missing)}"
@@ -236,21 +236,21 @@ def record(
     u : array, shape (N,)
         Command [V] at the machine's sample time; see `sewfast.signals.excitation`.
     name : str
-        Of the excitation, for messages and files.
+        Name of the excitation, for messages and files.
     method : "kalman", "savgol" or "difference"
-        How the speed of a virtual machine or a drive is estimated from the counts.
+        Method of estimating the speed of a virtual machine or a drive from the counts.
     file : path, optional
-        Of a drive an MCAP recording, written while it runs, so that nothing is lost; of another
+        For a drive, an MCAP recording, written while it runs so that nothing is lost; for another
         machine any format, written at the end.
     live : str
-        Of a drive: see `sewfast.live.open_view`.
+        For a drive: see `sewfast.live.open_view`.
     settings : mapping, optional
         Further entries for the header of the file.
     overwrite : bool
         Whether `file` may replace a recording of a drive, which cannot be repeated exactly; one of
         a virtual machine is always replaced.
     cancel : threading.Event, optional
-        Of a drive: set in another thread, it ends the run as Ctrl-C does.
+        For a drive: set it in another thread to end the run as Ctrl-C does.
 
     Returns
     -------
@@ -263,13 +263,12 @@ def record(
     DataError
         If `u` is not one-dimensional and finite, or too short for a speed.
     SettingError
-        If `file` has an unknown ending or is a recording that is kept, before anything moves.
+        Before anything moves, if `file` has an unknown ending or must not be replaced.
     LinkError
-        If the port or the drive failed or tripped; the motor is stopped, `recording` holds what
-        came.
+        If the port or the drive failed or tripped; the motor is stopped, `recording` holds the
+        samples so far.
     Interrupted
-        On Ctrl-C or `cancel`, of a drive; the motor is stopped, `best` is the recording up to
-        there.
+        On Ctrl-C or `cancel` with a drive; the motor is stopped, `best` is the recording so far.
     """
     if not isinstance(machine, VirtualMachine) and not hasattr(machine, "excite"):
         raise SettingError(
@@ -294,7 +293,7 @@ def record(
 
 
 def cancelled_by(cancel: threading.Event | None) -> dict[str, Any]:
-    """The option for a streaming machine; one that knows none is asked only where it is wanted."""
+    """The option `cancel`, left out if None, as a user's streaming machine may lack it."""
     return {} if cancel is None else {"cancel": cancel}
 
 
@@ -326,9 +325,9 @@ class MachineBench:
     ----------
     machine : VirtualMachine
     speed : float
-        Speed beyond which it stops by itself [RPM].
+        Speed above which it stops by itself [RPM].
     method : "kalman", "savgol" or "difference"
-        How the speed is estimated from the counts.
+        Method of estimating the speed from the counts.
     """
 
     machine: VirtualMachine
@@ -363,7 +362,7 @@ class MachineBench:
     def follow(
         self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
-        # undisturbed, the machine does the same again and shows its counts
+        # the machine is deterministic: run it again with the same commands for its counts
         found = run(controller, self.machine, r, name=name)
         recording = self.excite(found.u, name)
         for k in range(0, len(r) if watch is not None else 0, WATCHED):
@@ -375,13 +374,13 @@ class MachineBench:
 class Stepped(Protocol):
     """A machine that is advanced one sample at a time: a simulator, or a test rig without a clock.
 
-    `speed_rpm`, where there is one, is its true speed [RPM]: runs are then scored by it, and by the
-    speed estimated from counts otherwise.
+    If it has `speed_rpm`, its true speed [RPM], runs are scored by it, otherwise by the speed
+    estimated from counts.
     """
 
     @property
     def counts(self) -> float:
-        """What its encoder shows now."""
+        """Present encoder counts."""
 
     def reset(self) -> None:
         """Bring it to rest."""
@@ -392,9 +391,9 @@ class Stepped(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SteppedBench:
-    """Any machine that can be advanced sample by sample, with sewfast's own controller around it.
+    """A machine that is advanced sample by sample, with the controller computed here.
 
-    Every run ends with a sample at 0 V, also one that is broken off.
+    Every run, even an aborted one, ends with a sample at 0 V.
 
     Parameters
     ----------
@@ -405,10 +404,10 @@ class SteppedBench:
     counts_per_rev : float
         Encoder counts per turn.
     volt : float
-        Largest command that it takes to either side [V]; larger ones are clipped.
+        Largest command in either direction [V]; larger ones are clipped.
     name : str
     speed : float
-        Speed beyond which it stops by itself [RPM].
+        Speed above which it stops by itself [RPM].
 
     Raises
     ------
@@ -473,7 +472,7 @@ class SteppedBench:
                 counts[k], speed[k] = machine.counts - first, getattr(machine, "speed_rpm", np.nan)
                 machine.step(min(max(decide(k, float(counts[k])), -self.volt), self.volt))
         finally:
-            # a rig holds its last command: no run leaves it turning, however it ends
+            # a test rig holds its last command: no run may leave it turning, however it ends
             machine.step(0.0)
         return counts, speed if hasattr(machine, "speed_rpm") else None
 

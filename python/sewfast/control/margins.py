@@ -1,4 +1,4 @@
-"""Margins of the linear loop; a linear plant in whatever form it comes, as a fraction in z^-1."""
+"""Margins of the linear loop; `sampled` converts any linear plant to a fraction in z^-1."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from .controller import Controller
 from .loop import plant_units, require_controller, require_units
 
 _GRID = 25
-"""Constant commands among which a speed is sought."""
+"""Number of constant commands in the search for a speed."""
 _HALVINGS = 20
-"""Of the interval in which it lies."""
+"""Bisections of the interval in which it lies."""
 
 
 def sampled(plant: Any, Ts: float, speed: float | None = None) -> tuple[FloatArray, FloatArray]:
@@ -36,15 +36,15 @@ def sampled(plant: Any, Ts: float, speed: float | None = None) -> tuple[FloatArr
     ----------
     plant : Fopdt, model, OperatingPoint, or system of python-control or scipy.signal
     Ts : float
-        Sample time [s]; what is continuous is sampled under a zero-order hold.
+        Sample time [s]; a continuous plant is sampled with a zero-order hold.
     speed : float, optional
         Steady output about which a nonlinear model is linearised.
 
     Raises
     ------
     SettingError
-        For several inputs, another sample time, a nonlinear model without a speed, or what is no
-        plant.
+        For several inputs, another sample time, a nonlinear model without a speed, or anything but
+        a plant.
     """
     if all(hasattr(plant, name) for name in ("K", "T", "L")):
         return _core.sampled_fopdt(plant.K, plant.T, plant.L, Ts=Ts)
@@ -96,7 +96,7 @@ def operating_point(model: Any, speed: float) -> OperatingPoint:
     Raises
     ------
     SettingError
-        For an ensemble, or where no command within the range of the training data holds that speed.
+        For an ensemble, or if no command within the range of the training data holds that speed.
     """
     if model.members:
         raise SettingError(
@@ -118,7 +118,7 @@ def operating_point(model: Any, speed: float) -> OperatingPoint:
             f"{max(reached):.4g}",
         )  # fmt: skip
     below, above = pairs[0]
-    # halves, as steady outputs may jump where friction lets go
+    # bisection, as steady outputs can jump where friction breaks away
     for _ in range(_HALVINGS):
         found = operating_range(model, [0.5 * (below.u + above.u)]).points[0]
         if (found.y - speed) * (below.y - speed) > 0.0:
@@ -129,7 +129,7 @@ def operating_point(model: Any, speed: float) -> OperatingPoint:
 
 
 def _integrating_point(model: Any, grid: Any, level: float) -> OperatingPoint:
-    """Where an integrator keeps its output: at a command of its own, at any level."""
+    """The operating point of an integrator: the command that keeps its output, at any level."""
     pairs = [p for p in itertools.pairwise(grid) if p[0].drift * p[1].drift <= 0.0]
     if not pairs:
         raise SettingError(
@@ -192,7 +192,7 @@ def _of_system(system: Any, Ts: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _discrete(system: Any, Ts: float) -> Any:
-    """A system in continuous time as it is under a zero-order hold; others as they are."""
+    """A continuous system sampled with a zero-order hold; a discrete one unchanged."""
     if getattr(system, "dt", math.nan) not in (0, None):
         return system
     if type(system).__module__.startswith("control."):
@@ -217,7 +217,7 @@ def _require(inputs: int, of: float, Ts: float) -> None:
         )  # fmt: skip
 
 
-# --- `margins`: how far a controller on a linear plant is from instability ------------------------
+# --- `margins` ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -229,11 +229,11 @@ class Margins(Plotted):
     Attributes
     ----------
     stable : bool
-        Whether every closed-loop pole lies inside the unit circle.
+        Whether every closed-loop pole is inside the unit circle.
     Ms, Mt : float
         Largest |S| and |T|; `Ms` is the inverse of the distance of L to -1.
     Ms_omega, Mt_omega : float
-        Where [rad/s].
+        Their frequencies [rad/s].
     gain_margin : float
         The factor above 1 on the loop's gain that makes the loop unstable; inf if none does.
     gain_reduction : float
@@ -243,7 +243,7 @@ class Margins(Plotted):
     delay_margin_s : float
         The additional delay that makes it unstable [s].
     gain_crossovers, phase_crossovers : tuple of float
-        Where |L| is 1, and where L is real and negative [rad/s].
+        Frequencies at which |L| is 1, and at which L is real and negative [rad/s].
     noise_gain : float
         rms of the command over rms of white noise on the measured output [u/y].
     largest_pole : float
@@ -296,7 +296,7 @@ class Margins(Plotted):
         ax.plot(-1.0, 0.0, linestyle="none", marker="+", color="black", markersize=9)
         for factor, name in ((self.gain_margin, "gain"), (self.gain_reduction, "gain, down to")):
             if math.isfinite(factor) and factor > 0.0:
-                # what is drawn further out than this would make the rest too small to see
+                # farther out, the rest would become too small to see
                 at = -min(1.0 / factor, 4.0)
                 ax.plot([-1.0, at], [0.0, 0.0], marker="o", label=f"{name} {factor:.3g}")
         if math.isfinite(self.phase_margin_deg):
@@ -384,13 +384,7 @@ def loop_response(
 
 
 def _require_units(gains: Gains, plant: Any) -> None:
-    """Refuse a first-order model or a model whose units are others; toolboxes' systems have none.
-
-    Raises
-    ------
-    SettingError
-        Naming both.
-    """
+    """Raise `SettingError` for a model with other units; systems of toolboxes have none."""
     if isinstance(plant, Fopdt):
         require_units(gains, (plant.u_unit, plant.y_unit))
     elif isinstance(plant, Model):
@@ -398,7 +392,7 @@ def _require_units(gains: Gains, plant: Any) -> None:
 
 
 def loop_path(controller: Controller, *, speed: float | None = None) -> _core.LoopPath:
-    """What of the controller lies in the loop, with a schedule's gains at `speed`.
+    """The part of the controller in the feedback path, with a schedule's gains at `speed`.
 
     Raises
     ------
@@ -422,10 +416,10 @@ def loop_path(controller: Controller, *, speed: float | None = None) -> _core.Lo
 
 
 def scheduled_gains(controller: Controller, speed: float | None) -> tuple[Gains, float]:
-    """Gains in standard form where the output is `speed`, and what the schedule adds to Kp there.
+    """Gains in standard form at the output `speed`, and the schedule's contribution to Kp there.
 
-    That is `alpha r dKp/dy` at r = y [u/y]: `-Kp alpha r` follows the output, too. 0 without a
-    schedule.
+    The contribution is `alpha r dKp/dy` at r = y [u/y], as `-Kp alpha r` varies with the output; 0
+    without a schedule.
 
     Raises
     ------

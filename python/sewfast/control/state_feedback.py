@@ -19,9 +19,9 @@ from .controller import SampledController, bounded, unbounded
 from .margins import sampled
 
 STATES = 4
-"""The largest number of states of the plant."""
+"""Largest number of states of the plant."""
 VARIABLES = ("rho", "integral", "noise", "weight", "lead")
-"""What is searched unless it is named."""
+"""Default variables of a search."""
 _UNBOUNDED = {"u_min": -math.inf, "u_max": math.inf, "slew": math.inf, "r_rate": math.inf}
 _REALS = ("Ts", *VARIABLES, *_UNBOUNDED)
 FIELDS = (
@@ -42,27 +42,27 @@ class StateFeedback(SampledController):
     ``y(k) = num[0] u(k-1) + .. - den[0] y(k-1) - ..``. The gains on its states minimise the sum of
     ``e^2 + rho u^2 + (integral int e dt)^2``; the observer is the Kalman filter of a plant whose
     command is disturbed by white noise, and whose measurement noise has `noise` times the variance
-    of that. It is fed the command as limited. Both are found from a Riccati equation (Franklin,
-    Powell and Workman, Digital Control of Dynamic Systems, 3rd ed. 1998, chapters 8 and 9; Astrom
-    and Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, chapters 4 and 11).
+    of that. Its input is the command after the limits. Both follow from a Riccati equation
+    (Franklin, Powell and Workman, Digital Control of Dynamic Systems, 3rd ed. 1998, chapters 8 and
+    9; Astrom and Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, chapters 4 and 11).
 
     Parameters
     ----------
     num, den : array, shape (n,)
-        Of the plant with the encoder that measures it, 1 to 4 numbers each [y/u and 1]; zeros stand
-        for those that are missing. `from_model` takes them from a model.
+        Coefficients of the plant with its encoder, 1 to 4 numbers each [y/u and 1], padded with
+        zeros. `from_model` computes them from a model.
     rho : float
-        Weight of the command's square, above 0 [(y/u)^2]: less is faster.
+        Weight of the command's square, above 0 [(y/u)^2]: a smaller one is faster.
     integral : float
         Weight of the error's integral, 0 or more [1/s]; 0 for no integral action.
     noise : float
         Variance of the measurement over that of a disturbance of the command, above 0 [(y/u)^2]:
-        less trusts the measurement more.
+        a smaller one trusts the measurement more.
     weight : float
-        Set-point weight: 1 takes the model to the reference without help of the integral; less
-        leaves it a share, and lessens the overshoot.
+        Set-point weight: with 1 the model reaches the reference without the integral; a smaller one
+        leaves a share to the integral, and reduces the overshoot.
     lead : float
-        The reference is fed forward as it will be after so long at its present rate [s].
+        The reference fed forward is extrapolated by this time at its present rate [s].
     Ts : float
         Sample time [s].
     u_min, u_max : float
@@ -81,7 +81,7 @@ class StateFeedback(SampledController):
     Raises
     ------
     SettingError
-        For a setting outside its range, more than four states, or a plant that has no such gains.
+        For a setting outside its range, more than four states, or a plant without such gains.
     """
 
     KIND: ClassVar[str] = "state_feedback"
@@ -127,7 +127,7 @@ class StateFeedback(SampledController):
         counts_per_rev: float | None = None,
         **settings: Any,
     ) -> StateFeedback:
-        """For a plant, with weights that suit its gain unless they are given.
+        """The controller for a plant, by default with weights that suit its gain.
 
         Parameters
         ----------
@@ -136,15 +136,15 @@ class StateFeedback(SampledController):
         speed : float, optional
             Steady output about which a nonlinear model is linearised [y].
         counts_per_rev : float, optional
-            Encoder of the output. It measures the mean of a sample time, which takes a state more
-            and is left out where there is none left.
+            Encoder of the output. It measures the mean over a sample time, which needs one more
+            state and is left out if there is none left.
         **settings
-            Of this class: `rho`, `u_min` and the like.
+            Settings of this class: `rho`, `u_min` and the like.
 
         Raises
         ------
         SettingError
-            For a plant of more than four states or without delay, or as the class.
+            For a plant with more than four states or without delay, or as the class.
         """
         Ts = real("Ts", settings.pop("Ts", getattr(plant, "Ts", 0.001)))
         num, den = _fraction(plant, Ts, speed)
@@ -153,7 +153,8 @@ class StateFeedback(SampledController):
         gain = abs(_response(num, den, _PACE))
         if not 0.0 < gain < math.inf:
             raise SettingError(
-                name="plant", expected="one that a command moves", received=f"a gain of {gain:g}",
+                name="plant", expected="one that responds to its command",
+                received=f"a gain of {gain:g}",
                 remedy="identify it from a recording in which the command moves the output",
             )  # fmt: skip
         first = {"rho": gain**2, "noise": gain**2, "integral": _INTEGRAL / Ts}
@@ -186,7 +187,7 @@ class StateFeedback(SampledController):
         return cls.from_model(linear, speed=middle, **settings)
 
     def core(self) -> _core.StateFeedback:
-        """The arithmetic itself, at rest: `step(r, y, feedforward)` gives the command of a sample.
+        """The compiled controller, at rest: `step(r, y, feedforward)` gives a sample's command.
 
         `core().single()` is the same in single precision, bit by bit what a device computes.
         """
@@ -195,7 +196,7 @@ class StateFeedback(SampledController):
         )
 
     def sent(self) -> tuple[int, list[float]]:
-        """Number of the kind and its own numbers, as a device is sent them (docs/PROTOCOL.md)."""
+        """Number of the kind and its parameters, as sent to a device (docs/PROTOCOL.md)."""
         return 1, self.core().sent()
 
     @property
@@ -220,11 +221,11 @@ class StateFeedback(SampledController):
 
     @property
     def pace(self) -> float:
-        """A time constant for a plant of which only its controller is known [s]."""
+        """An estimate of the plant's time constant from the controller alone [s]."""
         return 50.0 * self.Ts
 
     def with_values(self, values: Mapping[str, float], notes: str) -> StateFeedback:
-        """The same with values by name; other names are left."""
+        """The same controller with values by name; other names are ignored."""
         known: dict[str, Any] = {
             name: values[name] for name in (*VARIABLES, "r_rate") if name in values
         }
@@ -277,7 +278,7 @@ class StateFeedback(SampledController):
 
 
 def _four(name: str, given: ArrayLike) -> tuple[float, ...]:
-    """Four numbers, those that are missing 0."""
+    """The numbers padded with zeros to four."""
     numbers = [float(x) for x in vector(name, given)]
     while len(numbers) > STATES and numbers[-1] == 0.0:
         numbers.pop()
@@ -290,7 +291,7 @@ def _four(name: str, given: ArrayLike) -> tuple[float, ...]:
 
 
 def _fraction(plant: Any, Ts: float, speed: float | None) -> tuple[FloatArray, FloatArray]:
-    """Numerator and denominator from `z^-1` on; the command acts a sample later at the earliest."""
+    """Numerator and denominator from `z^-1` on, of a plant with a delay of at least one sample."""
     num, den = sampled(plant, Ts, speed)
     num, den = num / den[0], den / den[0]
     if num[0] != 0.0:

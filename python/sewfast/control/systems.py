@@ -1,4 +1,4 @@
-"""The linear loop as state space: controller, measurement, plant, and what they make together.
+"""The linear loop as state space: controller, measurement and plant, and their connections.
 
 Exact for deviations from an operating point as long as no limit, slew or ramp acts.
 """
@@ -20,30 +20,30 @@ from .loop import require_controller
 from .margins import scheduled_gains
 
 SYSTEMS = ("L", "S", "T", "closed", "tracking", "disturbance", "plant", "measurement", "pid")
-"""What a `LinearLoop` hands to toolboxes by name."""
+"""Systems of a `LinearLoop` for toolboxes, by name."""
 
 
 def gain(D: Any) -> StateSpace:
-    """Outputs that are the inputs times a matrix."""
+    """A static gain: the outputs are `D` times the inputs."""
     D = np.atleast_2d(np.asarray(D, dtype=np.float64))
     outputs, inputs = D.shape
     return StateSpace(np.zeros((0, 0)), np.zeros((0, inputs)), np.zeros((outputs, 0)), D)
 
 
 def series(first: StateSpace, then: StateSpace) -> StateSpace:
-    """`then` behind `first`."""
+    """The series connection, `first` before `then`."""
     (A1, B1, C1, D1), (A2, B2, C2, D2) = first, then
     A = np.block([[A1, np.zeros((len(A1), len(A2)))], [B2 @ C1, A2]])
     return StateSpace(A, np.vstack([B1, B2 @ D1]), np.hstack([D2 @ C1, C2]), D2 @ D1)
 
 
 def beside(one: StateSpace, other: StateSpace) -> StateSpace:
-    """Both with inputs and outputs of their own."""
+    """Both systems side by side, with separate inputs and outputs."""
     return StateSpace(*(_diagonal(a, b) for a, b in zip(one, other, strict=True)))
 
 
 def plus(one: StateSpace, other: StateSpace) -> StateSpace:
-    """The sum of both outputs for common inputs."""
+    """The parallel connection: the sum of both outputs for common inputs."""
     A, B, C, _ = beside(one, other)
     inputs = one.D.shape[1]
     outputs = one.D.shape[0]
@@ -63,7 +63,7 @@ def _diagonal(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def moving_average(samples: int) -> StateSpace:
-    """Mean of the last samples."""
+    """Mean over the last samples."""
     n = samples - 1
     A, B = np.eye(n, k=-1), np.zeros((n, 1))
     B[:1] = 1.0
@@ -88,7 +88,7 @@ def observer(time: float, Ts: float) -> StateSpace:
 def cascade(controller: Controller) -> StateSpace:
     """The controller's biquads, one after the other.
 
-    In the canonical form of H = 1 + (1 - q)(c0 + c1 q)/(1 + a1 q + a2 q^2), q = 1/z, whose
+    Each is in the canonical form of H = 1 + (1 - q)(c0 + c1 q)/(1 + a1 q + a2 q^2), q = 1/z, whose
     numerator less the constant c0 is (c1 - c0 - a1 c0) q - (c1 + a2 c0) q^2.
     """
     found = gain(1.0)
@@ -108,13 +108,13 @@ def _first_order(a: float, c: float, d: float) -> StateSpace:
 
 
 def measurement(controller: Controller, encoder: bool) -> StateSpace:
-    """From the plant's output to what the PID is fed: encoder, feedback filters, biquads.
+    """From the plant's output to the PID's input: encoder, feedback filters, biquads.
 
     Parameters
     ----------
     controller : Controller
     encoder : bool
-        Whether a difference of positions is measured: the mean over the sample before.
+        Whether the output is measured by differences of positions: the mean over the sample before.
     """
     found = moving_average(controller.filter_samples)
     if encoder:
@@ -125,14 +125,14 @@ def measurement(controller: Controller, encoder: bool) -> StateSpace:
 
 
 def pid(controller: Controller, speed: float = 0.0) -> StateSpace:
-    """From reference and filtered output, in this order, to the command; the reference passes the
-    biquads first.
+    """From reference and filtered output, in this order, to the command, with the biquads of the
+    reference.
 
     Parameters
     ----------
     controller : Controller
     speed : float
-        Output at which the gains of a schedule are taken [y].
+        Output at which a gain schedule is evaluated [y].
     """
     g, slope = scheduled_gains(controller, speed)
     Ts = controller.Ts
@@ -177,13 +177,17 @@ class LinearLoop:
         encoder: bool | None = None,
         speed: float = 0.0,
     ) -> LinearLoop:
-        """Close the loop; `encoder` as the controller has one unless told, a schedule's gains at
-        `speed`.
+        """Close the loop, with a schedule's gains at `speed`.
+
+        Parameters
+        ----------
+        encoder : bool, optional
+            Whether an encoder measures the output; by default if the controller has one.
 
         Raises
         ------
         SettingError
-            For what is no Controller or no StateSpace, such as that of `model.to_ss()`.
+            For anything but a Controller and a StateSpace, such as that of `model.to_ss()`.
         """
         require_controller(controller, plant, "LinearLoop.of(controller, plant)")
         if not isinstance(plant, StateSpace):
@@ -206,7 +210,7 @@ class LinearLoop:
 
     @property
     def S(self) -> StateSpace:
-        """Sensitivity 1/(1 + L): what feedback leaves of a disturbance at the plant's input."""
+        """Sensitivity 1/(1 + L): the share of a disturbance at the plant's input that remains."""
         A, B, C, D = self.L
         return StateSpace(A - B @ C, B, -C, 1.0 - D)
 
@@ -246,7 +250,7 @@ class LinearLoop:
         return StateSpace(A, B[:, 1:], C[:1], D[:1, 1:])
 
     def poles(self) -> NDArray[np.complex128]:
-        """Of the closed loop in the z plane, the slowest first."""
+        """Poles of the closed loop in the z plane, the slowest first."""
         found = np.linalg.eigvals(self.closed.A).astype(np.complex128)
         return found[np.argsort(-np.abs(found), kind="stable")]
 
@@ -256,7 +260,7 @@ class LinearLoop:
         Raises
         ------
         SettingError
-            Where python-control is not installed, or for another name.
+            If python-control is not installed, or for another name.
         """
         return require_control().ss(*self._named(name), self.Ts)
 
@@ -266,7 +270,7 @@ class LinearLoop:
         Raises
         ------
         SettingError
-            Where scipy is not installed.
+            If scipy is not installed.
         """
         return require_scipy_signal().dlti(*self._named(name), dt=self.Ts)
 

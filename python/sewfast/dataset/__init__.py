@@ -1,4 +1,4 @@
-"""Data sets: experiments, their parts, what they must fulfil.
+"""Data sets: experiments, their parts, checks and preparation.
 
 Read in this order: `experiment` and `dataset` (the values, immutable), `pieces` (parts, gaps, what
 a data set must fulfil); preparation: `trends` (offsets, kept for restoring), `rates` (sample times,

@@ -20,7 +20,7 @@ from .experiment import Experiment, require_some_weight
 class Dataset:
     """Recordings of one plant: the same columns, units and sample time in every experiment.
 
-    Immutable. An output may be NaN, which means that it was not measured: models run through it and
+    Immutable. An output can be NaN, which means that it was not measured: models run through it and
     it has no weight. An input that is NaN is refused if a model needs it; the message names the
     sample.
 

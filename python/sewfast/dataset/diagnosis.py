@@ -142,7 +142,7 @@ def diagnose(data: Dataset) -> Diagnosis:
     Parameters
     ----------
     data : Dataset
-        Values may be missing.
+        Values can be missing.
 
     Returns
     -------
@@ -286,7 +286,7 @@ def _coarse(data: Dataset) -> Iterator[Finding]:
     yield Finding(
         "coarse_output",
         f"{_output(data)} comes in steps of {step:.4g}, {steps:.2g} of them in its standard "
-        "deviation: rounding is much of what a model would fit",
+        "deviation: a model would mainly fit the rounding",
         "of an encoder, record the counts and let their speed be computed (--counts COL "
         "--counts-per-rev N); else excite more strongly or use a finer sensor",
         {"step": step, "steps_in_standard_deviation": steps},

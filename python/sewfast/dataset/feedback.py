@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .dataset import Dataset
 
 
-# --- Whether the output integrates an input, as a position does what drives the motor -------------
+# --- Whether the output integrates an input -------------------------------------------------------
 
 
 SCALES = ((60, 1), (200, 2), (1000, 4))
@@ -265,7 +265,7 @@ def _without_line(column: FloatArray) -> FloatArray:
     return column - line
 
 
-# --- Whether a record was made in closed loop: whether noise of the output comes back in an input -
+# --- Whether a record was made in closed loop: noise of the output returns in an input ------------
 
 
 PAST = 20

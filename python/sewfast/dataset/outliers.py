@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Protocol, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray, runs
+from ..arrays import FloatArray, is_whole, runs
 from ..errors import DataError, SettingError
 from .pieces import require_sane
 
 if TYPE_CHECKING:
     from .dataset import Dataset
 
-# --- What one column says of its sensor: white noise, quantum, limits -----------------------------
+# --- The sensor of a column: white noise, quantum, limits -----------------------------------------
 
 
 MAD = 1.4826
@@ -72,7 +72,7 @@ def share_at_limits(column: FloatArray) -> tuple[float, float]:
     return low, high
 
 
-# --- Where the power of a signal lies -------------------------------------------------------------
+# --- The spectrum of a signal ---------------------------------------------------------------------
 
 
 LONGEST = 4096
@@ -125,7 +125,7 @@ def top(frequency: FloatArray, power: FloatArray) -> float | None:
     return float(frequency[min(found, len(frequency) - 1)])
 
 
-# --- Outliers: marks of single wrong outputs, which a separate step may take out ------------------
+# --- Outliers: marks of single wrong outputs ------------------------------------------------------
 
 
 class Simulates(Protocol):
@@ -240,8 +240,7 @@ def mark_outliers(
     number = isinstance(threshold, (int, float, np.number)) and not isinstance(threshold, bool)
     if not number or not threshold > 0.0:
         raise SettingError(f"threshold: expected a number above 0, received {threshold!r}")
-    odd = isinstance(window, (int, np.integer)) and not isinstance(window, bool)
-    if not odd or window < 3 or window % 2 == 0 or window > 1001:
+    if not is_whole(window) or window < 3 or window % 2 == 0 or window > 1001:
         raise SettingError(f"window: expected an odd number from 3 to 1001, received {window!r}")
     require_sane(data)
     series = _series(data, model)
@@ -308,7 +307,7 @@ def _levelled(rows: FloatArray, level: float) -> FloatArray:
 
 
 def _medians(rows: FloatArray) -> FloatArray:
-    """Median of each row over what is not NaN; NaN where nothing is."""
+    """Median of each row without NaN; NaN if all of it is."""
     ordered = np.sort(rows, axis=1)
     count = np.isfinite(ordered).sum(axis=1)
     index, row = np.maximum(count, 1), np.arange(len(rows))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .dataset import Dataset
     from .experiment import Experiment
 
-# --- What a data set must fulfil before it is used ------------------------------------------------
+# --- Checks of a data set before it is used -------------------------------------------------------
 
 
 INPUT_REMEDY = (
@@ -169,7 +169,7 @@ def require_finite(column: FloatArray, what: str, start: int, remedy: str) -> No
     )
 
 
-# --- Parts of a data set: ranges, fractions, what lies between gaps -------------------------------
+# --- Parts of a data set: ranges, fractions, pieces between gaps ----------------------------------
 
 
 SHORTEST_PIECE = 100
@@ -177,7 +177,7 @@ SHORTEST_PIECE = 100
 
 
 def take(data: Dataset, text: str) -> Dataset:
-    """`"A:B"` of every experiment, 0-based, end excluded; A or B may be left out.
+    """`"A:B"` of every experiment, 0-based, end excluded; A or B can be left out.
 
     Raises
     ------
@@ -302,7 +302,7 @@ def split_at_gaps(
     Parameters
     ----------
     shortest : int
-        Samples that a piece must have; shorter ones are left out, which `notes` says. The
+        Least samples of a piece; shorter ones are left out, with a note. The
         initial state alone takes 20.
     of : {"any", "inputs"}
         Whether a gap in the output splits an experiment, or only one in an input.
@@ -318,7 +318,11 @@ def split_at_gaps(
         raise SettingError(f"shortest: expected a number of samples above 0, got {shortest!r}")
     if of not in ("any", "inputs"):
         raise SettingError(f"of: expected 'any' or 'inputs', received {of!r}")
-    pieces = [(e, a, n) for e in data.experiments for a, n in runs(_without_gap(e, of))]
+    pieces = [
+        (e, a, n)
+        for e in data.experiments
+        for a, n in runs(e.measured if of == "any" else e.known_inputs)
+    ]
     kept = tuple(e.cut(a, a + n) for e, a, n in pieces if n >= shortest)
     if not kept:
         longest = max((n for _, _, n in pieces), default=0)
@@ -335,11 +339,7 @@ def split_at_gaps(
     return replace(data, experiments=kept, notes=(*data.notes, *dropped))
 
 
-def _without_gap(e: Experiment, of: str) -> NDArray[np.bool_]:
-    return e.measured if of == "any" else e.known_inputs
-
-
-# --- Missing samples: outputs taken out of the score, inputs filled by a stated assumption --------
+# --- Missing samples: outputs without weight, inputs filled by a stated assumption ----------------
 
 
 BoolArray: TypeAlias = NDArray[np.bool_]

@@ -322,7 +322,7 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-# --- What to do about the numbers that a summary of data shows ------------------------------------
+# --- Advice on the figures of a summary -----------------------------------------------------------
 
 
 LIMITED = 0.02
@@ -416,12 +416,12 @@ def _limits(output: ColumnSummary) -> Iterator[str]:
 
 
 def _noise_advice(output: ColumnSummary) -> Iterator[str]:
-    # the square of a tiny output may be 0
+    # the square of a tiny output can be 0
     known = output.moves and output.std > 0.0 and math.isfinite(output.noise)
     if known and output.noise > NOISY * output.std:
         yield (
             f"white noise is {output.noise / output.std:.0%} of what {output.name} does: excite "
-            "more strongly or record longer; prefer output error to arx, which noise bends"
+            "more strongly or record longer; prefer output error to arx, which noise biases"
         )
 
 
@@ -449,7 +449,7 @@ def nice(value: float) -> float:
     return float(max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)) * power)
 
 
-# --- The picture of a data set: columns over time with what is missing or stands out, and spectra -
+# --- The picture: columns over time with gaps and outliers, and spectra ---------------------------
 
 
 INPUT, OUTPUT, MISSING, OUTLIER = "#333333", "#0072B2", "#D55E00", "#CC0000"

@@ -149,7 +149,7 @@ def _mean(data: Dataset) -> Trend:
         known = column[np.isfinite(column)]
         if len(known) == 0:
             raise DataError(
-                name=f"{data.source}: {name!r}", expected="a value to take a mean of",
+                name=f"{data.source}: {name!r}", expected="a value for a mean",
                 received="none", remedy="leave this column out",
             )  # fmt: skip
         level.append(known.mean())
@@ -226,7 +226,7 @@ def _offset_of(like: Dataset, data: Dataset) -> Trend:
     if first is None or not all(t is not None and t.is_offset(first.level) for t in trends):
         raise SettingError(
             "detrend: expected a `like` from which one constant offset was taken off in all "
-            "experiments (order 0); a line or a level of its own says nothing of other data"
+            "experiments (order 0); a line, or a level per experiment, does not apply to other data"
         )
     return first
 

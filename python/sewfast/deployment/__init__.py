@@ -1,7 +1,7 @@
 """Models and controllers as code for other processors and tools.
 
-`deploy` writes a folder: C99 with a test against the step of this package, structured text, FMU,
-ONNX.
+`deploy` writes a folder with C99 and its test against the step of this package, structured text, an
+FMU or ONNX.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _WRITERS: dict[str, _Writer] = {
 
 @dataclass(frozen=True)
 class Deployment:
-    """What `deploy` wrote.
+    """The result of `deploy`.
 
     Attributes
     ----------
@@ -78,13 +78,13 @@ def deploy(
         controller only; a co-simulation FMU of FMI 3.0, for which a C compiler is needed; ONNX, of
         a model only.
     precision : {"f32", "f64"}, optional
-        Of the arithmetic: f32 by default, f64 for FMI and ONNX. A microcontroller that computes
-        only single precision in hardware takes some fifty times as long for `f64`.
+        Precision of the arithmetic: f32 by default, f64 for FMI and ONNX. A microcontroller with
+        single precision only in hardware takes about fifty times as long for `f64`.
     name : str, optional
         Prefix of every name in the code; by default `controller` or `model`.
     changeable : bool
         Whether gains and limits of a controller in C can be changed while it runs (`set_gains`,
-        `set_limits`), without a bump. They lie in memory then, not among the constants.
+        `set_limits`), without a bump. Then they are in RAM, not among the constants.
 
     Returns
     -------
@@ -94,9 +94,9 @@ def deploy(
     ------
     SettingError
         For another target, precision or name, for a model that single precision would change, and
-        for changeable gains of what has none.
+        for changeable gains of anything but a controller in C with constant gains.
     ModelFileError
-        If a file cannot be written; none is then.
+        If a file cannot be written; then none is written.
     """
     if isinstance(what, SampledController):
         what = pid_of(what, "deploy")
@@ -119,8 +119,8 @@ def deploy(
     if taken or not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
         raise SettingError(
             name="name",
-            expected="lower-case letters, digits and underscores that are no word of the "
-            "language and no name of another file (_test, fmi3)",
+            expected="lower-case letters, digits and underscores that are not a word of the "
+            "language or the name of another file (_test, fmi3)",
             received=repr(name), remedy="for example drive",
         )  # fmt: skip
     writer = _WRITERS[to]
@@ -138,7 +138,7 @@ def _bytes(content: str | bytes) -> bytes:
 
 
 def _write(target: Path, contents: Mapping[Path, bytes]) -> None:
-    """All files or none: a header beside the source of another controller would compile."""
+    """Write all files or none: a header next to another controller's source would compile."""
     made: list[Path] = []
     try:
         if target.exists() and not target.is_dir():
@@ -151,10 +151,10 @@ def _write(target: Path, contents: Mapping[Path, bytes]) -> None:
             folder.mkdir(parents=True, exist_ok=True)
         replace_files(contents)
     except BaseException as error:
-        for folder in sorted(made, reverse=True):  # what is inside comes first
+        for folder in sorted(made, reverse=True):  # inner folders first
             with suppress(OSError, ValueError):
                 folder.rmdir()
-        # a name with the character 0 is a ValueError
+        # a name with the character 0 raises a ValueError
         if isinstance(error, SettingError) or not isinstance(error, OSError | ValueError):
             raise
         raise ModelFileError(
@@ -166,7 +166,7 @@ def _write(target: Path, contents: Mapping[Path, bytes]) -> None:
 
 
 def _require_changeable(what: Model | Controller, to: str) -> None:
-    """Raises a SettingError for what has no gains that C could change."""
+    """Raise `SettingError` for anything but a controller in C with constant gains."""
     refused = partial(SettingError, name="changeable", remedy="leave it out")
     if to != "c99":
         raise refused(expected="c99", received=to)

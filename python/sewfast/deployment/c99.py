@@ -1,9 +1,10 @@
 """C99 of models and controllers: coefficients from the core, the steps from the files in `c99/`.
 
-The C has the bits of `sewfast_control`, the Rust crate for microcontrollers, in either precision.
+The C computes bit for bit what `sewfast_control`, the Rust crate for microcontrollers, computes in
+the same precision.
 
-In the files `@_` stands for the name with which every function begins, `@@_` for the same in
-capitals, `@m_` and `@M_` for those of a model's member; `R(1.0)` is a number of the precision.
+Placeholders in the files: `@_` is the prefix of every function, `@@_` the same in capitals, `@m_`
+and `@M_` the prefixes of a model's member; `R(1.0)` is a literal of the precision.
 """
 
 from __future__ import annotations
@@ -43,16 +44,16 @@ KEYWORDS = frozenset(
     )
     for keyword in line.split()
 )
-"""Words of C and C++ that no name may be."""
+"""Words of C and C++, and the file `fmi3`, which cannot be names."""
 _VECTORS = 200
-"""Samples of the test that stands beside the code."""
+"""Samples of the test that is written with the code."""
 _LICENCE = "The code in this file may be used under MIT, Apache-2.0 or 0BSD, as you like."
 
 
 def files(
     what: Model | Controller, name: str, precision: str, *, changeable: bool = False
 ) -> tuple[dict[str, str], list[str]]:
-    """The texts of all files by their names, and what is to be said of them."""
+    """The texts of all files by file name, and notes on them."""
     code = Code(name, precision)
     if isinstance(what, Controller):
         header, source, vectors, notes = _controller(what, code, changeable)
@@ -97,19 +98,19 @@ class Code:
         return f"{text}f" if self.single else text
 
     def literals(self, values: Iterable[float], indent: str = "    ") -> str:
-        """Several, six in a row."""
+        """Numbers separated by commas, six in a row."""
         written = [self.literal(float(v)) for v in values]
         rows = [", ".join(written[i : i + 6]) for i in range(0, len(written), 6)]
         return f",\n{indent}".join(rows)
 
     def table(self, name: str, values: Iterable[float]) -> str:
         """A constant array."""
-        held = list(values)
-        body = self.literals(held)
-        return f"static const {self.name}_real {name}[{len(held)}] = {{\n    {body}\n}};\n"
+        numbers = list(values)
+        body = self.literals(numbers)
+        return f"static const {self.name}_real {name}[{len(numbers)}] = {{\n    {body}\n}};\n"
 
     def template(self, file: str, member: str = "", **values: str) -> str:
-        """A file of `c99/` with its places filled."""
+        """A file of `c99/` with its placeholders replaced."""
         text = resources(__package__).joinpath("c99", file).read_text(encoding="utf-8")
         for key in sorted(values, key=len, reverse=True):
             text = text.replace(f"@{key}", values[key])
@@ -130,7 +131,7 @@ class Code:
         return self.template(f"tanh_{self.precision}.c", **values)
 
     def opening(self, what: str, about: Iterable[str]) -> str:
-        """The comment that every file begins with."""
+        """The comment at the start of every file."""
         lines = [
             what,
             "",
@@ -143,12 +144,12 @@ class Code:
         return f"/*\n{body}\n */\n"
 
     def framed(self, file: str, opening: str, body: str) -> str:
-        """A whole file: a header, or code that refuses arithmetic of another kind."""
+        """A whole file: a header, or code that does not compile with fast-math."""
         return self.template(file, OPENING=opening, REAL=self.real, NAME=self.name, BODY=body)
 
 
 def _safe(text: str) -> str:
-    """Text of a user that may stand in a comment, and holds no place to be filled."""
+    """Text of a user without control characters, ends of comments and placeholders."""
     return re.sub(r"[\x00-\x1f\x7f]", " ", text.replace("*/", "* /").replace("/*", "/ *")).replace(
         "@", "(at)"
     )
@@ -194,7 +195,7 @@ def _named(name: str, unit: str) -> str:
 
 
 def _digest(model: Model) -> str:
-    """What tells two models apart: the start of the hash of all parameters."""
+    """The start of the hash of all parameters, by which two models can be distinguished."""
     import hashlib
 
     return f"SHA-256 {hashlib.sha256(model.theta.tobytes()).hexdigest()[:16]}"
@@ -312,7 +313,7 @@ def _whole(
     embedded: list[_core.EmbeddedModel],
     combined: str,
 ) -> str:
-    """The public functions: all members, and what they give together."""
+    """The public functions, which run all members and combine their outputs."""
     count = len(prefixes)
     names = [_member_name(p, code) for p in prefixes]
     at, begins = 0, ""
@@ -471,7 +472,7 @@ def _controller_source(
         places["INIT"] += "    c->held = 0;\n"
         places |= {
             "HELD": "    c->held = 1;\n",
-            "TERMS_TYPE": "",  # it stands in the header
+            "TERMS_TYPE": "",  # the header declares it
             "GAINS_OF": code.template("terms.c", **step),
             "GAINS_NOW": "c->terms",
             "CHANGES": code.template(
@@ -494,17 +495,17 @@ def _controller_source(
 
 
 def _derivative_lag(code: Code, numbers: Mapping[str, Any]) -> str:
-    """`Td/N`, of which an infinite N leaves 0."""
+    """`Td/N`, which is 0 for an infinite N."""
     return "R(0.0)" if math.isinf(numbers["n"]) else f"td / {code.literal(numbers['n'])}"
 
 
 def _gains(code: Code, numbers: Mapping[str, Any]) -> str:
-    """The body of the function that gives a sample's gains."""
+    """The body of the function that returns the gains of a sample."""
     rows = numbers["rows"]
     if not rows:
         terms = ", ".join(code.literal(numbers[k]) for k in ("kp", "ki", "kd", "pole"))
         return code.template("constant.c", TERMS=terms)
-    # behind the last point, whose distance to the next is 0, it comes once more
+    # the last point, whose distance to the next is 0, is listed twice
     used = rows[: next(i for i, row in enumerate(rows) if row[4] == 0.0) + 2]
     lines = [f"{{{', '.join(code.literal(v) for v in row)}}}" for row in used]
     return code.template(

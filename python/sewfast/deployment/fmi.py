@@ -26,7 +26,7 @@ from . import c99
 from .precision import embedded_members
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Of all files within: the same model gives the same bytes."""
+"""Date of all files within, so that the same model gives the same bytes."""
 _UNITS = {
     "V": ("kg=1, m=2, s=-3, A=-1", 1.0),
     "A": ("A=1", 1.0),
@@ -43,7 +43,7 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class _System:
-    """What an FMU is made of."""
+    """The contents of an FMU."""
 
     name: str
     title: str
@@ -51,7 +51,7 @@ class _System:
     inputs: Sequence[tuple[str, str]]
     output: tuple[str, str]
     direct: bool
-    """Whether the output depends on the inputs of the same moment."""
+    """Whether the output depends on the inputs of the same sample."""
     kind: str
     advance: str
     now: str
@@ -60,7 +60,7 @@ class _System:
 def files(
     what: Model | Controller, name: str, precision: str
 ) -> tuple[dict[str, bytes], list[str]]:
-    """The FMU by its file's name, and what is to be said of it."""
+    """The FMU by its file name, and notes on it."""
     if precision != "f64":
         raise SettingError(
             name="precision", expected="f64 for fmi", received=repr(precision),
@@ -181,7 +181,7 @@ def _with_unit(unit: str) -> str:
 
 
 def _build(name: str) -> str:
-    """`buildDescription.xml`: from which importers on other platforms compile."""
+    """`buildDescription.xml`, with which importers on other platforms compile the FMU."""
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <fmiBuildDescription fmiVersion="3.0">
   <BuildConfiguration modelIdentifier="{name}">
@@ -195,7 +195,7 @@ def _build(name: str) -> str:
 
 
 def _platform() -> str:
-    """As FMI 3.0 names it: architecture and system."""
+    """Architecture and system, as FMI 3.0 spells them."""
     machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower())
     return f"{machine or platform.machine()}-linux"
 
@@ -218,9 +218,9 @@ def _compiled(name: str, sources: dict[str, str]) -> bytes:
             [compiler, *flags, *files, "-o", str(made)], capture_output=True, text=True
         )
         if done.returncode:
-            said = done.stderr.strip().splitlines() or ["nothing was said"]
+            errors = done.stderr.strip().splitlines() or ["an error without a message"]
             raise SettingError(
-                name="to", expected=f"{compiler} to compile the FMU", received=said[0][:300]
+                name="to", expected=f"{compiler} to compile the FMU", received=errors[0][:300]
             )
         return made.read_bytes()
 

@@ -1,4 +1,4 @@
-"""What build systems ask of a folder of C: CMake, PlatformIO, Zephyr, and a page to read."""
+"""Files for the build systems of C code: CMake, PlatformIO, Zephyr, and a page of instructions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..models import Model
 
 
 def files(name: str, what: Model | Controller) -> dict[str, str]:
-    """Texts by file name; those of the build systems take all that is deployed into the folder."""
+    """Texts by file name; the build systems include everything deployed into the folder."""
     return {
         "CMakeLists.txt": _CMAKE,
         "library.json": _platformio(),

@@ -1,7 +1,7 @@
 """ONNX of a model: one step with its state as inputs and outputs, and a batch of free runs.
 
-Both graphs compute in double precision and hold nothing but standard operators of opset 17; the
-free run is a `Scan`, not a `Loop`.
+Both graphs compute in double precision, with standard operators of opset 17 only; the free run is a
+`Scan`, not a `Loop`.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from .precision import embedded_members
 
 OPSET = 17
 IR = 9
-"""Format of the file: what every runtime since 2023 reads."""
+"""Format of the file, which every runtime since 2023 reads."""
 
 
 def files(
     what: Model | Controller, name: str, precision: str
 ) -> tuple[dict[str, bytes], list[str]]:
-    """Both graphs by their files' names, and what is to be said of them."""
+    """Both graphs by file name, and notes on them."""
     if isinstance(what, Controller):
         raise SettingError(
             name="to", expected="a model for onnx", received="a controller",
@@ -65,15 +65,15 @@ def files(
 def initial_state(
     model: Model, state: FloatArray | None = None, held: FloatArray | None = None
 ) -> FloatArray:
-    """The graphs' `state` for a model's own state and inputs that were held before.
+    """The graphs' `state` for a model's own state and the inputs before the first sample.
 
     Parameters
     ----------
     model : Model
     state : array, optional
-        As `Model.simulate` has it; at rest where there is none.
+        The state of `Model.simulate`; by default the model is at rest.
     held : array, shape (n_inputs,), optional
-        Inputs before the first sample, in their units; 0 where there are none.
+        Constant inputs before the first sample, in their units; 0 by default.
 
     Returns
     -------
@@ -106,7 +106,7 @@ def _library() -> ModuleType:
 
 
 def _properties(model: Model) -> dict[str, str]:
-    """What the file says beside its graph."""
+    """Metadata of the file."""
     units = zip(model.input_names, model.input_units, strict=True)
     return {
         "sample_time_s": repr(model.Ts),
@@ -119,17 +119,17 @@ def _properties(model: Model) -> dict[str, str]:
 
 
 def _kept(e: _core.EmbeddedModel) -> int:
-    """Samples of each input that the graph remembers: this one's comes from outside."""
+    """Past samples of each input in the state; the current sample is an input of the graph."""
     return e.orders["nk"] + e.orders["nb"] - 1
 
 
 def _sizes(e: _core.EmbeddedModel) -> tuple[int, int]:
-    """Numbers of state, and of inputs remembered."""
+    """Lengths of the two parts of the state: the model's own, and past inputs."""
     return e.orders["na"], e.orders["inputs"] * _kept(e)
 
 
 class _Graph:
-    """Nodes and constants of one graph; every method gives the name of its result."""
+    """Nodes and constants of one graph; every method returns the name of its result."""
 
     def __init__(self, onnx: ModuleType) -> None:
         self.onnx = onnx
@@ -167,7 +167,7 @@ class _Graph:
 
 
 def _step(g: _Graph, model: Model, u: str, state: str) -> tuple[str, str]:
-    """Adds one step: the names of the output (batch, 1) and of the next state."""
+    """Add one step; return the names of the output (batch, 1) and of the next state."""
     _, embedded, combined = embedded_members(model, "f64")
     outputs, states, at = [], [], 0
     for e in embedded:
@@ -184,7 +184,7 @@ def _step(g: _Graph, model: Model, u: str, state: str) -> tuple[str, str]:
 def _member(
     g: _Graph, e: _core.EmbeddedModel, u: str, past: str, waiting: str
 ) -> tuple[str, list[str]]:
-    """One model: its output, and the parts of its next state."""
+    """Add one model; return its output and the parts of its next state."""
     nk, nb, kept = e.orders["nk"], e.orders["nb"], _kept(e)
     if e.scaling is not None:
         u = g.node("Sub", u, g.constant(e.scaling["u_mean"]))
@@ -207,7 +207,7 @@ def _member(
 
 
 def _pushed(g: _Graph, e: _core.EmbeddedModel, past: str, y: str) -> str:
-    """Past outputs with the newest in front."""
+    """Past outputs, the newest first."""
     na = e.orders["na"]
     return y if na == 1 else g.joined([y, g.columns(past, 0, na - 1)])
 
@@ -247,7 +247,7 @@ def _times(g: _Graph, x: str, matrix: FloatArray) -> str:
 
 
 def _output(g: _Graph, e: _core.EmbeddedModel, s: str) -> str:
-    """The output function; softplus by parts, as ONNX's own has no double precision everywhere."""
+    """The output function, without `Softplus`, which some runtimes have in f32 only."""
     function, values = e.output
     if function == "linear":
         return s

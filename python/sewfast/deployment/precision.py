@@ -1,6 +1,6 @@
-"""The steps that deployed code has to compute, and what single precision costs them.
+"""The steps that deployed code has to compute, and the loss of single precision.
 
-A model or controller that single precision would change is refused here, before anything is
+A model or controller that single precision would change is rejected here, before anything is
 written.
 """
 
@@ -18,9 +18,9 @@ from ..errors import FitError, SettingError
 from ..models import Ensemble, Model
 
 MOST_LOSS = 0.01
-"""Of the output's span: a model that single precision changes by more is refused."""
+"""Largest change by single precision that is accepted, as a share of the output's span."""
 _SAMPLES = 5000
-"""Over which the loss of single precision is measured."""
+"""Length of the free run that measures the loss of single precision."""
 _MOST_MEMBERS = 64
 
 
@@ -90,7 +90,7 @@ def combined_run(
 def model_loss(
     model: Model, members: list[Model], embedded: list[_core.EmbeddedModel], combined: str
 ) -> str:
-    """Refuses a model that single precision would change; else what it costs."""
+    """A note on the loss of single precision; `SettingError` if it is more than `MOST_LOSS`."""
     _, exact, _ = embedded_members(model, "f64")
     u = excitation(model, _SAMPLES)
     with np.errstate(all="ignore"):
@@ -121,7 +121,7 @@ def model_loss(
 
 
 def controller_step(controller: Controller, precision: str) -> tuple[Any, list[str]]:
-    """A controller's step in a precision, and what is to be said of its loss."""
+    """A controller's step in a precision, and notes on its loss."""
     core: Any = controller.core()
     if precision == "f64":
         return core, []
@@ -138,11 +138,11 @@ def controller_step(controller: Controller, precision: str) -> tuple[Any, list[s
 
 
 def _controller_loss(controller: Controller, double: Any, single: Any) -> str:
-    """Refuses a controller that single precision would change; else what it costs.
+    """A note on the loss of single precision; `SettingError` if it would change the controller.
 
-    A gain that becomes 0 is lost. An integral of the size of the limits is a multiple of 2^-24 of
-    them, and an error whose share of a sample is less than half of that does not move it any more:
-    there the loop stays, however long it waits.
+    A gain that becomes 0 is lost. An integral as large as the limits is resolved to 2^-24 of them.
+    An error that adds less than half of that per sample does not change it, so a steady error of
+    this size remains.
     """
     lost = [k for k in ("kp", "ki", "kd") if double[k] and not single[k]]
     if lost:

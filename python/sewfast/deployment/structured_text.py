@@ -17,7 +17,7 @@ from .precision import controller_step
 
 
 def files(what: Model | Controller, name: str, precision: str) -> tuple[dict[str, str], list[str]]:
-    """The function block by its file's name, and what is to be said of it."""
+    """The function block by its file name, and notes on it."""
     if not isinstance(what, Controller):
         raise SettingError(
             name="to", expected="a controller for structured text", received="a model",
@@ -238,7 +238,7 @@ _NUMBERS = (
 
 
 def _biquads(number: _Type, sections: Sequence[Sequence[float]]) -> tuple[str, str, str, str]:
-    """Declarations, feedback and reference through the sections, and how both are forgotten."""
+    """Declarations, statements that filter the feedback and the reference, and their restart."""
     if not sections:
         return "", "", "", ""
     zero, count = number(0.0), len(sections)
@@ -277,7 +277,7 @@ def _biquads(number: _Type, sections: Sequence[Sequence[float]]) -> tuple[str, s
 
 
 def _gains(number: _Type, n: Mapping[str, Any]) -> str:
-    """Statements that give kp, ki, kd and pole of this sample."""
+    """Statements that set kp, ki, kd and pole of this sample."""
     rows = n["rows"]
     if not rows:
         return "".join(f"  {k} := {number(n[k])};\n" for k in ("kp", "ki", "kd", "pole"))

@@ -150,7 +150,7 @@ class VerdictTable:
         return "\n".join(found)
 
 
-# --- The closing sentence of a report card: good enough or not, because of what, what to do first -
+# --- The conclusion of a report card: good enough or not, why, what to do first -------------------
 
 
 _NAMED = 3
@@ -195,9 +195,7 @@ def summary(lines: Sequence[Line]) -> str:
         return f"useless here ({free.shown}); first {_step([free])}"
     shown = "" if free is None else f" ({free.shown})"
     if free is not None and free.verdict == "info":
-        return (
-            "the output is constant here, which says nothing about the model; record one that moves"
-        )
+        return "the output is constant here, which does not test the model; record one that moves"
     follows = f"the free run follows the data{shown}"
     if free is not None and free.verdict == "warn":
         follows = f"not good enough to tune on: the free run follows the data loosely{shown}"
@@ -228,7 +226,7 @@ def _step(lines: Sequence[Line]) -> str:
     return "read the lines above"
 
 
-# --- ReportCard: how far a model can be trusted, one line per question with its verdict -----------
+# --- ReportCard: how far a model can be trusted, in lines with verdicts ---------------------------
 
 
 FORMAT = "sewfast.report_card"

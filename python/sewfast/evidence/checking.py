@@ -15,7 +15,7 @@ from ..errors import FitError, SewfastError
 from ..validation import Scores, by_input, noise_of, without_input
 from . import verdicts
 from .card import Line, ReportCard
-from .operating import OperatingRange, operating_range
+from .operating import operating_range
 from .parameters import Criteria, Parameters, StoredInformation, estimate
 from .portmanteau import LAGS, parameter_test, residual_tests
 from .region import RegionRuns, region_runs, training_region
@@ -79,7 +79,8 @@ def check(
         training = weighed if training is data else in_effect(training)
     data = weighed
     free = Residuals.of(model, data, init, "free run")
-    tested = free if model.kind != "arx" or _has_gaps(data) else Residuals.of(model, data, init)
+    has_gaps = not all(np.isfinite(e.y).all() for e in data.experiments)
+    tested = free if model.kind != "arx" or has_gaps else Residuals.of(model, data, init)
     scores = horizon_scores(model, data, free)
     unit = free.unit
     on_training = training is data or (training is None and is_training_data(model, data))
@@ -111,11 +112,12 @@ def check(
         judged = np.concatenate([d[init:] for d in far])
         outside, farthest = float(np.mean(judged > 1.0)), float(judged.max())
     lines.append(verdicts.region(outside, farthest))
-    operating = _operating(model)
+    operating = operating_range(model) if model.training.get("input_range") else None
     if operating is not None:
         lines += verdicts.operation(operating)
+    named = ", ".join(f"{e.name} [{e.range_text}]" for e in data.experiments)
     return ReportCard(
-        tuple(lines), model.title, _named(data), on_training, scores, tests, covered, operating,
+        tuple(lines), model.title, named, on_training, scores, tests, covered, operating,
         found[0], found[1], outside, tuple(far), free.runs, data.Ts, data.output_name, unit,
     )  # fmt: skip
 
@@ -178,14 +180,6 @@ def training_evidence(model: DynamicModel, data: Dataset) -> dict[str, Any]:
     return found
 
 
-def _has_gaps(data: Dataset) -> bool:
-    return not all(np.isfinite(e.y).all() for e in data.experiments)
-
-
-def _named(data: Dataset) -> str:
-    return ", ".join(f"{e.name} [{e.range_text}]" for e in data.experiments)
-
-
 def _training_scores(model: DynamicModel, training: Dataset, init: int) -> Scores:
     return horizon_scores(
         model, training, Residuals.of(model, training, init, "free run"), ()
@@ -225,9 +219,3 @@ def _bands(
     if known is None:
         return None
     return bands_of(model, data, free, known, level, place)
-
-
-def _operating(model: DynamicModel) -> OperatingRange | None:
-    if not model.training.get("input_range"):
-        return None
-    return operating_range(model)

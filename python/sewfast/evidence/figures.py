@@ -40,7 +40,7 @@ def figures(card: ReportCard) -> dict[str, Figure]:
     Raises
     ------
     SettingError
-        Where matplotlib is not installed.
+        If matplotlib is not installed.
     """
     return {name: drawing(card, name).figure() for name in names(card)}
 
@@ -79,7 +79,7 @@ def save(card: ReportCard, folder: str | os.PathLike[str]) -> list[Path]:
     Raises
     ------
     SettingError
-        Where matplotlib is not installed or the folder cannot be written to.
+        If matplotlib is not installed or the folder cannot be written to.
     """
     written = []
     drawn = figures(card)

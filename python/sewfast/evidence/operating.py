@@ -68,7 +68,7 @@ def linearise(
     Raises
     ------
     SettingError
-        For a model of another package.
+        For an object that is no compiled model, linear, lagged or state space.
     """
     u = np.ascontiguousarray(u, dtype=np.float64)
     if hasattr(core, "a") and hasattr(core, "offset"):
@@ -310,8 +310,10 @@ class OperatingPoint:
         return found
 
     def bandwidth(self, i: int = 0) -> float:
-        """Where the gain of input i first falls to 1/sqrt 2 of the steady one [Hz]; NaN if "
-        "never."""
+        """Frequency at which the gain of input i first falls to 1/sqrt 2 of the steady one [Hz].
+
+        NaN if it never does.
+        """
         steady = abs(self.dc_gain[i])
         if not 0.0 < steady < math.inf:
             return math.nan
@@ -332,7 +334,7 @@ class OperatingPoint:
         Raises
         ------
         SettingError
-            Where python-control is not installed.
+            If python-control is not installed.
         """
         try:
             import control
@@ -456,7 +458,7 @@ def _input_range(model: DynamicModel, first: DynamicModel) -> FloatArray:
     if not ranges:
         raise DataError(
             "operating range: expected a model that stores the range of its training inputs, "
-            "received one without; identify it anew, or give the operating points"
+            "received one without; identify it again, or give the operating points"
         )
     limits: FloatArray = np.array(ranges, dtype=np.float64)
     return limits

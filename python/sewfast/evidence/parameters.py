@@ -12,7 +12,7 @@ from ..dataset import FloatArray
 from ..dynamic_model import DynamicModel
 from .residuals import Noise, Residuals, representative
 
-# --- Information criteria with the number of parameters that count --------------------------------
+# --- Information criteria -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Criteria:
         return {k: v if math.isfinite(v) else None for k, v in asdict(self).items()}
 
 
-# --- Parameters: their covariance in sandwich form, conditioning, and how many of them count ------
+# --- Parameters: sandwich covariance, conditioning, effective number ------------------------------
 
 
 DETERMINED = 1e-10

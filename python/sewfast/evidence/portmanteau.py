@@ -317,8 +317,10 @@ def _squares_about_mean(s: _Setting) -> _Columns:
 
 
 def _product(s: _Setting) -> ResidualTest:
-    """For white w, w(k) and w(k-1-a) u(k-1-a) have the covariance sum u(k-1-a)^2 w(k)^2 "
-    "w(k-1-a)^2 alone."""
+    """Test of e(k) with e(k-1-lag) u(k-1-lag).
+
+    For white w only the sum of u(k-1-a)^2 w(k)^2 w(k-1-a)^2 enters the covariance.
+    """
     lags = s.lags(len(s.names))
     inputs = s.centred(lambda u: u)
     past = [

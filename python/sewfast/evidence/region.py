@@ -132,7 +132,7 @@ class Region:
         Raises
         ------
         ValueError
-            Where the values are of another form.
+            If the values are of another form.
         """
         mean, scale, centres = (_array(values, k) for k in ("mean", "scale", "centres"))
         sound = mean.ndim == 1 and mean.shape == scale.shape and bool((scale > 0.0).all())
@@ -249,7 +249,7 @@ class TrainingRegion:
         Raises
         ------
         ValueError
-            Where the values are of another form, such as an older version's.
+            If the values are of another form, such as an older version's.
         """
         nearest = values.get("nearest")
         if values.get("form") != FORM or not isinstance(nearest, Mapping):

@@ -131,8 +131,7 @@ def _largest_order(series: Sequence[tuple[FloatArray, NDArray[np.bool_]]]) -> in
 
 
 def _gram(series: Sequence[tuple[FloatArray, NDArray[np.bool_]]], order: int) -> FloatArray:
-    """Sums of e(k-i) e(k-j), i, j = 0 .. order, over whole windows; the last row is their "
-    "number."""
+    """Sums of e(k-i) e(k-j), i, j = 0 .. order, over whole windows; last row: their number."""
     total = np.zeros((order + 2, order + 1))
     for e, known in series:
         if len(e) <= order:
@@ -168,7 +167,7 @@ def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
     return found
 
 
-# --- `Residuals`: what a model leaves of data, with its sensitivity to every parameter ------------
+# --- `Residuals`, with their sensitivity to every parameter ---------------------------------------
 
 
 Horizon: TypeAlias = Literal["free run", "one step"]
@@ -250,9 +249,9 @@ class Residuals:
         Raises
         ------
         DataError
-            Where the data do not match the model or leave nothing to judge.
+            If the data do not match the model or leave nothing to judge.
         FitError
-            Where the model is unstable on this input.
+            If the model is unstable on this input.
         """
         require_dataset(data, "data")
         require_init(init)
@@ -282,8 +281,7 @@ class Residuals:
 
     @property
     def errors(self) -> list[FloatArray]:
-        """Residuals less their mean and what the initial state could explain, one array (N,) "
-        "per experiment."""
+        """Residuals without mean and initial state's effect, one array (N,) per experiment."""
         errors = [r.without_state(r.error) for r in self.runs]
         mean = self.mean
         return [e - mean * one for e, one in zip(errors, self.constants, strict=True)]

@@ -87,7 +87,7 @@ class Uncertainty:
         Raises
         ------
         ValueError
-            Where the values are of another form.
+            If the values are of another form.
         """
         try:
             factor = np.array(values["factor"], dtype=np.float64)

@@ -1,4 +1,4 @@
-"""The paper's experiment on a virtual sewing machine: what `sewfast demo` does."""
+"""The paper's experiment on a virtual sewing machine, for `sewfast demo`."""
 
 from .demo import STAGES, run_demo
 

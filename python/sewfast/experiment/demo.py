@@ -1,4 +1,4 @@
-"""The paper's experiment on a virtual machine, stage by stage: `run_demo`."""
+"""`run_demo`: the paper's experiment on a virtual machine, stage by stage."""
 
 from __future__ import annotations
 
@@ -35,21 +35,16 @@ from ..signals import excitation
 from ..tuning.search import TuningResult
 from ..writers import write_table
 from . import loops
-from .loops import Rig, rig
+from .loops import ExperimentDrive, drive_of
 
-# --- The result folder: every artefact written whole, results.json last ---------------------------
+# --- The result folder: complete files only, results.json last ------------------------------------
 
 
 _FOLDERS = ("recordings", "models", "controllers", "predictions", "runs", "check", "commissioning")
 
 
 def require_own(folder: Path, *, overwrite: bool) -> None:
-    """Refuse a folder whose files would be lost and are of no experiment, which can be repeated.
-
-    Raises
-    ------
-    SettingError
-    """
+    """Raise `SettingError` for a folder with files of anything but an earlier experiment."""
     if overwrite or _is_result(folder):
         return
     place = first_taken(folder, (*_FOLDERS, "results.json", "report.html"))
@@ -62,12 +57,12 @@ def require_own(folder: Path, *, overwrite: bool) -> None:
 
 
 def _is_result(folder: Path) -> bool:
-    # of any version: what an older one has left is replaced as well
+    # of any version: results of older versions are replaced as well
     return numbers_in(folder / "results.json").get("format") == FORMAT
 
 
 def abandon(folder: Path) -> None:
-    """Take the folder away again where nothing has been put into it."""
+    """Remove the folder if it is empty."""
     with suppress(OSError):
         folder.rmdir()
 
@@ -84,10 +79,10 @@ def write(
     drawings: Mapping[str, str],
     commissioning: Commissioning | None = None,
 ) -> None:
-    """Put the artefacts in place of those of an earlier experiment.
+    """Replace the artefacts of an earlier experiment.
 
-    Without `results.json` a folder is refused by the report: an interruption in between leaves no
-    mixture that looks whole.
+    The report refuses a folder without `results.json`, so an interruption in between leaves no
+    mixture that looks complete.
     """
     for name in ("results.json", "report.html"):
         (folder / name).unlink(missing_ok=True)
@@ -110,11 +105,11 @@ def write(
     storage.write(folder / "results.json", FORMAT, VERSION, results)
 
 
-# --- The paper's experiment on a virtual machine, stage by stage: run_demo ------------------------
+# --- run_demo -------------------------------------------------------------------------------------
 
 
 Progress: TypeAlias = Callable[[int, int, str], object]
-"""Called with stages done, stages in all, and what comes now."""
+"""Called with the stages done, their total, and the present stage."""
 
 STAGES = (
     "recording the machine",
@@ -131,7 +126,7 @@ STAGES = (
 
 
 class _Clock:
-    """Tells the progress and how long each stage took."""
+    """Reports progress and measures the time of each stage."""
 
     def __init__(self, progress: Progress | None) -> None:
         self._progress = progress
@@ -167,22 +162,22 @@ def run_demo(
 ) -> dict[str, Any]:
     """Carry out the paper's experiment: excite, record, identify, validate, commission, report.
 
-    The machine is behind a port and is talked to as to hardware (docs/PROTOCOL.md).
+    The machine is served on a port and used like hardware (docs/PROTOCOL.md).
 
     Parameters
     ----------
     out : path
-        Result folder (docs/CONVENTIONS.md); artefacts of an earlier experiment are replaced once
-        this one is through.
+        Result folder (docs/CONVENTIONS.md); artefacts of an earlier experiment are replaced when
+        this one is finished.
     seed : int
-        Of the random signals, of the networks' starts and of the search for gains.
+        Seed of the random signals, of the networks' initial weights and of the search for gains.
     machine : str
         `virtual`, or `virtual:SEED` for another machine of the type.
     overwrite : bool
-        Whether files of these names may be replaced that no experiment has left.
+        Whether to replace files of these names that are not from an experiment.
     progress : callable(done, total, stage), optional
-        Called as each stage begins, and at the end.
-        In a notebook a bar is shown where this is left out; None shows none.
+        Called as each stage begins, and at the end. By default a notebook shows a bar; None shows
+        nothing.
 
     Returns
     -------
@@ -192,37 +187,37 @@ def run_demo(
     Raises
     ------
     SettingError
-        For an unknown machine, a seed that is none, a folder with files of somebody else's, or
-        where the report's packages are missing.
+        For an unknown machine, an invalid seed, a folder with other files, or if the report's
+        packages are missing.
     DataError
-        Where the folder cannot be made.
+        If the folder cannot be created.
     Interrupted
-        On Ctrl-C; an earlier experiment in the folder is left as it was.
+        On Ctrl-C; an earlier experiment in the folder stays unchanged.
     """
     require()
     plant = VirtualMachine.from_name(machine)
-    excitation("random", seed)  # refuses a seed that is none before the folder is made
+    excitation("random", seed)  # refuses an invalid seed before the folder is created
     target = Path(out)
     require_own(target, overwrite=overwrite)
     prepare(target)
     try:
-        with rig(plant) as bench:
-            return _carry_out(target, bench, seed, _Clock(progress))
+        with drive_of(plant) as drive:
+            return _carry_out(target, drive, seed, _Clock(progress))
     except BaseException:
         abandon(target)
         raise
 
 
-def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, Any]:
-    """The stages, one after the other; the folder is written at the end."""
+def _carry_out(target: Path, drive: ExperimentDrive, seed: int, clock: _Clock) -> dict[str, Any]:
+    """Run the stages one after the other; write the folder at the end."""
     clock.enter("recording the machine")
-    recorded = loops.open_loop(rig, seed)
+    recorded = loops.open_loop(drive, seed)
     lo_hi = recorded["chirp_lo_hi"]
     speed = loops.speed_numbers(lo_hi)
 
     clock.enter("paper's network")
     models = {"paper": loops.paper(recorded, seed)}
-    ideal = loops.ideal_cost(rig.machine, seed)
+    ideal = loops.ideal_cost(drive.machine, seed)
 
     clock.enter("linear models")
     models["arx_raw"] = loops.arx_raw(recorded)
@@ -231,8 +226,8 @@ def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, An
 
     clock.enter("closed-loop recording")
     fopdt = loops.first_order(recorded["step"])
-    coarse = loops.coarse_controller(fopdt, Ts=rig.Ts, counts_per_rev=rig.counts_per_rev)
-    recorded["closed_loop"] = loops.closed_loop(rig, coarse)
+    coarse = loops.coarse_controller(fopdt, Ts=drive.Ts, counts_per_rev=drive.counts_per_rev)
+    recorded["closed_loop"] = loops.closed_loop(drive, coarse)
 
     clock.enter("default network")
     models["oe_all"] = loops.linear(recorded, "oe", loops.ALL_RECORDS)
@@ -245,11 +240,11 @@ def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, An
     check, drawings = loops.report_card(models["neural_oe"], recorded["random"])
 
     clock.enter("commissioning")
-    found = loops.commissioned(rig, seed)
+    found = loops.commissioned(drive, seed)
     runs = loops.commissioned_runs(found)
 
     clock.enter("paper's gains")
-    paper_runs = loops.paper_runs(rig)
+    paper_runs = loops.paper_runs(drive)
 
     clock.enter("writing")
     tuned, tuning = found.controller, found.tuning
@@ -260,10 +255,10 @@ def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, An
     identification["paper"]["cost_ideal"] = ideal
     results = {
         "sewfast": __version__,
-        "machine": rig.drive.identity.name,
-        "link": rig.numbers(),
+        "machine": drive.name,
+        "link": drive.numbers(),
         "seed": seed,
-        "counts_per_rev": rig.counts_per_rev,
+        "counts_per_rev": drive.counts_per_rev,
         "speed": speed,
         "identification": identification,
         "check": check,
@@ -293,7 +288,7 @@ def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, An
 def _controller_numbers(
     fopdt: Fopdt, controllers: dict[str, Controller], tuning: TuningResult
 ) -> dict[str, Any]:
-    """How the gains came about, for `results.json`."""
+    """First-order fit, gains and tuning, for `results.json`."""
     names = ("K", "T", "L", "offset", "u_low", "u_high", "fit_percent")
     ratio = fopdt.L / fopdt.T
     return {

@@ -36,27 +36,27 @@ from ..signals import excitation
 from ..speed import Method, floor_of_J
 from ..validation import Validation, validate
 
-# --- Rig: the virtual machine as the experiment has it, a drive behind a port ---------------------
+# --- ExperimentDrive: the virtual machine as a drive behind a port --------------------------------
 
 
 T = TypeVar("T")
 
 
 @dataclass(eq=False)
-class Rig(DriveBench):
-    """A drive, and what went over its link so far.
+class ExperimentDrive(DriveBench):
+    """The virtual machine as a drive, with figures of its link.
 
     Attributes
     ----------
     inner : Drive
     machine : VirtualMachine
-        What is behind the port; asked only for what no drive could tell.
+        The machine behind the port, used only for figures that no drive can provide.
     port : str
         `pty` or `tcp`.
     samples : int
-        That the device took and the host received.
+        Samples that the device took and the host received.
     seconds : float
-        That the runs took.
+        Time of the runs [s].
     """
 
     machine: VirtualMachine
@@ -65,7 +65,7 @@ class Rig(DriveBench):
     seconds: float = 0.0
 
     def excite(self, u: NDArray[np.float64], name: str) -> Recording:
-        """Excite the drive, as a bench of commissioning."""
+        """Excite the drive, as a `Machine`."""
         return self.record(u, name)
 
     def follow(
@@ -76,7 +76,7 @@ class Rig(DriveBench):
         *,
         watch: Watch | None = None,
     ) -> RecordedRun:
-        """Run a controller on the drive, as a bench of commissioning."""
+        """Run a controller on the drive, as a `Machine`."""
         began = time.perf_counter()
         return self._counted(super().follow(controller, r, name, watch=watch), began)
 
@@ -88,7 +88,7 @@ class Rig(DriveBench):
     def run(
         self, controller: Controller, reference: str, *, seed: int = 0, volt: float | None = None
     ) -> ClosedLoopRun:
-        """Run a controller on the drive, with another volt limit where one is given."""
+        """Run a controller on the drive, optionally with another volt limit."""
         began = time.perf_counter()
         before = self.drive.limits().volt
         self.drive.set_limits(volt=volt)
@@ -97,7 +97,7 @@ class Rig(DriveBench):
         return self._counted(found, began)
 
     def _counted(self, found: T, began: float) -> T:
-        """What came, once it is known that nothing is missing."""
+        """The result, after checking that no sample is missing and counting the samples."""
         outcome = self.drive.outcome
         if outcome is None or not outcome.is_complete:
             raise LinkError(f"expected every sample of the run, received: {outcome}; run it again")
@@ -117,29 +117,29 @@ class Rig(DriveBench):
 
 
 @contextmanager
-def rig(machine: VirtualMachine) -> Iterator[Rig]:
-    """Serve a machine on a port of its own and connect to it, limits at their ceilings."""
+def drive_of(machine: VirtualMachine) -> Iterator[ExperimentDrive]:
+    """Serve a machine on a new port and connect to it, with limits at their ceilings."""
     port = _port()
     with (
         VirtualDevice(machine.name, fast=True, endpoint=port) as device,
         connect(device.port) as drive,
     ):
         drive.set_limits()
-        yield Rig(drive, machine, port)
+        yield ExperimentDrive(drive, machine, port)
 
 
 def _port() -> Literal["pty", "tcp"]:
-    """A serial port where there are pseudo terminals and something that opens them."""
+    """A pty if the system has them and pyserial is installed, else TCP."""
     return "pty" if find_spec("serial") and find_spec("pty") and find_spec("termios") else "tcp"
 
 
-# --- Models of the experiment, and what they predict ----------------------------------------------
+# --- Models of the experiment, and their predictions ----------------------------------------------
 
 
 PAPER_RECORDS = ("chirp_lo_hi",)
-"""What the paper trains on."""
+"""The paper's training data."""
 ALL_RECORDS = ("chirp_lo_hi", "saturating", "closed_loop")
-"""What the default network trains on: the drive's limits and the controller's world as well."""
+"""The default network's training data, which include the drive's limits and a closed loop."""
 _SCALE = 1000.0
 """The paper's unit of speed [RPM]."""
 
@@ -152,9 +152,9 @@ def paper(recordings: Mapping[str, Recording], seed: int) -> Model:
 
 
 def ideal_cost(machine: VirtualMachine, seed: int) -> float:
-    """J of the paper's network in free run on Lo-Hi, on a machine without encoder and turn.
+    """J of the paper's network in free run on Lo-Hi, on an ideal machine.
 
-    Exact position instead of counts, and load, inertia and torque at their means over the turn.
+    It has exact positions instead of counts, and means of load, inertia and torque over the turn.
     """
     parameters = machine.parameters | {"angle_dependence": 0.0, "quantisation": 0.0}
     ideal = VirtualMachine(parameters=parameters)
@@ -164,7 +164,7 @@ def ideal_cost(machine: VirtualMachine, seed: int) -> float:
 
 
 def arx_raw(recordings: Mapping[str, Recording]) -> Model:
-    """ARX on differences of counts, as the paper's rival was."""
+    """ARX on differences of counts, as in the paper."""
     lo_hi = recordings["chirp_lo_hi"]
     return identify(lo_hi.dataset(lo_hi.speed("difference")), model="arx")
 
@@ -184,7 +184,7 @@ def neural(recordings: Mapping[str, Recording], seed: int) -> Model:
 def scores(
     models: Mapping[str, Model], recordings: Mapping[str, Recording]
 ) -> dict[str, dict[str, Validation]]:
-    """Free run and one step of every model on every scored record, from rest, against the truth."""
+    """Scores of every model on every scored record, from rest, against the true speed."""
     data = {r: recordings[record_of(r)].dataset() for r in SCORED}
     return {
         name: {r: validate(m, d, init=0, against="speed_true") for r, d in data.items()}
@@ -206,7 +206,7 @@ def report_card(model: Model, recording: Recording) -> tuple[dict[str, Any], dic
 def predictions(
     scored: Mapping[str, Mapping[str, Validation]],
 ) -> dict[str, dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float64]]]]:
-    """Per scored record the series of every model, as the report draws them."""
+    """For each scored record, the series of every model for the report."""
     columns: dict[str, dict[str, Any]] = {r: {} for r in SCORED}
     for model, by_record in scored.items():
         for name, validation in by_record.items():
@@ -263,21 +263,21 @@ def _cost(rmse: float) -> float:
     return (rmse / _SCALE) ** 2 / 2.0
 
 
-# --- Recordings of the experiment: open-loop excitations, and one closed loop under first gains ---
+# --- Recordings of the experiment -----------------------------------------------------------------
 
 
 EXCITATIONS = ("step", "chirp_lo_hi", "chirp_hi_lo", "random", "saturating", "saturating_2")
 FILTER_SAMPLES = 8
-"""Of the feedback's moving average: one count in a sample is 38 RPM, in eight it is 5."""
+"""Moving average of the feedback: one count in a sample is 38 RPM, in eight it is 5."""
 LIMIT = 20.0
-"""Of the command to either side [V]."""
+"""Largest command in either direction [V]."""
 DERIVATIVE_FILTER = 10.0
 _METHODS: tuple[Method, ...] = ("difference", "savgol", "kalman")
 
 
-def open_loop(rig: Rig, seed: int) -> dict[str, Recording]:
+def open_loop(drive: ExperimentDrive, seed: int) -> dict[str, Recording]:
     """Every excitation on the drive, each from rest."""
-    return {name: rig.record(signals.excitation(name, seed), name) for name in EXCITATIONS}
+    return {name: drive.record(signals.excitation(name, seed), name) for name in EXCITATIONS}
 
 
 def first_order(step: Recording) -> Fopdt:
@@ -303,16 +303,16 @@ def coarse_controller(fopdt: Fopdt, *, Ts: float, counts_per_rev: float) -> Cont
     )
 
 
-def closed_loop(rig: Rig, controller: Controller) -> Recording:
-    """A recording under the first gains, which follow trapezoids.
+def closed_loop(drive: ExperimentDrive, controller: Controller) -> Recording:
+    """A recording of a closed loop that follows trapezoids with the first gains.
 
-    The command is replayed: undisturbed, the machine does the same again and shows its counts.
+    The machine is deterministic: the command is replayed to record its counts.
     """
-    return rig.record(rig.run(controller, "trapezoids").u, "closed_loop")
+    return drive.record(drive.run(controller, "trapezoids").u, "closed_loop")
 
 
 def speed_numbers(recording: Recording) -> dict[str, dict[str, float]]:
-    """Error and floor of J of each way to a speed, against the true one."""
+    """Error and floor of J of each estimate of the speed, against the true one."""
     true = recording.speed_true
     assert true is not None, "of a virtual machine"
     estimates = {m: recording.speed(m) for m in _METHODS}
@@ -331,18 +331,18 @@ def speed_numbers(recording: Recording) -> dict[str, dict[str, float]]:
 Runs = dict[tuple[str, str], ClosedLoopRun]
 
 PRACTICE = ("trapezoid", "trapezoids", "random")
-"""References to tune on, half as long as those to verify on."""
+"""References for tuning, half as long as those for the verification."""
 PAPER_LIMIT = 10.0
-"""Of the command under the paper's gains [V]."""
+"""Limit of the command with the paper's gains [V]."""
 
 
-def commissioned(rig: Rig, seed: int) -> Commissioning:
+def commissioned(drive: ExperimentDrive, seed: int) -> Commissioning:
     """The drive, commissioned for the experiment's references."""
-    return commission(rig, references=REFERENCES, practice=PRACTICE, seed=seed)
+    return commission(drive, references=REFERENCES, practice=PRACTICE, seed=seed)
 
 
 def commissioned_runs(found: Commissioning) -> Runs:
-    """Every reference as the ensemble predicted it, and on the machine."""
+    """The runs of every reference: predicted by the ensemble, and measured."""
     runs: Runs = {}
     for c in found.comparisons:
         runs[c.reference, "model"] = c.predicted
@@ -351,17 +351,17 @@ def commissioned_runs(found: Commissioning) -> Runs:
     return runs
 
 
-def paper_runs(rig: Rig) -> Runs:
-    """The paper's gains on the plant of its Eq. 8, ideal feedback, and on the machine."""
+def paper_runs(drive: ExperimentDrive) -> Runs:
+    """The paper's gains on the plant of its Eq. 8 with ideal feedback, and on the machine."""
     gains = paper_controller()
     return {
         ("paper_gains", "eq8"): run(replace(gains, counts_per_rev=None), eq8(), "trapezoid"),
-        ("paper_gains", "machine"): rig.run(gains, "trapezoid", volt=PAPER_LIMIT),
+        ("paper_gains", "machine"): drive.run(gains, "trapezoid", volt=PAPER_LIMIT),
     }
 
 
 def readings() -> dict[str, dict[str, float | None]]:
-    """The paper's gains on the plant of its Eq. 8, by the error's unit and the gains' form."""
+    """The paper's gains on the plant of its Eq. 8, for each unit of the error and form of gains."""
     paper = replace(paper_controller(), counts_per_rev=None)
     numbers = (paper.gains.Kp, paper.gains.Ki, paper.gains.Kd)
     units = {"rpm": 1.0, "cps": 60.0 / (1572.0 * paper.Ts), "krpm": 1000.0}

@@ -33,7 +33,7 @@ TRAINED = 0.7
 """Share of a recording for identification; the figures are computed on the rest."""
 
 
-# --- What there is to do --------------------------------------------------------------------------
+# --- Jobs -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def jobs_of(
             )  # fmt: skip
         if job.file in seen:
             raise SettingError(
-                f"expected every recording once, got {job.file} twice; take one of them out"
+                f"expected every recording once, got {job.file} twice; remove one of them"
             )
         seen.add(job.file)
     return jobs

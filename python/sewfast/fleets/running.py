@@ -18,9 +18,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .. import storage
+from ..arrays import is_whole
 from ..control.controller import Controller
 from ..errors import ModelFileError, SettingError, unreadable, unwritable
 from ..kinds import KINDS, Kind
@@ -74,7 +73,7 @@ def fleet(
         As for `identify`. Linear output error by default: its gain and residence time can be
         compared from run to run, and it takes a fraction of a second.
     controller : Controller, optional
-        Tuned anew for every model, from these settings.
+        Tuned separately for every model, from these settings.
     before : path or Fleet, optional
         An earlier result (`.csv`, `.json`, `.parquet`): `drifts` lists the quantities that have
         moved beyond their bands.
@@ -148,7 +147,7 @@ def _require_settings(workers: Any, controller: Any, seed: Any, model: Any) -> N
         raise SettingError(
             name="model", expected=", ".join(KINDS), received=repr(model), remedy="take 'oe'"
         )
-    if workers is not None and not (_is_whole(workers) and workers >= 0):
+    if workers is not None and not (is_whole(workers) and workers >= 0):
         raise SettingError(
             f"workers: expected a whole number of 0 or more, got {workers!r}; 0 works in this "
             "process, None takes every core"
@@ -158,7 +157,7 @@ def _require_settings(workers: Any, controller: Any, seed: Any, model: Any) -> N
             f"controller: expected a Controller, got {type(controller).__name__}; load one with "
             "load_controller"
         )
-    if not (_is_whole(seed) and 0 <= seed < 2**64):
+    if not (is_whole(seed) and 0 <= seed < 2**64):
         raise SettingError(
             f"seed: expected a whole number from 0 to 2^64 - 1, got {seed!r}; take 0"
         )
@@ -177,11 +176,7 @@ def _require_cluster(client: Any, scheduler: Any) -> None:
         )  # fmt: skip
 
 
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-
-
-# --- Where it is done -----------------------------------------------------------------------------
+# --- Workers --------------------------------------------------------------------------------------
 
 
 def _worked(
@@ -271,7 +266,7 @@ def _ended(running: Collection[Any], connected: Any) -> Any:
         except CancelledError:
             missed = "scheduler: expected it to stay, got a connection that is closed"
     raise SettingError(
-        f"{missed}; start it again and repeat the call: with `out` it goes on from what is done"
+        f"{missed}; start it again and repeat the call: with `out` it continues where it stopped"
     )
 
 
@@ -370,7 +365,7 @@ def _workers_without_ctrl_c() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-# --- What is kept on the way ----------------------------------------------------------------------
+# --- Journal --------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -427,7 +422,7 @@ class Journal:
             try:
                 self._file.write((json.dumps(line) + "\n").encode())
             except OSError as error:
-                remedy = "make room; the same call goes on from what is done"
+                remedy = "make room; the same call continues where it stopped"
                 raise unwritable(ModelFileError, self.place, error, remedy) from error
 
     def __exit__(self, *_: object) -> None:

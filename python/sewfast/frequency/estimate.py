@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, is_whole
 from ..errors import DataError, SettingError
 from .response import Complex, FrequencyResponse
 
 SEGMENTS = 16
-"""Default number of half segments of a record: gives bands of a fifth of the gain at a coherence of
-one half."""
+"""Default number of segments, which overlap by half: gives bands of a fifth of the gain at a
+coherence of one half."""
 LEAST = 16
 """Least samples of a segment or period."""
 LARGEST = 1e150
@@ -66,7 +66,7 @@ def periodic(
     if realisations * periods < 2:
         raise DataError(
             name="y", expected="at least two periods or realisations", received="one",
-            remedy="nothing tells how sure it is",
+            remedy="without repetition there is no uncertainty",
         )  # fmt: skip
     k = _lines(lines, n)
     U, Y = (np.fft.rfft(x, axis=-1)[..., k] / n for x in (u, y))
@@ -138,7 +138,7 @@ def spectral(
         of the noise. Without it, the response under feedback is that of the plant if there is no
         noise, and minus one over the controller if there is only noise.
     segment : int, optional
-        Samples of a segment; by default 16 overlapping half segments make up the record.
+        Samples of a segment; by default 16 segments, which overlap by half, fill the record.
     labels
         `u_unit`, `y_unit`, `from_counts`, `provenance` of the result.
 
@@ -203,7 +203,7 @@ def _explained(value: Complex, Suu: FloatArray, residual: FloatArray) -> FloatAr
 def _segment(segment: int | None, n: int) -> int:
     if segment is None:
         return max(2 * (n // (SEGMENTS + 1)), LEAST)
-    if not isinstance(segment, (int, np.integer)) or isinstance(segment, bool) or segment < LEAST:
+    if not is_whole(segment) or segment < LEAST:
         raise SettingError(
             name="segment", expected=f"at least {LEAST} samples", received=repr(segment)
         )

@@ -130,7 +130,8 @@ class _Piece:
     Attributes
     ----------
     solution : array of complex, shape (6, m)
-        Coefficients for each of m outputs: first the response, then the leakage.
+        Coefficients for each of m outputs: first of the response to the input over `scale`, then of
+        the leakage.
     inverse : array of complex, shape (6, 6)
         Inverse of the triangular factor R of the regressors.
     products : array of complex, shape (m, m)

@@ -68,7 +68,7 @@ BEYOND, FARTHEST = (1.05, 1.3, 1.8), 1.0
 largest one accepted, relative to the sample rate."""
 CONFIDENCE = 1.96
 DEPTHS, WIDTHS = (0.02, 0.7), (0.1, 2.0)
-"""Limits of the depth of a proposed notch."""
+"""Limits of depth and width of a proposed notch."""
 
 
 @dataclass(frozen=True)

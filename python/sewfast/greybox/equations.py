@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import storage
-from ..arrays import FloatArray, as_column
+from ..arrays import FloatArray, as_column, require_whole
 from ..errors import DataError, FitError, SettingError
 from ..frequency.shaft import Parameter
 from ..identification.least_squares import least_squares
@@ -203,7 +203,7 @@ def load_equations(path: str | os.PathLike[str]) -> EquationFit:
     )
 
 
-# --- What is asked of the function ----------------------------------------------------------------
+# --- Calls of the function ------------------------------------------------------------------------
 
 
 def _not_callable(equations: object) -> SettingError:
@@ -270,7 +270,7 @@ class Simulation:
             raise FitError(
                 name="equations", expected="finite derivatives at the start of the record",
                 received=str(single.tolist()),
-                remedy="start from other parameters, or mend a division by nothing there",
+                remedy="start from other parameters, or avoid a division by zero there",
             )  # fmt: skip
         rng = np.random.default_rng(0)
         states = speed * np.ones((self.states, 8)) + rng.standard_normal((self.states, 8)) * 50.0
@@ -343,10 +343,7 @@ def fit_equations(
     if not callable(equations):
         raise _not_callable(equations)
     for name, count in (("states", states), ("substeps", substeps)):
-        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 1000:
-            raise SettingError(
-                name=name, expected="a whole number from 1 to 1000", received=repr(count)
-            )
+        require_whole(name, count, 1, 1000)
     names, start, low, high = _starts(parameters)
     simulation = Simulation(equations, names, states, substeps)
     first = records.pieces[0]
@@ -376,7 +373,7 @@ def fit_equations(
         raise FitError(
             name="equations", expected="a finite free run from the start's parameters",
             received="NaN or infinity on the way",
-            remedy="start from other parameters, or take more substeps than "
+            remedy="start from other parameters, or use more substeps than "
             f"{substeps} a sample: substeps={2 * substeps}",
         )  # fmt: skip
     found = least_squares(

@@ -137,7 +137,7 @@ def physics(
     if intervals not in get_args(Intervals):
         raise SettingError(
             name="intervals", expected="curvature or profile", received=repr(intervals),
-            remedy="profile takes some seconds more, and has ends of their own to either side",
+            remedy="profile takes some seconds more, and gives asymmetric intervals",
         )  # fmt: skip
     terms = _terms(structure)
     if volts is not None and not (

@@ -462,7 +462,7 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
     )
 
 
-# --- From the estimate to what is printed ---------------------------------------------------------
+# --- From the estimate to a motor -----------------------------------------------------------------
 
 
 def motor_of(found: Estimated, volts: float | None, *, profile: bool) -> Motor:

@@ -197,7 +197,7 @@ class Choice(Finals):
                 f"{self.task.data.source}: expected a network with a finite free run on data not "
                 f"trained on, found none; {remedy}, give nx and hidden, or ask for model oe"
             )
-        self.reasons.append("no network passed the guard: the best of them all the same")
+        self.reasons.append("no network passed the guard; the best of them is used")
         return [min(found, key=lambda c: c.error)]
 
     def _state_space_networks(self) -> list[Candidate]:
@@ -273,7 +273,7 @@ class Choice(Finals):
         model = self._of(c.models[:MOST_MEMBERS], c.structure)
         choice: Provenance = {
             "chosen": c.structure.kind,
-            "reason": "an alternative to what was chosen",
+            "reason": "an alternative to the choice",
         }
         choice |= {"free_run_rmse": {c.structure.kind: finite(c.error)}}
         extra: Provenance = {"initial_state": "estimated", "choice": choice}
@@ -380,7 +380,7 @@ class Choice(Finals):
                 f"{task.data.source}: expected a linear model or a network with a finite free run, "
                 "found none; check units and signs, record longer, or give more time"
             )
-        self.reasons.append("no output-error fit came to an end; least squares instead")
+        self.reasons.append("no output-error fit finished; least squares instead")
         model = wrap(LinearOE, core, task.data)
         error = errors_of(free_runs(core, self.split), self.split).rmse
         extra: Provenance = {"initial_state": "estimated", "termination": "time budget"}

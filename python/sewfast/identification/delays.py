@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import _core
+from ..arrays import require_whole
 from ..dataset import Dataset, Experiment, FloatArray, require_dataset
 from ..dataset.experiment import in_effect
 from ..errors import DataError, FitError, SettingError
@@ -107,7 +108,7 @@ def _chunks(e: Experiment, na: int, lags: int) -> Iterator[FloatArray]:
         yield rows[np.isfinite(rows).all(axis=1)]
 
 
-# --- delay: how long the output takes to answer ---------------------------------------------------
+# --- delay: the dead time of each input -----------------------------------------------------------
 
 
 LONGEST = 30
@@ -328,10 +329,7 @@ def _require(data: Dataset, longest: int, least: int, confidence: float) -> None
     data.require_inputs()
     data.require_excited()
     for name, value, low, high in (("least", least, 0, 1000), ("longest", longest, least, 1000)):
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise SettingError(
-                f"{name}: expected a whole number from {low} to {high}, received {value!r}"
-            )
+        require_whole(name, value, low, high)
     if not 0.0 < confidence < 1.0:
         raise SettingError(f"confidence: expected a number between 0 and 1, received {confidence}")
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Literal
 
+from ..arrays import require_whole
 from ..dataset import Dataset, require_dataset
 from ..dataset.experiment import in_effect
 from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
@@ -40,7 +41,6 @@ _KINDS: dict[str, Callable[[Task], Model]] = {
 SHARE_OF_FIT = 0.9
 """Share of a time budget for the fits; the rest is for the evidence stored with the model."""
 NETWORKS = ("neural_oe", "neural_ss")
-LINEAR_WIDTH = 10
 EVIDENCE_RATE, LEAST_EVIDENCE = 2.5e5, 2_000
 """Samples times parameters whose evidence takes a second on a slow machine."""
 _SEARCHED = ("auto", "neural_ss")
@@ -82,7 +82,7 @@ def identify(
     ----------
     data : Dataset
         Training data: inputs complete; outputs that are NaN were not measured and have no weight.
-        With weights, the costs that are minimised and the errors on what is held out are weighted
+        With weights, the minimised costs and the errors on held-out data are weighted
         (a sample of weight 0 counts as not measured); starts, scalings, output functions, the guard
         and the evidence stored with the model ignore them. `iv` takes no weights between 0 and the
         largest.
@@ -332,11 +332,7 @@ def _require_settings(**settings: object) -> None:
     for name, value in settings.items():
         if value is None and name != "seed":
             continue
-        low, high = least.get(name, 1), most.get(name, 1_000_000)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise SettingError(
-                f"{name}: expected a whole number from {low} to {high}, received {value!r}"
-            )
+        require_whole(name, value, least.get(name, 1), most.get(name, 1_000_000))
 
 
 def _require_meaning(

@@ -178,7 +178,7 @@ def _blocks(e: Experiment, samples: int) -> list[Experiment]:
     return [b for b in blocks if len(b) - b.unmeasured > INIT]
 
 
-# --- errors on what is held out, and their comparison ---------------------------------------------
+# --- Errors on held-out data, and their comparison ------------------------------------------------
 
 ERROR_BLOCKS = 12
 """Number of blocks of squared errors in a comparison, over all held-out parts together."""

@@ -21,7 +21,7 @@ STARTING_SCALE = 1.0
 
 
 def trained(task: Task, model: Model) -> Model:
-    """The model after further iterations of its own kind of fit on the task's data.
+    """The model after further iterations of its kind of fit on the task's data.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def _single(task: Task, model: Model) -> Model:
         # messages of the core that ask for other starts and sizes do not apply here
         raise FitError(
             name=f"{task.data.source}", expected="data on which the model's free run is finite",
-            received="none", remedy="check scale and signs of the data, or identify anew",
+            received="none", remedy="check scale and signs of the data, or identify again",
         ) from e  # fmt: skip
 
 
@@ -113,7 +113,7 @@ def _require_trainable(model: Model) -> None:
     if isinstance(model, StructuredModel):
         raise SettingError(
             name="model", expected="a model that can be trained further",
-            received=f"the {model.title} model, whose fit begins anew",
+            received=f"the {model.title} model, which is always fitted from scratch",
             remedy=f"identify it anew (model={model.kind!r}) on all the data",
         )  # fmt: skip
     if isinstance(model, NeuralOE) and not model.core.settings["bypass"]:

@@ -35,7 +35,7 @@ SEARCHED, MOST_FITTED = 10_000, 100_000
 PER_SAMPLE = 2e-4
 """Time of a motor's fits on one processor, including the final one to all data [s]."""
 ENOUGH = 1.0
-"""Squared step in standard errors at which the descent ends."""
+"""Squared distance to the minimum in standard errors at which the descent ends."""
 ARGUMENTS, OUTPUTS = 3.0, 0.1
 """Prior standard deviations of the weights, in units of the scales. They keep a network small where
 the record gives no information, and count as much as a single residual."""
@@ -243,7 +243,7 @@ def _changed(core: _core.GreyBox, **values: Any) -> _core.GreyBox:
 _DERIVED = ("nx", "nk", "n_inputs", "integrator", "hidden")
 
 
-# --- The network beside it ------------------------------------------------------------------------
+# --- The network ----------------------------------------------------------------------------------
 
 
 def _at_any_time(look: Look | None) -> Callable[[], None]:

@@ -71,7 +71,10 @@ def paper(task: Task) -> Model:
         progress=task.progress,
     )
     provenance = {"preset": "paper", "initial_state": "measured"}
-    return _unless_interrupted(fit, _network_model(task, fit, began, provenance))
+    model = _network_model(task, fit, began, provenance)
+    if fit.termination == "interrupted":
+        raise Interrupted(model)
+    return model
 
 
 def neural_oe(task: Task) -> Model:
@@ -232,12 +235,6 @@ def _network_fit(
         known = {"weight_decay": decay, "samples_fitted": len(task.data)}
         raise Interrupted(_network_model(task, fit, began, known))
     return fit
-
-
-def _unless_interrupted(fit: _core.NeuralFit, model: Model) -> Model:
-    if fit.termination == "interrupted":
-        raise Interrupted(model)
-    return model
 
 
 # --- selection --------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import _core
-from ..arrays import FloatArray
+from ..arrays import FloatArray, is_whole
 from ..errors import DataError, Interrupted, SettingError
 
 Differences: TypeAlias = Literal["2-point", "3-point", "cs"]
@@ -400,6 +400,6 @@ def _tolerance(name: str, value: float | None) -> float:
 def _evaluations(value: int | None, n: int) -> int:
     if value is None:
         return max(1000, 200 * (n + 1))
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+    if not is_whole(value) or value < 1:
         raise SettingError(f"expected max_nfev as a whole number above 0, got {value!r}")
     return int(min(value, 2**62))

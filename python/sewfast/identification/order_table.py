@@ -26,7 +26,7 @@ Progress: TypeAlias = Callable[[int, int, float], object]
 BLOCKS = 10
 """Number of parts of the later data, for the standard error of a difference between structures."""
 ABOUT_AS_WELL = 1.005
-"""Ratio of free-run errors below which they count as equal."""
+"""Ratio of free-run errors below which they count as equal: a tenth of the noise, if only that."""
 EXACT = 1e-3
 """Error due to the unknown inputs before the later part, in standard deviations of the output."""
 IV_ITERATIONS = 10
@@ -447,7 +447,7 @@ def _is_not_worse(errors: FloatArray, least: FloatArray) -> bool:
     return float(difference.mean()) <= 2.0 * float(difference.std(ddof=1)) / math.sqrt(n)
 
 
-# --- Lipschitz quotients: how many lags it takes to explain an output -----------------------------
+# --- Lipschitz quotients: the number of lags that explain an output -------------------------------
 
 
 POINTS = 600

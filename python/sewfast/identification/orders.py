@@ -139,7 +139,12 @@ class LinearTable:
         """Fit these orders and delays on every fold."""
         todo = [w for w in dict.fromkeys(wanted) if w not in self.candidates]
         jobs = [(o, nk, fold) for o, nk in todo for fold in range(len(self.folds))]
-        found = iter(self.pool.map(self._fitted, jobs, until=until))
+
+        def fit(job: tuple[int, int, int], look: Look) -> _core.LinearModel | None:
+            order, nk, fold = job
+            return fitted(self._excerpts[fold], order, nk, look)
+
+        found = iter(self.pool.map(fit, jobs, until=until))
         for order, nk in todo:
             models = tuple(next(found) for _ in self.folds)
             if models[0] is None:
@@ -149,10 +154,6 @@ class LinearTable:
                 for m, f in zip(models, self._excerpts, strict=True)
             )
             self.candidates[order, nk] = LinearCandidate(order, nk, models, errors)
-
-    def _fitted(self, job: tuple[int, int, int], look: Look) -> _core.LinearModel | None:
-        order, nk, fold = job
-        return fitted(self._excerpts[fold], order, nk, look)
 
     def error(self, order: int, nk: int) -> float:
         """Error on the newest fold; infinite if there is no such model."""

@@ -220,7 +220,7 @@ class Search(Trials):
         new = self.simplest(better)
         return new if new.converged else self.continued([new], 30, [0])[0]
 
-    # --- what is tried --------------------------------------------------------------------------
+    # --- structures to try ------------------------------------------------------------------------
 
     def _likely(self) -> list[Structure]:
         """Sizes near the linear order, with every output function that the data suggest."""
@@ -363,10 +363,11 @@ class Search(Trials):
             later, at_once = replace(s, nk=s.nk + 1), replace(s, nk=0)
             moves += [("fresh", later)]
             moves += [("fresh", at_once)] if task.data.counts is None and s.nk == 1 else []
-        return [m for m in moves if self._is_possible(m[1])]
-
-    def _is_possible(self, s: Structure) -> bool:
-        return LEAST_DECAY <= s.decay <= MOST_DECAY and self.is_affordable(s)
+        return [
+            (name, s)
+            for name, s in moves
+            if LEAST_DECAY <= s.decay <= MOST_DECAY and self.is_affordable(s)
+        ]
 
     def _moved(self, moves: Sequence[tuple[Candidate, str, Structure]]) -> list[Candidate]:
         """All moves of one round, trained side by side."""

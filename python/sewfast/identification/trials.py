@@ -355,8 +355,10 @@ class Trials:
         def fault(start: Start, look: Look) -> str:
             return _core.guard(start.model, self._guarded, linear=bounds)
 
-        faults = iter(self.pool.map(fault, flat, until=self.pool.clock.until(SHARE_OF_GUARD)))
-        return [[replace(s, fault=_said(next(faults))) for s in starts] for starts in found]
+        late = "not asked within the time budget"
+        until = self.pool.clock.until(SHARE_OF_GUARD)
+        faults = (late if f is None else f for f in self.pool.map(fault, flat, until=until))
+        return [[replace(s, fault=next(faults)) for s in starts] for starts in found]
 
     @property
     def bounding_models(self) -> list[_core.LinearModel]:
@@ -419,7 +421,3 @@ class Trials:
             missing, self.pool.map(fit, missing, until=self.until), strict=True
         ):
             self._starts[key] = model
-
-
-def _said(fault: str | None) -> str:
-    return "not asked within the time budget" if fault is None else fault

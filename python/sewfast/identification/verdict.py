@@ -39,7 +39,7 @@ def verdict(choice: Choice, model: Model, error: float) -> Provenance:
     found = _judged(model, choice.task.data, choice.split, error)
     if found["grade"] == "good" and choice.search.repeats:
         found["grade"] = "fair"
-        found["text"] = found["text"].replace(_TEXTS["good"], "good where it repeats itself")
+        found["text"] = found["text"].replace(_TEXTS["good"], "good on repetitions of this record")
         found["next"] += _what_to_record(choice.task.data)
     if choice.clock.truncated and found["grade"] != "good":
         found["next"].insert(0, "give a longer time budget, or none")

@@ -295,7 +295,7 @@ class PolledBoard(Unique, ABC):
             raise LinkError(
                 name=self.name, expected=f"at most {self.speed:g} RPM",
                 received=f"{speed:.0f} RPM at sample {k}",
-                remedy="excite it less, or raise `speed` if the machine bears it",
+                remedy="excite it less, or raise `speed` if the machine tolerates it",
             )  # fmt: skip
 
     def _recording(self, run: _Samples, name: str) -> Recording | None:

@@ -289,7 +289,7 @@ class Connection(Unique):
         heard, remedy = "nothing at all", "check cable and device"
         if others > 0:
             heard = f"{others} other frames"
-            remedy = "the device hears nothing or is too busy: see `sewfast doctor`"
+            remedy = "the device receives nothing or is too busy: see `sewfast doctor`"
         return LinkError(
             name=self.port.url, expected=f"an answer to {Kind(kind).name}",
             received=f"{heard} within {1e-6 * waited_us:.2g} s of {attempts} attempts",

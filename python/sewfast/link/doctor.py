@@ -360,7 +360,7 @@ def _counters(after: wire.Status, before: wire.Status, drive: Drive) -> Finding:
     if after.dropped:
         remedies.append("frames were dropped: the link was too slow or the host did not read")
     if 2 * after.late_us >= drive.identity.period_us:
-        remedies.append("control periods come late: shorten what else the firmware does")
+        remedies.append("control periods come late: shorten the firmware's other tasks")
     if after.foreign != before.foreign:
         remedies.append(
             "frames of another host arrived meanwhile: use the line from one program only"

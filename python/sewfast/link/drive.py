@@ -252,7 +252,7 @@ class Drive(Unique):
         self._link.ask(Kind.ARM, wire.arm(self._link.watchdog_us, self._link.identity.key))
 
     def stop(self) -> None:
-        """Set command 0 and disable the drive at once; return when the device has confirmed it.
+        """Set command 0 and disable the drive immediately; return when the device has confirmed it.
 
         A run in another thread is cancelled; then this returns when the motor is at rest.
         """

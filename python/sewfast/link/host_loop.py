@@ -174,7 +174,7 @@ def _ratio(drive: Drive, controller: Controller) -> int:
     if drive.identity.on_credit:
         raise SettingError(
             name="drive", expected="a device in real time for a loop on the host",
-            received="one whose time stands still between grants", remedy="start it without --fast",
+            received="one whose time stops between grants", remedy="start it without --fast",
         )  # fmt: skip
     ratio = controller.Ts / drive.identity.Ts
     whole = round(ratio)

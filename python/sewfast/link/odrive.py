@@ -85,7 +85,7 @@ class ODrive(PolledBoard):
             self.unit = "V"
         if round(self._read(f"{self._place}.current_state")) != IDLE:
             raise LinkError(
-                name=self.name, expected="an axis in IDLE", received="one that something drives",
+                name=self.name, expected="an axis in IDLE", received="one that is in use",
                 remedy="end what drives it, and request IDLE",
             )  # fmt: skip
         self._require_no_error()

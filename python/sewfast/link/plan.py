@@ -338,7 +338,7 @@ def other_kind(
     if not identity.capabilities & wire.KINDS:
         raise SettingError(
             name="controller", expected="a PID (Controller) for this device",
-            received=f"{type(controller).__name__}, which its firmware does not know",
+            received=f"{type(controller).__name__}, which its firmware does not support",
             remedy="tune a PID (--controller pid), or build the firmware with this sewfast and set "
             "SEWFAST_CAN_KINDS",
         )  # fmt: skip
@@ -354,7 +354,7 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
     Raises
     ------
     SettingError
-        If its gains have other units than the device, or the firmware does not know its parts.
+        If its gains have other units than the device, or the firmware does not support its parts.
     """
     g, c = fitting(controller, streamed), controller
     named = ("observer_time", bool(c.observer_time)), ("r_rate", c.r_rate != math.inf)
@@ -365,7 +365,7 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
     if unknown:
         raise SettingError(
             name="controller", expected=f"one without {' and '.join(unknown)} for this device",
-            received="one with what its firmware does not know",
+            received="one that its firmware does not support",
             remedy="leave it out, or build the firmware with this sewfast",
         )  # fmt: skip
     values = (

@@ -417,7 +417,7 @@ _LIMITED = {"speed": (1, "RPM"), "acceleration": (2, "RPM/s"), "current": (3, "A
 def _why(reason: str, drive: Drive) -> str:
     """The reason of a trip, with the limit or the time that was in force."""
     if reason == "watchdog":
-        return f"{reason}, it had heard nothing for {drive.watchdog * 1e3:g} ms"
+        return f"{reason}, it had received nothing for {drive.watchdog * 1e3:g} ms"
     if reason not in _LIMITED:
         return reason
     place, unit = _LIMITED[reason]

@@ -76,7 +76,7 @@ class SimpleFOC(PolledBoard):
         self._watchdog = next((c for c, label in registered.items() if "watchdog" in label), None)
         if self._watchdog is None and self._requires_watchdog:
             raise SettingError(
-                name="watchdog", expected="a sketch that stops the motor where nothing comes",
+                name="watchdog", expected="a sketch that stops the motor without commands",
                 received="none",
                 remedy="add its lines (page on drives of other makers), or watchdog=False",
             )  # fmt: skip
@@ -84,7 +84,7 @@ class SimpleFOC(PolledBoard):
         if not self._discard():
             raise LinkError(
                 name=self._port.url, expected="a board that is silent unless asked",
-                received="one that goes on telling", remedy="take its telemetry out of the sketch",
+                received="one that keeps sending", remedy="remove telemetry from the sketch",
             )  # fmt: skip
         if self._number(f"{self._motor}R") > 0.0:
             raise SettingError(
@@ -136,7 +136,7 @@ class SimpleFOC(PolledBoard):
         if self._number(f"{self._motor}E") != 1.0:
             raise LinkError(
                 name=self.name, expected="a motor that is enabled", received="a disabled one",
-                remedy="see what the board says on its own; a watchdog may have expired",
+                remedy="read the board's own output; a watchdog may have expired",
             )  # fmt: skip
 
     def _apply(self, u: float) -> None:

@@ -368,7 +368,7 @@ def _without(kind: int) -> str:
 def _refused(kind: int, result: int, detail: int) -> str:
     where = _field(kind, detail)
     texts = {
-        1: "it does not know the command; update the firmware",
+        1: "its firmware does not support the command; update it",
         2: f"wrong length, {detail} bytes; update sewfast and the firmware to the same version",
         3: f"{where} is outside its range; change it",
         4: f"not while {name_of(STATES, detail)}; {_way_out(detail)}",
@@ -382,7 +382,9 @@ def _refused(kind: int, result: int, detail: int) -> str:
         12: "no limits were set in this session; set them first",
         13: "the key is not that of its reply to HELLO; connect again",
     }
-    return texts.get(result, f"result {result} (detail {detail}), which this sewfast does not know")
+    return texts.get(
+        result, f"result {result} (detail {detail}), unknown to this version of sewfast"
+    )
 
 
 def _field(kind: int, index: int) -> str:

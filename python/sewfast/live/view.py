@@ -157,7 +157,7 @@ class Shown:
 def open_view(kind: str | Kind, feed: Feed, *, own_process: bool = True) -> Iterator[Shown | None]:
     """Show a feed for the duration of a `with`.
 
-    The view is a process of its own with a lower priority, so that it does not hold up the link by
+    The view is a separate process with a lower priority, so that it does not hold up the link by
     Python's interpreter lock or by using the processor. Leaving the `with` closes the feed and
     waits for the last line, half a second at most: stop the drive before.
 

@@ -12,7 +12,7 @@ from .. import _core
 from ..dataset import FloatArray
 from ..errors import SettingError, not_installed
 
-# --- ContinuousModel: the differential equation that a zero-order hold turns into a linear model --
+# --- ContinuousModel: the differential equation behind a zero-order hold --------------------------
 
 
 NODES = 8
@@ -61,7 +61,7 @@ class ContinuousModel:
         Raises
         ------
         SettingError
-            Where python-control is not installed.
+            If python-control is not installed.
         """
         control = require_control()
         names = {"inputs": list(self.input_names), "outputs": [self.output_name]}
@@ -82,7 +82,7 @@ def continuous(
     Raises
     ------
     SettingError
-        Where a pole is zero or negative: no differential equation has such a discretisation.
+        If a pole is zero or negative: no differential equation has such a discretisation.
     """
     spare = max(core.nk - 1, 0)
     s = observer_form(_core.LinearModel(core.a, core.b, core.nk - spare, core.offset))
@@ -169,7 +169,7 @@ def difference_equation(num: ArrayLike, den: ArrayLike, offset: float) -> _core.
     Raises
     ------
     SettingError
-        Where shapes are wrong, values are not finite, or the denominator begins with zero.
+        If shapes are wrong, values are not finite, or the denominator begins with zero.
     """
     numerators, denominator = np.atleast_2d(_finite(num, "num")), _finite(den, "den")
     if numerators.ndim != 2 or denominator.ndim != 1 or 0 in (numerators.size, denominator.size):
@@ -218,7 +218,7 @@ def from_state_space(
     Raises
     ------
     SettingError
-        Where shapes disagree, values are not finite, or there are several outputs.
+        If shapes disagree, values are not finite, or there are several outputs.
     """
     s = _checked(A, B, C, D)
     n = len(s.A)
@@ -245,7 +245,7 @@ def with_common_denominator(
     Raises
     ------
     SettingError
-        Where a numerator has a higher degree than its denominator, which is not causal.
+        If a numerator has a higher degree than its denominator, which is not causal.
     """
     distinct: list[FloatArray] = []
     for den in denominators:
@@ -279,7 +279,7 @@ def offset_at(core: _core.LinearModel, u0: ArrayLike, y0: float) -> float:
     Raises
     ------
     SettingError
-        Where `u0` has not one finite value per input.
+        If `u0` has not one finite value per input.
     """
     u = np.atleast_1d(_finite(u0, "operating point"))
     if u.shape != (len(core.b),):
@@ -332,7 +332,7 @@ def _product(factors: list[FloatArray]) -> FloatArray:
     return product
 
 
-# --- python-control and scipy.signal: objects of theirs from arrays, and arrays from their objects
+# --- Conversion from and to objects of python-control and scipy.signal ----------------------------
 
 
 _PURPOSE = "its linear systems (to_tf and to_ss give plain arrays)"

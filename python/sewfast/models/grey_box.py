@@ -120,7 +120,7 @@ class GreyBox(SingleModel):
         named |= {"sag": ("sag", f"1/{u}^2")}
         parts += [f"{text} {of[n]:.3g} {unit}" for n, (text, unit) in named.items() if of[n]]
         units = self.settings["hidden"]
-        network = f"{units} tanh for what they leave" if units else "no network beside them"
+        network = f"{units} tanh for what they leave" if units else "no network"
         return [f"motor: {', '.join(parts)}", network]
 
 

@@ -118,7 +118,7 @@ class LinearDifference(SingleModel):
         Raises
         ------
         SettingError
-            Where python-control is not installed, or for another form.
+            If python-control is not installed, or for another form.
         """
         inputs, output = list(self.input_names), self.output_name
         if form == "ss":
@@ -133,7 +133,7 @@ class LinearDifference(SingleModel):
         Raises
         ------
         SettingError
-            Where scipy is not installed.
+            If scipy is not installed.
         """
         return scipy_system(*in_descending_powers(self.core), self.to_ss(), self.Ts)
 
@@ -143,7 +143,7 @@ class LinearDifference(SingleModel):
         Raises
         ------
         SettingError
-            Where there is none: a pole on the negative real axis or at 0, or nb > na.
+            If there is none: a pole on the negative real axis or at 0, or nb > na.
         """
         return continuous(self.core, self.Ts, self.input_names, self.output_name)
 
@@ -161,7 +161,7 @@ class LinearDifference(SingleModel):
         Raises
         ------
         SettingError
-            Where `u0` has not one value per input, or for a pole at 1, which has no such level.
+            If `u0` has not one value per input, or for a pole at 1, which has no such level.
         """
         at_rest = 1.0 + float(self.core.a.sum())
         if at_rest == 0.0:
@@ -207,7 +207,7 @@ class LinearDifference(SingleModel):
         Raises
         ------
         SettingError
-            Where shapes or values are impossible, or both `offset` and `operating_point` are given.
+            If shapes or values are impossible, or both `offset` and `operating_point` are given.
         """
         core = difference_equation(num, den, offset)
         if operating_point is not None:

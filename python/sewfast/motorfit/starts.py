@@ -46,8 +46,8 @@ def started(task: Task, terms: tuple[str, ...]) -> State:
     if best is None or not math.isfinite(cost):
         if np.mean(signs) > 0.5:
             raise DataError(
-                "expected a speed that rises with the command, received one that falls; turn the "
-                "sign of one of them"
+                "expected a speed that rises with the command, received one that falls; reverse "
+                "the sign of one of them"
             )
         raise FitError(
             "expected a speed that follows the command as a motor's does, none of the starts is "
@@ -75,8 +75,8 @@ def started(task: Task, terms: tuple[str, ...]) -> State:
         resistance = float(drive @ drive) / float(drive @ i) if float(drive @ i) > 0 else math.nan
         if not (math.isfinite(resistance) and resistance > 0):
             raise DataError(
-                "expected a current that rises with the command, received one that does not; turn "
-                "its sign, or leave it out"
+                "expected a current that rises with the command, received one that does not; "
+                "reverse its sign, or leave it out"
             )
         best = State(best.theta, resistance, best.terms)
     task.weigh(best)

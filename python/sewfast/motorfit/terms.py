@@ -151,7 +151,7 @@ def estimated(
         for t, share in shares.items()
         if t in given and (t not in WAVES or state.orders[WAVES.index(t)])
     }
-    missing = "no wave over the turn stands out from what is left over"
+    missing = "no wave over the turn stands out from the residuals"
     if set(WAVES[:3]) <= set(terms) and not any(state.orders[:3]):
         reasons["cogging"] = missing
     if WAVES[3] in terms and not state.orders[3]:
@@ -197,13 +197,13 @@ def _too_fast(records: Records, terms: tuple[str, ...]) -> dict[str, str]:
     y = np.concatenate([p.y for p in records.pieces])
     turn = float(np.quantile(np.abs(y), 0.95)) * records.Ts
     why = (
-        f"the shaft turns {turn:.2g} rad between two samples, too far to see what repeats; record "
-        "faster, or more slowly turning"
+        f"the shaft turns {turn:.2g} rad between two samples, too far to see repetitions; record "
+        "faster, or at lower speed"
     )
     return {t: why for t, order in ORDERS.items() if t in terms and order * turn > 0.5 * math.pi}
 
 
-# --- Which terms there are ------------------------------------------------------------------------
+# --- Choice of terms ------------------------------------------------------------------------------
 
 
 def _with_limit(task: Task, state: State, terms: tuple[str, ...]) -> State:

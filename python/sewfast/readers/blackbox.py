@@ -201,7 +201,7 @@ def blackbox_series(raw: bytes) -> Iterator[tuple[str, FloatArray, Any]]:
     Raises
     ------
     ValueError
-        Where the header is damaged or no frame can be read.
+        If the header is damaged or no frame can be read.
     """
     starts = [m.start() for m in re.finditer(re.escape(BLACKBOX), raw)]
     names: list[str] = []
@@ -308,7 +308,8 @@ def _flight(header: _Header, data: _Bytes) -> tuple[list[str], array[int]]:
         except Damaged:
             # differences are meaningless until the next whole frame
             last = before = None
-            data.at = _next_whole(data.raw, start + 1)
+            found = data.raw.find(b"I", start + 1)
+            data.at = len(data.raw) if found < 0 else found
             continue
         if kind == "S":
             held = fresh_slow
@@ -318,11 +319,6 @@ def _flight(header: _Header, data: _Bytes) -> tuple[list[str], array[int]]:
         before = fresh if kind == "I" or last is None else last
         last = fresh
     return names, rows
-
-
-def _next_whole(raw: bytes, at: int) -> int:
-    found = raw.find(b"I", at)
-    return len(raw) if found < 0 else found
 
 
 def _skipped(iteration: int, interval: int, part: int, whole: int) -> int:

@@ -32,7 +32,7 @@ class Table:
     path : Path
         The file.
     columns : mapping of name to array
-        Columns may differ in length where the format allows it (`.mat`, `.npz`).
+        Columns can differ in length if the format allows it (`.mat`, `.npz`).
     units : mapping of name to text
         From headers such as `u [V]` or `speed (RPM)`; absent where unknown.
     unusable : mapping of name to text
@@ -73,12 +73,12 @@ class Table:
         return f"Table({self.path.name!r}: {', '.join(self.names)})"
 
     def resolve(self, name: str) -> str:
-        """The column's own name for `name`, which may also be the whole header (`u [V]`).
+        """The column's own name for `name`, which can also be the whole header (`u [V]`).
 
         Raises
         ------
         DataError
-            Where the file has no such column, or it cannot be used.
+            If the file has no such column, or it cannot be used.
         """
         name = printable(name)
         for candidate in (name, split_unit(name)[0]):

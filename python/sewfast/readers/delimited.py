@@ -61,7 +61,7 @@ def read_delimited(path: Path, raw: bytes) -> Table:
     Raises
     ------
     DataError
-        Where the file is not a table of that kind.
+        If the file is not a table of that kind.
     """
     layout = _layout(path, _decode(path, raw))
     fast = _fast_pass(layout)
@@ -411,21 +411,17 @@ def _split(layout: _Layout) -> Iterator[tuple[int, list[str]]]:
 
 
 def _of_other_width(layout: _Layout, number: int, cells: list[str]) -> DataError:
+    hint = ""
+    if layout.delimiter == "," and len(cells) > len(layout.header):
+        hint = "; numbers with decimal commas need semicolons between the columns"
     return DataError(
         f"{layout.path}: line {number}: expected {len(layout.header)} cells, as in the header, "
-        f"received {len(cells)}: {_short(layout.delimiter.join(cells))}"
-        + _comma_hint(layout, len(cells))
+        f"received {len(cells)}: {_short(layout.delimiter.join(cells))}{hint}"
     )
 
 
 def _count(lines: int, where: str) -> str:
     return f"1 line {where} is" if lines == 1 else f"{lines} lines {where} are"
-
-
-def _comma_hint(layout: _Layout, received: int) -> str:
-    if layout.delimiter == "," and received > len(layout.header):
-        return "; numbers with decimal commas need semicolons between the columns"
-    return ""
 
 
 def _column(layout: _Layout, cells: Sequence[str]) -> FloatArray | None:

@@ -40,7 +40,7 @@ def table_of(frame: Any) -> Table:
     Raises
     ------
     DataError
-        Where it has no rows, or no column holds numbers.
+        If it has no rows, or no column holds numbers.
     SettingError
         For another object, or where pyarrow is needed and not installed.
     """
@@ -85,7 +85,7 @@ def collected(path: Path, found: Iterator[Found]) -> Table:
     Raises
     ------
     DataError
-        Where there are no rows.
+        If there are no rows.
     """
     headers, columns, bad, units = [], [], {}, {}
     for i, (header, values, unit, why) in enumerate(found):

@@ -64,9 +64,9 @@ def read_log(path: Path, raw: bytes) -> Table:
     Raises
     ------
     DataError
-        Where it is damaged, or holds no series of numbers.
+        If it is damaged, or holds no series of numbers.
     SettingError
-        Where its package is not installed.
+        If its package is not installed.
     """
     name = _kind_of(raw)
     assert name is not None
@@ -151,7 +151,7 @@ def joined(path: Path, signals: Sequence[Signal], kind: str) -> Table:
     Raises
     ------
     DataError
-        Where there is no series of numbers, or there are too many.
+        If there is no series of numbers, or there are too many.
     """
     names = _unique([printable(s.name) for s in signals])
     usable: dict[str, Signal] = {}

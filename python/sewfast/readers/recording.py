@@ -47,9 +47,9 @@ def read_parquet(path: Path, raw: bytes) -> Table:
     Raises
     ------
     DataError
-        Where the file is damaged or has no rows.
+        If the file is damaged or has no rows.
     SettingError
-        Where pyarrow is not installed.
+        If pyarrow is not installed.
     """
     try:
         import pyarrow.parquet as pq
@@ -74,7 +74,7 @@ def read_mcap(path: Path, raw: bytes) -> Table:
     Raises
     ------
     DataError
-        Where the file is not a recording of sewfast, or has no samples.
+        If the file is not a recording of sewfast, or has no samples.
     """
     found = decode_recording(path, raw)
     columns = {name: freeze(c) for name, c in found.table_columns().items()}
@@ -100,9 +100,9 @@ def read_installed(path: Path) -> Table | None:
     Raises
     ------
     DataError
-        Where the package's function fails, or returns no table of numbers.
+        If the package's function fails, or returns no table of numbers.
     SettingError
-        Where several packages handle the ending, or the function cannot be imported.
+        If several packages handle the ending, or the function cannot be imported.
     """
     ending = path.suffix.lower().removeprefix(".")
     if not ending or ending in OWN:

@@ -57,7 +57,7 @@ _QUALIFIERS = frozenset(
         "percent pct raw filt filtered",
     )
 )
-"""Words that say nothing about what a column is."""
+"""Words without meaning for the role of a column."""
 _WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+(?![^\W\d_A-Z])")
 
 

@@ -150,7 +150,7 @@ class Grid:
         missing = _means(unknown.astype(np.float64), edges, ends) > TOLERANCE
         return np.where(missing, np.nan, means)
 
-    def says(self, name: str) -> str:
+    def note(self, name: str) -> str:
         """What was done, for the notes."""
         steps = np.diff(self.t)
         gaps = self.gaps
@@ -205,10 +205,10 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
     Raises
     ------
     DataError
-        Where time goes back, or even time stamps disagree with `given` by more than 1 %, or are
+        If time goes back, or even time stamps disagree with `given` by more than 1 %, or are
         such that a grid would have far more samples than there are rows.
     SettingError
-        Where there is neither a time column nor a sample time.
+        If there is neither a time column nor a sample time.
     """
     if given is not None and not (
         isinstance(given, (int, float, np.number)) and math.isfinite(given) and given > 0
@@ -219,33 +219,33 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
     if stated and (table.Ts_source == "the header" or name is None):
         assert table.Ts is not None
         if given is None:
-            notes = (f"{table.path.name}: Ts = {table.Ts:g} s, from {table.Ts_source}",)
-            return TimeBase(table.Ts, None, () if table.Ts_source == "the header" else notes)
+            note = f"{table.path.name}: Ts = {table.Ts:g} s, from {table.Ts_source}"
+            return TimeBase(table.Ts, None, () if table.Ts_source == "the header" else (note,))
         return TimeBase(_agreed(table, table.Ts_source, table.Ts, given))
     if name is None:
         if given is None:
             for spoiled in filter(_is_time, table.unusable):
-                table.resolve(spoiled)  # says why it cannot be used
+                table.resolve(spoiled)  # raises with the reason
             raise SettingError(
                 name=str(table.path), expected="a column t or time",
                 received=f"{', '.join(table.names[:30])}",
                 remedy="state the sample time in seconds (Ts, --ts), or name the column (time=...)",
             )  # fmt: skip
         return TimeBase(float(given))
-    scale, said = _unit(table, name)
+    scale, notes = _unit(table, name)
     t = _seconds(table, name, scale or 1.0)
     steps = np.diff(t)
     period = float(np.median(steps[steps > 0.0]))
     if scale is None:
-        scale, said = _guessed(table, name, period, given)
+        scale, notes = _guessed(table, name, period, given)
         t, steps, period = t * scale, steps * scale, period * scale
     if np.abs(steps - period).max() <= TOLERANCE * period:
         # the mean step is exact even where every printed time is rounded
         found = float(t[-1] / len(steps))
         Ts = found if given is None else _agreed(table, f"column {name!r}", found, given)
-        return TimeBase(Ts, None, said)
+        return TimeBase(Ts, None, notes)
     grid = _grid(table, name, t, period, given)
-    return TimeBase(grid.Ts, grid, (*said, grid.says(table.path.name)))
+    return TimeBase(grid.Ts, grid, (*notes, grid.note(table.path.name)))
 
 
 def _agreed(table: Table, source: str, found: float, given: float) -> float:
@@ -290,12 +290,12 @@ def _guessed(
     Raises
     ------
     SettingError
-        Where seconds would make a sample time that no machine uses.
+        If seconds would make a sample time that no machine uses.
     """
     for unit, scale in _SMALLER if given is not None and given < 0.01 * step else ():
         # not for a grid far finer than the rows
         if given is not None and 0.5 * given < step * scale < 2.0 * given:
-            return scale, (f"{table.path.name}: column {name!r} is taken as {unit}, as Ts says",)
+            return scale, (f"{table.path.name}: column {name!r} counts {unit}, according to Ts",)
     if step < LONG or given is not None:
         return 1.0, ()
     ways = " or ".join(
@@ -378,7 +378,7 @@ def _grid(table: Table, name: str, t: FloatArray, period: float, given: float | 
         raise DataError(
             f"{table.path}: column {name!r}: expected time stamps that a grid of Ts = {Ts:.4g} s "
             f"has up to {most} samples for, received {len(t)} over {t[-1]:.4g} s, with a step of "
-            f"{t[k + 1] - t[k]:.4g} s at {table.row(int(rows[k + 1]))}; take that row out, or "
+            f"{t[k + 1] - t[k]:.4g} s at {table.row(int(rows[k + 1]))}; remove that row, or "
             "give a longer sample time (Ts, --ts)"
         )
     if t[-1] < 2.0 * Ts:

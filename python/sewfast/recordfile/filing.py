@@ -19,7 +19,7 @@ from . import format
 from .format import Assembler, Message, Topic, opening
 from .header import Header, bearable
 
-# --- A file that grows by whole pieces: what is in it is complete, whatever stops the writer ------
+# --- Sink: a file that grows by whole pieces ------------------------------------------------------
 
 
 _BATCH = 1 << 16
@@ -82,14 +82,14 @@ def _own(path: Path, file: int) -> None:
     Raises
     ------
     SettingError
-        Where another recorder holds the lock.
+        If another recorder holds the lock.
     """
     try:
         _lock(file)
     except BlockingIOError:
         raise SettingError(
             name=str(path), expected="a file that nobody else writes",
-            received="one in which a recording is being made, which is kept",
+            received="one with a recording in progress, which is kept",
             remedy="choose another name",
         ) from None  # fmt: skip
     except (ImportError, OSError):
@@ -103,7 +103,7 @@ def _lock(file: int, *, free: bool = False) -> None:
     Raises
     ------
     BlockingIOError
-        Where another process holds it.
+        If another process holds it.
     """
     try:
         import fcntl
@@ -153,9 +153,9 @@ class Sink:
     Raises
     ------
     SettingError
-        Where the file exists and `overwrite` is False, or another recorder is writing to it.
+        If the file exists and `overwrite` is False, or another recorder is writing to it.
     DataError
-        Where it cannot be created: a folder, no such folder, no permission.
+        If it cannot be created: a folder, no such folder, no permission.
     """
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
@@ -187,7 +187,7 @@ class Sink:
         Raises
         ------
         OSError
-            Where it does not fit; the file then ends before the piece.
+            If it does not fit; the file then ends before the piece.
         """
         rest = memoryview(piece)
         try:
@@ -227,7 +227,7 @@ def replacing(target: Path) -> Iterator[Path]:
     Raises
     ------
     DataError
-        Where the file cannot be written.
+        If the file cannot be written.
     """
     if target.is_dir():
         raise _folder(target)
@@ -241,7 +241,7 @@ def replacing(target: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-# --- Filing: the thread that owns a recording's file; what callers give it, it writes in order ----
+# --- Filing: the thread that owns a recording's file ----------------------------------------------
 # A separate thread, because Ctrl-C is raised in the main thread at any point and could leave half a
 # chunk. The thread also writes samples that have waited long enough even if no call comes, and
 # keeps a slow disk from blocking the link.
@@ -369,7 +369,7 @@ class Filing:
             if self.is_made:
                 self._finish(item)
         except Exception as e:
-            # callers must be told of any error
+            # callers must learn of any error
             self.failure = e
         finally:
             if self.is_made:

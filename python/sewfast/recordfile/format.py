@@ -174,14 +174,14 @@ def parse(data: bytes) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        Where it is not a JSON object, or holds numbers that are not finite.
+        If it is not a JSON object, or holds numbers that are not finite.
     """
     try:
         content = json.loads(data, parse_constant=_refuse)
     except RecursionError as e:
         raise ValueError("it is nested too deeply") from e
     if not isinstance(content, dict):
-        raise ValueError("it is no JSON object")
+        raise ValueError("it is not a JSON object")
     return content
 
 
@@ -202,7 +202,7 @@ def decode(content: Mapping[str, Any], names: Iterable[str]) -> Block:
     Raises
     ------
     ValueError
-        Where columns are missing or differ in length, numbers are not finite, or the samples'
+        If columns are missing or differ in length, numbers are not finite, or the samples'
         numbers do not increase.
     """
     index = _column(content, "index", (int,))
@@ -309,7 +309,7 @@ class Assembler:
     Raises
     ------
     SettingError
-        Where chunks are to be compressed and zstandard is not installed.
+        If chunks are to be compressed and zstandard is not installed.
     """
 
     def __init__(
@@ -425,7 +425,7 @@ def zstandard(purpose: str) -> Any:
     Raises
     ------
     SettingError
-        Where it is not installed.
+        If it is not installed.
     """
     try:
         import zstandard as found

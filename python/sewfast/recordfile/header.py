@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import is_whole
 from ..errors import SettingError
 
 FORMAT, VERSION = "sewfast.recording", 1
@@ -147,7 +148,7 @@ class Header:
         Raises
         ------
         SettingError
-            Where it is of another format or version, or a value is missing or unusable.
+            If it is of another format or version, or a value is missing or unusable.
         """
         if content.get("format") != FORMAT:
             raise SettingError(
@@ -157,7 +158,7 @@ class Header:
             raise SettingError(
                 name="version", expected=f"{VERSION} of {FORMAT!r}",
                 received=str(content.get("version"))[:60],
-                remedy="a newer sewfast may be able to read it",
+                remedy="try a newer sewfast",
             )  # fmt: skip
         names = ("name", "Ts", "columns", "n", "counts_per_rev", "device", "settings", "started")
         if missing := [name for name in names if name not in content]:
@@ -177,12 +178,11 @@ def _positive(what: str, value: object) -> float:
 
 
 def _whole_number(value: object) -> int:
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not whole or not 0 <= value <= 2**53:  # type: ignore[operator]
+    if not is_whole(value) or not 0 <= value <= 2**53:
         raise SettingError(
             name="n", expected="a whole number of samples or None", received=repr(value)
         )
-    return int(value)  # type: ignore[call-overload, no-any-return]
+    return int(value)
 
 
 def _columns(columns: object) -> Mapping[str, str]:
@@ -215,7 +215,7 @@ def plain(what: str, content: Mapping[str, Any]) -> dict[str, Any]:
     Raises
     ------
     SettingError
-        Where a value is none of these.
+        If a value is none of these.
     """
     try:
         text = json.dumps(dict(content), allow_nan=False, ensure_ascii=False, default=_python)

@@ -42,7 +42,7 @@ from .format import (
 )
 from .header import LARGEST_HEADER, MOST_MISSING, Header, bearable, plain
 
-# --- The whole chunks of an MCAP file, and what between them is damaged ---------------------------
+# --- The whole chunks of an MCAP file, and the damage between them --------------------------------
 # Only data covered by a checksum are trusted: chunks are searched for, not reached by the lengths
 # of the records before them. A chunk's head states its size three times (twice if compressed), and
 # its CRC-32 covers the rest. The search has a budget, because each head without a chunk costs a
@@ -74,7 +74,7 @@ def chunks(raw: bytes) -> Iterator[Chunk]:
         For a file with more heads without chunks than damage can explain, and for one that unpacks
         to more than `MOST_RATIO` times its size.
     SettingError
-        Where a chunk is compressed and zstandard is not installed.
+        If a chunk is compressed and zstandard is not installed.
     """
     at, left, unpacked = 0, BUDGET * len(raw) + LARGEST_CHUNK, 0
     while (at := raw.find(CHUNK.to_bytes(1, "little"), at)) >= 0:
@@ -86,7 +86,7 @@ def chunks(raw: bytes) -> Iterator[Chunk]:
                 raise DataError(
                     name="chunks", received=f"{unpacked} bytes in {chunk.stop} of the file",
                     expected=f"at most {MOST_RATIO} times the file, and {LARGEST_FILE >> 30} GiB",
-                    remedy="the file is no recording; a long one is recorded in parts",
+                    remedy="the file is not a recording; record long runs in parts",
                 )  # fmt: skip
             yield chunk
         elif claim is not None:
@@ -95,7 +95,7 @@ def chunks(raw: bytes) -> Iterator[Chunk]:
                 raise DataError(
                     name="chunks", expected="heads of chunks with their chunks",
                     received=f"{at} bytes with heads alone",
-                    remedy="the file is no recording that was damaged",
+                    remedy="the file is not a damaged recording",
                 )  # fmt: skip
         at = at + 1 if chunk is None else chunk.stop
 
@@ -226,7 +226,7 @@ def _u32(raw: bytes, at: int) -> int:
     return value
 
 
-# --- read_recording: an MCAP recording in whatever state -> RecordedFile --------------------------
+# --- read_recording: an MCAP recording, whole or damaged -> RecordedFile --------------------------
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -373,7 +373,7 @@ def read_recording(path: str | os.PathLike[str]) -> RecordedFile:
     Raises
     ------
     DataError
-        Where the file cannot be read, is not an MCAP file, or both copies of its header message
+        If the file cannot be read, is not an MCAP file, or both copies of its header message
         are damaged.
     """
     path = _named(path)
@@ -544,7 +544,7 @@ def _checked_event(content: Mapping[str, Any]) -> Mapping[str, Any]:
     detail = content.get("detail")
     known = isinstance(content.get("kind"), str) and isinstance(detail, dict)
     if not known or not (index is None or _is_number(index)) or type(elapsed) not in (int, float):
-        raise ValueError("it is no event")
+        raise ValueError("it is not an event")
     plain("event", dict(content))
     kept = {"kind": content["kind"], "index": index, "elapsed": elapsed, "detail": detail}
     return MappingProxyType(kept)
@@ -553,7 +553,7 @@ def _checked_event(content: Mapping[str, Any]) -> Mapping[str, Any]:
 def _checked_completeness(content: Mapping[str, Any]) -> Mapping[str, Any]:
     numbers = _is_number(content.get("received")) and _is_number(content.get("end"))
     if not isinstance(content.get("outcome"), str) or not numbers:
-        raise ValueError("it is no account of completeness")
+        raise ValueError("it is not a completeness message")
     return content
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import is_whole
 from ..errors import DataError, SettingError
 from ..writers import write_table
 from . import format
@@ -21,7 +22,7 @@ from .format import Assembler, Message, Topic, opening
 from .header import MOST_MISSING, Header, bearable, plain
 from .reader import RecordedFile, read_header, read_recording
 
-# --- What is not written over: a recording of a drive, which cannot be had again ------------------
+# --- Protected files: recordings of a drive, which cannot be made again ---------------------------
 
 
 ENDING = ".mcap"
@@ -47,7 +48,7 @@ def require_ending(path: str | os.PathLike[str]) -> Path:
         raise SettingError(
             name=str(found), expected=f"a recording's name, which ends in {ENDING}",
             received=found.suffix or "none",
-            remedy="rename it, and `sewfast.recordfile.export` makes other formats of it",
+            remedy="rename it; `sewfast.recordfile.export` converts it to other formats",
         )  # fmt: skip
     return found
 
@@ -68,7 +69,7 @@ def require_replaceable(path: str | os.PathLike[str], *, overwrite: bool) -> Non
     Raises
     ------
     SettingError
-        Where the file is protected.
+        If the file is protected.
     """
     found = Path(path)
     if overwrite or found.suffix.lower() != ENDING or not _is_there(found):
@@ -76,7 +77,7 @@ def require_replaceable(path: str | os.PathLike[str], *, overwrite: bool) -> Non
     try:
         header = read_header(found)
     except DataError:
-        raise _kept(found, "a file that may be one") from None
+        raise _kept(found, "a file that can be one") from None
     if not _is_computed(header):
         device = header.device.get("name", "a drive")
         raise _kept(found, f"one of {str(device)[:60]!r} of {header.started[:19]}")
@@ -88,7 +89,7 @@ def require_free(paths: Iterable[str | os.PathLike[str] | None], *, overwrite: b
     Raises
     ------
     SettingError
-        Where one of the files exists.
+        If one of the files exists.
     """
     for path in paths:
         if path is not None and not overwrite and _is_there(Path(path)):
@@ -148,9 +149,9 @@ class RecordWriter:
     Raises
     ------
     SettingError
-        Where the file exists and `overwrite` is False, or zstandard is not installed.
+        If the file exists and `overwrite` is False, or zstandard is not installed.
     DataError
-        Where it cannot be written.
+        If it cannot be written.
 
     Notes
     -----
@@ -229,7 +230,7 @@ class RecordWriter:
         Raises
         ------
         DataError
-            Where columns do not match the header, samples are repeated or the file cannot be
+            If columns do not match the header, samples are repeated or the file cannot be
             written any further.
         """
         first = _index("first", first)
@@ -288,7 +289,7 @@ class RecordWriter:
         SettingError
             For a detail without a JSON form.
         DataError
-            Where the file cannot be written any further.
+            If the file cannot be written any further.
         """
         index = None if index is None else _index("index", index)
         content = plain(f"event {kind!r}", {"kind": str(kind), "index": index, "detail": detail})
@@ -312,7 +313,7 @@ class RecordWriter:
         Raises
         ------
         DataError
-            Where that could not be written; the samples before it are whole.
+            If that could not be written; the samples before it are whole.
         """
         if not self._closed:
             self._filing.put(End(str(outcome), taken or 0))
@@ -338,12 +339,11 @@ class RecordWriter:
 
 
 def _index(what: str, value: object) -> int:
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not whole or not 0 <= value <= format.EXACT:  # type: ignore[operator]
+    if not is_whole(value) or not 0 <= value <= format.EXACT:
         raise DataError(
             name=what, expected="the number of a sample, 0 or more", received=repr(value)
         )
-    return int(value)  # type: ignore[call-overload, no-any-return]
+    return int(value)
 
 
 def save_columns(
@@ -362,13 +362,13 @@ def save_columns(
     Raises
     ------
     DataError
-        Where columns do not match the header or the file cannot be written.
+        If columns do not match the header or the file cannot be written.
     """
     with replacing(Path(path)) as temporary, RecordWriter(temporary, header) as writer:
         writer.samples(0, columns)
 
 
-# --- A recording with one message a sample: what plotting programs draw as curves without more ado
+# --- A recording with one message per sample, as plotting programs need it ------------------------
 
 
 CHUNK_SAMPLES, CHUNK_BYTES = 500, 1 << 20
@@ -386,7 +386,7 @@ def save_curves(
     Raises
     ------
     DataError
-        Where the file cannot be written.
+        If the file cannot be written.
     SettingError
         For compression without zstandard.
     """
@@ -431,17 +431,15 @@ def _samples(recording: RecordedFile) -> Iterator[Message]:
     gaps = iter((*recording.gaps, (len(recording), 0)))
     begin = 0
     for first, count in gaps:
-        for k, row in zip(range(begin, first), _rows(recording, begin, first), strict=True):
+        columns = [
+            format.numbers(n, np.array(c[begin:first])) for n, c in recording.columns.items()
+        ]
+        for k, *row in zip(range(begin, first), *columns, strict=True):
             at = header.time_ns(k)
             own = {"index": k, "t": round(k * header.Ts, 9)}
             data = format.dumps({**own, **dict(zip(recording.columns, row, strict=True))})
             yield Message(Topic.SAMPLES, at, at, data)
         begin = first + count
-
-
-def _rows(recording: RecordedFile, begin: int, end: int) -> Iterable[tuple[Any, ...]]:
-    columns = [format.numbers(n, np.array(c[begin:end])) for n, c in recording.columns.items()]
-    return zip(*columns, strict=True)
 
 
 def _account(recording: RecordedFile) -> dict[str, Any]:
@@ -455,7 +453,7 @@ def _account(recording: RecordedFile) -> dict[str, Any]:
     }
 
 
-# --- A recording -> CSV, Parquet, .mat, .npz, or MCAP with one message a sample -------------------
+# --- A recording -> CSV, Parquet, .mat, .npz, or MCAP with one message per sample -----------------
 
 
 def _is_earlier(out: Path, recording: RecordedFile) -> bool:
@@ -502,9 +500,9 @@ def export(
     Raises
     ------
     DataError
-        Where the recording cannot be read or the other file cannot be written.
+        If the recording cannot be read or the other file cannot be written.
     SettingError
-        Where the extension is unknown or its package is not installed, `out` is the recording
+        If the extension is unknown or its package is not installed, `out` is the recording
         itself or another one that cannot be made again, or another format is to be compressed.
     """
     if compress and Path(out).suffix.lower() != ENDING:
@@ -515,7 +513,7 @@ def export(
     recording = read_recording(path)
     if Path(out).exists() and Path(out).samefile(path):
         raise SettingError(
-            name=str(out), expected="another file than the recording, which cannot be had again",
+            name=str(out), expected="another file than the recording, which cannot be made again",
             received="the same", remedy="choose another name",
         )  # fmt: skip
     require_replaceable(out, overwrite=overwrite or _is_earlier(Path(out), recording))

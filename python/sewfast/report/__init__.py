@@ -1,7 +1,7 @@
 """The report: one self-contained HTML page from the artefacts of an experiment.
 
-Read in this order: `artefacts` (what a folder holds), `pictures`, `page`, `commissioned` (the page
-of a commissioning).
+Read in this order: `artefacts` (the files of a folder), `pictures`, `page`, `commissioned` (the
+page of a commissioning).
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ __all__ = ["report"]
 
 
 def report(folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` into a result folder, from what lies there; nothing is computed anew.
+    """Write `report.html` into a result folder, from its files; nothing is computed again.
 
     Parameters
     ----------
     folder : path
-        What `sewfast demo --out DIR` or `sewfast commission --out DIR` left: see
+        A folder of `sewfast demo --out DIR` or `sewfast commission --out DIR`: see
         docs/CONVENTIONS.md for the layouts.
 
     Returns
     -------
     Path
-        The page: one HTML file that loads nothing, its one script named by its hash; an existing
-        one is replaced.
+        The page: one HTML file that loads nothing, with one script that its policy allows by hash;
+        an existing one is replaced.
 
     Raises
     ------
     DataError, ModelFileError
-        Where the folder holds no results, or a file in it is missing or damaged; it is named.
+        If the folder has no results, or a file in it is missing or damaged; the error names it.
     SettingError
-        Where matplotlib or Jinja2 is not installed.
+        If matplotlib or Jinja2 is not installed.
     """
     plotting.require()
     target = Path(folder) / "report.html"

@@ -1,4 +1,4 @@
-"""`Artefacts`: what an experiment left in its result folder, read and checked."""
+"""`Artefacts`: the files of an experiment's result folder, read and checked."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RECORDINGS = (
     "step", "chirp_lo_hi", "chirp_hi_lo", "random", "saturating", "saturating_2", "closed_loop",
 )  # fmt: skip
 SCORED = ("chirp_lo_hi", "chirp_hi_lo", "random", "saturating")
-"""Records in `results.json`; `saturating` is the second saturating record, never trained on."""
+"""Records in `results.json`; `saturating` is the second saturating one, not used for training."""
 MODELS = ("paper", "neural_oe", "oe", "oe_all", "arx", "arx_raw")
 REFERENCES = ("trapezoid", "chirp_hi_lo", "chirp_lo_hi", "random")
 PLANTS = ("model", "machine")
@@ -39,33 +39,33 @@ _RUN = ("t", "r", "u", "y", "feedback")
 
 
 def drawing_file(name: str) -> str:
-    """Where in the folder a figure of the report card lies."""
+    """Path in the folder of a figure of the report card."""
     return f"check/{name}.svg"
 
 
 def recording_file(record: str) -> str:
-    """Where in the folder a recording lies."""
+    """Path in the folder of a recording."""
     return f"recordings/{record}.csv"
 
 
 def prediction_file(record: str) -> str:
-    """Where in the folder the models' predictions of a scored record lie."""
+    """Path in the folder of the models' predictions of a scored record."""
     return f"predictions/{record}.npz"
 
 
 def run_file(reference: str, plant: str) -> str:
-    """Where in the folder a closed loop lies."""
+    """Path in the folder of a closed loop."""
     return f"runs/{reference}_{plant}.npz"
 
 
 def record_of(scored: str) -> str:
-    """The recording that a scored record's name stands for."""
+    """The recording of a scored record."""
     return "saturating_2" if scored == "saturating" else scored
 
 
 @dataclass(frozen=True, eq=False)
 class Artefacts:
-    """Everything that the report shows.
+    """The content of the report.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Artefacts:
     runs : mapping of (reference, plant) to columns
         t [s], r [RPM], u [V], y (true speed) [RPM], feedback [RPM].
     drawn : mapping of name to inline SVG
-        Figures of the report card; none in results of before there was one.
+        Figures of the report card; empty for older results.
     """
 
     folder: Path
@@ -94,7 +94,7 @@ class Artefacts:
         Raises
         ------
         ModelFileError
-            Where it is missing.
+            If it is missing.
         """
         found: Any = self.results
         for key in path.split("."):
@@ -107,7 +107,7 @@ class Artefacts:
         return found
 
     def number(self, path: str) -> float | None:
-        """One number of `results.json` by its dotted path; None where it is undefined there."""
+        """One number of `results.json` by its dotted path; None if it is null there."""
         found = self.value(path)
         if found is None:
             return None
@@ -125,9 +125,9 @@ def load(folder: str | os.PathLike[str]) -> Artefacts:
     Raises
     ------
     DataError
-        Where the folder is none or holds no results, or a recording or run is damaged.
+        If there is no such folder or it has no results, or a recording or run is damaged.
     ModelFileError
-        Where `results.json` is damaged or of another version.
+        If `results.json` is damaged or has another version.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -159,19 +159,19 @@ def load(folder: str | os.PathLike[str]) -> Artefacts:
 
 
 def _drawings(results: Mapping[str, Any]) -> list[str]:
-    """The report card's figures that the results speak of."""
+    """The report card's figures that the results name."""
     check = results.get("check")
     named = check.get("figures", []) if isinstance(check, Mapping) else []
     return [name for name in DRAWINGS if isinstance(named, list) and name in named]
 
 
 def drawing(path: Path) -> str:
-    """An SVG that is nothing but a drawing.
+    """An SVG without active content.
 
     Raises
     ------
     DataError
-        Where it cannot be read, or is something else.
+        If it cannot be read, or is anything else.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -218,7 +218,7 @@ def _columns(folder: Path, name: str, needed: tuple[str, ...] | list[str]) -> Co
     return columns
 
 
-# --- What models, records and references are called on the page -----------------------------------
+# --- Names of models, records and references on the page ------------------------------------------
 
 
 MODEL = {

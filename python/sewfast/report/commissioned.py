@@ -1,4 +1,4 @@
-"""The page of a commissioning, from its folder only."""
+"""The page of a commissioning, from the files of its folder alone."""
 
 from __future__ import annotations
 
@@ -32,31 +32,31 @@ WHAT = {
     "tuning": "gains of least cost on all networks, with encoder, filter, gain spread and delay",
     "verification": "prediction, then the machine",
 }
-"""Of each stage, for its table."""
+"""Descriptions of the stages."""
 
 
 def run_file(reference: str, kind: str) -> str:
-    """Where in the folder a closed loop lies; `kind` is predicted or measured."""
+    """Path in the folder of a closed loop; `kind` is predicted or measured."""
     return f"runs/{file_name(reference)}_{kind}.npz"
 
 
 def file_name(reference: str) -> str:
-    """What a reference of any name is called in a folder."""
+    """A file name for a reference of any name."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in reference)
 
 
 def is_commissioning(folder: Path) -> bool:
-    """Whether a folder was left by a commissioning."""
+    """Whether it is the folder of a commissioning."""
     return (folder / NUMBERS).is_file()
 
 
 def context(folder: Path) -> dict[str, Any]:
-    """What the template shows.
+    """The values for the template.
 
     Raises
     ------
     DataError, ModelFileError
-        Where a file is missing or damaged.
+        If a file is missing or damaged.
     """
     found = storage.read(folder / NUMBERS, FORMAT, {VERSION})
     try:
@@ -108,7 +108,7 @@ def _gains(found: Mapping[str, Any]) -> Table:
 
 
 def _met(found: Mapping[str, Any]) -> Table | None:
-    """How the gains meet what was required besides the cost."""
+    """How the gains meet the requirements besides the cost."""
     met = found.get("met")
     if not met or not (met["Ms"] or met["load"]):
         return None
@@ -128,7 +128,7 @@ def _met(found: Mapping[str, Any]) -> Table | None:
 
 
 def _opinion(found: Mapping[str, Any]) -> Table | None:
-    """What gains of models and linear rival cost on either; none in folders of before."""
+    """Costs of the gains of models and linear rival on either; None for older folders."""
     opinion = found.get("second_opinion")
     if not opinion:
         return None
@@ -152,7 +152,7 @@ def _judged(name: str, judged: Mapping[str, Any]) -> Table:
 
 
 def _predicted_and_measured(found: Mapping[str, Any]) -> Table | None:
-    """Margins of the loop at work and as predicted; none for a machine without a resonance."""
+    """Measured and predicted margins of the loop; None for a machine without a resonance."""
     margins = found.get("margins")
     if not margins:
         return None
@@ -179,7 +179,7 @@ def _predicted_and_measured(found: Mapping[str, Any]) -> Table | None:
 
 
 def _response(folder: Path) -> Picture | None:
-    """The frequency response from which the margins were read."""
+    """The frequency response of the measured margins."""
     if not (folder / RESPONSE).is_file():
         return None
     figure = load_response(folder / RESPONSE).drawing().figure()
@@ -244,7 +244,7 @@ def _columns(path: Path) -> Mapping[str, Any]:
     return {n: table[n] for n in _RUN}
 
 
-# --- The section of a page on an analysis that lies in its folder (`Analysis.save`) ---------------
+# --- The section on an analysis in the folder (`Analysis.save`) -----------------------------------
 
 
 _CAPTIONS = {
@@ -272,12 +272,12 @@ _CAPTIONS = {
 
 
 def section(folder: Path) -> dict[str, Any] | None:
-    """What the template `analysis.html` shows; None where the folder holds no analysis.
+    """The values for the template `analysis.html`; None if the folder has no analysis.
 
     Raises
     ------
     DataError, ModelFileError
-        Where a file is missing or damaged.
+        If a file is missing or damaged.
     """
     path = folder / analyses.NUMBERS
     if not path.is_file():
@@ -358,18 +358,18 @@ def _score_cells(s: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
-# --- The section of a page on a motor that lies in its folder (`Motor.save`) ----------------------
+# --- The section on a motor in the folder (`Motor.save`) ------------------------------------------
 
 MOTOR = "motor.json"
 
 
 def motor_section(folder: Path) -> dict[str, Any] | None:
-    """What the template `motor.html` shows; None where the folder holds no motor.
+    """The values for the template `motor.html`; None if the folder has no motor.
 
     Raises
     ------
     ModelFileError
-        Where its file is damaged.
+        If its file is damaged.
     """
     path = folder / MOTOR
     if not path.is_file():

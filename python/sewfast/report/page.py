@@ -1,4 +1,4 @@
-"""The page: tables of numbers, figures and text in one HTML document."""
+"""The page of the experiment: goals, tables, figures and text in one HTML document."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from . import artefacts as labels
 from . import commissioned, pictures
 from .artefacts import MODELS, PLANTS, REFERENCES, SCORED, Artefacts
 
-# --- The goals of the experiment, each with what was reached: verdicts follow from the numbers ----
+# --- The goals of the experiment, with the values reached and verdicts from the numbers -----------
 
 
 _TESTS = ("chirp_hi_lo", "random")
@@ -29,9 +29,9 @@ class Goal:
     Attributes
     ----------
     demand, reached : str
-        What is required and what was measured, in words.
+        The requirement and the measured value, in words.
     met : bool or None
-        None where the number is undefined.
+        None if the value is undefined.
     """
 
     demand: str
@@ -40,7 +40,7 @@ class Goal:
 
     @property
     def verdict(self) -> str:
-        """One word or two."""
+        """The verdict in one or two words."""
         return {True: "reached", False: "not reached", None: "undefined"}[self.met]
 
 
@@ -62,7 +62,7 @@ def goals(artefacts: Artefacts) -> tuple[Goal, ...]:
 
 
 def verdict(a: Artefacts) -> str:
-    """In one sentence, whether the machine did what had been predicted."""
+    """One sentence on whether the machine behaved as predicted."""
     path = "control.trapezoid"
     met = all(goal.met for goal in (_rise(a), _overshoot(a), _alike(a)))
     return (
@@ -208,7 +208,7 @@ def _duration(a: Artefacts) -> Goal:
 
 
 def identification_tables(artefacts: Artefacts) -> list[Table]:
-    """Free run and one step: error and fit per model and record."""
+    """Error and fit of free run and one step, per model and record."""
     return [
         _scores(
             artefacts, "simulation",
@@ -259,7 +259,7 @@ def _trained_on(artefacts: Artefacts, model: str) -> str:
 
 
 def speed_table(artefacts: Artefacts) -> Table:
-    """Speed from counts: error and floor of J per method."""
+    """Error and floor of J of each method of computing the speed from counts."""
     methods = {
         "difference": "difference of counts over 1 ms",
         "savgol": "Savitzky-Golay",
@@ -282,7 +282,7 @@ def speed_table(artefacts: Artefacts) -> Table:
 
 
 def control_table(artefacts: Artefacts) -> Table:
-    """Closed loops of the tuned controller: numbers per reference and plant."""
+    """Figures of the tuned controller's loops per reference and plant."""
     rows = []
     for r in REFERENCES:
         for p in PLANTS:
@@ -339,7 +339,7 @@ def gains_table(artefacts: Artefacts) -> Table:
 
 
 def readings_table(artefacts: Artefacts) -> Table:
-    """What the paper's gains do on the plant of Eq. 8, by how they are read."""
+    """The loops of the paper's gains on the plant of Eq. 8, for each reading of the gains."""
     names = {
         "per_sample_rpm": "per sample, error in RPM",
         "continuous_rpm": "continuous time, error in RPM",
@@ -366,7 +366,7 @@ def readings_table(artefacts: Artefacts) -> Table:
     )
 
 
-# --- The page: figures, tables and text of a result folder in one HTML document -------------------
+# --- The page -------------------------------------------------------------------------------------
 
 
 def render(artefacts: Artefacts) -> str:
@@ -375,10 +375,10 @@ def render(artefacts: Artefacts) -> str:
 
 
 def fill(template: str, context: Mapping[str, Any]) -> str:
-    """A template with values in it, and the one script of its page, which zooms into pictures.
+    """A template filled with values and with the page's one script, which zooms into pictures.
 
-    The page's policy names that script by its hash: whatever else may get onto the page does not
-    run, and nothing is loaded from anywhere.
+    The page's policy allows that script by its hash: no other script on the page runs, and nothing
+    is loaded from anywhere.
     """
     from jinja2 import Environment, FunctionLoader, StrictUndefined
     from markupsafe import Markup
@@ -415,17 +415,15 @@ def _context(artefacts: Artefacts) -> dict[str, Any]:
         "readings": readings_table(artefacts),
         "number": artefacts.number,
         "value": artefacts.value,
-        # results of before the link have none
+        # older results lack link, check and commissioning
         "link": artefacts.results.get("link"),
-        # nor have those of before the report card
         "check": artefacts.results.get("check"),
         "analysed": commissioned.section(artefacts.folder)
         or commissioned.section(artefacts.folder / "commissioning"),
         "motor": commissioned.motor_section(artefacts.folder),
-        # nor those of before commissioning
         "commissioning": artefacts.results.get("commissioning"),
     }
-    # drawn last: where a number is missing nothing is drawn in vain
+    # draw last, as a missing number raises before
     with style():
         return numbers | {
             "opening": pictures.opening_picture(artefacts),

@@ -1,4 +1,4 @@
-"""The figures of the report, each with its paper's number and the numbers that belong to it."""
+"""The figures of the report, each with its number in the paper and a table of its values."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def recorded_pictures(artefacts: Artefacts) -> list[Picture]:
 
 
 def scaled_pictures(artefacts: Artefacts) -> dict[str, Picture]:
-    """Fig. 7, the training data, and Fig. 12, the random test data, as the network sees them."""
+    """Fig. 7, the training data, and Fig. 12, the random test data, scaled for the network."""
     return {
         "7": _scaled(artefacts.recordings["chirp_lo_hi"], "7", "Training data, scaled"),
         "12": _scaled(artefacts.recordings["random"], "12", "Random test data, scaled"),
@@ -161,7 +161,7 @@ _BESIDE = ("paper", "neural_oe", "oe")
 
 @dataclass(frozen=True)
 class _Case:
-    """A record, the paper's numbers of its two figures and what it is for."""
+    """A record, the paper's numbers of its two figures and its purpose."""
 
     record: str
     free_run: str
@@ -178,7 +178,7 @@ _CASES = (
 
 
 def prediction_pictures(artefacts: Artefacts) -> dict[str, list[Picture]]:
-    """Per scored record: the networks in free run, then their errors as series and histogram."""
+    """For each scored record: the networks in free run and their errors, over time and binned."""
     return {case.record: [_free_run(artefacts, case), _errors(artefacts, case)] for case in _CASES}
 
 
@@ -272,7 +272,7 @@ def _histogram(ax: Any, error: Float, model: str, limit: float) -> None:
 
 
 def _worst(t: Float, error: Float) -> Any:
-    """The window with the largest error inside."""
+    """The window around the largest error."""
     width = min(_ZOOM, float(t[-1] - t[0]) / 3)
     start = float(t[int(np.argmax(np.abs(error)))]) - 0.5 * width
     start = min(max(start, float(t[0])), float(t[-1]) - width)
@@ -298,7 +298,7 @@ def _names(models: tuple[str, ...]) -> str:
     return " and ".join(labels.MODEL[m] for m in models)
 
 
-# --- The report card's figures: drawn when the card was made, read as they are --------------------
+# --- The report card's figures, read from their files ---------------------------------------------
 
 
 CAPTIONS = {
@@ -333,11 +333,11 @@ CAPTIONS = {
         "Outside the green area no training sample was like it.",
     ),
 }
-"""Title, what a reader sees, what to look at."""
+"""Title, description and caption."""
 
 
 def trust_pictures(artefacts: Artefacts) -> list[Picture]:
-    """The figures of the report card that the folder holds."""
+    """The figures of the report card in the folder."""
     letters = iter("CDEFG")
     return [
         Picture(f"trust-{name}", f"Check {next(letters)}", *CAPTIONS[name], svg=svg)
@@ -345,7 +345,7 @@ def trust_pictures(artefacts: Artefacts) -> list[Picture]:
     ]
 
 
-# --- Closed loops: the paper's Fig. 19 to 22, and what the paper's own gains do -------------------
+# --- Closed loops: the paper's Fig. 19 to 22, and the loops of the paper's own gains --------------
 
 
 _LOOPS = (("19", "trapezoid"), ("20", "chirp_hi_lo"), ("21", "chirp_lo_hi"), ("22", "random"))
@@ -363,7 +363,7 @@ _MAGNIFIED = 0.4
 
 
 def opening_picture(artefacts: Artefacts) -> Picture:
-    """What it is all for: the trapezoid as predicted and as measured, and its rise magnified."""
+    """The main result: the trapezoid as predicted and as measured, and its rise magnified."""
     names = {"model": "predicted on the model", "machine": "measured on the machine"}
     traces = [
         Trace.of(artefacts.runs["trapezoid", plant], plant, label) for plant, label in names.items()
@@ -458,7 +458,7 @@ def _rise(trace: Trace) -> tuple[float, float]:
 
 
 def _magnify(ax: Axes, traces: list[Trace], window: tuple[float, float]) -> None:
-    """The rise, which lasts a few per cent of the record."""
+    """Draw the rise, which is only a small part of the record."""
     for s in reversed(traces):
         inside = (s.t >= window[0]) & (s.t <= window[1])
         draw(ax, s.t[inside], s.y[inside], s.look)

@@ -1,12 +1,12 @@
-"""The process that owns the port: it runs what a page asks for, and stops when nobody answers.
+"""The process that owns the port: it runs a page's requests, and stops when the page is silent.
 
-The server speaks to it by lines of JSON and hears frames (`session.packed`). It is a process of its
-own so that no work of the server can hold up the heartbeats of a drive. The motor stops where
+The server sends lines of JSON and receives frames (`session.packed`). It is a separate process,
+so that no work of the server can hold up the heartbeats of a drive. The motor stops if
 
-- a page asks for it, at once, whatever else is under way;
-- the page that has armed the drive has not answered for `LEASE`;
-- the pipe of the server ends: it was closed or killed;
-- this process dies or hangs: then the drive's own watchdog does it.
+- a page asks for it: at once, whatever else is running;
+- the page that armed the drive has not answered for `LEASE`;
+- the pipe from the server ends: the server was closed or killed;
+- this process dies or hangs: then the drive's own watchdog stops it.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ if TYPE_CHECKING:
     from ..link.plan import Outcome, Plan, Sink
 
 LEASE = 0.5
-"""Seconds without an answer of the page after which an armed drive is stopped."""
+"""Time without an answer of the page after which an armed drive is stopped [s]."""
 
 FRAME = 1.0 / 60.0
-"""Seconds between two batches of live samples."""
+"""Time between two batches of live samples [s]."""
 
 LOOK = 0.2
-"""Seconds between two questions to a drive at rest."""
+"""Time between two status requests to a drive at rest [s]."""
 
 LAST_WORDS = 10.0
-"""Seconds that a run which was stopped has to close its file, where the server is gone."""
+"""Time for a stopped run to close its file after the server has ended [s]."""
 
 STOPPED = "stopped; what was recorded until then is kept"
 
@@ -50,14 +50,14 @@ Send = Callable[..., None]
 
 
 class SeenDrive(Drive):
-    """A drive of which every run needs a permit, can be stopped, and is looked at as it runs."""
+    """A drive that runs only while armed, and shows its running samples to the page."""
 
-    #: When a stop was confirmed last, before the motor is at rest.
+    #: Time of the last confirmed stop, before the motor is at rest.
     off_at = -math.inf
     bench: Bench
 
     def stream(self, plan: Plan, sink: Sink, *, cancel: threading.Event | None = None) -> Outcome:
-        """Run a plan where the drive is armed."""
+        """Run a plan if the drive is armed."""
         bench = self.bench
         bench.require_armed()
         columns = {c.name: c.unit for c in self.layout(plan).channels}
@@ -76,7 +76,7 @@ class SeenDrive(Drive):
 
 
 class _Both:
-    """A sink beside the feed of the page."""
+    """Passes samples to the page's feed and to a sink."""
 
     def __init__(self, sink: Sink, feed: Feed) -> None:
         self._sink, self._feed = sink, feed
@@ -90,13 +90,13 @@ class _Both:
 
 
 class Bench:
-    """What the process knows: the drive, whether it is armed, and who has answered last.
+    """The state of the process: the drive, whether it is armed, the last answer of the page.
 
     Parameters
     ----------
     send : callable(message, curves=None)
-        Hands a message to the server. It may block, so that nothing calls it while the motor
-        turns but the thread that shows samples.
+        Sends a message to the server. It can block, so while the motor turns only the thread that
+        shows samples calls it.
     """
 
     def __init__(self, send: Send) -> None:
@@ -112,31 +112,26 @@ class Bench:
         self._shown = self._runs = 0
         self._showing = threading.Lock()
 
-    # --- Who may move it --------------------------------------------------------------------------
+    # --- Arming and stopping ----------------------------------------------------------------------
 
     def require_armed(self) -> None:
-        """Refuse a run that nobody has allowed.
-
-        Raises
-        ------
-        SettingError
-        """
+        """Raise `SettingError` unless the drive is armed."""
         if not self._armed:
             raise SettingError("expected an armed drive, it is not; press Arm first")
 
     def alive(self, age: float) -> None:
-        """The page has answered what it was sent `age` seconds ago."""
+        """Note that the page has answered a message sent `age` seconds ago."""
         self._alive = max(self._alive, time.monotonic() - age)
 
     def watch(self) -> None:
-        """Stop an armed drive whose page has fallen silent; for a thread of its own."""
+        """Stop an armed drive whose page has fallen silent; runs in its own thread."""
         while True:
             time.sleep(0.02)
             if self._armed and time.monotonic() - self._alive > LEASE:
                 self.stop(f"the page did not answer for {LEASE * 1e3:.0f} ms")
 
     def stop(self, why: str) -> None:
-        """Command 0 and drive disabled, before anything is said about it."""
+        """Set command 0 and disable the drive first, then report it."""
         began = time.monotonic()
         was = self._armed or bool(self.job)
         self._armed = False
@@ -146,7 +141,7 @@ class Bench:
         while drive is not None:
             try:
                 drive.stop()
-            except SettingError:  # the other thread has begun a question meanwhile
+            except SettingError:  # the other thread is using the connection
                 time.sleep(0.002)
                 continue
             except LinkError as e:
@@ -159,10 +154,10 @@ class Bench:
             "off_ms": 1e3 * (off - began), "rest_ms": 1e3 * (now - began),
         })  # fmt: skip
 
-    # --- What the server says ---------------------------------------------------------------------
+    # --- Messages of the server -------------------------------------------------------------------
 
     def listen(self, lines: BinaryIO) -> None:
-        """Take the server's messages until its pipe ends; for a thread of its own."""
+        """Take the server's messages until its pipe ends; runs in its own thread."""
         for line in lines:
             asked = json.loads(line)
             name = asked["do"]
@@ -180,7 +175,7 @@ class Bench:
         os._exit(1)
 
     def serve(self) -> None:
-        """Do one thing after the other until the server's pipe ends."""
+        """Carry out the requests one after the other until the server's pipe ends."""
         try:
             while True:
                 try:
@@ -200,7 +195,7 @@ class Bench:
         try:
             found = {"found": getattr(self, f"_do_{name}")(**asked)}
         except Exception as e:
-            found = {"error": said(e)}
+            found = {"error": error_text(e)}
         self._look()
         self.send({"answer": number, **found})
 
@@ -247,12 +242,12 @@ class Bench:
         return self.drive
 
     def _look(self) -> None:
-        """Ask the drive how it is, and say it."""
-        drive, told = self.drive, {"connected": False, "armed": False, "job": self.job}
+        """Ask the drive for its status and send it."""
+        drive, state = self.drive, {"connected": False, "armed": False, "job": self.job}
         if drive is not None:
             try:
                 status, limits = drive.status(), drive.limits()
-                told = {
+                state = {
                     "connected": True, "armed": self._armed, "job": self.job,
                     "name": drive.identity.name, "port": drive._link.port.url,
                     "state": status.state, "reason": status.reason, "speed": status.speed_rpm,
@@ -261,23 +256,23 @@ class Bench:
                     "received": status.received, "dropped": status.dropped,
                 }  # fmt: skip
             except SettingError:
-                # a stop is under way in its own thread, and says what came of it
+                # another thread is stopping the drive, and reports the result
                 return
             except LinkError as e:
                 self._armed, self.drive = False, None
                 drive.close()
-                told["error"] = str(e)
-        self.send({"event": "drive", **told})
+                state["error"] = str(e)
+        self.send({"event": "drive", **state})
 
-    # --- What moves it ----------------------------------------------------------------------------
+    # --- Runs -------------------------------------------------------------------------------------
 
     def _do_work(self, kind: str, folder: str, **asked: Any) -> None:
-        """Begin a record, run or commissioning; its end is an event."""
+        """Carry out a record, run or commissioning; its end is an event."""
         from . import driving
 
         self.cancel = threading.Event()
         try:
-            # after the event is made: a stop from here on is seen by one or the other
+            # check after creating the event: a stop from here on shows in one or the other
             self.require_armed()
             drive, self.job = self._connected(), kind
             self._look()
@@ -287,10 +282,10 @@ class Bench:
         except (KeyboardInterrupt, Interrupted):
             found = {"error": STOPPED}
         except Exception as e:
-            # what ends may meet the thread that stops at the port, and is refused
+            # the stopping thread may hold the port, so that the last request of a run is refused
             met = isinstance(e, SettingError) and self.cancel.is_set()
-            found = {"error": STOPPED if met else said(e)}
-            # a trip or a lost port is looked at by a person before anything moves again
+            found = {"error": STOPPED if met else error_text(e)}
+            # a person must look at a trip or a lost port before anything moves again
             self._armed = self._armed and not isinstance(e, LinkError)
         self.job = ""
         self.show()
@@ -298,28 +293,28 @@ class Bench:
         self.send({"event": "driven", "kind": kind, **found})
 
     def progress(self, done: int, total: int, stage: str) -> None:
-        """A stage of a commissioning."""
+        """Report a stage of a commissioning."""
         self.send({
             "event": "progress", "of": "driven", "done": done, "total": total, "best": stage
         })  # fmt: skip
 
     def wait_for_go(self) -> None:
-        """Until a person says so, or the drive is stopped."""
+        """Wait until a person lets it go on, or the drive is stopped."""
         self._go.clear()
         while not (self._go.wait(0.1) or self.cancel.is_set()):
             pass
 
-    # --- What is seen of it -----------------------------------------------------------------------
+    # --- Live samples -----------------------------------------------------------------------------
 
     def begin(self, feed: Feed) -> None:
-        """Samples of another run follow."""
+        """Announce the samples of another run."""
         with self._showing:
             self._feed, self._shown = feed, 0
             self._runs += 1
         self.send({"event": "begin", "run": self._runs, **feed.description})
 
     def show(self) -> None:
-        """Hand over what has come since the last time."""
+        """Send the samples since the last call."""
         with self._showing:
             feed = self._feed
             if feed is None:
@@ -330,15 +325,15 @@ class Bench:
                 self._shown = stop
 
     def show_always(self) -> None:
-        """`show` 60 times a second; for a thread of its own."""
+        """`show` 60 times a second; runs in its own thread."""
         with suppress(OSError):
             while True:
                 time.sleep(FRAME)
                 self.show()
 
 
-def said(error: Exception) -> str:
-    """What the page is told: a refusal in its own words, a fault with its kind."""
+def error_text(error: Exception) -> str:
+    """The text of an error for the page: a refusal as it is, a fault with its type."""
     if isinstance(error, (ValueError, RecursionError, SewfastError, OSError)):
         return str(error)
     return f"a fault in sewfast: {type(error).__name__}: {error}"
@@ -348,14 +343,14 @@ def main() -> None:
     """Serve the process at the other end of standard input and output."""
     from .session import packed
 
-    # whatever else is printed must not get between two frames
+    # keep other output out of the stream of frames
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     sending = threading.Lock()
 
     def send(message: dict[str, Any], curves: Mapping[str, FloatArray] | None = None) -> None:
         body = packed(message, curves or {})
-        with sending, suppress(BrokenPipeError):  # the server is gone, as `listen` hears too
+        with sending, suppress(BrokenPipeError):  # the server has ended, as `listen` notices too
             out.write(struct.pack("<I", len(body)) + body)
             out.flush()
 

@@ -1,4 +1,4 @@
-"""A commissioning as a page asks for it, and what is shown of one; curves to draw."""
+"""A page's request for a commissioning, its result for the page, and curves to draw."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ COLUMNS = 1200
 """Pairs of lowest and highest value in a drawn curve: about two a pixel of a wide window."""
 
 COMMISSIONED = "commissioned"
-"""Folder that a commissioning fills."""
+"""The folder of a commissioning."""
 
 
 @dataclass(frozen=True)
 class Commission:
-    """Which virtual machine to commission, and with what effort.
+    """The virtual machine to commission, and the effort.
 
     Parameters
     ----------
@@ -46,11 +46,12 @@ class Commission:
 
     @classmethod
     def parse(cls, asked: dict[str, Any]) -> Commission:
-        """From a message; what is out of range is refused.
+        """From a message.
 
         Raises
         ------
         SettingError
+            For a value out of range.
         """
         machine = asked.get("machine", "virtual")
         named = isinstance(machine, str) and re.fullmatch(r"virtual(:\d{1,9})?", machine)
@@ -66,7 +67,7 @@ class Commission:
         return cls(str(machine), **numbers)
 
     def python(self) -> str:
-        """A script that does it again, run in the project folder."""
+        """A script that repeats it, to run in the project folder."""
         call = f"machine, seed={self.seed}, members={self.members}, evaluations={self.evaluations}"
         return (
             f"import sewfast\n\nmachine = sewfast.VirtualMachine.from_name({self.machine!r})\n"
@@ -89,14 +90,14 @@ def carry_out(
     between: Callable[[str, Commissioning], object] | None = None,
     writing: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> dict[str, Any]:
-    """Commission a machine or a drive into the folder `commissioned`, and say what came of it.
+    """Commission a machine or a drive into the folder `commissioned`; return its result.
 
     Raises
     ------
     Refusal
-        Where the evidence is not good enough.
+        If the evidence is not good enough.
     SettingError
-        For a folder of that name with files of somebody else's.
+        For a folder of that name with other files.
     """
     from ..commissioning import commission
     from ..commissioning.result import require_own
@@ -124,7 +125,7 @@ def carry_out(
 
 
 def drawn(comparisons: Iterable[Comparison]) -> list[dict[str, Any]]:
-    """Tracking errors along each reference, as measured where that was done and as predicted."""
+    """Tracking errors along each reference, predicted and, if it has run, measured."""
     return [
         {
             "name": c.reference,
@@ -144,12 +145,7 @@ def require(ok: bool, name: str, expected: str, received: object) -> None:
 
 
 def require_writable(folder: Path) -> None:
-    """Refuse work of minutes whose result could not be kept.
-
-    Raises
-    ------
-    SettingError
-    """
+    """Raise `SettingError` before work of minutes whose result could not be saved."""
     if not os.access(folder, os.W_OK | os.X_OK):
         raise SettingError(
             name=folder.name, expected="a folder that can be written to", received="a closed one",

@@ -1,4 +1,4 @@
-"""What a page does with a drive: a record, a run, a commissioning; each can be copied."""
+"""The steps of a page on a drive: record, run and commission, with copies for a script."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LIMITS = {
 """Limits by their names in Python and on the command line."""
 
 REFERENCE = "reference.csv"
-"""What a copied command runs along."""
+"""The file of the reference in copied commands."""
 
 SOCKET = "drive.port"
 """Name of a virtual drive's port in copied commands."""
@@ -33,17 +33,17 @@ SOCKET = "drive.port"
 
 @dataclass(frozen=True)
 class Place:
-    """A drive as it was connected: what a copy has to open before it does anything.
+    """The connection of a drive, which a copy opens first.
 
     Parameters
     ----------
     port : str
-        As the page gave it: a serial port, ``socket://HOST:PORT``, or ``virtual[:SEED]``.
+        The page's address: a serial port, ``socket://HOST:PORT``, or ``virtual[:SEED]``.
     baud : int
     watchdog : float or None
-        Seconds.
+        [s]
     limits : mapping
-        By their names in Python; infinite where there is none.
+        By their names in Python; infinite for no limit.
     """
 
     port: str
@@ -56,7 +56,7 @@ class Place:
         return re.fullmatch(r"virtual(:\d{1,9})?", self.port) is not None
 
     def python(self, *body: str) -> str:
-        """A script that opens the drive, sets its limits and does what `body` says."""
+        """A script that opens the drive, sets its limits and runs the lines of `body`."""
         options = "" if self.baud == 115_200 else f", baud={self.baud}"
         options += "" if self.watchdog is None else f", watchdog={self.watchdog!r}"
         if self.is_virtual:
@@ -94,7 +94,7 @@ class Place:
 def record(
     drive: SeenDrive, folder: Path, bench: Bench, signal: str, seed: int, scale: float, file: str
 ) -> dict[str, Any]:
-    """Play a named excitation; written to a file as it comes."""
+    """Record a named excitation into a file."""
     from .. import signals
     from ..control.machine import record
 
@@ -123,13 +123,13 @@ def commission(
     drive: SeenDrive, folder: Path, bench: Bench, seed: int, members: int, evaluations: int,
     go_on: bool,
 ) -> dict[str, Any]:  # fmt: skip
-    """From rest to a verified controller; before each stage a page may be asked to go on."""
+    """Commission a drive; with `go_on`, each stage waits for the page."""
 
     def between(following: str, so_far: Commissioning) -> None:
-        told: dict[str, Any] = {"event": "stage", "next": following, "waits": go_on}
+        event: dict[str, Any] = {"event": "stage", "next": following, "waits": go_on}
         if following == "references":
-            told["references"] = drawn(so_far.comparisons)
-        bench.send(told)
+            event["references"] = drawn(so_far.comparisons)
+        bench.send(event)
         if go_on:
             bench.wait_for_go()
 
@@ -140,7 +140,7 @@ def commission(
 
 
 def copies(kind: str, place: Place, asked: dict[str, Any]) -> dict[str, str]:
-    """The same work as a script and as commands, to be run in the project folder."""
+    """The same work as a script and as commands, to run in the project folder."""
     if kind == "record":
         signal, seed, scale, file = (asked[k] for k in ("signal", "seed", "scale", "file"))
         u = f"{scale!r} * sewfast.signals.excitation({signal!r}, {seed})"
@@ -153,7 +153,7 @@ def copies(kind: str, place: Place, asked: dict[str, Any]) -> dict[str, str]:
         load = f"controller = sewfast.load_controller({asked['controller']!r})"
         call = f"sewfast.run(controller, drive, {r}, name={reference!r}, file={file!r})"
         words = ["run", asked["controller"], f"--reference={REFERENCE}", "-o", file]
-        # the command line takes a reference as it is
+        # the command line does not scale a reference
         made = (
             f"import sewfast; r = {r}; t = [k / 1000 for k in range(len(r))]; "
             f"sewfast.write_table({REFERENCE!r}, {{'t': t, 'r': r}})"
@@ -171,7 +171,7 @@ def copies(kind: str, place: Place, asked: dict[str, Any]) -> dict[str, str]:
 
 
 def checked_recording(file: Any) -> str:
-    """The name of a recording to write, which says nothing about a folder.
+    """The plain name of a recording to write, without a folder.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""Long steps, each in a process of its own: a crash or an endless search leaves the server alone.
+"""Long steps, each in its own process: a crash or an endless search does not affect the server.
 
-The server sends the step and keeps the pipe open; its end, by a cancel or with the server, ends the
-work. Progress and the result come back by another pipe. Both carry pickles, which only these two
-processes write.
+The server sends the step and keeps the pipe open; the end of the pipe, by a cancel or with the
+server, ends the work. Progress and result come back by another pipe. Both carry pickles, which only
+these two processes write.
 """
 
 from __future__ import annotations
@@ -18,22 +18,29 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from ..errors import Interrupted, SettingError
-from .bench import said
+from .bench import error_text
+from .commissioning import COMMISSIONED, Commission, carry_out
+from .project import Project
+from .step import Step
+
+if TYPE_CHECKING:
+    from ..frequency import FrequencyResponse
+    from .search import Found, Search
 
 BETWEEN_REPORTS = 0.05
-"""Seconds between two messages of a step's progress."""
+"""Time between two messages of a step's progress [s]."""
 
 GRACE = 0.4
-"""Seconds that a cancelled step has to hand over its best so far, before its process is ended."""
+"""Time for a cancelled step to return its best result so far before its process is killed [s]."""
 
 LAST_WORDS = 5.0
-"""Seconds that a step has to end by itself where the server is gone."""
+"""Time for a step to end by itself after the server has ended [s]."""
 
 CANCELLED = "cancelled; nothing was written"
-LATE = "cancelled after its files had been written; they are whole"
+LATE = "cancelled after its files had been written; they are complete"
 
 _PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.studio.jobs import main; main()"
 
@@ -46,7 +53,7 @@ class Jobs:
     folder : Path
         The project.
     tell : callable(event)
-        Takes progress and results; called in a thread of its own.
+        Takes progress and results; called in its own thread.
     """
 
     def __init__(self, folder: Path, tell: Callable[[dict[str, Any]], None]) -> None:
@@ -60,7 +67,7 @@ class Jobs:
         self, event: str, step: str, *arguments: Any,
         finish: Callable[[Any], dict[str, Any]] | None = None,
     ) -> None:  # fmt: skip
-        """Begin a function of `work`; what it returns becomes an event.
+        """Start one of the `STEPS`; its result becomes an event.
 
         Parameters
         ----------
@@ -69,26 +76,26 @@ class Jobs:
         step : str
             Name of the function.
         *arguments
-            Of the function after the project and the report.
+            Arguments of the function after the project and the report.
         finish : callable, optional
-            Makes what pages hear of what the function returned.
+            Converts the function's result for the pages.
 
         Raises
         ------
         SettingError
-            Where another step is running.
+            If another step is running.
         """
         with self._lock:
             if self._ear is not None and self._ear.is_alive():
                 raise SettingError(
-                    expected="nothing else under way", received="a job that runs",
+                    expected="no other step running", received="a job that runs",
                     remedy="cancel it or wait for its end",
                 )  # fmt: skip
             self._cancelled = self._writes = self._wrote = False
             program = self._program = subprocess.Popen(
                 [sys.executable, "-c", _PROGRAM.format(path=sys.path)],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                # Ctrl-C is for the server, whose end is the end of this
+                # keep Ctrl-C for the server, whose end ends this process
                 start_new_session=True,
             )  # fmt: skip
             self._ear = threading.Thread(
@@ -96,12 +103,12 @@ class Jobs:
             )
             self._ear.start()
         assert program.stdin is not None
-        with suppress(OSError, ValueError):  # it has ended already, and the listener says so
+        with suppress(OSError, ValueError):  # it has ended already, which the listener reports
             program.stdin.write(pickle.dumps((self.folder, event, step, arguments)))
             program.stdin.flush()
 
     def cancel(self) -> None:
-        """End the step; within `GRACE` it may hand over what it has."""
+        """End the step; within `GRACE` it can return its best result so far."""
         with self._lock:
             program = self._program
             if program is None or self._cancelled:
@@ -114,7 +121,7 @@ class Jobs:
 
     def _end_soon(self, program: subprocess.Popen[bytes]) -> None:
         def end() -> None:
-            # files that are being written become whole first
+            # wait for files that are being written
             if self._writes and program.poll() is None:
                 self._end_soon(program)
             else:
@@ -164,8 +171,8 @@ class Jobs:
             try:
                 found = {"found": finish(found["found"])}
             except Exception as e:
-                found = {"error": said(e)}
-        # whoever hears of the end may begin the next step at once
+                found = {"error": error_text(e)}
+        # reset it first: the next step can start as soon as the event is sent
         self._ear = None
         self._tell({"event": event, **found})
 
@@ -177,7 +184,7 @@ class Report:
     ----------
     send : callable(kind, value)
     event : str
-        Of which step.
+        Name of the step.
     """
 
     def __init__(self, send: Callable[[str, Any], None], event: str) -> None:
@@ -199,7 +206,7 @@ class Report:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Nothing interrupts what is done inside, so that files are whole or not there."""
+        """Protect the writing of files from a cancel, so that they are complete or absent."""
         with self.lock:
             if self.cancelled.is_set():
                 raise KeyboardInterrupt
@@ -209,11 +216,9 @@ class Report:
 
 
 def main() -> None:
-    """Do the step that comes by standard input; end with that pipe."""
-    from . import work
-
+    """Run the step that arrives on standard input; end with that pipe."""
     asked: IO[bytes] = sys.stdin.buffer
-    # whatever else is printed must not get between two messages
+    # keep other output out of the stream of messages
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     sending = threading.Lock()
@@ -225,7 +230,7 @@ def main() -> None:
             out.flush()
 
     if hasattr(os, "nice"):
-        os.nice(5)  # a slider of the page goes ahead of a search
+        os.nice(5)  # a slider of the page has priority over a search
     folder, event, step, arguments = pickle.load(asked)
     report, done = Report(send, event), threading.Event()
 
@@ -241,12 +246,68 @@ def main() -> None:
 
     threading.Thread(target=watch, daemon=True).start()
     try:
-        result = ("found", getattr(work, step)(folder, report, *arguments))
-    except (KeyboardInterrupt, Interrupted):  # whoever passes it on makes one of the two of it
+        result = ("found", STEPS[step](folder, report, *arguments))
+    except (KeyboardInterrupt, Interrupted):  # the API may have converted one into the other
         result = ("error", CANCELLED)
     except Exception as e:
-        result = ("error", said(e))
+        result = ("error", error_text(e))
     done.set()
     with suppress(KeyboardInterrupt, OSError):
         send(*result)
-    os._exit(0)  # nothing is left to do, and threads of a search may still run
+    os._exit(0)  # do not wait for threads of a search that may still run
+
+
+# --- The steps, as calls of the public API --------------------------------------------------------
+
+
+def identify(folder: Path, report: Report, step: Step) -> dict[str, Any]:
+    """A model from a recording, written to `model.json`."""
+    return Project(folder).identify(step, report, report.writing)
+
+
+def bode(
+    folder: Path, report: Report, step: Step, reference: str | None, segment: int | None
+) -> tuple[FrequencyResponse, dict[str, Any], Any]:
+    """A measured response and its view for the page; fitting a shaft takes seconds."""
+    from .loops import shown_response
+
+    report(0, 2, "response")
+    response = Project(folder).bode(step, reference, segment)
+    report(1, 2, "shaft")
+    return response, *shown_response(response)
+
+
+def tune(
+    folder: Path, report: Report, model: str, controller: str | None, notches: Any,
+    values: dict[str, Any], search: Search,
+) -> Found:  # fmt: skip
+    """A search that starts from the present values."""
+    return Project(folder).tuning(model, controller, notches).search(values, search, report)
+
+
+def commission(folder: Path, report: Report, asked: Commission) -> dict[str, Any]:
+    """The commissioning of a virtual machine into the folder `commissioned`."""
+    from ..machine import VirtualMachine
+
+    machine = VirtualMachine.from_name(asked.machine)
+    return carry_out(asked, machine, folder, report, writing=report.writing)
+
+
+def write_report(folder: Path, report: Report) -> dict[str, Any]:
+    """The HTML report of a commissioning."""
+    from ..report import report as write
+
+    report(0, 1, "report")
+    with report.writing():
+        written = write(folder / COMMISSIONED)
+    return {
+        "file": written.relative_to(folder).as_posix(),
+        "python": f"from sewfast.report import report\n\nprint(report({COMMISSIONED!r}))\n",
+        "commands": f"sewfast report {COMMISSIONED}\n",
+    }
+
+
+STEPS: dict[str, Callable[..., Any]] = {
+    step.__name__: step for step in (identify, bode, tune, commission, write_report)
+}
+"""The long steps by name."""

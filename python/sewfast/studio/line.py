@@ -1,4 +1,4 @@
-"""The server's end of the bench process: what the page asks of a drive, and what it sees of it."""
+"""The server's client of the process that owns a drive's port (`bench`)."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ if TYPE_CHECKING:
     from ..link import VirtualDevice
 
 PATIENCE = 15.0
-"""Seconds for an answer of the bench; it waits up to 10 s for a motor to rest."""
+"""Longest wait for an answer of the process, which waits up to 10 s for a motor to rest [s]."""
 
 CLOSING = 3.0
-"""Seconds for the bench to end by itself."""
+"""Time for the process to end by itself [s]."""
 
 _PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.studio.bench import main; main()"
 
 
 class Line:
-    """A drive, by way of the process that owns its port.
+    """A drive in the process that owns its port.
 
     Parameters
     ----------
     folder : Path
-        Where recordings go.
+        Folder of the recordings.
     tell : callable(event)
-        Takes what the bench says; called in a thread of its own.
+        Takes the events of the process; called in its own thread.
     """
 
     def __init__(self, folder: Path, tell: Callable[[dict[str, Any]], None]) -> None:
@@ -67,7 +67,7 @@ class Line:
 
     @property
     def may_move(self) -> bool:
-        """Whether the motor turns or may be made to."""
+        """Whether the motor turns or can be started."""
         return bool(self.state["armed"]) or self._work is not None
 
     # --- The process ------------------------------------------------------------------------------
@@ -78,7 +78,7 @@ class Line:
                 self._program = subprocess.Popen(
                     [sys.executable, "-c", _PROGRAM.format(path=sys.path)],
                     stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                    # Ctrl-C is for the server; its end stops the motor
+                    # keep Ctrl-C for the server, whose end stops the motor
                     start_new_session=True,
                 )  # fmt: skip
                 self._ear = threading.Thread(target=self._hear, args=(self._program,), daemon=True)
@@ -126,52 +126,49 @@ class Line:
         if not body:
             return
         length = struct.unpack_from("<I", body)[0]
-        said = json.loads(body[4 : 4 + length])
-        if "answer" in said:
-            waiting = self._waiting.get(said["answer"])
+        message = json.loads(body[4 : 4 + length])
+        if "answer" in message:
+            waiting = self._waiting.get(message["answer"])
             if waiting is not None:
-                waiting.set_result(said)
+                waiting.set_result(message)
             return
-        event = said["event"]
+        event = message["event"]
         if event == "samples":
-            self._put(said, np.frombuffer(body, "<f4", offset=4 + length))
+            self._put(message, np.frombuffer(body, "<f4", offset=4 + length))
             return
-        del said["curves"]
+        del message["curves"]
         if event == "begin":
-            columns = {k: v for k, v in said["columns"].items() if k != "counts"}
-            speed = {"speed": "RPM"} if said["counts_per_rev"] else {}
-            feed = Feed({**columns, **speed}, said["Ts"], said["n"], said["title"])
-            self._feed, self._run = feed, said["run"]
+            columns = {k: v for k, v in message["columns"].items() if k != "counts"}
+            speed = {"speed": "RPM"} if message["counts_per_rev"] else {}
+            feed = Feed({**columns, **speed}, message["Ts"], message["n"], message["title"])
+            self._feed, self._run = feed, message["run"]
             return
         if event == "drive":
-            self.state = said
-            # in single precision on the wire; none is infinite, which JSON does not know
+            self.state = message
+            # limits are in single precision on the wire; null is infinity, which JSON lacks
             given = {
                 name: math.inf if value is None else float(f"{value:.7g}")
-                for name, value in zip(LIMITS, said.get("limits", ()), strict=False)
+                for name, value in zip(LIMITS, message.get("limits", ()), strict=False)
             }
             self._place = replace(self._place, limits=given)
         if event == "stopped":
             self.state = {**self.state, "armed": False}
         if event == "driven":
-            said |= self._copies() if "found" in said else {}
+            if "found" in message and self._work is not None:
+                message |= copies(self._work[0], self._place, self._work[1])
             self._work = None
-        self._tell(said)
+        self._tell(message)
 
-    def _put(self, said: dict[str, Any], values: FloatArray) -> None:
+    def _put(self, head: dict[str, Any], values: FloatArray) -> None:
         feed = self._feed
         if feed is None:
             return
-        lengths = [n for _, n in said["curves"]]
+        names, lengths = zip(*head["curves"], strict=True)
         parts = np.split(values, np.cumsum(lengths)[:-1])
-        names = (name for name, _ in said["curves"])
-        feed.put(said["first"], dict(zip(names, parts, strict=True)))
-
-    def _copies(self) -> dict[str, str]:
-        return {} if self._work is None else copies(self._work[0], self._place, self._work[1])
+        feed.put(head["first"], dict(zip(names, parts, strict=True)))
 
     def _lost(self) -> None:
-        """The bench has ended; the watchdog of a drive that it ran stops the motor."""
+        """The process has ended; the drive's watchdog stops a running motor."""
         self.state = {"event": "drive", "connected": False, "armed": False}
         self._work = None
         error = {"error": "the process at the port has ended; connect again"}
@@ -198,22 +195,22 @@ class Line:
         if self._device is not None:
             self._device.stop()
 
-    # --- What the page asks for -------------------------------------------------------------------
+    # --- Requests of the page ---------------------------------------------------------------------
 
     def stop(self, why: str) -> None:
-        """Command 0 and drive disabled, ahead of everything else."""
+        """Set command 0 and disable the drive, ahead of everything else."""
         self._write({"do": "stop", "why": why})
 
     def alive(self, age: float) -> None:
-        """The page that has armed the drive has answered."""
+        """Pass on that the page that armed the drive has answered."""
         self._write({"do": "alive", "age": age})
 
     def go(self) -> None:
-        """Have a commissioning that waits go on."""
+        """Let a waiting commissioning go on."""
         self._write({"do": "go"})
 
     def connect(self, port: str, baud: int = 115_200, watchdog: float | None = None) -> None:
-        """Open a port; ``virtual[:SEED]`` is a computed drive of this process."""
+        """Open a port; ``virtual[:SEED]`` is a virtual drive served by this process."""
         from ..link import VirtualDevice
 
         with self._lock:
@@ -230,12 +227,12 @@ class Line:
             self._ask("connect", port=url, baud=baud, watchdog=watchdog)
 
     def disconnect(self) -> None:
-        """Stop the motor and give the port back."""
+        """Stop the motor and close the port."""
         if self._program is not None:
             self._ask("disconnect")
 
     def limits(self, **limits: float | None) -> None:
-        """Set what the drive may do; None is its own ceiling."""
+        """Set the drive's limits; None is its own ceiling."""
         self._ask("limits", **limits)
 
     def arm(self) -> None:
@@ -243,20 +240,20 @@ class Line:
         self._ask("arm")
 
     def disarm(self) -> None:
-        """Allow no further run."""
+        """Allow no more runs."""
         self._ask("disarm")
 
     def clear(self) -> None:
-        """Take a trip back."""
+        """Clear a trip."""
         self._ask("clear")
 
     def work(self, kind: str, **asked: Any) -> None:
-        """Begin a record, run or commissioning; its end is the event ``driven``.
+        """Start a record, run or commissioning; its end is the event ``driven``.
 
         Raises
         ------
         SettingError
-            Where the drive is not armed, or at work.
+            If the drive is not armed, or busy.
         """
         with self._lock:
             if not self.is_connected:
@@ -278,14 +275,14 @@ class Line:
         Returns
         -------
         head, curves
-            By column ``NAME_low`` and ``NAME_high`` beside the times ``t`` [s].
+            For each column ``NAME_low`` and ``NAME_high``, and the times ``t`` [s].
         """
         feed = self._feed
         if feed is None:
             return {"run": 0}, {}
         end = feed.end
         n = min(math.ceil(seconds / feed.Ts), feed.window)
-        # pieces begin at multiples of their length, so that a curve does not shimmer as it moves
+        # pieces begin at multiples of their length, so that a moving curve does not flicker
         step = max(1, math.ceil(n / columns))
         start = max(0, end - n) // step * step
         head = {

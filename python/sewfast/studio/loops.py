@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from .tuning import Tuning
 
 LEAST_COHERENCE = 0.5
-"""Below it a line of a response says little, and is left out of the curves."""
+"""Lines of a response with a smaller coherence are left out of the curves."""
 
 FINE = 400
-"""Frequencies at which a fit is drawn."""
+"""Number of frequencies at which a fit is drawn."""
 
 Curves = dict[str, "FloatArray"]
 
 
 def shown_response(response: FrequencyResponse) -> tuple[dict[str, Any], Curves]:
-    """What the page shows of a measured response: curves, the shaft in it, and a notch for that."""
+    """A measured response for the page: curves, the fitted shaft, and a notch for it."""
     from ..frequency import fit_shaft
 
     fit: ShaftFit | None = None
@@ -58,13 +58,13 @@ def shown_response(response: FrequencyResponse) -> tuple[dict[str, Any], Curves]
 def _measured(
     name: str, response: FrequencyResponse, value: NDArray[np.complex128], radius: FloatArray
 ) -> Curves:
-    """Gain [dB] and phase [deg] with their 95 % bands; gaps where little is known."""
+    """Gain [dB] and phase [deg] with their 95 % bands; gaps at low coherence."""
     size = np.maximum(np.abs(value), 1e-300)
     phase = np.degrees(np.unwrap(np.angle(value)))
     half = np.degrees(np.arcsin(np.minimum(radius / size, 1.0)))
     curves = {
         f"{name}_db": _db(value),
-        # at its lower end a band that holds 0 has no logarithm
+        # a band that includes 0 has no logarithm at its lower end
         f"{name}_db_low": 20.0 * np.log10(np.maximum(size - radius, 0.05 * size)),
         f"{name}_db_high": 20.0 * np.log10(size + radius),
         f"{name}_deg": phase,
@@ -78,12 +78,12 @@ def _measured(
 def shown_loop(
     tuning: Tuning, values: Mapping[str, Any], response: FrequencyResponse | None
 ) -> tuple[dict[str, Any], Curves]:
-    """Plant, L, S and T of the loop with these values, margins marked; a measured response over it.
+    """Plant, L, S and T of the loop with these values, with marked margins and a measured response.
 
     Raises
     ------
     SettingError
-        For a response at another sample time or in other units.
+        For a response with another sample time or other units.
     """
     from ..analysis.points import loop_bodes
 
@@ -121,10 +121,10 @@ def shown_loop(
 
 
 def _plant(point: PlantPoint, hertz: FloatArray, *, counted: bool) -> NDArray[np.complex128]:
-    """Response of the plant from held command to output; `counted`: to its mean over a sample."""
+    """Response from held command to output; with `counted` to its mean over a sample."""
     z = np.exp(2j * np.pi * hertz * point.Ts)
     poles, V = np.linalg.eig(point.A)
-    # a defective A (a delay line) has no full set of eigenvectors, so it is solved line by line
+    # a defective A (a delay line) lacks eigenvectors: solve at each frequency instead
     if np.linalg.cond(V) < 1e8:
         left, right = point.C @ V, np.linalg.solve(V, point.B)
         value = (left[0] * right[:, 0] / (z[:, None] - poles)).sum(axis=1) + point.D[0, 0]
@@ -139,7 +139,7 @@ def _plant(point: PlantPoint, hertz: FloatArray, *, counted: bool) -> NDArray[np
 
 
 def _marks(bode: LoopBode, worst: Margins) -> list[dict[str, Any]]:
-    """Where the margins of the worst member are read off: frequency, gain or phase, and a label."""
+    """Marks for the margins of the worst member: frequency, gain or phase, and a label."""
     if not worst.stable:
         return []
     L = bode.L[bode.margins.index(worst)]
@@ -158,7 +158,7 @@ def _marks(bode: LoopBode, worst: Margins) -> list[dict[str, Any]]:
         return float(np.interp(hertz, bode.hertz, _db(L)))
 
     def distance(omega: float) -> float:
-        """Turn of L to -1 [deg]."""
+        """Angle from L to -1 [deg]."""
         return abs(math.remainder(phase(omega / (2.0 * math.pi)) + 180.0, 360.0))
 
     if worst.gain_crossovers:
@@ -180,7 +180,7 @@ def _db(value: NDArray[np.complex128]) -> FloatArray:
 
 
 def _turned(value: NDArray[np.complex128], first: complex) -> FloatArray:
-    """Phase [deg] by whole turns as near to that of the first measured line as can be."""
+    """Phase [deg], shifted by whole turns to be nearest to that of the first measured line."""
     turn = np.degrees(np.unwrap(np.angle(value)))
     near = turn[0] - math.degrees(math.atan2(first.imag, first.real))
     found: FloatArray = turn - 360.0 * round(near / 360.0)

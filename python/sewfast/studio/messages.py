@@ -1,4 +1,4 @@
-"""What a page may ask for: a JSON schema for every message, and the check of one."""
+"""The messages of a page: a JSON schema for each, and the check against it."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _SIGNAL = {
     "file": NAME,
 }
 
-# name: (fields, of which these must be there)
+# name: (fields, required fields)
 _MESSAGES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "take": ({}, ()),
     "cancel": ({}, ()),
@@ -137,7 +137,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     }
     for name, (fields, required) in _MESSAGES.items()
 }
-"""A JSON schema for every message of a page, by its name."""
+"""JSON schemas of the messages of a page, by name."""
 
 _KINDS: dict[str, type | tuple[type, ...]] = {
     "string": str, "object": dict, "array": list, "boolean": bool, "null": type(None),
@@ -146,12 +146,12 @@ _KINDS: dict[str, type | tuple[type, ...]] = {
 
 
 def checked(asked: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a message that keeps to its schema.
+    """The fields of a message, checked against its schema.
 
     Raises
     ------
     SettingError
-        It names the field, what was expected and what came.
+        Names the field, the expected and the received value.
     """
     name = asked.get("do")
     schema = SCHEMAS.get(name) if isinstance(name, str) else None
@@ -191,7 +191,7 @@ def _check(field: str, value: Any, rule: dict[str, Any]) -> None:
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         low, high = rule.get("minimum", -math.inf), rule.get("maximum", math.inf)
         above = rule.get("exclusiveMinimum", -math.inf)
-        # a whole number of JSON may have thousands of digits, which no float holds
+        # a whole number in JSON can have thousands of digits, too many for a float
         finite = -sys.float_info.max <= value <= sys.float_info.max
         if not (finite and low <= value <= high and value > above):
             least, most = max(low, above), high

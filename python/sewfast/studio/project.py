@@ -1,4 +1,4 @@
-"""A project folder and the steps on it: each is a call of the public API and can be copied."""
+"""A project folder and its steps: each is a call of the public API and can be copied."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ if TYPE_CHECKING:
 
 RECORDINGS = (".csv", ".npz", ".mat", ".parquet", ".mcap")
 LARGEST = 512 * 2**20
-"""Bytes of a recording that the page opens."""
+"""Most bytes of a recording."""
 
 KEPT = 4
-"""Models with their starts that are kept ready, for pages that look at different ones."""
+"""Models with their first controllers that are cached, for pages that use different ones."""
 
 _ARTEFACTS = ("controllers", "models")
-"""Where the documents are in the folder of a commissioning."""
+"""Subfolders of a commissioning with documents."""
 
 DEMO_MEMBERS, DEMO_SAMPLES = 4, 8000
 
 MODEL_FORMAT, CONTROLLER_FORMAT = "sewfast.model", "sewfast.controller"
 LARGEST_DOCUMENT = 16 * 2**20
-"""Bytes of a JSON file that is looked into."""
+"""Most bytes of a JSON file."""
 
 Progress = Callable[[int, int, float], None]
 
 
 def make_demo(folder: str | os.PathLike[str]) -> None:
-    """Fill a folder for the demo: four records of the virtual machine, and an ensemble of them.
+    """Fill a folder for the demo: four records of the virtual machine, and an ensemble of models.
 
     Raises
     ------
     ModelFileError
-        Where the folder cannot be written to.
+        If the folder is not writable.
     """
     from .. import signals
     from ..control.machine import record
@@ -64,7 +64,7 @@ def make_demo(folder: str | os.PathLike[str]) -> None:
 
 
 class Project:
-    """A folder with recordings and what was made of them, as the command line writes it.
+    """A folder with recordings, models and controllers in the files of the command line.
 
     Parameters
     ----------
@@ -73,12 +73,12 @@ class Project:
     demo : bool
         Whether the page begins with the model, as in the demo.
     port : str, optional
-        Of a drive, with which the page begins then.
+        Port of a drive; the page then begins with the drive.
 
     Raises
     ------
     SettingError
-        Where there is no such folder or file.
+        If there is no such folder or file.
     """
 
     def __init__(
@@ -99,8 +99,8 @@ class Project:
     def recordings(self) -> list[str]:
         """Names of the recordings in the folder itself, sorted.
 
-        A link to somewhere else is no part of the project. `:` stands between file and columns on
-        the command line, so that a copied command could not name such a file.
+        A link to another place is not part of the project. Names with `:` are left out: on the
+        command line it separates file and columns, so a copied command could not name the file.
         """
         return sorted(
             entry.name
@@ -109,7 +109,7 @@ class Project:
         )
 
     def documents(self, format: str) -> list[str]:
-        """Names of the JSON files of a format, sorted: in the folder itself and commissioned."""
+        """Names of the JSON files of a format, sorted: in the folder and in `commissioned`."""
         places = [self.folder, *(self.folder / COMMISSIONED / name for name in _ARTEFACTS)]
         return sorted(
             entry.relative_to(self.folder).as_posix()
@@ -119,7 +119,7 @@ class Project:
         )
 
     def _format_of(self, path: Path) -> str:
-        """What a file says it is, read again only where it has changed."""
+        """The format of a file, cached until the file changes."""
         from .. import storage
 
         try:
@@ -132,11 +132,12 @@ class Project:
         return self._formats[path][1]
 
     def document(self, name: Any, format: str) -> Path:
-        """The path of one of `documents`; nothing else is opened.
+        """The path of one of `documents`.
 
         Raises
         ------
         SettingError
+            For any other name.
         """
         if name not in self.documents(format):
             raise SettingError(
@@ -145,11 +146,12 @@ class Project:
         return self.folder / str(name)
 
     def path_of(self, name: str) -> Path:
-        """The path of one of `recordings`; nothing else is opened.
+        """The path of one of `recordings`.
 
         Raises
         ------
         SettingError
+            For any other name, and for a file that is too large.
         """
         if name not in self.recordings():
             raise SettingError(
@@ -182,7 +184,7 @@ class Project:
     def tuning(
         self, model: Any, controller: Any = None, notches: Sequence[Sequence[float]] = ()
     ) -> Tuning:
-        """A model and the controller to begin with; the same as long as neither file has changed.
+        """A model with its first controller; the same object until one of the files changes.
 
         Parameters
         ----------
@@ -217,11 +219,12 @@ class Project:
             return found
 
     def save_controller(self, tuning: Tuning, values: dict[str, Any], file: str) -> None:
-        """Write a controller into the folder; only another controller is replaced.
+        """Write a controller into the folder; it replaces only another controller.
 
         Raises
         ------
         SettingError
+            For the name of another file.
         """
         path = self.folder / checked_name(file)
         if path.is_symlink() or (path.exists() and file not in self.documents(CONTROLLER_FORMAT)):
@@ -231,7 +234,7 @@ class Project:
     # --- Steps ------------------------------------------------------------------------------------
 
     def columns(self, step: Step) -> dict[str, Any]:
-        """Columns of a recording, and which of them are probably the input and the output."""
+        """Columns of a recording, and the probable input and output among them."""
         from ..readers import read_table
 
         table = read_table(self.path_of(step.file))
@@ -248,7 +251,7 @@ class Project:
         }
 
     def look(self, step: Step) -> dict[str, Any]:
-        """The signals, and what `sewfast look` says of them."""
+        """The signals, with the summary of `sewfast look`."""
         return looked_at(self._read(step))
 
     def identify(
@@ -274,7 +277,7 @@ class Project:
         }
 
     def validate(self, step: Step) -> dict[str, Any]:
-        """Measured against free run, and the report card of `sewfast check`."""
+        """Measured output and free run, with the report card of `sewfast check`."""
         from ..evidence import check
         from ..models import load_model
         from ..validation import validate
@@ -290,7 +293,7 @@ class Project:
             "fit": found.simulation.fit_percent,
             "rmse": found.simulation.rmse,
             "unit": found.unit,
-            # of the whole card: by its fit alone a model may be praised that fails a test below
+            # the verdict of the whole card: a model with a good fit can fail another check
             "verdict": card.summary,
             "card": str(card),
             "free_run": curves,
@@ -305,7 +308,7 @@ class Project:
         ----------
         step : Step
         reference : str, optional
-            Column that a controller followed: without it a record under feedback is biased.
+            Column with the controller's reference: without it a record under feedback is biased.
         segment : int, optional
             Samples; see `sewfast.bode`.
         """
@@ -322,7 +325,7 @@ class Project:
     def python(
         self, step: Step, name: str, reference: str | None = None, segment: int | None = None
     ) -> str:
-        """A script that does the step again, run in the project folder."""
+        """A script that repeats the step, to run in the project folder."""
         return script(step, name, self._columns(step, reference), reference, segment)
 
     def commands(
@@ -344,7 +347,7 @@ class Project:
 
 
 def looked_at(data: Dataset) -> dict[str, Any]:
-    """The signals of a data set, to draw, and what `sewfast look` says of them."""
+    """The signals of a data set to draw, with the summary of `sewfast look`."""
     summary = data.summary()
     experiment = data.experiments[0]
     curves = [
@@ -358,12 +361,12 @@ def looked_at(data: Dataset) -> dict[str, Any]:
 
 
 def _files(place: Path) -> list[Path]:
-    """Files of a folder that are in it and not only linked there; none where it was removed."""
+    """Files of a folder, without links to other places; none if it was removed."""
 
     def is_own(entry: Path) -> bool:
         try:
             return entry.name.isprintable() and entry.is_file() and entry.resolve().parent == place
-        except OSError:  # of a link into a folder that is closed to this user
+        except OSError:  # a link into a folder that this user cannot read
             return False
 
     try:
@@ -373,7 +376,7 @@ def _files(place: Path) -> list[Path]:
 
 
 def checked_name(file: Any) -> str:
-    """The name of a controller file to write, which says nothing about a folder.
+    """The plain name of a controller file to write, without a folder.
 
     Raises
     ------

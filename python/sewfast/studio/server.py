@@ -16,7 +16,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from ..errors import SettingError, not_installed
-from .bench import said
+from .bench import error_text
 from .commissioning import COMMISSIONED
 from .driving import checked_recording
 from .jobs import Jobs
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 ADDRESS = "127.0.0.1"
 LARGEST_MESSAGE = 64 * 1024
 PATIENCE = 5.0
-"""Seconds that a socket has for its token."""
+"""Time for a socket to send its token [s]."""
 
 FAREWELL = 1.0
-"""Seconds that a page has to answer the end of its socket."""
+"""Time for a page to confirm the end of its socket [s]."""
 
 WRITES = (
     "identify", "bode", "commission", "report", "cancel", "tune_search", "tune_save", "upload",
@@ -45,13 +45,13 @@ WRITES = (
     "drive_disconnect", "drive_limits", "drive_arm", "drive_disarm", "drive_clear", "drive_go",
     "drive_record", "drive_run", "drive_commission",
 )  # fmt: skip
-"""What only the page that holds the control can ask for; a stop may come from any."""
+"""Messages that only the page in control can send; every page can send a stop."""
 
 RESULTS = ("identified", "responded", "searched", "commissioned", "reported", "driven")
-"""Events that a step has ended."""
+"""Events at the end of a step."""
 
 BEAT = 0.1
-"""Seconds between two questions whether the page that holds the control is there."""
+"""Time between two heartbeats to the page in control [s]."""
 
 PAGE = {
     "/": ("index.html", "text/html; charset=utf-8"),
@@ -68,7 +68,7 @@ PAGE = {
     "/studio.css": ("studio.css", "text/css; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
 }
-"""Everything that is served: a path is looked up here and never on the disk."""
+"""All files that are served: a path is looked up here and never on the disk."""
 
 HEADERS = {
     "Cache-Control": "no-store",
@@ -86,18 +86,18 @@ REPORT_POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{digest}'; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'; sandbox allow-scripts"
 )
-"""Of a report, a file that anybody may have written: its one script is the package's own, and in a
-sandbox it cannot reach the page's token."""
+"""Policy for a report, which is a file from an unknown source: it allows only the package's own
+script, and the sandbox keeps it from the page's token."""
 
 LARGEST_REPORT = 64 * 2**20
-"""Bytes."""
+"""Most bytes of a report."""
 
 
 class Studio:
-    """Serves a project; use it in a `with`.
+    """Serves a project; use it in a `with` block.
 
-    The token stands in the address's fragment, which a browser never sends; the page gives it in
-    the first message of its socket. One page may start steps, all others look on.
+    The token is in the address's fragment, which a browser never sends; the page sends it as the
+    first message of its socket. One page can start steps, all others only watch.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class Studio:
     Raises
     ------
     SettingError
-        Where the extra is missing or the port is taken.
+        If the extra is missing or the port is taken.
     """
 
     def __init__(self, project: Project, port: int = 0) -> None:
@@ -156,7 +156,7 @@ class Studio:
         self._server.serve_forever()
 
     def close(self) -> None:
-        """End a running step and every socket, also those of pages that no longer answer."""
+        """End a running step and every socket, even of pages that no longer answer."""
         self._jobs.cancel()
         self._ended.set()
         self._line.close()
@@ -178,13 +178,13 @@ class Studio:
         self.close()
         self._thread.join()
 
-    # --- Who is let in ----------------------------------------------------------------------------
+    # --- Access -----------------------------------------------------------------------------------
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """A page, a refusal, or None: the socket may open.
+        """A page, a refusal, or None to open the socket.
 
-        The list of hosts keeps out a foreign name that was bound to this address, the list of
-        origins a foreign page in the same browser.
+        The check of the host keeps out foreign names bound to this address, the check of the origin
+        foreign pages in the same browser.
         """
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         known = {f"http://{host}" for host in self._hosts}
@@ -252,11 +252,11 @@ class Studio:
         given = given.encode() if isinstance(given, str) else given
         return hmac.compare_digest(given, self.token.encode())
 
-    # --- What a page asks for ---------------------------------------------------------------------
+    # --- Requests of a page -----------------------------------------------------------------------
 
     def _is_done_at_once(self, page: Session, message: str | bytes) -> bool:
-        """Do what must not wait behind anything else; False for what may."""
-        # a stop is taken from every page, also where the rest of its message is nonsense
+        """Carry out an urgent message at once; return False for any other."""
+        # accept a stop from every page, even if the rest of its message is invalid
         try:
             asked = json.loads(message)
             name = asked.get("do") if isinstance(asked, dict) else None
@@ -279,11 +279,11 @@ class Studio:
             found = self._line.live(**fields) if name == "live" else (None, {})
             page.send(packed({"id": number, "found": found[0]}, found[1]))
         except Exception as e:
-            page.send(to_text({"id": number, "error": said(e)}))
+            page.send(to_text({"id": number, "error": error_text(e)}))
         return True
 
     def _beat(self) -> None:
-        """Ask the page that holds the control whether it is there, as long as there is a drive."""
+        """Send heartbeats to the page in control while a drive is connected."""
         while not self._ended.wait(BEAT):
             page = self._writer
             if page is not None and self._line.is_connected:
@@ -305,10 +305,10 @@ class Studio:
             else:
                 page.send(to_text({"id": number, "found": found}))
         except Exception as e:
-            page.send(to_text({"id": number, "error": said(e)}))
+            page.send(to_text({"id": number, "error": error_text(e)}))
 
     def _permitted(self, page: Session, asked: dict[str, Any]) -> dict[str, Any]:
-        """The fields of a message that keeps to its schema, of a page that may send it."""
+        """The fields of a message, checked against its schema and the page's rights."""
         if asked.get("do") in WRITES and self._writer is not page:
             raise SettingError(
                 name="page", expected="one in control", received="one that looks on",
@@ -353,7 +353,7 @@ class Studio:
         with self._lock:
             if is_open := page in self._pages:
                 self._uploads[page] = begun
-        if not is_open:  # it was closed meanwhile, and nobody would take the file away
+        if not is_open:  # the page was closed meanwhile: nothing else would delete the file
             begun.abandon()
         return None
 
@@ -395,16 +395,16 @@ class Studio:
         return getattr(line, name)(**fields)
 
     def _tell_all(self) -> None:
-        """The state, to every page; each hears whether it holds the control."""
+        """Send the state to every page, with whether it is in control."""
         state = self.project.state()
         with self._lock:
             pages, writer = list(self._pages), self._writer
         for page in pages:
-            told = {**state, "writes": page is writer, "pages": len(pages)}
-            page.send(to_text({"event": "state", **told}))
+            own = {"writes": page is writer, "pages": len(pages)}
+            page.send(to_text({"event": "state", **state, **own}))
 
     def _tell(self, event: dict[str, Any]) -> None:
-        """To every page; results of long steps, after which there may be other files."""
+        """Send an event to every page; after the result of a long step, also the state."""
         with self._lock:
             pages = list(self._pages)
         if event["event"] == "reported" and "found" in event:
@@ -417,7 +417,7 @@ class Studio:
 
 
 def _ports() -> list[dict[str, str]]:
-    """The serial ports of this computer; without pyserial none are known."""
+    """The serial ports of this computer; none without pyserial."""
     from ..link.ports import list_ports
 
     try:

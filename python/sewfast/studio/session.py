@@ -1,4 +1,4 @@
-"""A page that gave its token: what is sent to it and what it asks for, each in its own thread."""
+"""`Session`: a page that gave its token, with a thread for each direction of its messages."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
     from ..dataset import FloatArray
 
 PROMPT, ROW = 0.15, 10
-"""A drive is armed for a page that has answered so many times in a row within so many seconds."""
+"""A page can arm a drive after `ROW` answers in a row, each within `PROMPT` [s]."""
 
 MOST_UNANSWERED = 20
-"""Questions to a page that does not answer, which are then no longer put."""
+"""Most heartbeats without an answer; then no further ones are sent."""
 
 MOST_WAITING = 200
-"""Messages of a page that wait for their turn; a page that sends more is closed."""
+"""Most queued messages of a page; a page that sends more is closed."""
 
 
 class Session:
     """A page that has given its token.
 
-    What is sent to it and what it asks for each have a thread of their own, so that a page that
-    takes nothing more holds up nobody, and a long question of a page does not delay its STOP.
+    Sending to the page and answering its requests have a thread each, so that a page that no longer
+    reads holds up nobody, and a long request of a page does not delay its STOP.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Session:
         self._answer = answer
         self._beats: dict[int, float] = {}
         self._beat = 0
-        #: Heartbeats in a row that it has answered promptly.
+        #: Number of heartbeats in a row with a prompt answer.
         self.prompt = 0
         self._threads = [
             threading.Thread(target=run, daemon=True) for run in (self._send, self._work)
@@ -57,7 +57,7 @@ class Session:
         self._outgoing.put(message)
 
     def take(self, message: str | bytes) -> None:
-        """Have a message answered in its turn."""
+        """Queue a message for its answer."""
         if self._incoming.qsize() >= MOST_WAITING:
             self.connection.close(1008, "too many messages wait for an answer")
             return
@@ -68,7 +68,7 @@ class Session:
         self._incoming.put(None)
 
     def wait(self, seconds: float) -> None:
-        """Let a computation end: Python must not exit in the middle of it."""
+        """Wait for the threads, so that Python does not exit during a computation."""
         self.end()
         for thread in self._threads:
             thread.join(seconds)
@@ -85,12 +85,12 @@ class Session:
             self._answer(self, message)
 
     def beat(self) -> None:
-        """Ask whether it is there."""
+        """Send a heartbeat for the page to answer."""
         now = time.monotonic()
         if len(self._beats) >= MOST_UNANSWERED:
             self.prompt = 0
             oldest = min(self._beats)
-            if now - self._beats[oldest] > 10.0:  # it may have lost them, for all that is known
+            if now - self._beats[oldest] > 10.0:  # the page may have lost them
                 self._beats.clear()
             return
         self._beat += 1
@@ -98,7 +98,7 @@ class Session:
         self.send(to_text({"event": "beat", "n": self._beat, "prompt": self.prompt}))
 
     def answered(self, n: int) -> float | None:
-        """Seconds that the answer to a beat took; None where that was not asked."""
+        """Time of the answer to a heartbeat [s]; None for an unknown number."""
         sent = self._beats.pop(n, None)
         if sent is None:
             return None
@@ -110,8 +110,8 @@ class Session:
 def packed(head: dict[str, Any], curves: Mapping[str, FloatArray]) -> bytes:
     """A message with curves: length of the head, head as JSON, then every curve in float32.
 
-    The head's `curves` are names and lengths in order; it is padded so that a browser can lay an
-    array over the rest.
+    The head's `curves` are names and lengths in order; it is padded so that a browser can map an
+    array onto the rest.
     """
     names = [[name, len(values)] for name, values in curves.items()]
     text = to_text({**head, "curves": names}).encode()
@@ -121,12 +121,12 @@ def packed(head: dict[str, Any], curves: Mapping[str, FloatArray]) -> bytes:
 
 
 def to_text(value: Any) -> str:
-    """As JSON, which knows no NaN and no infinity: null."""
+    """The value as JSON, with null for NaN and infinity."""
     return json.dumps(finite(value), allow_nan=False)
 
 
 def finite(value: Any) -> Any:
-    """JSON values, None for what is not finite."""
+    """The value for JSON, with None for NaN and infinity."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):

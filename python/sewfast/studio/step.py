@@ -1,4 +1,4 @@
-"""A step on a recording: what to read and how, and its copies for a script and for a shell."""
+"""`Step`: a step on a recording, and its copies for a script and for a shell."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RESPONSE = "response.json"
 
 @dataclass(frozen=True)
 class Step:
-    """What to read and how, as the page asked for it.
+    """A page's request to read and use a recording.
 
     Parameters
     ----------
@@ -27,15 +27,15 @@ class Step:
         Name of a recording in the project folder.
     inputs : tuple of str
     output : str or None
-        None: the speed from the encoder counts that the recording states.
+        None for the speed from the recording's encoder counts.
     counts : str or None
-        Column of encoder counts, from which the speed is computed where there is no output.
+        Column of encoder counts, from which the speed is computed without an output.
     counts_per_rev : float or None
-        Counts of one turn; a recording of the package states them itself.
+        Counts of one turn; a recording of the package contains them.
     Ts : float or None
-        Sample time of a recording that has no time column [s].
+        Sample time of a recording without a time column [s].
     resample : float or None
-        Sample time to work at [s]; None: the recording's own.
+        Sample time to work at [s]; None for the recording's own.
     model : str
         Kind of model to identify.
     seed : int
@@ -53,11 +53,12 @@ class Step:
 
     @classmethod
     def parse(cls, asked: dict[str, Any]) -> Step:
-        """A step from a message; what has the wrong type is refused.
+        """A step from a message.
 
         Raises
         ------
         SettingError
+            For a value of the wrong type.
         """
         inputs, output = asked.get("inputs", []), asked.get("output")
         resample, model, seed = asked.get("resample"), asked.get("model", "auto"), asked.get("seed")
@@ -81,12 +82,12 @@ class Step:
         )  # fmt: skip
 
     def columns(self, table: Table, reference: str | None = None) -> dict[str, Any]:
-        """Arguments of `sewfast.read`; the references go along, as they do on the command line.
+        """Arguments of `sewfast.read`, with the references, as on the command line.
 
         Raises
         ------
         SettingError, DataError
-            Where input or output are missing.
+            If input or output are missing.
         """
         from ..dataset import is_reference
 
@@ -119,7 +120,7 @@ class Step:
 def script(
     step: Step, name: str, columns: dict[str, Any], reference: str | None, segment: int | None
 ) -> str:
-    """Python that does a step again, run in the project folder.
+    """Python that repeats a step, to run in the project folder.
 
     Parameters
     ----------
@@ -129,7 +130,7 @@ def script(
     columns : dict
         Arguments of `sewfast.read`.
     reference, segment
-        Of ``bode``.
+        For ``bode``.
     """
     read = ", ".join([repr(step.file), *(f"{k}={v!r}" for k, v in columns.items())])
     lines = ["import sewfast", "", f"data = sewfast.read({read})"]

@@ -1,4 +1,4 @@
-"""The steps on a project that a page or a widget asks for; those on a drive are `driving`."""
+"""The requests of a page or a widget for steps on a project; those on a drive are in `driving`."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from .tuning import Tuning
 
 KEPT = 4
-"""Measured responses that are kept, to be drawn over a loop."""
+"""Number of measured responses that are kept, to draw over a loop."""
 
 Curves = Mapping[str, "FloatArray"]
 
 
 class Steps:
-    """A project, and what can be done with it.
+    """Carries out the steps on a project.
 
     Parameters
     ----------
     project : Project
     jobs : Jobs
-        Does what takes long.
+        Runs the long steps.
     """
 
     def __init__(self, project: Project, jobs: Jobs) -> None:
@@ -43,7 +43,7 @@ class Steps:
         self._last = 0
 
     def do(self, name: str, fields: dict[str, Any]) -> Any:
-        """What a message with checked fields asks for: JSON values, or these and curves.
+        """Carry out a checked message; return JSON values, or these and curves.
 
         Raises
         ------
@@ -68,14 +68,14 @@ class Steps:
         if name == "bode":
             return self._bode(step, fields.get("reference") or None, fields.get("segment"))
         if name == "identify":
-            copies = self._copies(step, name)  # refuses wrong columns before work is begun
+            copies = self._copies(step, name)  # refuses wrong columns before the work starts
             return self.jobs.start(
                 "identified", name, step, finish=lambda found: {**found, **copies}
             )
         return {**getattr(self.project, name)(step), **self._copies(step, name)}
 
     def _bode(self, step: Step, reference: str | None, segment: int | None) -> None:
-        # what resampling filters out looks ahead, which hides the delay
+        # the filter of resampling looks ahead, which hides the delay
         step = replace(step, resample=None)
         copies = {
             "python": self.project.python(step, "bode", reference, segment),

@@ -1,8 +1,8 @@
-"""A controller in the hand: what each of its numbers does to the loop around every model at once.
+"""Tuning by hand: the effect of each setting of a controller on the loops with all models.
 
 A move of a slider costs one closed loop per member and step, and the margins about an operating
-point that was found once. What is slower, the cost as `tune` counts it and a search, is asked for
-by itself.
+point that is computed once. Slower computations, the cost of `tune` and a search, are separate
+requests.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ if TYPE_CHECKING:
 
 MOST_MEMBERS = 16
 READABLE_DB = -60.0
-"""Below it the phase is left out: it jumps at the zeros of a mean over samples."""
+"""Gain below which the phase is left out: it jumps at the zeros of a mean over samples."""
 
 
 @dataclass(frozen=True)
 class Knob:
-    """A number of the controller that is moved, and how far.
+    """A setting of the controller with its range.
 
     Parameters
     ----------
     name, unit : str
     value, low, high : float
     log : bool
-        Whether equal ways are equal factors.
+        Whether the scale is logarithmic.
     whole : bool
     """
 
@@ -54,27 +54,27 @@ class Knob:
 
 
 class Tuning:
-    """A model, or an ensemble whose members are all looked at, and a controller that is changed.
+    """A model, or all members of an ensemble, and a controller whose settings change.
 
     Parameters
     ----------
     model : Model
         With one input.
     name : str
-        The model's file, as the copies name it.
+        The model's file, for the copies.
     start : Controller, optional
         With constant gains; by default the first controller of `sewfast.tune`.
     notches : sequence of (frequency [Hz], depth, width)
-        Put after the biquads of the start, of which a controller has four at most.
+        Added after the biquads of the start; a controller has four at most.
     stamp : str
-        What tells these files from later ones of the same names.
+        Identifies this version of the files.
 
     Raises
     ------
     SettingError
         For a model with several inputs, a gain schedule, or a controller for another drive.
     FitError
-        Where the model has no first controller.
+        If the model has no first controller.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class Tuning:
 
         self.model, self.name, self.stamp = model, name, stamp
         start = first_controller(model) if start is None else start
-        # one form for all: copies are written in it
+        # the copies are written in standard form
         added = tuple(Biquad.notch(*numbers) for numbers in notches)
         self.start = replace(
             start, gains=start.gains.to("standard"), biquads=(*start.biquads, *added)
@@ -124,7 +124,7 @@ class Tuning:
 
     @property
     def knobs(self) -> list[Knob]:
-        """What there is to move: gains, weights of the reference, filters."""
+        """The adjustable settings: gains, weights of the reference, filters."""
         gains, Ts = self.start.gains, self.start.Ts
         per = f"{gains.u_unit}/{gains.y_unit}" if gains.u_unit and gains.y_unit else ""
         knobs = [_factors("Kp", per, gains.Kp)]
@@ -162,7 +162,7 @@ class Tuning:
         return knobs
 
     def opened(self) -> dict[str, Any]:
-        """What the page shows before anything is moved."""
+        """The values for the page before anything is moved."""
         gains = self.start.gains
         return {
             "model": self.name,
@@ -179,14 +179,13 @@ class Tuning:
         }
 
     def controller(self, values: Mapping[str, Any]) -> Controller:
-        """The start with these values; one that a search found is that very controller.
+        """The start with these values; for the values of a search, exactly its controller.
 
         Raises
         ------
         SettingError
-            For an unknown name, or what is no number in its range.
+            For an unknown name, or a value that is not a number in its range.
         """
-
         found = self._search_of(values)
         if found is not None:
             return found.controller
@@ -210,17 +209,17 @@ class Tuning:
             wanted[name] = float(value)
         return wanted
 
-    # --- What a controller does -------------------------------------------------------------------
+    # --- The loop ---------------------------------------------------------------------------------
 
     def move(self, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, FloatArray]]:
-        """Steps, L, S, T and numbers of the loop with these values.
+        """Step responses, L, S, T and figures of the loop with these values.
 
         Returns
         -------
         numbers : dict
             `stable`, margins of the worst member and metrics of the steps.
         curves : dict of array
-            By name: the median of all members, their lowest and their highest.
+            By name: median, lowest and highest of the members.
         """
         from ..analysis.points import loop_bodes
         from ..analysis.responses import responses
@@ -246,7 +245,7 @@ class Tuning:
     def costs(
         self, several: list[Mapping[str, Any]], weights: Mapping[str, float] | None = None
     ) -> list[float]:
-        """What controllers cost on the model, as `sewfast.tune` counts it; inf if one diverges.
+        """Costs of controllers on the model, as in `sewfast.tune`; inf if one diverges.
 
         Parameters
         ----------
@@ -257,13 +256,13 @@ class Tuning:
         """
         from ..tuning import Cost, costs
 
-        # one weight for all of them: that of the first
+        # all get the same weights: the defaults depend on the first
         controllers = [self.controller(values) for values in several]
         found = costs(controllers, self.model, cost=Cost(**(weights or {})))
         return [float(cost) for cost in found]
 
     def check(self, search: Search) -> None:
-        """Refuse what a search cannot begin with.
+        """Check the settings of a search.
 
         Raises
         ------
@@ -278,21 +277,22 @@ class Tuning:
         search: Search,
         progress: Callable[[int, int, float], None],
     ) -> Found:
-        """`sewfast.tune` from these values on; of one that is interrupted the best so far.
+        """`sewfast.tune` from these values; the best so far if it is interrupted.
 
         Parameters
         ----------
         values : dict
         search : Search
         progress : callable
-            Called with (done, total, lowest cost); a KeyboardInterrupt out of it ends the search.
+            Called with (done, total, lowest cost); a KeyboardInterrupt raised in it ends the
+            search.
 
         Raises
         ------
         SettingError
             For values, weights or constraints out of range.
         FitError
-            Where every controller diverges or breaks a constraint.
+            If every controller diverges or breaks a constraint.
         """
         from ..tuning import tune
 
@@ -305,7 +305,7 @@ class Tuning:
                 progress=progress,
             )  # fmt: skip
         except Interrupted as stopped:
-            # when it was stopped cannot be repeated: these are values like any that a hand has set
+            # an interruption cannot be repeated: treat these as values set by hand
             return Found(self._values_of(stopped.best), stopped.best, start, None)
         return Found(
             self._values_of(result.pid), result.pid, start,
@@ -314,7 +314,7 @@ class Tuning:
         )  # fmt: skip
 
     def keep(self, found: Found) -> dict[str, Any]:
-        """Remember a search, so that its copy repeats it; what the page shows of it."""
+        """Store a search, so that its copy repeats it; return its result for the page."""
         if found.search is not None:
             self._found.append(found)
         return {
@@ -339,7 +339,7 @@ class Tuning:
     # --- Copies -----------------------------------------------------------------------------------
 
     def python(self, values: Mapping[str, Any], file: str) -> str:
-        """A script that writes the same controller file, run in the project folder."""
+        """A script that writes the same controller file, to run in the project folder."""
         lines = ["import math", "", "import sewfast", ""]
         lines.append(f"model = sewfast.load_model({self.name!r})")
         found = self._search_of(values)
@@ -370,12 +370,12 @@ class Tuning:
 
 
 def _factors(name: str, unit: str, value: float) -> Knob:
-    """From a quarter to four times: bounds about a sane point."""
+    """A setting with the range from a quarter to four times its value."""
     return Knob(name, unit, value, 0.25 * value, 4.0 * value, log=True)
 
 
 def _margins(bode: LoopBode) -> dict[str, Any]:
-    """Of each number the worst member's."""
+    """Each figure of the worst member."""
     rows = bode.margins
     stable = all(row.stable for row in rows)
     crossovers = [w for row in rows for w in row.gain_crossovers]
@@ -403,7 +403,7 @@ def bode_curves(bode: LoopBode) -> dict[str, FloatArray]:
 
 
 def band(name: str, rows: FloatArray) -> dict[str, FloatArray]:
-    """Median, lowest and highest of the members; of one member its curve alone."""
+    """Median, lowest and highest of the members; for one member its curve alone."""
     if len(rows) == 1:
         return {name: rows[0]}
     found = {name: np.median(rows, axis=0)}
@@ -411,13 +411,13 @@ def band(name: str, rows: FloatArray) -> dict[str, FloatArray]:
 
 
 def _worst(found: Responses, name: str) -> float | None:
-    """The largest of all members; None where one has none, such as a rise that does not end."""
+    """The largest of all members; None if one has none, such as a rise that does not end."""
     values = [row[name] for row in found.metrics()]
     return None if None in values else max((v for v in values if v is not None), key=abs)
 
 
 def _call(controller: Controller) -> str:
-    """The call that makes a controller, with every bit of its numbers."""
+    """The call that constructs a controller, with every bit of its numbers."""
     gains = controller.gains
     numbers = ", ".join(_number(getattr(gains, name)) for name in ("Kp", "Ti", "Td"))
     units = f"u_unit={gains.u_unit!r}, y_unit={gains.y_unit!r}"

@@ -1,4 +1,4 @@
-"""A recording that a page sends, piece by piece, into the project folder."""
+"""`Upload`: a recording sent by a page, piece by piece, into the project folder."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from .commissioning import require
 from .project import LARGEST, RECORDINGS
 
 LONGEST_NAME = 100
-"""Bytes of a file's name."""
+"""Most bytes of a file's name."""
 
 
 class Upload:
-    """A file that comes in pieces; it appears under its name when it is whole.
+    """A file that arrives in pieces; it appears under its name when it is complete.
 
     Parameters
     ----------
     folder : Path
     file : str
-        A new name, which says nothing about a folder.
+        A new, plain name without a folder.
     size : int
-        Bytes that will come.
+        Announced number of bytes.
 
     Raises
     ------
     SettingError
-        For a name that is taken or no recording's, or a size out of range.
+        For a name that is taken or not a recording's, or a size out of range.
     """
 
     def __init__(self, folder: Path, file: str, size: int) -> None:
@@ -39,7 +39,7 @@ class Upload:
         require(0 < size <= LARGEST, "size", f"1 byte to {LARGEST >> 20} MB", size)
         self._place = folder / file
         self._require_new()
-        # hidden, and no recording's ending: nobody takes it for one before it is whole
+        # hidden and without a recording's ending, so that it is not used before it is complete
         self._part = folder / f".{secrets.token_hex(8)}.part"
         try:
             self._out: BinaryIO = self._part.open("xb")
@@ -54,12 +54,12 @@ class Upload:
             )
 
     def add(self, piece: bytes) -> int:
-        """Write the next piece; the bytes that have come so far.
+        """Write the next piece; return the bytes received so far.
 
         Raises
         ------
         SettingError
-            For more than was announced, or where it cannot be written; nothing of it is kept.
+            For more bytes than announced, or if it cannot be written; then the file is deleted.
         """
         self.received += len(piece)
         if self.received > self.size:
@@ -75,12 +75,12 @@ class Upload:
         return self.received
 
     def finish(self) -> str:
-        """Give the whole file its name, which it returns.
+        """Give the complete file its name, and return the name.
 
         Raises
         ------
         SettingError
-            For less than was announced, or a name that was taken meanwhile; nothing is kept.
+            For fewer bytes than announced, or a name taken meanwhile; then the file is deleted.
         """
         try:
             if self.received != self.size:
@@ -103,7 +103,7 @@ class Upload:
         return self.file
 
     def abandon(self) -> None:
-        """Remove what has come so far."""
+        """Delete the part received so far."""
         with suppress(OSError):
             self._out.close()
         with suppress(OSError):
@@ -116,7 +116,7 @@ class Upload:
 
 
 def checked_recording_name(file: Any) -> str:
-    """The name of an uploaded recording, if it says nothing about a folder.
+    """The plain name of an uploaded recording, without a folder.
 
     Raises
     ------

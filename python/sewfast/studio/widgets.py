@@ -1,7 +1,7 @@
 """Two views of the studio in a notebook: the sliders of a controller, and a look at a data set.
 
-Both are the page's own modules; the kernel's messages take the place of the page's socket, and the
-same steps answer them.
+Both use the page's own modules; the kernel's messages replace the page's socket, and the same steps
+answer them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import SettingError, not_installed
-from .bench import said
+from .bench import error_text
 from .jobs import Jobs
 from .messages import checked
 from .project import Project
@@ -38,7 +38,7 @@ ALLOWED = (
     "tune_copy",
     "cancel",
 )
-"""What a notebook's view may ask for."""
+"""Messages allowed in a notebook."""
 
 _TUNE = """
 export default { render({ model, el }) {
@@ -63,20 +63,20 @@ def tune_view(model: Model | str | Path, start: Controller | None = None) -> Any
     Parameters
     ----------
     model : Model or path
-        With a path, controllers are saved next to it and the copies name it; else both are in a
-        folder that is gone with the kernel.
+        With a path, controllers are saved next to it and the copies name it; otherwise both are in
+        a temporary folder that is deleted with the kernel.
     start : Controller, optional
         By default the first controller of `sewfast.tune`.
 
     Returns
     -------
     anywidget.AnyWidget
-        Its method `controller()` returns the controller as the sliders stand.
+        Its method `controller()` returns the controller at the present sliders.
 
     Raises
     ------
     SettingError
-        Where anywidget is not installed, or for a model or controller that cannot be tuned.
+        If anywidget is not installed, or for a model or controller that cannot be tuned.
 
     Examples
     --------
@@ -136,7 +136,7 @@ def tune_view(model: Model | str | Path, start: Controller | None = None) -> Any
 
 
 def look_view(data: Dataset) -> Any:
-    """The signals of a data set with what to improve, as the studio's view Data shows them.
+    """The signals of a data set with advice, as in the studio's view Data.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def look_view(data: Dataset) -> Any:
     Raises
     ------
     SettingError
-        Where anywidget is not installed.
+        If anywidget is not installed.
     """
     from .project import looked_at
 
@@ -172,7 +172,7 @@ def _reply(view: Any, asked: Any, answer: Any) -> None:
             raise SettingError("expected an object")
         found = answer(asked)
     except Exception as e:
-        view.send({"id": number, "error": said(e)})
+        view.send({"id": number, "error": error_text(e)})
         return
     if not isinstance(found, tuple):
         view.send(finite({"id": number, "found": found}))
@@ -204,7 +204,7 @@ def _fragment(view: str) -> str:
 
 
 def _source(modules: tuple[str, ...], render: str, html: str) -> str:
-    """One module of several, as a notebook takes it: no imports, and the elements as text."""
+    """Several modules as one for a notebook: without imports, with the elements as text."""
     import json
 
     css = _page("studio.css").replace(":root", ":host")

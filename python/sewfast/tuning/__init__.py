@@ -1,7 +1,7 @@
 """From models to a controller.
 
-Read in this order: `objective` (`Cost`, `Constraints`, `LoadStep`), `task` (what is searched, on
-which plants, from where), `search` (`tune`, a second opinion), `front` (`pareto`).
+Read in this order: `objective` (`Cost`, `Constraints`, `LoadStep`), `task` (plants, variables and
+start of a search), `search` (`tune`), `opinion` (a second opinion), `front` (`pareto`).
 """
 
 from .front import ParetoFront, pareto

@@ -1,4 +1,4 @@
-"""`pareto`: what can be had, where more of one thing costs another."""
+"""`pareto`: the best trade-offs between several objectives."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ EVALUATIONS = 3000
 SIZE = 40
 _WIDE = 10.0
 _TUNED = 0.25
-"""Share of the evaluations for the tuned controller that the front begins with."""
+"""Share of the evaluations for the tuned controller from which the front starts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +50,8 @@ class ParetoFront(Plotted):
     values : array, shape (controllers, objectives)
         In these units, over plants and references.
     pick : int
-        The knee: the controller closest to the best of every objective at once, each in shares of
-        its range on the front, of ranges wider than 1 to 10 by the logarithm.
+        The knee: the controller closest to the best of every objective at once, each as a share of
+        its range on the front, on a logarithmic scale for ranges wider than 1 to 10.
     evaluations : int
         Controllers tried.
     """
@@ -116,7 +116,7 @@ class ParetoFront(Plotted):
         write_table(path, self.table(), units=units)
 
     def drawing(self) -> Drawing:
-        """The front, every pair of objectives in a panel, the knee marked."""
+        """The front, with a panel for every pair of objectives and the knee marked."""
         return drawing(self)
 
     def _repr_html_(self) -> str:
@@ -174,12 +174,12 @@ def pareto(
     cost : Cost, optional
         Defines the objective ``cost``, for which the first controller is tuned.
     size : int
-        Controllers on the front, at most.
+        Most controllers on the front.
     evaluations : int
         Candidates tried.
     progress : callable, optional
-        Called with (done, total, lowest cost).
-        In a notebook a bar is shown where this is left out; None shows none.
+        Called with (done, total, lowest cost). By default a notebook shows a bar; None shows
+        nothing.
 
     Returns
     -------
@@ -258,7 +258,7 @@ def _front(
     start = pid_of(task.start, "pareto")
     names = [name for name, _, _ in found["variables"]]
     notes = "on the front of " + ", ".join(objectives) + task.assumed
-    # different controllers with the same values are one choice; the rows stay in their order
+    # keep one of several controllers with the same values
     values, rows = np.unique(np.array(found["values"]), axis=0, return_index=True)
     front = ParetoFront(
         controllers=tuple(
@@ -293,20 +293,20 @@ def _units(objectives: Sequence[str], controller: Controller) -> dict[str, str]:
 
 
 def wide(column: NDArray[np.float64]) -> bool:
-    """Whether values are so far apart that ratios say more than differences."""
+    """Whether values are so far apart that ratios matter more than differences."""
     return bool(column.min() > 0.0 and column.max() > _WIDE * column.min())
 
 
 def knee(values: NDArray[np.float64]) -> int:
-    """The row closest to the least of every column at once, columns in shares of their range; of
-    wide ranges by the logarithm.
+    """The row closest to the minimum of every column at once, relative to the columns' ranges; wide
+    ranges are on a logarithmic scale.
     """
     columns = [np.log(c) if wide(c) else c for c in values.T]
     shares = [(c - c.min()) / (np.ptp(c) or 1.0) for c in columns]
     return int(np.argmin(np.sum(np.square(shares), axis=0)))
 
 
-# --- The figure: every pair of objectives in a panel, the knee marked -----------------------------
+# --- The figure -----------------------------------------------------------------------------------
 
 
 NAMES = {
@@ -323,11 +323,11 @@ NAMES = {
     "Ms": "largest sensitivity Ms",
 }
 HEIGHT = 3.6
-"""Of a panel [inch]."""
+"""Height of a panel [inch]."""
 
 
 def drawing(front: ParetoFront) -> Drawing:
-    """Every pair of objectives in a panel."""
+    """A panel for every pair of objectives."""
     pairs = itertools.combinations(range(len(front.objectives)), 2)
     panels: list[Panel | None] = [partial(_panel, front=front, i=i, j=j) for i, j in pairs]
     columns = min(2, len(panels))

@@ -1,4 +1,4 @@
-"""What a good controller is: cost of a run, constraints before it, loads to stand."""
+"""The objective of a search: cost of a run, constraints, load steps."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ class Cost:
     Parameters
     ----------
     tracking : float
-        Of rms(r - y) [y], y the true output.
+        Weight of rms(r - y) [y], y the true output.
     chatter : float or None
-        Of rms(du) [u], du the command's change from sample to sample; .5 R/(u_max - u_min).
+        Weight of rms(du) [u], du the command's change from sample to sample; .5 R/(u_max - u_min).
     effort : float
-        Of rms(u) [u].
+        Weight of rms(u) [u].
     overshoot : float or None
-        Of the overshoot above its limit [%], if the reference is a step or trapezoid; R/100.
+        Weight of the overshoot above its limit [%] on a step or trapezoid; R/100.
     overshoot_limit : float
-        Overshoot that costs nothing [%].
+        Overshoot without a cost [%].
     rise : float
-        Of the 10-to-90 % rise time beyond the reference's own [ms], on a step or trapezoid.
+        Weight of the 10-to-90 % rise time beyond the reference's own [ms], on a step or trapezoid.
     lag : float
-        Of the shift of the output against the reference with the least rms difference [ms].
+        Weight of the shift of the output against the reference with the least rms difference [ms].
     saturation : float or None
-        Of the share of samples at a limit; .02 R.
+        Weight of the share of samples at a limit; .02 R.
     recovery : float
-        Of the recovery time from a load step [ms] (`LoadStep`), the mean over these.
+        Weight of the recovery time from a load step [ms] (`LoadStep`), the mean over these.
     load : float
-        Of the rms deviation under a load step [y].
+        Weight of the rms deviation under a load step [y].
 
     Raises
     ------
@@ -85,9 +85,7 @@ class Cost:
         return {name: value for name, value in values.items() if value is not None}
 
     def resolved(self, span: float, u_range: float) -> Cost:
-        """The same with numbers in place of None, for references of this span and limits of u this
-        far apart.
-        """
+        """The same cost with the default weights for this span of the references and range of u."""
         shares = {
             "chatter": 0.5 * span / u_range,
             "overshoot": span / 100.0,
@@ -98,12 +96,12 @@ class Cost:
     def of(self, runs: ClosedLoopRun | Sequence[ClosedLoopRun]) -> float:
         """The cost of runs: the mean over them, as in `sewfast.tune` over references.
 
-        For runs along references: recovery and load do not count.
+        Recovery and load do not count, as the runs are along references.
 
         Raises
         ------
         DataError
-            If there is no run, or what is none, or one has samples missing.
+            Without a run, for anything but runs, and for a run with missing samples.
         """
         several = list(runs) if isinstance(runs, Sequence) else [runs]
         for one in several:
@@ -126,16 +124,16 @@ class Cost:
 
 
 def terms(run: ClosedLoopRun) -> dict[str, float]:
-    """What a run was like: tracking [y], chatter and effort [u], overshoot [%], rise and lag [ms],
-    saturation (a share), u_max (largest \\|u\\|) [u].
+    """The terms of a run's cost: tracking [y], chatter and effort [u], overshoot [%], rise and lag
+    [ms], saturation (a share), u_max (largest \\|u\\|) [u].
 
-    Overshoot and rise are 0 where the reference is no step or trapezoid; where the response does
-    not reach 90 %, rise is the whole time that it had.
+    Overshoot and rise are 0 unless the reference is a step or trapezoid; if the response does not
+    reach 90 %, rise is the whole time available.
 
     Raises
     ------
     DataError
-        Where samples are missing.
+        If samples are missing.
     """
     limits = run.controller
     return _core.cost_terms(
@@ -143,7 +141,7 @@ def terms(run: ClosedLoopRun) -> dict[str, float]:
     )
 
 
-# --- Constraints: what a controller must keep to, whatever it costs -------------------------------
+# --- Constraints ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -174,7 +172,7 @@ class Constraints:
         one of these counts with its bands: Ms is the largest that they allow. By default the linear
         models among the plants used for tuning.
     speed : float, optional
-        Where a nonlinear `plant` is linearised [y].
+        Output at which a nonlinear `plant` is linearised [y].
 
     Raises
     ------
@@ -206,7 +204,7 @@ class Constraints:
 
     @property
     def limits(self) -> _core._Limits:
-        """By name, as the core takes them."""
+        """The limits by name, for the core."""
         values = {name: getattr(self, name) for name in LIMITS}
         cores = {n: v.core() if isinstance(v, Controller) else v for n, v in values.items()}
         return cast("_core._Limits", cores)
@@ -227,13 +225,13 @@ def _described(name: str, limit: float | Controller) -> str:
     return f"{name} <= {limit:g}{LIMITS[name]}"
 
 
-# --- LoadStep: a disturbance that comes on while a level is held ----------------------------------
+# --- LoadStep: a disturbance while a level is held ------------------------------------------------
 
 
 BAND = 0.01
-"""Of the level: deviation that counts as recovered."""
+"""Default band of recovery as a share of the level."""
 MOST_SAMPLES = 10_000_000
-"""Of a load step, which every candidate runs."""
+"""Most samples of a load step, which every candidate runs."""
 
 
 @dataclass(frozen=True)
@@ -248,11 +246,11 @@ class LoadStep:
     Parameters
     ----------
     level : float
-        What is held [y].
+        The held level [y].
     disturbance : float
-        Added to the command behind its limits [u]; a braking one has the opposite sign.
+        Added to the command after its limits [u]; a braking one has the opposite sign.
     band : float, optional
-        [y]; a hundredth of the level by default.
+        Band of recovery [y]; a hundredth of the level by default.
     ramp, settle, look : float
         Duration of the rise to the level, of the hold before the load, and of the load [s].
     mean : float
@@ -297,7 +295,7 @@ class LoadStep:
         Raises
         ------
         SettingError
-            For one of more than `MOST_SAMPLES`.
+            For more than `MOST_SAMPLES`.
         """
         lasts = self.ramp + self.settle + self.look + self.mean
         if not lasts / Ts <= MOST_SAMPLES:

@@ -1,10 +1,10 @@
-"""A second opinion on tuned gains, of a model of another kind.
+"""A second opinion on tuned gains by a model of another kind.
 
-A search finds what is good on its models, their mistakes included: a network can follow a record to
-94 % and still reward gains that its drive does not. A model of another kind has other mistakes. Its
-own gains are searched for briefly; where either gains cost much more on the other's model than that
-one's own, at least one model is wrong in closed loop, and no simulation says which. Then the gains
-are taken that are the least wrong whichever it is.
+A search finds gains that are good on its models, including their mistakes: a network can fit a
+record to 94 % and still favour gains that are bad on its drive. A model of another kind makes other
+mistakes. A brief search finds its own gains. If either set of gains costs much more on the other's
+model than that model's own gains, at least one model is wrong in closed loop, and simulations
+cannot tell which. Then the gains whose worse relative cost is smallest are used.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from ..errors import FitError
 from .task import TuningTask
 
 SHARE = 0.2
-"""Of the evaluations on the models, those that each search of a second opinion has."""
+"""Evaluations of each search of a second opinion, as a share of those on the models."""
 MUCH = 3.0
-"""Times the cost of a model's own gains there, from which models contradict each other."""
+"""Ratio to the cost of a model's own gains above which models contradict each other."""
 OWN, OTHER, BOTH = range(3)
 _TITLES = (
     "those tuned on the models",
@@ -32,21 +32,21 @@ _TITLES = (
 )
 
 Search = Callable[[TuningTask], SampledController]
-"""Searches a task; FitError where nothing keeps to its constraints."""
+"""Searches a task; raises FitError if nothing meets its constraints."""
 
 
 @dataclass(frozen=True, eq=False)
 class SecondOpinion:
-    """Candidates, and what each costs on either kind of plant.
+    """Candidates with their costs on either kind of plant.
 
     Attributes
     ----------
     candidates : tuple of Controller
-        Tuned on the models, on the rival and, where these contradict each other, on both.
+        Tuned on the models, on the rival and, if these contradict each other, on both.
     costs : array, shape (2, candidates)
-        In the output's unit, on the models and on the rival; inf where a loop diverges.
+        In the output's unit, on the models and on the rival; inf if a loop diverges.
     allowed : array of bool, shape (candidates,)
-        Which keep to the constraints on the models, and may be taken.
+        Whether each meets the constraints on the models, so that it can be used.
     """
 
     candidates: tuple[SampledController, ...]
@@ -55,23 +55,23 @@ class SecondOpinion:
 
     @property
     def relative(self) -> NDArray[np.float64]:
-        """The costs over the least on the same plants; shape (2, candidates)."""
+        """The costs relative to the least on the same plants; shape (2, candidates)."""
         return _relative(self.costs)
 
     @property
     def is_contradiction(self) -> bool:
-        """Whether either gains cost much more on the other's plants than those plants' own."""
+        """Whether either gains cost much more on the other's plants than the gains tuned there."""
         return max(self._crossed) > MUCH
 
     @property
     def _crossed(self) -> tuple[float, float]:
-        """Of the models' gains on the rival, and of the rival's on the models."""
+        """Relative costs of the models' gains on the rival, and of the rival's on the models."""
         relative = _relative(self.costs[:, :BOTH])
         return float(relative[1, OWN]), float(relative[0, OTHER])
 
     @property
     def pick(self) -> int:
-        """The candidate to take: that of the models, or the one that is least wrong on either."""
+        """The candidate to use: that of the models or, if contradicted, the least bad on both."""
         if not self.is_contradiction:
             return OWN
         worst = self.relative.max(axis=0)
@@ -79,7 +79,7 @@ class SecondOpinion:
 
     @property
     def warning(self) -> str | None:
-        """What is to be known of it, and what to do; None where the models agree."""
+        """The contradiction and its remedy; None if the models agree."""
         if not self.is_contradiction:
             return None
         on_rival, on_models = self._crossed
@@ -96,23 +96,23 @@ class SecondOpinion:
 def second_opinion(
     own: SampledController, task: TuningTask, rival: TuningTask, search: Search
 ) -> SecondOpinion | None:
-    """Ask a rival about gains that were tuned on a task.
+    """Compare tuned gains with those of a rival.
 
     Parameters
     ----------
     own : Controller
-        The gains that were found.
+        The tuned gains.
     task, rival : TuningTask
-        What they were found on; the same on the rival's plants.
+        Their task, and the same task on the rival's plants.
     search : callable
         A brief search on a task.
 
     Returns
     -------
     SecondOpinion or None
-        None where the rival has no opinion: nothing on it keeps to the constraints.
+        None if nothing on the rival meets the constraints.
     """
-    # from the cheaper of two starts: gains that are good on both are then found to be so
+    # start from the cheaper of the two, so that gains that are good on both show as such
     starts = [own, task.start]
     begun = replace(rival, start=starts[int(np.argmin([_judged(rival, c)[0] for c in starts]))])
     try:
@@ -136,7 +136,7 @@ def _opinion(
 ) -> SecondOpinion:
     on_models = [_judged(task, c) for c in candidates]
     on_rival = [_judged(rival, c)[0] for c in candidates]
-    # the first was found within the constraints, by the search itself
+    # the search itself has found the first within the constraints
     allowed = [i == OWN or violation == 0.0 for i, (_, violation) in enumerate(on_models)]
     return SecondOpinion(
         candidates, np.array([[cost for cost, _ in on_models], on_rival]), np.array(allowed)
@@ -144,13 +144,13 @@ def _opinion(
 
 
 def _judged(task: TuningTask, controller: SampledController) -> tuple[float, float]:
-    """Cost, and by how much constraints are broken."""
+    """Cost, and the sum of violations of the constraints."""
     return _core.tuning_costs(task.core(), [controller.core()], threads=1)[0]
 
 
 def _relative(costs: NDArray[np.float64]) -> NDArray[np.float64]:
     least = costs.min(axis=1, keepdims=True)
-    # on plants that nothing is stable on, all are as bad
+    # on plants on which nothing is stable, all are equally bad
     ratios = np.full(costs.shape, np.inf)
     known = np.isfinite(costs) & (least > 0.0)
     np.divide(costs, least, out=ratios, where=known)

@@ -1,4 +1,4 @@
-"""Fine tuning by simulated closed loops: `tune`, `costs`."""
+"""Tuning by simulated closed loops: `tune`, `costs`, `recoveries`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _ENDED_BY = {
     "time": "the time budget",
     "interrupted": "Ctrl-C",
 }
-"""What a termination is called in a sentence."""
+"""The terminations in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,20 +96,20 @@ class TuningResult:
     def warning(self) -> str | None:
         """Objections to the gains, and what to do; None if there are none.
 
-        Models of two kinds that contradict each other on which gains are good; references that the
-        drive cannot follow with the least gain of the variations.
+        They are models of two kinds that contradict each other about good gains, and references
+        that the drive cannot follow with the least gain of the variations.
         """
         opinion = None if self.opinion is None else self.opinion.warning
-        return "; ".join(said for said in (opinion, self.beyond) if said) or None
+        return "; ".join(text for text in (opinion, self.beyond) if text) or None
 
     @property
     def pid(self) -> Controller:
-        """The controller, for what knows PIDs only.
+        """The controller as a PID.
 
         Raises
         ------
         SettingError
-            For one of another kind.
+            For a controller of another kind.
         """
         return pid_of(self.controller, "what comes next")
 
@@ -134,7 +134,7 @@ class TuningResult:
         reference : str or array, shape (N,), optional
             As for `sewfast.run`; by default a trapezoid that suits the plant.
         ax, file
-            As for `Drawing.plot`. One shows the output, further ones the error and the command.
+            As for `Drawing.plot`. One axes shows the output; further axes show error and command.
 
         Raises
         ------
@@ -217,7 +217,7 @@ def tune(
     Parameters
     ----------
     models : model, machine or sequence of them
-        Plants that one controller has to serve, with one input, one sample time, the same units;
+        Plants that the controller must suit, with one input, one sample time and the same units;
         every member of an ensemble is one.
     references : str, array of shape (N,), or sequence of them, optional
         Names (`sewfast.signals`) or samples [y]; trapezoid, trapezoids and random by default. A
@@ -226,7 +226,7 @@ def tune(
         defaults wherever the catalogue does not suit the drive.
     u_min, u_max : float, optional
         Limits of the command [u]. By default the range of the input that the first model was
-        identified on, with 0: a controller must not demand more than the drive has been seen to
+        identified on, with 0: a controller must not demand more than the drive is known to
         withstand.
     counts_per_rev : float, None or "model"
         Encoder in the loop of the models; None for ideal feedback, "model" for that of the counts
@@ -239,17 +239,17 @@ def tune(
         Start of the search; settings that are not searched are kept, and the five settings above
         are ignored. By default Table 1 on the first model's own step response.
     controller : str
-        The kind of controller where there is no start, as ``pid`` or ``state_feedback``
-        (`StateFeedback`); those of `sewfast.control.files.KINDS`.
+        The kind of controller without a start, ``pid`` or ``state_feedback`` (`StateFeedback`); see
+        `sewfast.control.files.KINDS`.
     variables : sequence of str or (str, float, float), optional
-        What to search, by name or with its bounds: ``Kp``, ``Ti``, ``Td``, ``alpha``, ``beta``,
-        ``N``, ``Tt``, ``filter_samples``, ``filter_time``, ``observer_time``, ``r_rate``;
+        Variables of the search, by name or with bounds: ``Kp``, ``Ti``, ``Td``, ``alpha``,
+        ``beta``, ``N``, ``Tt``, ``filter_samples``, ``filter_time``, ``observer_time``, ``r_rate``;
         ``Kp[0]``, ``Ti[0]``, ``Td[0]`` and so on of a gain schedule's points, ``schedule`` for all
         of them. By default the gains, alpha, beta, and N if the start has a derivative filter.
     cost : Cost, optional
-        What counts how much.
+        Weights of the terms.
     aggregate : "mean" or "worst"
-        Over the plants in their variations; over the references it is the mean.
+        Aggregate over the plants in their variations; over the references it is the mean.
     constraints : Constraints, optional
         Requirements that come before the cost.
     variations : sequence of (gain, delay), optional
@@ -260,28 +260,28 @@ def tune(
         Load steps simulated for every candidate, from which recovery and load of `cost` and
         `constraints` are computed. These runs count for nothing else.
     disturbances : sequence of array, shape (N,), optional
-        One for each reference: a command that is added behind the limits, unseen by the controller
-        [u]. For instance, a load over the turn that no model contains.
+        One for each reference: a command added after the limiter, unknown to the controller [u],
+        such as a load over the turn that no model contains.
     rival : model, optional
         A model of another kind of the same drive, such as a linear one next to networks: its own
         gains are searched for briefly (a fifth of the evaluations). If either set of gains costs
         more than three times as much on the other's model as that model's own gains,
-        `TuningResult.warning` says so. The result is then that one of the two, and of gains tuned
-        on both, whose largest cost relative to the least on the same model is smallest.
+        `TuningResult.warning` reports it. Then the result is the one of these two and of gains
+        tuned on both whose larger cost, relative to the least on the same model, is smallest.
     method : "genetic" or "cma-es"
         A genetic algorithm with local refinement, or CMA-ES with restarts.
     evaluations : int
         Candidates tried.
     time_budget : float, optional
         Time of the search [s], after which the best so far is the result (`termination` is
-        ``time``). A seed then no longer gives the same bits.
+        ``time``). Then the same seed no longer gives the same bits.
     seed : int
         Seed of the search.
     threads : int, optional
         All processors by default.
     progress : callable, optional
-        Called with (done, total, lowest cost).
-        In a notebook a bar is shown where this is left out; None shows none.
+        Called with (done, total, lowest cost). By default a notebook shows a bar; None shows
+        nothing.
 
     Raises
     ------
@@ -321,7 +321,7 @@ def tune(
         method, whole("evaluations", evaluations), seconds, whole("seed", seed),
         threads_or_all(threads), progress,
     )  # fmt: skip
-    # before anything is searched, so that a rival that cannot be used costs nothing
+    # check the rival before the search, which may take long
     other = None if rival is None else replace(task, plants=_rivals(rival, task))
     result = search.on(task, variables)
     if references is not None:
@@ -331,7 +331,7 @@ def tune(
 
 @dataclass(frozen=True)
 class _Search:
-    """How to search, whatever it is on."""
+    """The settings of a search."""
 
     method: str
     evaluations: int
@@ -358,7 +358,7 @@ class _Search:
         return result
 
     def brief(self) -> _Search:
-        """For a second opinion; nobody is told of it, but Ctrl-C ends it."""
+        """The search of a second opinion: shorter, and without progress; Ctrl-C ends it, too."""
         rest = None if self.seconds is None else 0.5 * SHARE / (1.0 - SHARE) * self.seconds
         few = max(1, round(SHARE * self.evaluations))
         return replace(self, evaluations=few, seconds=rest, progress=None)
@@ -370,7 +370,7 @@ def _rivals(rival: Plants, task: TuningTask) -> list[Plant]:
     Raises
     ------
     SettingError
-        For what the loop does not fit.
+        For a plant that does not suit the controller.
     """
     plants = each_plant(rival)
     if not plants:
@@ -387,7 +387,7 @@ def _asked(
     search: _Search,
     variables: Sequence[Wanted] | None,
 ) -> TuningResult:
-    """The result with a second opinion on it, and the gains that are least wrong."""
+    """The result with a second opinion, and with the gains that this picks."""
     found: list[TuningResult] = [result]
 
     def brief(on: TuningTask) -> SampledController:
@@ -430,7 +430,7 @@ def costs(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> NDArray[np.float64]:
-    """What controllers cost on plants, as `tune` counts it; shape (controllers,).
+    """Costs of controllers on plants, as in `tune`; shape (controllers,).
 
     Parameters are those of `tune`. The limits and the encoder of the first controller decide the
     default weights and the default variations. A controller that diverges costs inf.
@@ -478,7 +478,7 @@ def recoveries(
     *,
     variations: Sequence[tuple[float, int]] | None = None,
 ) -> NDArray[np.float64]:
-    """Recovery [ms] and rms deviation [y] under the load steps, the worst; shape (plants, 2).
+    """The worst recovery [ms] and rms deviation [y] under the load steps; shape (plants, 2).
 
     A row per plant in each variation: the first plant in all of them, then the next. Parameters are
     those of `tune`.
@@ -488,7 +488,7 @@ def recoveries(
     SettingError, DataError
         For a controller, plants or load steps that cannot be used.
     FitError
-        Where a loop runs away.
+        If a loop diverges.
     """
     task = TuningTask.of(
         models,

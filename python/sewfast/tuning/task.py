@@ -1,4 +1,4 @@
-"""One task to tune: plants, references, limits; what is searched; the first controller."""
+"""A tuning task: plants, references and limits; the variables; the first controller."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ Progress: TypeAlias = Callable[[int, int, float], object]
 Aggregate: TypeAlias = Literal["mean", "worst"]
 
 GAINS = (0.8, 1.25)
-"""Plant gains beside the identified one that a controller has to bear, so that it transfers."""
+"""Factors on the identified gain that a controller must also suit, so that it transfers."""
 
 
 @dataclass(frozen=True)
 class TuningTask:
-    """Everything but the search itself."""
+    """Everything that a search works on."""
 
     plants: list[Any]
     references: list[Any]
@@ -80,7 +80,7 @@ class TuningTask:
         loads: Sequence[LoadStep] = (),
         disturbances: Sequence[ArrayLike] | None = None,
     ) -> TuningTask:
-        """Checked; without a start, `first` are the settings of the first controller."""
+        """The checked task; without a start, `first` holds settings of the first controller."""
         given = list(models) if isinstance(models, Sequence) else [models]
         if not given:
             raise SettingError("expected at least one plant to tune on, got none")
@@ -113,7 +113,7 @@ class TuningTask:
         )
 
     def core(self, names: Sequence[Wanted] | None = None, *, ms: bool = False) -> _core._Task:
-        """As the core takes it, with variables by name; `ms`: Ms is asked for anyway."""
+        """The task for the core, with variables by name; `ms` if Ms is an objective."""
         asked = ms or self.constraints.Ms is not None
         if asked and not isinstance(self.start, Controller):
             raise SettingError(
@@ -141,7 +141,7 @@ class TuningTask:
         }
 
     def _loops(self) -> tuple[list[Any], list[Any]]:
-        """The linear plants that Ms is taken on, as fractions, and the measured ones, as lines."""
+        """The plants for Ms: linear ones as fractions, and measured ones as lines."""
         given = self.constraints.plant
         if given is None:
             plants = [p for p in self.plants if hasattr(p, "to_tf")]
@@ -167,9 +167,9 @@ class TuningTask:
 
 
 def out_of_reach(task: TuningTask) -> str | None:
-    """References that no gains can follow on the variation with the least gain, in words; or None.
+    """A warning about references that no gains can follow with the least gain of the variations.
 
-    Tuning on them looks for the gains that lose least at the limit of the command.
+    None if there are none. Tuning on them would minimise the loss at the limit of the command.
     """
     (plant, *_), start = task.plants, task.start
     gain = min(gain for gain, _ in task.variations)
@@ -178,7 +178,7 @@ def out_of_reach(task: TuningTask) -> str | None:
     try:
         fopdt = drive_step(plant, start.u_min, start.u_max).fopdt
     except (FitError, SettingError):
-        return None  # what it reaches is not known
+        return None  # its reach is unknown
     low, high = sorted(gain * (fopdt.K * u + fopdt.offset) for u in (start.u_min, start.u_max))
     top, bottom = max(r.max() for r in task.references), min(r.min() for r in task.references)
     if bottom >= min(low, 0.0) and top <= max(high, 0.0):
@@ -193,12 +193,12 @@ def out_of_reach(task: TuningTask) -> str | None:
 
 
 def _assumed(start: SampledController, given: list[Any], *, derived: bool) -> str:
-    """What of the limits has to be said in a controller's notes."""
+    """A note on the limits for the controller's notes."""
     if derived:
-        _, _, said = start.notes.partition("; ")
+        _, _, note = start.notes.partition("; ")
     else:
-        said = beyond_record(given, start.u_min, start.u_max)
-    return f"; {said}" if said else ""
+        note = beyond_record(given, start.u_min, start.u_max)
+    return f"; {note}" if note else ""
 
 
 def threads_or_all(threads: int | None) -> int:
@@ -207,7 +207,7 @@ def threads_or_all(threads: int | None) -> int:
 
 
 def default_variations(controller: SampledController) -> tuple[tuple[float, int], ...]:
-    """(gain, extra delay in samples) of the plants that a controller is tuned on; see `tune`."""
+    """(gain, extra delay in samples) of the default variations of a plant; see `tune`."""
     delay = max(1, getattr(controller, "filter_samples", 1) // 4)
     return ((1.0, 0), *((gain, delay) for gain in GAINS))
 
@@ -221,12 +221,12 @@ def _instance(given: Any, kind: type[Any], example: str) -> Any:
 
 
 def budget(seconds: Any) -> float:
-    """A time in which a search has to end [s].
+    """The time budget of a search [s], checked.
 
     Raises
     ------
     SettingError
-        For what is no number above 0.
+        For anything but a number above 0.
     """
     time = real("time_budget", seconds)
     if not 0.0 < time < math.inf:
@@ -235,12 +235,12 @@ def budget(seconds: Any) -> float:
 
 
 class TimeUp(KeyboardInterrupt):
-    """Asks the core to stop and hand over its best."""
+    """Makes the core stop and return its best result."""
 
 
 @dataclass
 class Deadline:
-    """Progress that ends a search after a time."""
+    """A progress callback that ends a search after a time."""
 
     seconds: float | None
     inner: Progress | None
@@ -252,7 +252,7 @@ class Deadline:
     def __call__(self, done: int, total: int, best: float) -> None:
         if self.inner is not None:
             self.inner(done, total, best)
-        # before the first gains are known there is nothing to hand over
+        # before the first gains are known there is no result to return
         if self.seconds is not None and math.isfinite(best) and done > 0:
             self.passed = time.monotonic() - self._began > self.seconds
             if self.passed:
@@ -273,7 +273,7 @@ def _checked(variations: Sequence[tuple[float, int]]) -> list[tuple[float, int]]
     return [(real("a variation's gain", g), whole("a variation's delay", d)) for g, d in variations]
 
 
-# --- Variables: what is searched of a controller, and the controller that values stand for --------
+# --- Variables of a search ------------------------------------------------------------------------
 
 
 Wanted: TypeAlias = str | tuple[str, float, float]
@@ -283,7 +283,7 @@ _EDGE = 1e-3
 
 @dataclass(frozen=True)
 class Variable:
-    """A number of the controller that was searched.
+    """A setting of the controller that was searched.
 
     Attributes
     ----------
@@ -293,7 +293,7 @@ class Variable:
     low, high : float
         Its bounds.
     value : float
-        What was found.
+        The value found.
     """
 
     name: str
@@ -303,7 +303,7 @@ class Variable:
 
     @property
     def at_bound(self) -> bool:
-        """Whether it lies on a bound: what is best may lie beyond."""
+        """Whether it is at a bound: the best value may be beyond."""
         room = _EDGE * (self.high - self.low)
         near_low = self.value <= self.low + min(room, _EDGE * abs(self.low) or room)
         return near_low or self.value >= self.high - room
@@ -316,13 +316,13 @@ class Variable:
 def wanted(
     variables: Sequence[Wanted] | None, start: SampledController
 ) -> list[tuple[str, tuple[float, float] | None]]:
-    """Names and bounds as the core takes them; ``schedule`` stands for the gains of all points,
-    ``notches`` for all that the start's notches are made from.
+    """Names and bounds for the core; ``schedule`` stands for the gains of all points, ``notches``
+    for all numbers of the start's notches.
 
     Raises
     ------
     SettingError
-        For what is neither a name nor a name with two bounds, or for no variable at all.
+        For anything but a name or a name with two bounds, and without any variable.
     """
     if variables is None:
         return []
@@ -335,10 +335,10 @@ def wanted(
 
 
 def usual_variables(start: SampledController) -> list[Wanted] | None:
-    """What is searched unless it is named, where the core's usual bounds do not hold it; else None.
+    """Default variables for a start outside the core's default bounds; None for any other.
 
-    These leave Ti at 4 sample times or more. A drive whose time constant is a few sample times
-    begins below that.
+    The core's bounds keep Ti at 4 sample times or more. The start for a drive with a time constant
+    of a few sample times is below that.
     """
     if not isinstance(start, Controller):
         return None
@@ -390,7 +390,7 @@ def _one(given: Any, start: SampledController) -> list[tuple[str, tuple[float, f
 
 
 DERIVATIVE_FILTER = 10.0
-"""N to begin with."""
+"""N of the first controller."""
 
 Encoder: TypeAlias = float | Literal["model"] | None
 
@@ -406,16 +406,16 @@ def first_controller(
 ) -> Controller:
     """A conservative controller from a model's own step response by Table 1 (nearest row).
 
-    Where the output integrates the command, as a position does, SIMC on the rate's step response
-    takes its place. The moving average's delay counts as dead time. Parameters are those of `tune`.
+    If the output integrates the command, such as a position, SIMC on the rate's step response is
+    used instead. The moving average's delay counts as dead time. Parameters are those of `tune`.
 
     Raises
     ------
     SettingError
         For a machine: record its step response and use `fit_fopdt` and `table_1`. For limits that
-        are neither stated nor recorded, and for an encoder on an output of unknown unit.
+        are neither given nor recorded, and for an encoder on an output of unknown unit.
     FitError
-        Where no step of the model settles.
+        If no step of the model settles.
     """
     plant = _require_model(plant)
     low, high, note = command_limits([plant], u_min, u_max)
@@ -448,13 +448,13 @@ def first_controller(
 def _of_position(rate: Fopdt, Ts: float) -> Rule:
     """SIMC for `K e^(-sL) / (s (1 + sT))` (Skogestad 2003, Table 1), in standard form.
 
-    The derivative cancels T; the loop is to be no faster than what it cancels and the dead time,
-    which the hold of a sample adds to.
+    The derivative cancels T. The loop must not be faster than the cancelled lag and the dead time,
+    which includes the hold of a sample.
     """
     tau = 2.0 * max(rate.L + Ts, 0.5 * rate.T) + rate.L
     Kc, Ti, Td = 1.0 / (rate.K * tau), 4.0 * tau, rate.T
     gains = Gains.standard(Kc * (1.0 + Td / Ti), Ti + Td, Ti * Td / (Ti + Td))
-    # half of a step goes to the integral alone: two integrators overshoot
+    # leave half of a step to the integral alone, as two integrators overshoot
     return Rule(gains, 0.5, 1.0, "SIMC for an integrator")
 
 
@@ -512,7 +512,7 @@ def _require_model(plant: Plant) -> Model:
 
 
 def _units(plant: Model, stated: str | None) -> tuple[str, str]:
-    """Units of command and output; empty where nobody says them."""
+    """Units of command and output; empty if unknown."""
     u_unit, y_unit = plant_units(plant)
     if stated is not None and not isinstance(stated, str):
         raise SettingError(f"expected a unit as text for output_unit, got {stated!r}")
@@ -525,7 +525,7 @@ def _units(plant: Model, stated: str | None) -> tuple[str, str]:
 
 
 def _encoder(plant: Model, stated: Encoder, unit: str) -> float | None:
-    """Counts of one turn: as stated, else of the counts that the model's output came from."""
+    """Counts of one turn: as given, else those of the model's output."""
     counts = stated
     if isinstance(stated, str):
         if stated != "model":

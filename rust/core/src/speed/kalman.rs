@@ -175,6 +175,8 @@ fn innovations(blocks: &[&[f64]], q: f64, r: f64) -> Innovations {
     blocks.iter().map(of).fold(none, add)
 }
 
+// Gains of the filter and the smoother under white jerk, and their two passes.
+
 /// Riccati steps until the gains count as constant, whatever they do.
 const MAX_TRANSIENT: usize = 50_000;
 
@@ -317,6 +319,8 @@ fn settled(last: &Gain, gain: &Gain) -> bool {
 fn predict(x: &Vector3<f64>) -> Vector3<f64> {
     Vector3::new(x[0] + x[1] + 0.5 * x[2], x[1] + x[2], x[2])
 }
+
+// Searches along one line, for the intensities here and for the ripple's.
 
 /// The point of the grid `from, from + step, .. <= to` with the least cost.
 pub(super) fn grid(from: f64, to: f64, step: f64, cost: impl Fn(f64) -> f64) -> f64 {

@@ -291,6 +291,8 @@ impl Mean {
     }
 }
 
+// Runs that go side by side: their terms come from sums that are taken as they run.
+
 /// What several controllers are run on.
 struct Runs<'a> {
     known: KernelPlant<'a>,
