@@ -149,7 +149,7 @@ def test_an_interruption_of_the_evidence_keeps_the_model(monkeypatch: pytest.Mon
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(entry, "remembered", interrupt)
+    monkeypatch.setattr(entry, "with_training_evidence", interrupt)
     with pytest.raises(Interrupted) as caught:
         identify(dataset(*record()), model="oe")
     assert caught.value.best.kind == "oe"
