@@ -20,7 +20,6 @@ pub mod lagged;
 #[cfg(test)]
 mod laws;
 pub mod least_squares;
-mod limit;
 pub mod linear;
 pub mod linearised;
 pub mod lm;

@@ -8,7 +8,6 @@ mod kalman;
 mod network;
 mod output;
 mod problem;
-mod realisation;
 mod recording;
 mod referee;
 mod sensitivities;

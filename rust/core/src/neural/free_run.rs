@@ -18,7 +18,7 @@
 use super::network::{self, Network};
 use crate::Monitor;
 use crate::data::weighted_squares;
-use crate::limit::Limit;
+use crate::monitor::Limit;
 use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 
 /// Samples whose inputs are prepared at once.

@@ -7,8 +7,8 @@ use super::sensitivities::Recursion;
 use super::train::InitialState;
 use crate::data::{total_weight, weighted_squares};
 use crate::gram::Gram;
-use crate::limit::Limit;
 use crate::lm::Problem;
+use crate::monitor::Limit;
 use crate::simd::{self, LANES, Lanes};
 use crate::{Monitor, Record};
 

@@ -7,7 +7,7 @@
 use super::network::{Network, Scratch, copy, unrolled};
 use super::shape::{Scaling, Shape};
 use super::{NeuralSS, state};
-use crate::limit::Limit;
+use crate::monitor::Limit;
 use crate::simd::{self, F64x8, Kernel, Lanes};
 use crate::{Error, Monitor, Result};
 

@@ -10,8 +10,8 @@ use super::single::MOST_STATES;
 use crate::Monitor;
 use crate::data::total_weight;
 use crate::gram::Gram;
-use crate::limit::Limit;
 use crate::lm::Problem;
+use crate::monitor::Limit;
 use crate::simd::{self, Lanes};
 
 /// A state beyond this many of its standard deviations has diverged.

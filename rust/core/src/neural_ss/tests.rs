@@ -1,5 +1,5 @@
 use super::*;
-use crate::limit::Limit;
+use crate::monitor::Limit;
 use crate::random::Random;
 use proptest::prelude::*;
 

@@ -1,17 +1,17 @@
 //! Training in free run: many starts in parallel, each by Levenberg-Marquardt, chosen by free run.
 
+use super::draw::{self, Realisation};
 use super::free_run::Trajectory;
 use super::friction::{self, Friction};
 use super::integrated::{Leak, Speed};
 use super::network::Network;
 use super::output::OutputFunction;
 use super::problem::{self, Attempts, Experiment};
-use super::realisation::Realisation;
 use super::recording::{Recording, check_recordings, constant_cost, scaling};
 use super::referee::{Referee, statistics};
 use super::shape::{Scaling, Shape};
 use super::state::{self, Statistics};
-use super::{NeuralSS, draw, kalman};
+use super::{NeuralSS, kalman};
 use crate::guard;
 use crate::linear::LinearModel;
 use crate::lm::{self, Damping, Outcome, Problem, Termination};

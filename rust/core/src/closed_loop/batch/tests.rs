@@ -8,7 +8,7 @@ use sewfast_control::{
 
 use super::*;
 use crate::closed_loop::kernel_plant::{AnyOrder, ScalarPlant, SecondOrder};
-use crate::closed_loop::scalar::{Constant, LoopController};
+use crate::closed_loop::{Constant, LoopController};
 use crate::closed_loop::{LaggedPlant, Plant, Run, Varied, encoder};
 use crate::lagged::Lags;
 use crate::linear::LinearModel;
