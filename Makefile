@@ -24,7 +24,7 @@ BUILT := $(VENV)/built.stamp
 REPORT := $(VENV)/report.stamp
 LIBRARIES := $(VENV)/libraries.stamp
 DEV := $(VENV)/dev.stamp
-MARKED := test checks lint rust-lint rust-test rust-units rust-rest no-std c-test python-lint types stubs python-test python-computes python-waits docs package
+MARKED := test lint rust-lint rust-test rust-units rust-rest no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
 .PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
@@ -40,15 +40,12 @@ $(OUT)/results.json: | $(REPORT)
 
 dev: $(DEV) ## builds and installs what the checks need (--jobs=2: in parallel)
 
-# Compilers and tests that compute fill both processors; tests that wait leave them idle, and the checks step back for them.
+# compilers side by side: one that optimises a crate keeps one processor busy
 SYNC := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
 test: ## every check; ends with pytest's summary
 	$(MAKE) --no-print-directory --jobs=3 $(SYNC) dev rust-units
-	$(MAKE) --no-print-directory --jobs=2 $(SYNC) python-waits checks
-	$(MAKE) --no-print-directory python-computes
-
-checks: $(DEV) # what runs beside tests that wait
-	nice -n 19 $(MAKE) --no-print-directory rust-rest docs lint no-std c-test counts package
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) rust-rest docs lint no-std c-test counts package
+	$(MAKE) --no-print-directory python-test
 
 lint: rust-lint python-lint types stubs ## formatting, clippy, ruff, mypy, stubs
 
@@ -164,12 +161,9 @@ firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian:
 	  arm-none-eabi-size target/bare/$$1.elf; \
 	done
 
-python-test: python-waits python-computes ## pytest, with every snippet of the documentation and every example
-
-python-computes: $(DEV)
+# first the tests that compute, then those that wait: beside compilers, even at the lowest priority, some come too late
+python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not alone'
-
-python-waits: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m alone
 
 docs: $(DEV) $(OUT)/results.json ## the site, in site/index.html, its pictures drawn from demo/; works offline
