@@ -28,13 +28,13 @@ def refused(capsys: pytest.CaptureFixture[str], *args: str) -> str:
 def test_a_signal_is_not_written_over(ramp: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = ramp.read_bytes()
     record = ("record", "--on", "virtual", "--signal", str(ramp))
-    assert "a file of its own" in refused(capsys, *record, "-o", str(ramp))
+    assert "a separate file" in refused(capsys, *record, "-o", str(ramp))
     link = ramp.with_name("other.csv")
     link.symlink_to(ramp)
-    assert "a file of its own" in refused(capsys, *record, "-o", str(link))
+    assert "a separate file" in refused(capsys, *record, "-o", str(link))
     (ramp.parent / "x").mkdir()
     elsewhere = ramp.parent / "x" / ".." / "ramp.csv"
-    assert "a file of its own" in refused(capsys, *record, "-o", str(elsewhere))
+    assert "a separate file" in refused(capsys, *record, "-o", str(elsewhere))
     assert ramp.read_bytes() == before
 
 
@@ -48,10 +48,10 @@ def test_nor_beside_a_recording_that_may_be_replaced(
         assert main([*record, str(ramp), "-o", str(recording)]) == 0
         assert recording.exists()
         capsys.readouterr()
-        assert "a file of its own" in refused(capsys, *record, str(ramp), "-o", str(ramp))
+        assert "a separate file" in refused(capsys, *record, str(ramp), "-o", str(ramp))
         assert ramp.read_bytes() == before
         kept = recording.read_bytes()
-        assert "a file of its own" in refused(capsys, *record, str(recording), "-o", str(ramp))
+        assert "a separate file" in refused(capsys, *record, str(recording), "-o", str(ramp))
         assert recording.read_bytes() == kept
 
 
@@ -59,7 +59,7 @@ def test_two_outputs_are_two_files(ramp: Path, capsys: pytest.CaptureFixture[str
     out = str(ramp.with_name("out.csv"))
     command = ("run", "none.json", "--on", "socket://127.0.0.1:1", "--reference", str(ramp))
     said = refused(capsys, *command, "--host-loop", "-o", out, "--samples", out)
-    assert "a file of its own" in said
+    assert "a separate file" in said
 
 
 def test_a_model_is_not_written_over_by_its_controller(
@@ -67,10 +67,10 @@ def test_a_model_is_not_written_over_by_its_controller(
 ) -> None:
     model = tmp_path / "m.json"
     model.write_text("{}")
-    assert "a file of its own" in refused(capsys, "tune", str(model), "-o", str(model))
+    assert "a separate file" in refused(capsys, "tune", str(model), "-o", str(model))
     data = tmp_path / "d.json"
     data.write_text("{}")
-    assert "a file of its own" in refused(capsys, "identify", f"{data}:u:y", "-o", str(data))
+    assert "a separate file" in refused(capsys, "identify", f"{data}:u:y", "-o", str(data))
     assert (model.read_text(), data.read_text()) == ("{}", "{}")
 
 
