@@ -42,8 +42,9 @@ dev: $(DEV) ## builds and installs what the checks need (--jobs=2: in parallel)
 
 # compilers side by side: one that optimises a crate keeps one processor busy
 SYNC := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
+FIRST ?= dev rust-units
 test: ## every check; ends with pytest's summary
-	$(MAKE) --no-print-directory --jobs=3 $(SYNC) dev rust-units
+	$(MAKE) --no-print-directory --jobs=3 $(SYNC) $(FIRST)
 	$(MAKE) --no-print-directory --jobs=2 $(SYNC) rust-rest docs lint no-std c-test counts package
 	$(MAKE) --no-print-directory python-test
 
@@ -72,7 +73,7 @@ rust-test: rust-units rust-rest ## unit, property and documentation tests of the
 WITH_CORE := sewfast-core sewfast-control
 rust-units:
 	@echo "properties with PROPTEST_RNG_SEED=$(SEED)"
-	PROPTEST_RNG_SEED=$(SEED) cargo test $(WITH_CORE:%=--package %) --lib --profile checked --quiet
+	PROPTEST_RNG_SEED=$(SEED) cargo test $(WITH_CORE:%=--package %) --tests --profile checked --quiet
 
 rust-rest: $(DEV)
 	PROPTEST_RNG_SEED=$(SEED) cargo test --workspace $(WITH_CORE:%=--exclude %) --release --quiet

@@ -63,7 +63,9 @@ def controller() -> sewfast.Controller:
     )  # fmt: skip
 
 
-def replayed(run: sewfast.control.RecordedRun, r: np.ndarray, motor: Motor) -> tuple[int, int]:
+def replayed(
+    run: sewfast.control.machine.RecordedRun, r: np.ndarray, motor: Motor
+) -> tuple[int, int]:
     """Samples whose counts, and whose filtered measurement, differ from those in Python."""
     core, start = controller().core().single(), motor.counts
     counts, feedback = np.zeros(len(r)), np.zeros(len(r))

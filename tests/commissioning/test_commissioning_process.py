@@ -62,7 +62,7 @@ def test_a_killed_commissioning_leaves_its_recordings(tmp_path: Path, behind: st
         with commissioning(tmp_path, on) as process:
             process.send_signal(signal.SIGKILL)
             _, said = process.communicate(timeout=PATIENCE)
-    assert ("recording lies in out/unfinished" in said) == (behind == "port")
+    assert ("recording is saved in out/unfinished" in said) == (behind == "port")
     out = tmp_path / "out"
     assert not (out / "commissioning.json").exists()
     files = {file.stem: file for file in (out / "unfinished").glob("*.mcap")}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ import pytest
 from effort import FULL
 from sewfast import FrequencyResponse, VirtualMachine, bode, fit_shaft
 from sewfast.control.margins import loop_response
-from sewfast.errors import FitError
+from sewfast.errors import DataError, FitError
 from sewfast.frequency import propose
 
 TS = 1e-3
@@ -126,6 +128,40 @@ def test_two_masses_stay_two(load: float) -> None:
 def test_a_machine_with_one_shaft_has_one(seed: int) -> None:
     machine = VirtualMachine(seed, load_inertia=1e-3, stiffness=150.0)
     assert fit_shaft(bode(machine, speed=1500.0)).resonances == 1
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"hertz": np.concatenate([[0.0], np.arange(2.5, 400.0, 0.5)])},
+        {"variance": np.full(796, -1.0)},
+        {"variance": np.concatenate([[np.nan], np.zeros(795)])},
+        {"value": chain([1e-3, 1e-3], [100.0]).value * 1e300},
+        {"value": chain([1e-3, 1e-3], [100.0]).value * 1e-290, "variance": np.zeros(796)},
+    ],
+)
+def test_lines_that_say_nothing_are_left_out(changed: dict[str, Any]) -> None:
+    fit = fit_shaft(replace(chain([1e-3, 1e-3], [100.0]), **changed))
+    assert fit.parameters["resonance_hertz"].value == pytest.approx(71.16, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"hertz": np.full(796, 50.0)},
+        {"hertz": np.arange(400.0, 2.0, -0.5)},
+        {"hertz": -np.arange(2.0, 400.0, 0.5)},
+        {"Ts": 0.0},
+        {"Ts": float("nan")},
+        {"value": np.zeros(796, dtype=complex)},
+        {"variance": np.full(796, np.nan)},
+    ],
+)
+def test_a_response_that_is_none_is_refused(changed: dict[str, Any]) -> None:
+    with pytest.raises(DataError) as caught:
+        fit_shaft(replace(chain([1e-3, 1e-3], [100.0]), **changed))
+    assert caught.value.name == "response"
 
 
 def test_filters_take_both_shafts_on(tmp_path: Path) -> None:

@@ -314,7 +314,7 @@ class _Plan:
         if realisations * periods < 2:
             raise SettingError(
                 name="periods", expected="at least two in all", received="one",
-                remedy="noise is estimated from repetitions",
+                remedy="use periods=2 or more: noise is estimated from repetitions",
             )  # fmt: skip
         highest = HIGHEST / Ts if f_max is None else real("f_max", f_max)
         if not 0.0 < real("f_min", f_min) < highest <= 0.5 / Ts:

@@ -66,7 +66,7 @@ def periodic(
     if realisations * periods < 2:
         raise DataError(
             name="y", expected="at least two periods or realisations", received="one",
-            remedy="without repetition there is no uncertainty",
+            remedy="record more periods: the uncertainty is estimated from repetitions",
         )  # fmt: skip
     k = _lines(lines, n)
     U, Y = (np.fft.rfft(x, axis=-1)[..., k] / n for x in (u, y))

@@ -33,8 +33,8 @@ from .response import Complex, FrequencyResponse
 
 RIGID, SHAFT = 4, 4
 """Number of parameters of a rigid machine, and of each shaft."""
-LEAST = 20
-"""Least frequencies for a fit."""
+LEAST, LEAST_GAIN = 20, 1e-300
+"""Least number of frequencies for a fit, and least magnitude of a usable one."""
 CLEAR = 100.0
 """Error that a resonance has to explain to be accepted, in mean squared errors of a frequency."""
 NEIGHBOURS = 10
@@ -209,30 +209,23 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
     FitError
         If nothing converges, or a resonance is requested and none is found.
     """
-    usable = (response.coherence > 0.5) & (response.value != 0.0)
-    if usable.sum() < LEAST:
-        raise DataError(
-            name="response", expected=f"at least {LEAST} frequencies with a coherence above .5",
-            received=str(usable.sum()), remedy="excite more, or longer",
-        )  # fmt: skip
-    f, g = response.hertz[usable], response.value[usable]
-    sigma = np.sqrt(0.5 * _smoothed(response.variance[usable]) + (FLOOR * np.abs(g)) ** 2)
-    task = _Task(f, g, sigma, response.Ts, response.from_counts)
+    task, level = _task_of(response)
+    f = task.hertz
     rigid = min((_solved(task, x) for x in _rigid_starts(task)), key=lambda s: s[0])
     best, beyond = rigid, None
     if resonance is not False:
         shaft = _best_shaft(task, _shaft_starts(task, rigid[1]))
-        if shaft is None and resonance:
+        if shaft is not None and (resonance or _is_better(task, shaft[0], rigid[0])):
+            best = shaft
+        second = _best_shaft(task, _second_starts(task, rigid[1], shaft))
+        if second is not None and _is_better(task, second[0], best[0]):
+            best = second
+        if best is rigid and resonance:
             raise FitError(
                 name="resonance", expected="one within the measured frequencies", received="none",
                 remedy="leave resonance=None, or measure to higher frequencies",
             )  # fmt: skip
-        if shaft is not None and (resonance or _is_better(task, shaft[0], rigid[0])):
-            best = shaft
-        second = _best_shaft(task, _second_starts(task, shaft))
-        if second is not None and _is_better(task, second[0], best[0]):
-            best = second
-        elif best is rigid:
+        if best is rigid:
             beyond = _beyond(task, rigid)
     cost, theta, covariance = best
     if not math.isfinite(cost):
@@ -242,6 +235,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
         )  # fmt: skip
     freedom = max(2 * len(f) - len(theta), 1)
     scale = max(1.0, cost / freedom)
+    theta = theta + math.log(level) * (np.arange(len(theta)) == 0)
     parameters = _parameters(theta, covariance * scale, response)
     return ShaftFit(parameters, math.sqrt(cost / freedom), response, theta, beyond)
 
@@ -358,8 +352,32 @@ class _Task:
         return np.concatenate([error.real, error.imag])
 
 
+def _task_of(response: FrequencyResponse) -> tuple[_Task, float]:
+    """The usable lines, divided by their median magnitude, and that."""
+    hertz, value = np.asarray(response.hertz), np.asarray(response.value)
+    variance = np.asarray(response.variance)
+    usable = (response.coherence > 0.5) & (hertz > 0.0) & (np.abs(value) > LEAST_GAIN)
+    usable &= np.isfinite(value) & np.isfinite(variance)
+    if usable.sum() < LEAST:
+        raise DataError(
+            name="response", expected=f"at least {LEAST} frequencies with a coherence above .5",
+            received=str(usable.sum()), remedy="excite more, or longer",
+        )  # fmt: skip
+    f, Ts = hertz[usable], response.Ts
+    if not (math.isfinite(Ts) and Ts > 0.0 and np.all(np.diff(f) > 0.0)):
+        raise DataError(
+            name="response", expected="ascending frequencies and a sample time above 0 s",
+            received=f"{f[0]:g} to {f[-1]:g} Hz, {Ts:g} s", remedy="sort the lines, each only once",
+        )  # fmt: skip
+    level = float(np.median(np.abs(value[usable])))
+    g = value[usable] / level
+    spread = np.minimum(np.sqrt(np.maximum(variance[usable], 0.0)) / level, 1e100)
+    sigma = np.sqrt(0.5 * _smoothed(spread**2) + (FLOOR * np.abs(g)) ** 2)
+    return _Task(f, g, sigma, Ts, response.from_counts), level
+
+
 def _smoothed(variance: FloatArray) -> FloatArray:
-    logs = np.log(variance)
+    logs = np.log(np.maximum(variance, 1e-300))  # a simulation without noise has none
     n = len(logs)
     around = [
         np.median(logs[max(0, k - NEIGHBOURS) : min(n, k + NEIGHBOURS + 1)]) for k in range(n)
@@ -375,10 +393,12 @@ def _solved(
     # a lag far below a sample, or far above all measured periods, has no effect on the residuals: a
     # search that gets there stays there
     low[1:3] = np.array([1.0, 2.0]) * math.log(FASTEST * task.Ts)
-    high[1:3] = np.array([1.0, 2.0]) * math.log(SLOWEST / task.hertz[0])
+    slowest = max(SLOWEST / task.hertz[0], task.Ts)
+    high[1:3] = np.array([1.0, 2.0]) * math.log(slowest)
+    begin = np.clip(start, low, high)
     try:
         found = least_squares(
-            task.residuals, start, "3-point", bounds=(low, high), max_nfev=evaluations
+            task.residuals, begin, "3-point", bounds=(low, high), max_nfev=evaluations
         )  # fmt: skip
     except DataError:  # no finite residual at the start
         return math.inf, start, np.zeros((len(start), len(start)))
@@ -406,17 +426,17 @@ def _shaft_starts(task: _Task, rigid: FloatArray) -> list[FloatArray]:
     """Starts from rational fits, and where the response is most above the rigid machine's."""
     f = task.hertz
     ratio = np.abs(task.value) / np.abs(_sampled(rigid, f, task.Ts, task.counted))
-    return _rational_starts(task, 1) + _starts_at(task, rigid, ratio, f[_peaks(ratio)[:4]])
+    return _rational_starts(task, rigid, 1) + _starts_at(task, rigid, ratio, f[_peaks(ratio)[:4]])
 
 
 def _second_starts(
-    task: _Task, shaft: tuple[float, FloatArray, FloatArray] | None
+    task: _Task, rigid: FloatArray, shaft: tuple[float, FloatArray, FloatArray] | None
 ) -> list[FloatArray]:
     """Starts from rational fits, and where the response is above that of one shaft.
 
     The latter over as many lines as a shaft needs.
     """
-    starts = _rational_starts(task, 2)
+    starts = _rational_starts(task, rigid, 2)
     if shaft is None:
         return starts
     cost, theta, _ = shaft
@@ -429,7 +449,7 @@ def _second_starts(
     return starts + _starts_at(task, theta, ratio, f[peaks[unexplained[peaks] > LIFTED][:4]])
 
 
-def _rational_starts(task: _Task, shafts: int) -> list[FloatArray]:
+def _rational_starts(task: _Task, fit: FloatArray, shafts: int) -> list[FloatArray]:
     """Starts from the poles and zeros of rational fits, which themselves need no start.
 
     Every choice of oscillating poles and zeros in the measured range is a start, if each
@@ -443,14 +463,13 @@ def _rational_starts(task: _Task, shafts: int) -> list[FloatArray]:
         ):
             pairs = list(zip(resonances, antiresonances, strict=True))
             if all(RATIOS[0] < (r[0] / a[0]) ** 2 - 1.0 < RATIOS[1] for r, a in pairs):
-                starts.append(
-                    _with_lags(task, np.concatenate([np.log([*r, *a]) for r, a in pairs]))
-                )
+                shaft = np.concatenate([np.log([*r, *a]) for r, a in pairs])
+                starts += _with_lags(task, fit, shaft)
     return starts
 
 
-def _with_lags(task: _Task, shafts: FloatArray) -> FloatArray:
-    """A start: these shafts, with the gain, lags and delay that fit best.
+def _with_lags(task: _Task, fit: FloatArray, shafts: FloatArray) -> list[FloatArray]:
+    """Starts: these shafts with the lags of a fit, and with the gain, lags and delay that fit best.
 
     Divided by the shafts, the response is `K / (1 + a1 s + a2 s^2)`, whose inverse is linear in
     its coefficients; a few values of the delay are tried. Holding the command delays by half a
@@ -461,7 +480,8 @@ def _with_lags(task: _Task, shafts: FloatArray) -> FloatArray:
     for wr, zr, wa, za in np.exp(shafts).reshape(-1, SHAFT):
         shape *= (s * s + 2.0 * za * wa * s + wa * wa) / (s * s + 2.0 * zr * wr * s + wr * wr)
         shape *= (wr / wa) ** 2
-    best = math.inf, np.zeros(RIGID)
+    best: tuple[float, list[FloatArray]] = math.inf, []
+    kept = np.concatenate([fit[:RIGID], shafts])
     for delay in DELAYS:
         samples = delay + (1.0 if task.counted else 0.5)
         inverse = shape * np.exp(-s * samples * task.Ts) / task.value
@@ -472,10 +492,12 @@ def _with_lags(task: _Task, shafts: FloatArray) -> FloatArray:
             np.vstack([rows.real, rows.imag]), np.concatenate([goal.real, goal.imag]), rcond=None
         )
         cost = float(left[0]) if len(left) else math.inf
-        if cost < best[0] and found[0] > 0.0:
+        # with lags below 0, a delay stands for a lag that it is not
+        if cost < best[0] and found[0] > 0.0 and found[1] > 0.0 and found[2] > 0.0:
             a1, a2 = np.maximum(found[1:] / found[0], [FAST * task.Ts, (FAST * task.Ts) ** 2])
-            best = cost, np.array([-math.log(found[0]), math.log(a1), math.log(a2), delay])
-    return np.concatenate([best[1], shafts])
+            lags = [-math.log(found[0]), math.log(a1), math.log(a2), delay]
+            best = cost, [np.concatenate([lags, shafts])]
+    return [kept, *best[1]]
 
 
 def _rational(task: _Task, order: int) -> tuple[FloatArray, FloatArray]:
@@ -496,7 +518,8 @@ def _rational(task: _Task, order: int) -> tuple[FloatArray, FloatArray]:
         den = np.concatenate([[1.0], found[order + 2 :]])
         below = np.abs(delays[:, : order + 1] @ den)
         weight = 1.0 / (task.sigma * np.maximum(below, 1e-12))
-        off = delays @ num / (delays[:, : order + 1] @ den) - task.value
+        with np.errstate(all="ignore"):
+            off = delays @ num / (delays[:, : order + 1] @ den) - task.value
         cost = float(np.sum(np.abs(off / task.sigma) ** 2))
         if cost < best[0]:
             best = cost, num, den
@@ -530,7 +553,7 @@ def _starts_at(
         valley = f[left][ratio[left].argmin()] if left.any() else 0.75 * place
         for antiresonance in (valley, 0.75 * place):
             shaft = np.log([2 * math.pi * place, 0.03, 2 * math.pi * antiresonance, 0.03])
-            starts.append(_with_lags(task, np.concatenate([fit[RIGID:], shaft])))
+            starts += _with_lags(task, fit, np.concatenate([fit[RIGID:], shaft]))
     return starts
 
 
