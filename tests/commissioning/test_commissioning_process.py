@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -92,6 +93,16 @@ def test_ctrl_c_says_at_once_that_it_writes(tmp_path: Path) -> None:
     assert said[1].startswith("the best so far is kept: ")
     assert (tmp_path / "out/unfinished/trapezoids.mcap").exists()
     assert (tmp_path / "out/recordings/trapezoids.csv").exists()
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("after", [0.2, 0.6])
+def test_ctrl_c_is_heard_while_linear_models_are_fitted(tmp_path: Path, after: float) -> None:
+    with commissioning(tmp_path) as process:
+        time.sleep(after)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
 
 
 @pytest.mark.alone

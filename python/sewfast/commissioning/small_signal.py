@@ -223,12 +223,14 @@ def fitted(part: Split, order: int) -> tuple[_core.LinearModel, Errors] | None:
     tried = []
     for fit in (_core.fit_oe, _core.fit_iv):
         try:
-            model = fit(
+            found = fit(
                 arrays(part.fitted), na=order, nb=order + 1, nk=1, max_iterations=ITERATIONS
-            ).model
+            )
         except (DataError, FitError):
             continue
-        tried.append((model, errors_of(free_runs(model, part), part)))
+        if found.termination == "interrupted":  # the core has heard Ctrl-C and kept its best
+            raise KeyboardInterrupt
+        tried.append((found.model, errors_of(free_runs(found.model, part), part)))
     return min(tried, key=lambda t: t[1].rmse, default=None)
 
 
