@@ -199,8 +199,8 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
         are omitted.
     resonance : bool, optional
         Whether there is a shaft. None: a shaft is accepted if it explains 100 times the mean
-        squared error of a frequency, is damped below .5 and lies within the measured range. If
-        there is one, a second shaft is searched under the same conditions.
+        squared error of a frequency, is damped below .5 and lies within the measured range. A
+        second shaft has to satisfy the same conditions.
 
     Raises
     ------
@@ -235,7 +235,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
         )  # fmt: skip
     freedom = max(2 * len(f) - len(theta), 1)
     scale = max(1.0, cost / freedom)
-    theta = theta + math.log(level) * (np.arange(len(theta)) == 0)
+    theta[0] += math.log(level)
     parameters = _parameters(theta, covariance * scale, response)
     return ShaftFit(parameters, math.sqrt(cost / freedom), response, theta, beyond)
 
@@ -243,14 +243,12 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
 # --- The sampled response: partial fractions ------------------------------------------------------
 
 
-def _polynomials(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Numerator and denominator of G without its delay; theta: logarithms, except the delay."""
-    K, a1, a2 = np.exp(theta[:3])
-    num, den = np.array([K]), np.array([a2, a1, 1.0])
-    for wr, zr, wa, za in _shafts(theta):
+def _numerator(theta: FloatArray) -> FloatArray:
+    """Numerator of G without its delay; theta: logarithms, except the delay."""
+    num: FloatArray = np.exp(theta[:1])
+    for wr, _, wa, za in _shafts(theta):
         num = np.convolve(num, [1.0, 2.0 * za * wa, wa * wa]) * (wr / wa) ** 2
-        den = np.convolve(den, [1.0, 2.0 * zr * wr, wr * wr])
-    return num, den
+    return num
 
 
 def _shafts(theta: FloatArray) -> FloatArray:
@@ -283,7 +281,6 @@ def _terms(theta: FloatArray, Ts: float, *, counted: bool) -> tuple[int, float, 
     For the speed, or for its integral if it is counted. The factors are quadratics, so their roots
     need no eigenvalue problem.
     """
-    num, _ = _polynomials(theta)
     a1, a2 = np.exp(theta[1:3])
     shafts = _shafts(theta)
     half = np.concatenate([[0.5 * a1 / a2], shafts[:, 1] * shafts[:, 0]])
@@ -294,7 +291,7 @@ def _terms(theta: FloatArray, Ts: float, *, counted: bool) -> tuple[int, float, 
     poles = np.concatenate([large, square / large, [0.0] if counted else []])
     apart = poles[:, None] - poles
     np.fill_diagonal(apart, 1.0)
-    residues = np.polyval(num, poles) / (a2 * apart.prod(axis=1))
+    residues = np.polyval(_numerator(theta), poles) / (a2 * apart.prod(axis=1))
     delay = max(float(theta[3]), 0.0)
     whole = math.floor(delay)
     return whole, delay - whole, poles, residues
@@ -488,9 +485,7 @@ def _with_lags(task: _Task, fit: FloatArray, shafts: FloatArray) -> list[FloatAr
         weight = np.abs(task.value) / (task.sigma * np.abs(inverse))
         rows = weight[:, None] * np.stack([np.ones(len(s)), s, s * s], axis=1)
         goal = weight * inverse
-        found, left, *_ = np.linalg.lstsq(
-            np.vstack([rows.real, rows.imag]), np.concatenate([goal.real, goal.imag]), rcond=None
-        )
+        found, left = _real_solution(rows, goal)
         cost = float(left[0]) if len(left) else math.inf
         # with lags below 0, a delay stands for a lag that it is not
         if cost < best[0] and found[0] > 0.0 and found[1] > 0.0 and found[2] > 0.0:
@@ -511,19 +506,25 @@ def _rational(task: _Task, order: int) -> tuple[FloatArray, FloatArray]:
     weight, best = 1.0 / task.sigma, (math.inf, np.zeros(1), np.ones(1))
     for _ in range(ROUNDS):
         rows, goal = weight[:, None] * columns, weight * task.value
-        found, *_ = np.linalg.lstsq(
-            np.vstack([rows.real, rows.imag]), np.concatenate([goal.real, goal.imag]), rcond=None
-        )
+        found, _ = _real_solution(rows, goal)
         num = np.concatenate([[0.0], found[: order + 2]])
         den = np.concatenate([[1.0], found[order + 2 :]])
-        below = np.abs(delays[:, : order + 1] @ den)
-        weight = 1.0 / (task.sigma * np.maximum(below, 1e-12))
+        below = delays[:, : order + 1] @ den
+        weight = 1.0 / (task.sigma * np.maximum(np.abs(below), 1e-12))
         with np.errstate(all="ignore"):
-            off = delays @ num / (delays[:, : order + 1] @ den) - task.value
+            off = delays @ num / below - task.value
         cost = float(np.sum(np.abs(off / task.sigma) ** 2))
         if cost < best[0]:
             best = cost, num, den
     return best[1], best[2]
+
+
+def _real_solution(rows: Complex, goal: Complex) -> tuple[FloatArray, FloatArray]:
+    """Real least-squares solution of complex equations, and its sum of squares if it is unique."""
+    found, left, *_ = np.linalg.lstsq(
+        np.vstack([rows.real, rows.imag]), np.concatenate([goal.real, goal.imag]), rcond=None
+    )
+    return found, left
 
 
 def _swinging(coefficients: FloatArray, task: _Task) -> list[tuple[float, float]]:
