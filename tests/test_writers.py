@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from refusals import refuses
 from sewfast.errors import DataError, SettingError
 from sewfast.readers import read, read_table
-from sewfast.writers import write_bytes, write_table
+from sewfast.storage import write_bytes, write_table
 
 FORMATS = [".csv", ".npz", ".mat", ".parquet"]
 

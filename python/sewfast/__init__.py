@@ -51,11 +51,11 @@ if TYPE_CHECKING:
     from .recording import Recording
     from .rules import fit_fopdt, table_1
     from .speed import speed_from_counts
+    from .storage import write_table
     from .tuning.front import ParetoFront, pareto
     from .tuning.objective import Constraints, Cost, LoadStep
     from .tuning.search import TuningResult, tune
     from .validation import Validation, validate
-    from .writers import write_table
 
 __all__ = [
     "ARX",
@@ -172,7 +172,7 @@ _HOMES = {
     "control.margins": "Margins margins operating_point",
     "speed": "speed_from_counts",
     "validation": "Validation validate",
-    "writers": "write_table",
+    "storage": "write_table",
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 

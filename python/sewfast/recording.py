@@ -18,7 +18,7 @@ from .gains import vector
 from .recordfile import Header, save_columns
 from .recordfile.writer import require_replaceable
 from .speed import Method, speed_from_counts
-from .writers import write_table
+from .storage import write_table
 
 UNITS: Mapping[str, str] = {"t": "s", "u": "V", "y": "RPM", "speed_true": "RPM"}
 """Units of the columns; counts have none."""
@@ -167,7 +167,7 @@ class Recording:
         Raises
         ------
         DataError, SettingError
-            As for `sewfast.writers.write_table`.
+            As for `sewfast.storage.write_table`.
         """
         require_replaceable(path, overwrite=overwrite)
         if Path(path).suffix.lower() == ".mcap":

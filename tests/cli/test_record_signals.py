@@ -13,7 +13,7 @@ from sewfast import signals
 from sewfast.link import VirtualDevice, connect
 from sewfast.readers import read_table
 from sewfast.recordfile import read_recording
-from sewfast.writers import write_table
+from sewfast.storage import write_table
 
 
 def test_a_signal_is_scaled(tmp_path: Path) -> None:

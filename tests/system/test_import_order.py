@@ -14,7 +14,7 @@ import sewfast
 
 ORDER = """
     errors kinds units arrays storage tables plotting progress threads speed signals
-    writers recordfile dataset readers benchmarks gains machine live recording
+    recordfile dataset readers benchmarks gains machine live recording
     dynamic_model validation comparison evidence models
     motorfit identification sklearn
     rules control tuning trust analysis frequency deployment fleets

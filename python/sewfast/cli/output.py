@@ -138,7 +138,7 @@ def _write(
 
         save_columns(out, header, {name: columns[name] for name in header.columns})
         return
-    from ..writers import write_table
+    from ..storage import write_table
 
     write_table(out, columns, units=units)
 

@@ -23,11 +23,11 @@ from ..plotting import Trace, loop_drawing
 from ..recording import Recording
 from ..report.commissioned import FORMAT, NUMBERS, RESPONSE, VERSION, run_file
 from ..rules import Fopdt
+from ..storage import write_table
 from ..tables import html_of
 from ..trust import Judgement
 from ..tuning.objective import Cost
 from ..tuning.search import TuningResult
-from ..writers import write_table
 from .checkpoint import clear, prepare, require_repeatable
 from .excitations import Motion
 from .numbers import numbers

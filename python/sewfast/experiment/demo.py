@@ -32,8 +32,8 @@ from ..report.artefacts import (
 )
 from ..rules import Fopdt
 from ..signals import excitation
+from ..storage import write_table
 from ..tuning.search import TuningResult
-from ..writers import write_table
 from . import loops
 from .loops import ExperimentDrive, drive_of
 

@@ -21,7 +21,7 @@ from ..plotting import Drawing, Plotted, Trace, loop_panels, stacked
 from ..recordfile import Header, RecordWriter
 from ..recordfile.filing import replacing
 from ..recordfile.writer import require_replaceable
-from ..writers import write_table
+from ..storage import write_table
 from .wire import Identity
 
 if TYPE_CHECKING:
@@ -343,7 +343,7 @@ class HostLoopRun(Plotted):
         Raises
         ------
         DataError, SettingError
-            As for `sewfast.writers.write_table`.
+            As for `sewfast.storage.write_table`.
         """
         require_replaceable(path, overwrite=overwrite)
         if Path(path).suffix.lower() == ".mcap":

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import is_whole
 from ..errors import DataError, SettingError
-from ..writers import write_table
+from ..storage import write_table
 from . import format
 from .filing import Block, End, Event, Filing, Sink, batched, replacing
 from .format import Assembler, Message, Topic, opening

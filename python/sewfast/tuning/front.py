@@ -19,8 +19,8 @@ from ..errors import Interrupted, SettingError
 from ..gains import whole
 from ..plotting import Drawing, Panel, Plotted, lettered
 from ..progress import shown_in_notebooks
+from ..storage import write_table
 from ..tables import Table, significant
-from ..writers import write_table
 from .objective import Constraints, Cost, LoadStep
 from .search import tune
 from .task import Aggregate, Progress, TuningTask, Wanted, threads_or_all
