@@ -3,15 +3,14 @@
 Read in this order: `procedure` (`commission`, its stages one after the other), `demands` (settings
 and limits, `Refusal`), `bench` (wrappers around a machine); the stages: `excitations`,
 `small_signal`, `gains`, `training`, `slow`, `verification`; `result` (the value and its folder).
-Apart from these: `shaking`, `records` (`bode` of a machine, of a record), `fmu` (an FMU as a
-machine).
+Apart from these: `shaking` (`bode` of a machine), `fmu` (an FMU as a machine).
 """
 
+from ..frequency.local import unsmoothed
 from .bench import Bench, Followed, Stepped, SteppedBench
 from .demands import Refusal
 from .fmu import FmuMachine, fmu_bench
 from .procedure import STAGES, commission
-from .records import unsmoothed
 from .result import Commissioning
 from .shaking import bode
 from .training import Rival

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import os
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,7 +31,7 @@ from ..tuning.objective import Cost
 from ..tuning.search import TuningResult
 from ..tuning.task import GAINS
 from . import excitations
-from .bench import RecordedBench, bench_of, description_of
+from .bench import ABORTED, RecordedBench, bench_of, description_of
 from .checkpoint import STAGES, Checkpoint
 from .demands import MS, Demands, Refusal, demands
 from .excitations import first_motion, standard, step_response
@@ -45,7 +46,6 @@ from .gains import (
     sensible,
     start_of,
 )
-from .journal import Journal, Progress
 from .result import VERIFIED, VERIFIED_POORLY, Commissioning, require_own
 from .shaking import margins_at_work
 from .slow import Thinning, turn_load
@@ -527,3 +527,111 @@ def _whole(name: str, reference: ArrayLike) -> FloatArray:
             remedy="give the speed to follow",
         )  # fmt: skip
     return samples
+
+
+# --- The journal: stages and results so far -------------------------------------------------------
+
+
+Progress: TypeAlias = Callable[[int, int, str], object]
+"""Called with the stages done, their total, and the present stage."""
+
+
+class Journal:
+    """Collects the results; `result` makes a `Commissioning` of them at any time.
+
+    Parameters
+    ----------
+    machine : str
+    progress : callable or None
+    cancel : threading.Event or None
+    between : callable or None
+        See `commission`.
+    """
+
+    def __init__(
+        self,
+        machine: str,
+        progress: Progress | None,
+        cancel: threading.Event | None = None,
+        between: Callable[[str, Commissioning], object] | None = None,
+    ) -> None:
+        self._progress = progress
+        self._cancel, self._between = cancel, between
+        self._began: list[tuple[str, float]] = []
+        self._values: dict[str, Any] = {"machine": machine, "recordings": {}}
+
+    @property
+    def fopdt(self) -> Fopdt:
+        """The fit to the step response."""
+        found: Fopdt = self._values["fopdt"]
+        return found
+
+    @property
+    def first(self) -> Controller:
+        """The first gains."""
+        found: Controller = self._values["first"]
+        return found
+
+    def recording(self, name: str) -> Recording:
+        """A recording by its name."""
+        found: Recording = self._values["recordings"][name]
+        return found
+
+    @property
+    def stage(self) -> str:
+        """The present stage."""
+        return self._began[-1][0] if self._began else STAGES[0]
+
+    def enter(self, stage: str) -> None:
+        """Begin a stage."""
+        # register it first: the callbacks can raise to stop
+        self._began.append((stage, time.perf_counter()))
+        self._report(STAGES.index(stage), stage)
+        self.pause(stage)
+        # the time that a person took does not count for the stage
+        self._began[-1] = (stage, time.perf_counter())
+
+    def pause(self, following: str) -> None:
+        """Call `between` with the next step and the results so far; it can wait for a person."""
+        if self._between is not None:
+            self._between(following, self.result("under way"))
+        self.heed()
+
+    def heed(self) -> None:
+        """Raise `KeyboardInterrupt` if `cancel` is set."""
+        if self._cancel is not None and self._cancel.is_set():
+            raise KeyboardInterrupt
+
+    def within(self, done: int, total: int) -> None:
+        """Report progress within the stage."""
+        self.heed()
+        self._report(STAGES.index(self.stage), f"{self.stage} {done}/{total}")
+
+    def finish(self) -> None:
+        """Report that all stages are done."""
+        self._report(len(STAGES), "done")
+
+    def _report(self, done: int, text: str) -> None:
+        if self._progress is not None:
+            self._progress(done, len(STAGES), text)
+
+    def keep(self, **values: Any) -> None:
+        """Store results."""
+        self._values |= values
+
+    def say(self, note: str) -> None:
+        """Add a note on something unusual."""
+        self._values["notes"] = (*self._values.get("notes", ()), note)
+
+    def note(self, name: str, recording: Recording) -> None:
+        """Store a recording, except those along the references, which are stored as runs."""
+        if self.stage != STAGES[-1] or name.startswith("hold_") or name.endswith(ABORTED):
+            self._values["recordings"] = {**self._values["recordings"], name: recording}
+
+    def result(self, verdict: str, reason: str = "") -> Commissioning:
+        """The results so far."""
+        ends = [t for _, t in self._began[1:]] + [time.perf_counter()]
+        seconds = {s: end - t for (s, t), end in zip(self._began, ends, strict=True)}
+        return Commissioning(
+            **self._values, verdict=verdict, stage=self.stage, reason=reason, seconds=seconds
+        )

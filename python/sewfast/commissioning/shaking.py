@@ -21,17 +21,12 @@ from ..control.machine import Machine, is_watched
 from ..control.margins import margins
 from ..dataset import Dataset
 from ..errors import DataError, LinkError, SettingError
-from ..frequency import (
-    FrequencyResponse,
-    ResponsesOverSpeed,
-    local_polynomial,
-    periodic,
-)
+from ..frequency import FrequencyResponse, ResponsesOverSpeed, local_polynomial, periodic
+from ..frequency.local import RecordMethod, of_record
 from ..gains import real
 from ..recording import Recording
 from ..speed import speed_from_counts
 from .bench import bench_of
-from .records import RecordMethod, of_record
 
 SHARE = 0.6
 """Default amplitude of the multisine as a share of the command left at the working point."""

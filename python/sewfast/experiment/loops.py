@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .. import _core, signals
 from ..commissioning import Commissioning, commission
 from ..commissioning.bench import DriveBench
-from ..commissioning.numbers import run_numbers
+from ..commissioning.result import run_numbers
 from ..control.controller import Controller, SampledController, paper_controller
 from ..control.loop import ClosedLoopRun, run
 from ..control.machine import RecordedRun, Watch, record

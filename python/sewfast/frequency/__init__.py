@@ -1,9 +1,9 @@
 """Frequency response of a machine with error bars, and the shaft behind it.
 
 `response` has the result and its uses (bands, loop, margins, files, pictures), `estimate` computes
-it from periods and by averaged spectra, `local` from any record, `shaft` fits a rigid machine or
-masses on shafts to it, `speeds` has the responses at several speeds, `proposal` finds gains and
-filters.
+it from periods and by averaged spectra, `local` from any record, with cautions; `shaft` fits a
+rigid machine or masses on shafts to it, `speeds` has the responses at several speeds, `proposal`
+finds gains and filters.
 """
 
 from .estimate import periodic, spectral

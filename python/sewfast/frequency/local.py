@@ -21,17 +21,22 @@ the three errors are independent.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import FloatArray
-from ..errors import DataError
-from .estimate import record_of
+from ..dataset import Dataset, Experiment
+from ..errors import DataError, SettingError
+from ..readers import parse_source, read_table
+from ..recording import Recording
+from ..speed import speed_from_counts
+from .estimate import record_of, spectral
 from .response import LEVEL, Complex, FrequencyResponse
 
 LINES = 13
@@ -315,3 +320,154 @@ def _require_related(pieces: list[_Piece]) -> None:
             received="one that has nothing to do with it",
             remedy="name the column that the controller follows",
         )  # fmt: skip
+
+
+# --- The response of a recording or a data set, with cautions about parts that are not linear -----
+
+
+RecordMethod: TypeAlias = Literal["segments", "local"]
+
+LEAST_RUN = 3
+"""Equal samples in a row at the largest or smallest value that count as a command at a limit."""
+MOVES = 0.9
+"""Least share of the other samples that differ from the one before; a staircase has fewer."""
+REVERSED = 0.02
+"""A mean speed over 20 ms in the opposite direction counts as a reversal from this share of the
+largest speed on."""
+MEAN = 0.02
+OUTSIDE = 1.0, 99.0
+"""Percentiles of the second half of a record; one that begins outside them has a run-up."""
+
+
+def of_record(
+    on: Recording | Dataset, reference: str | None, method: str | None, segment: int | None
+) -> FrequencyResponse:
+    """`bode` of a record, with the same arguments."""
+    if method not in (None, *get_args(RecordMethod)):
+        raise SettingError(
+            name="method", expected=" or ".join(get_args(RecordMethod)), received=repr(method)
+        )
+    if method == "local" and segment is not None:
+        raise SettingError(
+            name="segment", expected="none with the method local", received=repr(segment),
+            remedy="leave it out: how many frequencies belong together is found for each",
+        )  # fmt: skip
+    if isinstance(on, Recording):
+        u, r = on.u, None
+        y = speed_from_counts(on.counts, on.Ts, on.counts_per_rev, method="difference")
+        if reference is not None:
+            raise SettingError(
+                name="reference", expected="none for a recording of a command",
+                received=repr(reference), remedy="a data set names its columns",
+            )  # fmt: skip
+        labels = {"u_unit": "V", "y_unit": "RPM", "from_counts": True}
+        name = on.name
+    else:
+        one = _one_of(on)
+        u, y, r, name = one.u[:, 0], one.y, None, one.name
+        if reference is not None:
+            if reference not in one.channels:
+                raise SettingError(
+                    name="reference",
+                    expected=f"one of {', '.join(one.channels) or 'no columns'}",
+                    received=repr(reference),
+                )  # fmt: skip
+            r = one.channels[reference]
+        labels = {
+            "u_unit": on.input_units[0], "y_unit": on.output_unit,
+            "from_counts": on.counts is not None,
+        }  # fmt: skip
+    provenance = {"recording": name, **_cautions(u, y, on.Ts, is_speed=labels["y_unit"] == "RPM")}
+    if method == "local":
+        return local_polynomial(u, y, Ts=on.Ts, r=r, provenance=provenance, **labels)
+    return spectral(u, y, Ts=on.Ts, r=r, segment=segment, provenance=provenance, **labels)
+
+
+def _one_of(on: Dataset) -> Experiment:
+    if len(on.experiments) != 1 or len(on.input_names) != 1:
+        raise DataError(
+            name="data", expected="one record with one input",
+            received=f"{len(on.experiments)} with {len(on.input_names)}",
+            remedy="take one by data[k] and data.select(input)",
+        )  # fmt: skip
+    if on.looks_ahead:
+        raise DataError(
+            name="data", expected="an output as it was measured",
+            received="a speed that was smoothed with samples after it, which hides the delay",
+            remedy="take bode(recording), or a speed by method=\"difference\"",
+        )  # fmt: skip
+    return on.experiments[0]
+
+
+def _cautions(u: FloatArray, y: FloatArray, Ts: float, *, is_speed: bool) -> dict[str, Any]:
+    """Cautions about parts of a record that a linear response does not describe."""
+    found = []
+    at = _limited(np.asarray(u, dtype=np.float64))
+    if len(at):
+        found.append(
+            f"u rests at its largest or smallest value in {len(at)} samples, the first at "
+            f"{at[0] * Ts:.4g} s: if it was limited after it was recorded, the response is wrong"
+        )
+    k = max(1, round(MEAN / Ts))
+    if is_speed and len(y) >= k and np.isfinite(y).all():
+        means = np.convolve(y, np.ones(k) / k, "valid")
+        back = np.flatnonzero(means * np.sign(means.sum()) < -REVERSED * np.abs(means).max())
+        if len(back):
+            found.append(
+                f"the speed changes its sign, first at {back[0] * Ts:.4g} s: there friction acts "
+                "like a step, and the response is that of a mean over both directions"
+            )
+    if len(y) >= LEAST_RUN and np.isfinite(y).all():
+        later = y[len(y) // 2 :]
+        low, high = np.percentile(later, OUTSIDE)
+        ends = np.flatnonzero((y >= low) & (y <= high))
+        if not low <= y[: k + 1].mean() <= high and len(ends):
+            found.append(
+                f"the record begins away from where it works later, which it reaches at "
+                f"{ends[0] * Ts:.4g} s: its lowest frequencies are those of the run-up; cut it off"
+            )
+    return {"cautions": found} if found else {}
+
+
+def _limited(u: FloatArray) -> Any:
+    """Samples at which a command rests at an extreme, unless it is a staircase anyway."""
+    if len(u) < LEAST_RUN or not np.isfinite(u).all():
+        return np.zeros(0, dtype=np.intp)
+    extreme = (u == u.max()) | (u == u.min())
+    edges = np.diff(np.concatenate([[0], extreme.astype(np.intp), [0]]))
+    starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    long = stops - starts >= LEAST_RUN
+    moves = np.mean(np.diff(u)[~extreme[1:]] != 0.0) if not extreme[1:].all() else 0.0
+    if not long.any() or moves < MOVES:
+        return np.zeros(0, dtype=np.intp)
+    return np.concatenate([np.arange(a, b) for a, b in zip(starts[long], stops[long], strict=True)])
+
+
+def unsmoothed(source: str | os.PathLike[str], data: Dataset) -> Dataset:
+    """The same record with the difference of counts as its speed, for `bode`.
+
+    A speed estimated with the help of later counts hides the delay.
+
+    Parameters
+    ----------
+    source : path
+        The recording that the data were read from; columns after a colon as on the command line.
+    data : Dataset
+        A data set with a speed from counts.
+
+    Raises
+    ------
+    DataError
+        For a record in pieces.
+    """
+    assert data.counts is not None
+    column, per_rev = data.counts
+    counts = read_table(parse_source(os.fspath(source))[0])[column]
+    one = data.experiments[0]
+    if len(data.experiments) > 1 or len(counts) != len(one.y):
+        raise DataError(
+            name=str(source), expected="one even record without gaps",
+            received=f"{len(data.experiments)} pieces", remedy="cut one out",
+        )  # fmt: skip
+    y = speed_from_counts(counts, data.Ts, per_rev, method="difference")
+    return replace(data, experiments=(replace(one, y=y),), looks_ahead=False)
