@@ -6,12 +6,14 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -72,6 +74,16 @@ def quiet() -> Iterator[None]:
     """What a cluster says while it is taken down is not what is tested."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        yield
+
+
+@pytest.fixture
+def another_cluster() -> Iterator[None]:
+    """A server on the usual port of Dask's dashboard: this one, or one that is there already."""
+    with socket.socket() as dashboard:
+        with suppress(OSError):
+            dashboard.bind(("127.0.0.1", 8787))
+            dashboard.listen()
         yield
 
 
@@ -518,6 +530,7 @@ def test_ctrl_c_says_what_is_kept(
     assert "2 recordings are done and kept" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("another_cluster")
 @pytest.mark.skipif(sys.platform == "win32", reason="no process group to send Ctrl-C to")
 def test_ctrl_c_at_a_terminal_ends_the_workers_without_a_word_of_theirs(
     folder: Path, tmp_path: Path

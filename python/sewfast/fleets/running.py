@@ -342,7 +342,10 @@ def _connected(
             "n_workers": workers or os.cpu_count() or 1,
             "threads_per_worker": 1,
             "memory_limit": memory,
+            # no dashboard: its server starts nevertheless, and on its usual port would warn of
+            # another cluster of the user's
             "dashboard_address": None,
+            "scheduler_kwargs": {"dashboard_address": "127.0.0.1:0"},
             # messages of its processes about each other while they end are irrelevant
             "silence_logs": logging.CRITICAL,
         }
