@@ -11,8 +11,8 @@ from test_physics import linear
 import sewfast
 from sewfast import physics
 from sewfast.motorfit.estimation import covariance_of, minimised
+from sewfast.motorfit.problem import NOTHING, PLACE, Problem, State
 from sewfast.motorfit.records import records_of, spikes_of
-from sewfast.motorfit.task import NOTHING, PLACE, State, Task
 
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
 T = np.linspace(0.0, 4.0, 25)
@@ -93,16 +93,16 @@ def test_the_sums_of_the_core_are_those_of_residuals_and_jacobian() -> None:
     y[250:255] = np.nan
     u[300] = np.nan
     record = sewfast.Dataset.from_arrays(u, y, 0.02, output_unit="rad/s")
-    task = Task(records_of(record, rng.standard_normal(600), None))
-    task.speed_filter = np.array([0.9, -0.4, 0.2])
-    task.current_filter = np.array([1.5, -0.5])
+    problem = Problem(records_of(record, rng.standard_normal(600), None))
+    problem.speed_filter = np.array([0.9, -0.4, 0.2])
+    problem.current_filter = np.array([1.5, -0.5])
     theta = NOTHING.copy()
     for name, value in {"k_e": 0.02, "k_a": 0.006, "tau": 0.01, "k_s": 0.3}.items():
         theta[PLACE[name]] = value
     state = State(theta, 0.7, ("lag", "coulomb", "load_1"))
-    cost, gradient, matrix = task.normal(state)
-    J, r = task.jacobian(state), task.residuals(state)
-    assert len(task.records.pieces) == 2
+    cost, gradient, matrix = problem.normal(state)
+    J, r = problem.jacobian(state), problem.residuals(state)
+    assert len(problem.records.pieces) == 2
     assert cost == pytest.approx(float(r @ r), rel=1e-12)
     assert gradient == pytest.approx(J.T @ r, rel=1e-9, abs=1e-9 * np.abs(J.T @ r).max())
     assert matrix == pytest.approx(J.T @ J, rel=1e-9, abs=1e-12 * float(np.max(J.T @ J)))

@@ -19,7 +19,7 @@ from ..machine import VirtualMachine
 from ..models import LinearOE
 from ..motorfit import WAVES, Estimated, rad_per_second
 from ..motorfit.estimation import CONFIDENCE
-from ..motorfit.task import State
+from ..motorfit.problem import State
 from ..motorfit.terms import Values, profiled, slope_of, values_of
 from ..plotting import LOOKS, Drawing
 from ..tables import html_of
@@ -508,7 +508,7 @@ def motor_of(found: Estimated, volts: float | None, *, profile: bool) -> Motor:
         undetermined |= {"resistance_ohm" if n == "resistance" else n: missing for n in _SI}
     if volts is not None and estimate.resistance is not None:
         parameters["volts"] = Parameter(volts, volts, volts, f"V/{records.u_unit}".rstrip("/"))
-    y, model = found.task.outcome(estimate)
+    y, model = found.problem.outcome(estimate)
     error, factor = y - model, rad_per_second(records.speed_unit)
     spread = float(np.linalg.norm(y - y.mean()))
     return Motor(
@@ -517,7 +517,7 @@ def motor_of(found: Estimated, volts: float | None, *, profile: bool) -> Motor:
         estimate.terms,
         100.0 * (1.0 - float(np.linalg.norm(error)) / max(spread, 1e-300)),
         float(np.sqrt(np.mean(error**2))) / factor,
-        found.task.converged,
+        found.problem.converged,
         len(y),
         records.spikes,
         records.Ts,

@@ -217,14 +217,14 @@ def _motor(data: Dataset, look: Look | None = None) -> _core.GreyBox:
     found = estimated(records_of(data, None, None), TERMS, _at_any_time(look), if_clear=IF_CLEAR)
     state, records = found.state, found.records
     free = [n for n in state.names() if n not in ("k_b", "delay")]
-    y, model = found.task.outcome(state)
+    y, model = found.problem.outcome(state)
     unit = rad_per_second(data.output_unit)
     commands = np.concatenate([p.u for p in records.pieces])
     return _core.GreyBox(
         values=state.theta,
         free=[PLACE[n] for n in free],
         Ts=data.Ts,
-        steps=found.task.steps,
+        steps=found.problem.steps,
         mean=records.mean,
         unit=unit,
         speed_scale=float(np.std(y)),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -14,17 +13,19 @@ from numpy.typing import NDArray
 from ..arrays import FloatArray
 from ..errors import DataError, FitError
 from .estimation import filtered
+from .problem import NOTHING, PLACE, WAVES, Problem, State
 from .records import Piece, Records
-from .task import NOTHING, PLACE, WAVES, State, Task, fitted
 
 
-def started(task: Task, terms: tuple[str, ...]) -> State:
+def started(problem: Problem, terms: tuple[str, ...]) -> State:
     """The best of a few regressions, judged by free run."""
     first = tuple(t for t in ("lag", "delay", "coulomb", "offset") if t in terms)
-    Ts = task.records.Ts
+    Ts = problem.records.Ts
+    # a start needs no resistance, which only currents show
+    alone = problem.without_currents()
     best, cost, signs = None, math.inf, []
     for width in (1.5, 5.0, 15.0, 45.0):
-        smoothed = _smoothed(task.records, width)
+        smoothed = _smoothed(problem.records, width)
         for lag in (0.0, 5.0, 20.0) if "lag" in terms else (0.0,):
             for delay in (0, 2, 6) if "delay" in terms else (0,):
                 k_v, k_a, k_s, offset = _regressed(smoothed, lag, delay)
@@ -39,10 +40,10 @@ def started(task: Task, terms: tuple[str, ...]) -> State:
                 for name, value in values.items():
                     theta[PLACE[name]] = value
                 state = State(theta, None, first)
-                of_this = _Speeds(task).cost(state)
+                of_this = alone.cost(state)
                 if of_this < cost:
                     best, cost = state, of_this
-    y = np.concatenate([p.y for p in task.records.pieces])
+    y = np.concatenate([p.y for p in problem.records.pieces])
     if best is None or not math.isfinite(cost):
         if np.mean(signs) > 0.5:
             raise DataError(
@@ -53,9 +54,8 @@ def started(task: Task, terms: tuple[str, ...]) -> State:
             "expected a speed that follows the command as a motor's does, none of the starts is "
             "one; is the output a speed, and the input what drives the motor?"
         )
-    alone = _Speeds(task)
-    task.k_v = alone.k_v = max(float(best.theta[0]), 1e-12)
-    best = fitted(alone, best)
+    problem.k_v = alone.k_v = max(float(best.theta[0]), 1e-12)
+    best = alone.fitted(best)
     alone.settle_steps(best)
     explained = 1.0 - alone.cost(best) / max(float(np.sum((y - y.mean()) ** 2)), 1e-300)
     if best.value("k_e") + best.value("k_b") < 0.0 or explained < 0.5:
@@ -64,11 +64,13 @@ def started(task: Task, terms: tuple[str, ...]) -> State:
             f"the free run explains {100 * max(explained, 0):.0f} %; is the output a speed, the "
             "input what drives the motor, and the loop free of a load that others move?"
         )
-    task.steps = alone.steps
-    if task.has_current:
+    problem.steps = alone.steps
+    if problem.has_current:
         drives = [
             (d[p.used], p.current[p.used])
-            for p, (_, d, _, _) in zip(task.records.pieces, task.simulated(best, ()), strict=True)
+            for p, (_, d, _, _) in zip(
+                problem.records.pieces, problem.simulated(best, ()), strict=True
+            )
             if p.current is not None
         ]
         drive, i = (np.concatenate(c) for c in zip(*drives, strict=True))
@@ -79,16 +81,8 @@ def started(task: Task, terms: tuple[str, ...]) -> State:
                 "reverse its sign, or leave it out"
             )
         best = State(best.theta, resistance, best.terms)
-    task.weigh(best)
+    problem.weigh(best)
     return best
-
-
-class _Speeds(Task):
-    """The task without currents: a start needs no resistance."""
-
-    def __init__(self, task: Task) -> None:
-        pieces = tuple(replace(p, current=None) for p in task.records.pieces)
-        super().__init__(replace(task.records, pieces=pieces), task.steps, look=task.look)
 
 
 Smoothed: TypeAlias = tuple[FloatArray, FloatArray, NDArray[np.bool_]]
@@ -170,20 +164,20 @@ DECAYED = 8.0
 RIPPLE = "torque_ripple"
 
 
-def with_waves(task: Task, state: State, terms: tuple[str, ...]) -> State:
+def with_waves(problem: Problem, state: State, terms: tuple[str, ...]) -> State:
     """The state with the waves that stand out of the residuals, at their estimated sizes."""
     free = [t for t in WAVES if t in terms]
     if not free:
         return state
     candidates = [
         (order, kind)
-        for order in _orders(task)
+        for order in _orders(problem.records)
         for kind in dict.fromkeys(t if t == RIPPLE else "cogging" for t in free)
     ]
     if not candidates:
         return state
-    moved = _moved(task, state, candidates)
-    left, slopes = _left_over(task, state)
+    moved = _moved(problem, state, candidates)
+    left, slopes = _left_over(problem, state)
     basis = np.linalg.qr(slopes)[0]
     moved -= basis @ (basis.T @ moved)
     pairs = moved.T.reshape(len(candidates), 2, -1)
@@ -192,7 +186,7 @@ def with_waves(task: Task, state: State, terms: tuple[str, ...]) -> State:
         grams = pairs @ pairs.transpose(0, 2, 1)
         by = pairs @ left
         sizes = np.einsum("mij,mj->mi", np.linalg.pinv(grams, rcond=1e-8, hermitian=True), by)
-        variance = max(float(left @ left) / max(task.records.used, 1), 1e-300)
+        variance = max(float(left @ left) / max(problem.records.used, 1), 1e-300)
         gains = np.einsum("mi,mi->m", sizes, by) / variance
         open_ = np.array([any(_is_kind(t, kind) for t in free) for _, kind in candidates])
         best = int(np.argmax(np.where(open_, gains, 0.0)))
@@ -214,13 +208,13 @@ def with_waves(task: Task, state: State, terms: tuple[str, ...]) -> State:
     return widened.having([*state.terms, *taken], **values)
 
 
-def _left_over(task: Task, state: State) -> tuple[FloatArray, FloatArray]:
+def _left_over(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     """Whitened residuals of the speeds, (N,), and their derivatives, (N, n)."""
     left, slopes = [], []
-    runs = task.simulated(state, [n for n in state.names() if n != "R"])
-    for p, (y, _, by, _) in zip(task.records.pieces, runs, strict=True):
-        left.append(filtered(p.y - y, p.used, task.speed_filter))
-        slopes.append(filtered(by.T, p.used, task.speed_filter).T)
+    runs = problem.simulated(state, [n for n in state.names() if n != "R"])
+    for p, (y, _, by, _) in zip(problem.records.pieces, runs, strict=True):
+        left.append(filtered(p.y - y, p.used, problem.speed_filter))
+        slopes.append(filtered(by.T, p.used, problem.speed_filter).T)
     return np.concatenate(left), np.concatenate(slopes)
 
 
@@ -228,9 +222,8 @@ def _is_kind(term: str, kind: str) -> bool:
     return (term == RIPPLE) == (kind == RIPPLE)
 
 
-def _orders(task: Task) -> range:
+def _orders(records: Records) -> range:
     """Orders that the slower samples show above the noise of the encoder."""
-    records = task.records
     turns = np.concatenate([np.abs(np.diff(p.angle)) for p in records.pieces])
     moving = turns[turns > 0.0]
     if not len(moving):
@@ -241,17 +234,17 @@ def _orders(task: Task) -> range:
     return range(3, highest + 1)
 
 
-def _moved(task: Task, state: State, candidates: list[tuple[int, str]]) -> FloatArray:
+def _moved(problem: Problem, state: State, candidates: list[tuple[int, str]]) -> FloatArray:
     """Changes of the whitened speeds due to cosine and sine of each wave, (N, 2 candidates)."""
     parts = []
-    speeds, lag = _responses(state, task.records.Ts, task.speed_filter)
-    drives = [drive for _, drive, _, _ in task.simulated(state, ())]
-    for p, drive in zip(task.records.pieces, drives, strict=True):
+    speeds, lag = _responses(state, problem.records.Ts, problem.speed_filter)
+    drives = [drive for _, drive, _, _ in problem.simulated(state, ())]
+    for p, drive in zip(problem.records.pieces, drives, strict=True):
         kernels = [speeds[: len(p.u)], lag[: len(p.u)]]
         size = 1 << (len(p.u) + sum(map(len, kernels))).bit_length()
         through, electrical = (np.fft.fft(k, size) for k in kernels)
         columns = []
-        emf_of, waves = p.y * state.value("k_e"), _waves(p, task.records.quantum)
+        emf_of, waves = p.y * state.value("k_e"), _waves(p, problem.records.quantum)
         wave, at = next(waves), 1
         for order, kind in candidates:
             while at < order:

@@ -16,20 +16,17 @@ import numpy as np
 
 from ..arrays import FloatArray
 from .estimation import CONFIDENCE, Normal, inverse, minimised
-from .records import Records
-from .starts import CLEAR, started, with_waves
-from .task import (
+from .problem import (
     FINE,
     NEAR,
     PARAMETERS,
     TERMS,
     WAVES,
+    Problem,
     State,
-    Task,
-    bounds_of,
-    fitted,
-    least_inertia,
 )
+from .records import Records
+from .starts import CLEAR, started, with_waves
 
 ORDERS = {"load_1": 1, "load_2": 2, "inertia_2": 2}
 """Number of times that a term repeats in a turn."""
@@ -77,15 +74,15 @@ class Estimated:
         Terms (or the inertia) that the record does not show, and why.
     records : Records
         The records with estimated initial speeds and without spikes.
-    task : Task
-        The task of the final fit.
+    problem : Problem
+        The least-squares problem of the final fit.
     """
 
     state: State
     covariance: FloatArray
     reasons: dict[str, str]
     records: Records
-    task: Task
+    problem: Problem
 
 
 def estimated(
@@ -118,15 +115,15 @@ def estimated(
             "the speed has one sign, so that k_s holds friction and constant load together"
         )
     part = records.liveliest(STRETCH)
-    first = Task(part, look=look)
-    state = fitted(first, started(first, terms))
+    first = Problem(part, look=look)
+    state = first.fitted(started(first, terms))
     steps, first.steps = first.steps, min(first.steps, ON_THE_WAY)
     # so few steps diverge only if the motor is too fast for the record to show its inertia
     if not math.isfinite(first.cost(state)):
         first.steps = steps
     first.settle_starts(state)
     first.leave_out_spikes(state)
-    state = _with_limit(first, fitted(first, state), terms)
+    state = _with_limit(first, first.fitted(state), terms)
     first.leave_out_spikes(state)
     state = _all_terms(first, state, tuple(t for t in terms if t not in WAVES))
     given = terms
@@ -135,17 +132,17 @@ def estimated(
     first.records = true(first.records)
     before, state = state, with_waves(first, state, terms)
     if state is not before:  # terms hidden by the waves can be clear now
-        state = fitted(first, state)
+        state = first.fitted(state)
         first.weigh(state)
         state = _with_clear(first, state, if_clear)
     terms = tuple(t for t in TERMS if t in (*terms, *state.terms))
     needed = {t: SHOWN if t in given and t not in WAVES else SURE for t in terms}
     # keep the estimated initial speeds where the pieces are the same
     records = first.records if part is records else true(records)
-    task = Task(records, first.steps, k_v=first.k_v, look=look)
-    task.settle_starts(state)
-    task.leave_out_spikes(state)
-    state, shares, covariance = _shown_terms(task, state, needed, steps)
+    problem = Problem(records, first.steps, k_v=first.k_v, look=look)
+    problem.settle_starts(state)
+    problem.leave_out_spikes(state)
+    state, shares, covariance = _shown_terms(problem, state, needed, steps)
     reasons |= {
         t: f"not shown, if there is any (Wald's statistic {share:.2g}, it takes {needed[t]:g})"
         for t, share in shares.items()
@@ -156,13 +153,13 @@ def estimated(
         reasons["cogging"] = missing
     if WAVES[3] in terms and not state.orders[3]:
         reasons["torque_ripple"] = missing
-    if state.value("k_a") <= 1.01 * least_inertia(task, state) or task.is_slow(state):
+    if state.value("k_a") <= 1.01 * problem.least_inertia(state) or problem.is_slow(state):
         reasons["inertia"] = (
             "the record does not show how the motor speeds up; record steps, several samples in "
             "each of its time constants"
         )
-    records = replace(task.records, spikes=records.spikes + first.spikes + task.spikes)
-    return Estimated(state, covariance, reasons, records, task)
+    records = replace(problem.records, spikes=records.spikes + first.spikes + problem.spikes)
+    return Estimated(state, covariance, reasons, records, problem)
 
 
 def _trued(records: Records, *, c: float, s: float) -> Records:
@@ -206,63 +203,64 @@ def _too_fast(records: Records, terms: tuple[str, ...]) -> dict[str, str]:
 # --- Choice of terms ------------------------------------------------------------------------------
 
 
-def _with_limit(task: Task, state: State, terms: tuple[str, ...]) -> State:
+def _with_limit(problem: Problem, state: State, terms: tuple[str, ...]) -> State:
     """The state with a limit of the current, if the cost without is clearly higher."""
     if "limit" not in terms:
         return state
-    drive = np.concatenate([np.abs(d) for _, d, _, _ in task.simulated(state, ())])
+    drive = np.concatenate([np.abs(d) for _, d, _, _ in problem.simulated(state, ())])
     places = [float(np.quantile(drive, q)) for q in (0.999, 0.98, 0.94, 0.88, 0.8)]
     tried = [state.having([*state.terms, "limit"], limit=max(v, 1e-9)) for v in places]
-    before = task.cost(state)
-    best = min(tried, key=task.cost)
-    y, model = task.outcome(state)
-    if task.cost(best) <= LIMITED * before:
+    before = problem.cost(state)
+    best = min(tried, key=problem.cost)
+    y, model = problem.outcome(state)
+    if problem.cost(best) <= LIMITED * before:
         tried = [best]
     elif np.mean((y - model) ** 2) < UNEXPLAINED * np.var(y):
         return state
     # if much is unexplained, other parameters have moved to compensate for a missing limit
-    found = min((fitted(task, s) for s in tried), key=task.cost)
-    return found if task.cost(found) < LIMITED * before else state
+    found = min((problem.fitted(s) for s in tried), key=problem.cost)
+    return found if problem.cost(found) < LIMITED * before else state
 
 
-def _all_terms(task: Task, state: State, terms: tuple[str, ...]) -> State:
+def _all_terms(problem: Problem, state: State, terms: tuple[str, ...]) -> State:
     """All terms fitted together, roughly."""
-    size = max(state.value("k_s"), 0.01 * float(np.std(task.records.pieces[0].u)))
-    _, fast = task.stribeck_speeds()
+    size = max(state.value("k_s"), 0.01 * float(np.std(problem.records.pieces[0].u)))
+    _, fast = problem.stribeck_speeds()
     starts = {
         "drop": 0.2 * size, "ripple": 0.2 * size, "k_t": 0.2 * size, "w_s": 0.1 * fast,
     }  # fmt: skip
     whole = [t for t in terms if t != "limit" or "limit" in state.terms]
     new = {p for t in set(whole) - set(state.terms) for p in TERMS[t]}
     state = state.having(whole, **{p: v for p, v in starts.items() if p in new})
-    state = fitted(task, state)
-    task.weigh(state)
-    tried = [fitted(task, state)]
+    state = problem.fitted(state)
+    problem.weigh(state)
+    tried = [problem.fitted(state)]
     if "stribeck" in whole:  # the speed at which friction falls off has more than one minimum
         bumps = [state.having(whole, k_t=0.4 * size, w_s=part * fast) for part in BUMPS]
-        tried += [fitted(task, s) for s in bumps]
+        tried += [problem.fitted(s) for s in bumps]
     return min(
-        [*tried, state], key=lambda s: (task.rmse(s) > WORSE * task.rmse(state), task.cost(s))
+        [*tried, state],
+        key=lambda s: (problem.rmse(s) > WORSE * problem.rmse(state), problem.cost(s)),
     )
 
 
-def _with_clear(task: Task, state: State, terms: tuple[str, ...]) -> State:
+def _with_clear(problem: Problem, state: State, terms: tuple[str, ...]) -> State:
     """The state with those of the terms that the residuals show clearly, one after the other."""
-    while clear := _clear(task, state, terms):
-        state = fitted(task, state.having([*state.terms, *clear]))
-        task.weigh(state)
+    while clear := _clear(problem, state, terms):
+        state = problem.fitted(state.having([*state.terms, *clear]))
+        problem.weigh(state)
     return state
 
 
-def _clear(task: Task, state: State, terms: tuple[str, ...]) -> list[str]:
+def _clear(problem: Problem, state: State, terms: tuple[str, ...]) -> list[str]:
     """Terms without which the fit is clearly worse, by their scores (Rao 1948)."""
-    bumpy = "stribeck" in state.terms and _parts_sides(task, state.value("w_s"))
+    bumpy = "stribeck" in state.terms and problem.parts_sides(state.value("w_s"))
     tried = [t for t in terms if t not in state.terms and (bumpy or t != "stribeck_difference")]
     if not tried:
         return []
     whole = state.having([*state.terms, *tried])
-    cost, gradient, matrix = task.normal(whole)
-    names, variance, clear = whole.names(), max(cost / task.count, 1e-300), []
+    cost, gradient, matrix = problem.normal(whole)
+    names, variance, clear = whole.names(), max(cost / problem.count, 1e-300), []
     rest = [names.index(n) for n in state.names()]
     known, _ = inverse(matrix[np.ix_(rest, rest)])
     for t in tried:
@@ -275,17 +273,8 @@ def _clear(task: Task, state: State, terms: tuple[str, ...]) -> list[str]:
     return clear
 
 
-def _parts_sides(task: Task, w_s: float) -> bool:
-    """Whether friction that falls off over this speed [rad/s] can be told apart by direction.
-
-    At lower speeds there are no samples; at higher ones the difference is a constant load.
-    """
-    least, usual = task.stribeck_speeds()
-    return max(2.0 * least, task.records.quantum) <= w_s <= 0.3 * usual
-
-
 def _shown_terms(
-    task: Task, start: State, needed: Mapping[str, float], steps: int
+    problem: Problem, start: State, needed: Mapping[str, float], steps: int
 ) -> tuple[State, dict[str, float], FloatArray]:
     """Fit all terms together, then drop those that are not shown, in as many steps as needed.
 
@@ -293,14 +282,14 @@ def _shown_terms(
     dropped terms, and the covariance of the free parameters. The covariance allows for a dead zone
     or Stribeck friction that is not shown but hidden in the resistance or in dry friction.
     """
-    task.weigh(start)
-    state = fitted(task, start, NEAR)
-    if task.rmse(state) > WORSE * task.rmse(start):
-        task.weigh(start, order=0)
-        state = fitted(task, start, NEAR)
-    _, fast = task.stribeck_speeds()
+    problem.weigh(start)
+    state = problem.fitted(start, NEAR)
+    if problem.rmse(state) > WORSE * problem.rmse(start):
+        problem.weigh(start, order=0)
+        state = problem.fitted(start, NEAR)
+    _, fast = problem.stribeck_speeds()
     explained: dict[str, float] = {}
-    whole = task.covariance(state)
+    whole = problem.covariance(state)
     kept, out = list(state.terms), {t: 0.0 for t in needed if t not in state.terms}
     names, covariance, x = state.names(), whole, state.vector()
     while True:
@@ -309,39 +298,39 @@ def _shown_terms(
         if "stribeck" in kept and x[names.index("w_s")] > 0.99 * fast:
             shown["stribeck"] = 0.0  # it never falls off: Coulomb friction
         if "stribeck_difference" in kept:
-            if not _parts_sides(task, x[names.index("w_s")]):
+            if not problem.parts_sides(x[names.index("w_s")]):
                 shown["stribeck_difference"] = 0.0
             shown["stribeck"] = math.inf  # the difference has its shape, and is dropped first
         weakest = min(shown, key=lambda t: shown[t] / needed[t], default=None)
         if weakest is None or shown[weakest] >= needed[weakest]:
             break
         if weakest in SHAPED and shown[weakest] > 0.0 and weakest not in explained:
-            explained[weakest] = _explained(task, state, weakest, whole)
+            explained[weakest] = _explained(problem, state, weakest, whole)
             continue
         out[weakest] = shown[weakest]
         kept.remove(weakest)
         names, x, covariance = _without(TERMS[weakest], names, x, covariance)
-    task.steps = steps
-    last = fitted(task, state.having(kept), FINE)
+    problem.steps = steps
+    last = problem.fitted(state.having(kept), FINE)
     hidden = [t for t in state.terms if t in SHAPED and t not in kept]
     shapes = {p: state.value(p) for t in hidden for p in TERMS[t] if p in SHAPES}
     wider = last.having([*kept, *hidden], **shapes)
     at = [wider.names().index(n) for n in last.names()]
-    return last, out, task.covariance(wider)[np.ix_(at, at)]
+    return last, out, problem.covariance(wider)[np.ix_(at, at)]
 
 
-def _explained(task: Task, state: State, term: str, covariance: FloatArray) -> float:
+def _explained(problem: Problem, state: State, term: str, covariance: FloatArray) -> float:
     """Deviance of a fit without a term, over its expectation for errors of this colour.
 
     If the shape of a term is uncertain, so is its amplitude, however much it explains: Wald's
     statistic is then inadequate (Chandler and Bate 2007, Biometrika 94, for the factor).
     """
-    cost, _, matrix = task.normal(state)
-    variance = max(cost / task.count, 1e-300)
+    cost, _, matrix = problem.normal(state)
+    variance = max(cost / problem.count, 1e-300)
     at = next(j for j, n in enumerate(state.names()) if n in TERMS[term] and n not in SHAPES)
     white = inverse(matrix)[0][at, at] * variance
-    without = fitted(task, state.having([t for t in state.terms if t != term]))
-    deviance = (task.cost(without) - cost) / variance
+    without = problem.fitted(state.having([t for t in state.terms if t != term]))
+    deviance = (problem.cost(without) - cost) / variance
     return float(deviance * white / max(covariance[at, at], 1e-300))
 
 
@@ -407,16 +396,16 @@ def profiled(
     half : float
         Half-width of the interval by curvature, above 0: the start of the search.
     """
-    task, state = found.task, found.state
+    problem, state = found.problem, found.state
     x = state.vector()
-    start, _, matrix = task.normal(state)
+    start, _, matrix = problem.normal(state)
     value = of(values_of(state))
     spread, _ = inverse(matrix)
     along = spread @ slope
     size = max(float(slope @ along), 1e-300)
     # rise of the cost at the end of an interval
     rise = (half / CONFIDENCE) ** 2 / size * CONFIDENCE**2
-    low, high = bounds_of(task, state)
+    low, high = problem.bounds(state)
     held = HELD / size
     ends = []
     for sign in (-1.0, 1.0):
@@ -425,7 +414,7 @@ def profiled(
             goal = value + step
 
             def normal(at: FloatArray, goal: float = goal) -> Normal:
-                cost, gradient, gram = task.normal(state.at(at))
+                cost, gradient, gram = problem.normal(state.at(at))
                 off, by = _off(state.at(at), of, goal)
                 return (
                     cost + held * off**2, gradient + held * off * by,
@@ -434,16 +423,16 @@ def profiled(
 
             def cost(at: FloatArray, goal: float = goal) -> float:
                 off = of(values_of(state.at(at))) - goal
-                return task.cost(state.at(at)) + held * off**2
+                return problem.cost(state.at(at)) + held * off**2
 
             first = np.clip(x + step * along / size, low, high)
             if not math.isfinite(cost(first)):
                 break
             reached = minimised(
-                normal, cost, first, (low, high), task.count, enough=FINE, iterations=ITERATIONS
+                normal, cost, first, (low, high), problem.count, enough=FINE, iterations=ITERATIONS
             ).x
             way = of(values_of(state.at(reached))) - value
-            share = math.sqrt(max(task.cost(state.at(reached)) - start, 0.0) / rise)
+            share = math.sqrt(max(problem.cost(state.at(reached)) - start, 0.0) / rise)
             if way * sign <= 0.0:
                 break
             end = value + way / max(share, 1.0 / LONGEST)

@@ -1,4 +1,4 @@
-"""The task of a motor's fit: free parameters, whitened residuals of a record, and their sums."""
+"""A motor's least-squares problem: free parameters, whitened residuals of a record, the fit."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ _NOT_NEGATIVE = {"tau", "delay", "k_s", "k_t", "drop"}
 
 
 @dataclass
-class Task:
+class Problem:
     """The records, and the filters that weigh residuals of speeds [rad/s] and currents [A]."""
 
     records: Records
@@ -143,6 +143,11 @@ class Task:
     @property
     def has_current(self) -> bool:
         return self.records.pieces[0].current is not None
+
+    def without_currents(self) -> Problem:
+        """The same problem with the speeds alone, unweighted."""
+        pieces = tuple(replace(p, current=None) for p in self.records.pieces)
+        return Problem(replace(self.records, pieces=pieces), self.steps, look=self.look)
 
     def simulated(self, state: State, free: Sequence[str]) -> list[tuple[FloatArray, ...]]:
         """Speed, drive and their derivatives for each piece."""
@@ -337,6 +342,14 @@ class Task:
         effort = state.value("k_a") * float(np.std(np.concatenate(rates)))
         return bool(effort < QUASISTATIC * float(np.std(u)))
 
+    def parts_sides(self, w_s: float) -> bool:
+        """Whether friction that falls off over this speed [rad/s] can be told apart by direction.
+
+        At lower speeds there are no samples; at higher ones the difference is a constant load.
+        """
+        least, usual = self.stribeck_speeds()
+        return max(2.0 * least, self.records.quantum) <= w_s <= 0.3 * usual
+
     def stribeck_speeds(self) -> tuple[float, float]:
         """Range of the speed over which friction can fall off; below it there are few samples."""
         usual = float(np.quantile(np.abs(np.concatenate([p.y for p in self.records.pieces])), 0.9))
@@ -378,51 +391,45 @@ class Task:
             whole[at, at] += (AMMETER * state.resistance) ** 2
         return whole[:n, :n]
 
+    # --- the fit --------------------------------------------------------------------------------
 
-def fitted(task: Task, state: State, enough: float = COARSE) -> State:
-    """The state at the least-squares solution for its free parameters."""
-    names = state.names()
-    low, high = bounds_of(task, state)
-    found = minimised(
-        lambda x: task.normal(state.at(x)),
-        lambda x: task.cost(state.at(x)),
-        np.clip(state.vector(), low, high),
-        (low, high),
-        task.count,
-        enough=enough,
-        iterations=ITERATIONS,
-    )
-    # with the kinks of dry friction no test confirms a minimum: it is close enough
-    # if the remaining gain is less than noise alone would give
-    task.converged = found.left < len(names)
-    return state.at(found.x)
+    def fitted(self, state: State, enough: float = COARSE) -> State:
+        """The state at the least-squares solution for its free parameters."""
+        low, high = self.bounds(state)
+        found = minimised(
+            lambda x: self.normal(state.at(x)),
+            lambda x: self.cost(state.at(x)),
+            np.clip(state.vector(), low, high),
+            (low, high),
+            self.count,
+            enough=enough,
+            iterations=ITERATIONS,
+        )
+        # with the kinks of dry friction no test confirms a minimum: it is close enough
+        # if the remaining gain is less than noise alone would give
+        self.converged = found.left < len(low)
+        return state.at(found.x)
 
+    def bounds(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """Least and largest values of the free parameters, (n,) each."""
+        names = state.names()
+        low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+        for j, n in enumerate(names):
+            if n in _POSITIVE:
+                value = state.value(n)
+                low[j] = 1e-3 * value if math.isfinite(value) and value > 0 else 1e-9
+            elif n in _NOT_NEGATIVE or (n == "k_b" and state.resistance is None):
+                low[j] = 0.0
+            if n == "k_a":
+                low[j] = max(low[j], self.least_inertia(state))
+            if n == "delay":
+                high[j] = 100.0 * self.records.Ts
+            if n == "w_s":
+                low[j], high[j] = self.stribeck_speeds()
+            if n == "ripple":
+                low[j], high[j] = self.ripples()
+        return low, high
 
-def bounds_of(task: Task, state: State) -> tuple[FloatArray, FloatArray]:
-    """Least and largest values of the free parameters, (n,) each."""
-    names = state.names()
-    low = np.array([_least(n, state) for n in names])
-    high = np.full(len(names), np.inf)
-    for j, n in enumerate(names):
-        if n == "k_a":
-            low[j] = max(low[j], least_inertia(task, state))
-        if n == "delay":
-            high[j] = 100.0 * task.records.Ts
-        if n == "w_s":
-            low[j], high[j] = task.stribeck_speeds()
-        if n == "ripple":
-            low[j], high[j] = task.ripples()
-    return low, high
-
-
-def least_inertia(task: Task, state: State) -> float:
-    """k_a of a motor that is too fast for the samples to show and for the integration to follow."""
-    return float(QUICKEST * task.records.Ts * max(state.theta[0] + state.theta[1], 0.0))
-
-
-def _least(name: str, state: State) -> float:
-    if name in _POSITIVE:
-        value = state.value(name)
-        return 1e-3 * value if math.isfinite(value) and value > 0 else 1e-9
-    unparted = name == "k_b" and state.resistance is None
-    return 0.0 if name in _NOT_NEGATIVE or unparted else -np.inf
+    def least_inertia(self, state: State) -> float:
+        """k_a of a motor that is too fast for the samples to show and the integration to follow."""
+        return float(QUICKEST * self.records.Ts * max(state.theta[0] + state.theta[1], 0.0))
