@@ -20,8 +20,7 @@ from refusals import refuses
 from sewfast.cli import main
 from sewfast.errors import SettingError
 from sewfast.link import Diagnosis, Finding, VirtualDevice, doctor, examine, wire
-from sewfast.link.access import Access
-from sewfast.link.doctor import _counters, _round_trip, _state, _throughput, _unopened
+from sewfast.link.doctor import Access, _counters, _round_trip, _state, _throughput, _unopened
 
 pytest.importorskip("serial", reason="opens pseudo-terminals as serial ports")
 ECHOES = 40

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sewfast.link.clock import MAX_DRIFT, RESOLUTION, Clock
+from sewfast.link.connection import MAX_DRIFT, RESOLUTION, Clock
 
 EXCHANGES = st.lists(
     st.tuples(st.integers(0, 500_000), st.floats(0.0, 0.02), st.floats(0.0, 0.02)),

@@ -1,23 +1,22 @@
 """The link to a real or virtual drive: ports, sessions, runs (docs/PROTOCOL.md).
 
 Read in this order: `ports` (transports and their failures), `wire` (the frames' bodies as values),
-`connection` (a session: the core's client on a port) and its `clock`, `drive` (`Drive`), `plan`
-(a run's commands, its checks and its outcome), `run` (the loop of a run, and how it ends), `record`
-(into memory, a file and a live view). Then `host_loop` and `host_run` (a controller on this
-computer), `doctor` and `access`, `virtual` and `emulated` (devices without a motor), and `boards`
-with `odrive` and `simplefoc` (boards of other makers, polled over text).
+`connection` (a session: the core's client on a port, and the device's clock), `drive` (`Drive`),
+`plan` (a run's commands, its checks and its outcome), `run` (the loop of a run, and how it ends),
+`record` (into memory, a file and a live view). Then `host_loop` and `host_run` (a controller on
+this computer), `doctor`, `virtual` and `emulated` (devices without a motor), and `boards` with
+`makers` (boards of other makers, polled over text: ODrive, SimpleFOC).
 """
 
 from .boards import PolledBoard
-from .clock import ClockBounds
+from .connection import ClockBounds
 from .doctor import Diagnosis, Finding, examine
 from .drive import Drive, connect
 from .host_loop import at_period, run_on_host
 from .host_run import HostLoopRun, Jitter
-from .odrive import ODrive
+from .makers import ODrive, SimpleFOC
 from .plan import Layout, Outcome, Plan, Sink
 from .ports import Port, PortInfo, list_ports, open_port
-from .simplefoc import SimpleFOC
 from .virtual import VirtualDevice
 from .wire import Channel, Event, Identity, Limits, Status
 

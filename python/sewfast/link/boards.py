@@ -1,7 +1,7 @@
 """A board of another maker, polled over lines of text, as a `Machine`: what all of them share.
 
 `PolledBoard` runs sample by sample from this computer, checks the limits and ends every run safely;
-`odrive` and `simplefoc` hold the commands of each board.
+`makers` holds the commands of each board.
 
 The host sets the pace: in every sample it reads the position and sends the command. It keeps the
 time of each answer, so that a late answer costs no accuracy; a sample that is late by a whole

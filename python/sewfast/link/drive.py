@@ -24,8 +24,7 @@ from ..recording import Recording
 from ..speed import Method
 from . import run as profiles
 from . import wire
-from .clock import ClockBounds
-from .connection import Connection, DeviceReset, Loan
+from .connection import ClockBounds, Connection, DeviceReset, Loan
 from .plan import (
     Layout,
     Outcome,

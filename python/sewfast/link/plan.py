@@ -15,8 +15,7 @@ from ..errors import LinkError, SettingError
 from ..gains import Gains, real, vector
 from ..units import counts_per_unit, spelled
 from . import wire
-from .clock import ClockBounds
-from .connection import Connection
+from .connection import ClockBounds, Connection
 from .wire import Channel, Identity, Kind
 
 Mode: TypeAlias = Literal["commands", "controller", "direct"]
