@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sewfast.live import Feed, open_view
-from sewfast.live.terminal import status
+from sewfast.live.view import status
 
 UNITS = {"u": "V", "counts": "", "r": "RPM", "current": "A"}
 BATCH, SAMPLES, TS = 10, 30_000, 0.001

@@ -15,7 +15,7 @@ from sewfast.cli.arguments import add_view
 from sewfast.errors import DataError, SettingError
 from sewfast.live import Feed, Kind
 from sewfast.live.feed import _MOST, speed_over_window
-from sewfast.live.terminal import fitted, status
+from sewfast.live.view import fitted, status
 
 
 def feed(n: int | None = 5000, **settings: float) -> Feed:

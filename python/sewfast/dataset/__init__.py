@@ -1,9 +1,9 @@
 """Data sets: experiments, their parts, checks and preparation.
 
-Read in this order: `experiment` and `dataset` (the values, immutable), `pieces` (parts, gaps, what
-a data set must fulfil); preparation: `trends` (offsets, kept for restoring), `rates` (sample times,
-the speed of a position), `outliers`; properties: `summary`, `diagnosis` and `feedback`
-(integrators, closed loops, repetitions), `frames` (as tables of other packages).
+Read in this order: `experiment` and `dataset` (the values, immutable; as tables of other packages),
+`pieces` (parts, gaps, what a data set must fulfil); preparation: `trends` (offsets, kept for
+restoring), `rates` (sample times, the speed of a position), `outliers`; properties: `summary`,
+`diagnosis` and `feedback` (integrators, closed loops, repetitions).
 """
 
 from ..arrays import FloatArray, HasUnits, labelled, require_same_units

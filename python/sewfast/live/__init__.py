@@ -1,7 +1,7 @@
 """The live view of a running record or run.
 
 Read in this order: `feed` (the newest samples, between the link's thread and a view), `view` (the
-views, each in its own process), `terminal`, `stream` (PlotJuggler and Foxglove).
+views, each in its own process; the one on a terminal), `stream` (PlotJuggler and Foxglove).
 """
 
 from .feed import Feed
