@@ -26,7 +26,7 @@ from sewfast.commissioning import STAGES
 from sewfast.link import VirtualDevice
 from sewfast.recordfile import read_recording
 from sewfast.studio import Project, Studio
-from sewfast.studio.messages import SCHEMAS, checked
+from sewfast.studio.session import SCHEMAS, checked
 from studio_page import Page, Watching
 
 TRIPPED = 4

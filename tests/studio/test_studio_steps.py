@@ -21,7 +21,7 @@ from sewfast.frequency import load_response
 from sewfast.studio import Commission, Project, Step, Studio
 from sewfast.studio.commissioning import carry_out
 from sewfast.studio.loops import shown_loop, shown_response
-from sewfast.studio.uploads import Upload
+from sewfast.studio.project import Upload
 from studio_page import Page
 
 MOVE = {"model": "drive.json", "values": {"Kp": 0.03, "Ti": 0.07}}

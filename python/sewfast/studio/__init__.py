@@ -1,12 +1,12 @@
 """Studio: from a recording to a driven machine on a local page; its files are the command line's.
 
-Read in this order: `project` and `step` (the steps on recordings), `tuning` and `search` (the
-settings of a controller and their effect), `loops` (Bode plots), `commissioning` and `driving` (the
-steps that move a machine); each step is a call of the public API and can be copied. `messages`
-checks a page's messages, `steps` answers them, `uploads` receives files; `jobs` runs long steps in
-a separate process. `server` serves all of it to browsers on this computer only, with a
-`session` for each page; `line` is its client of `bench`, the process that owns a drive's port.
-`page` holds the files for the browser, `widgets` shows two of its views in a notebook.
+Read in this order: `project` and `step` (the steps on recordings, uploads), `tuning` (the settings
+of a controller, their effect, a search), `loops` (Bode plots), `commissioning` and `driving` (the
+steps that move a machine); each step is a call of the public API and can be copied. `jobs` answers
+a page's requests and runs long steps in a separate process. `server` serves all of it to browsers
+on this computer only, with a `session` for each page, which checks its messages; `line` is its
+client of `bench`, the process that owns a drive's port. `page` holds the files for the browser,
+`widgets` shows two of its views in a notebook.
 """
 
 from .commissioning import Commission

@@ -19,13 +19,10 @@ from ..errors import SettingError, not_installed
 from .bench import error_text
 from .commissioning import COMMISSIONED
 from .driving import checked_recording
-from .jobs import Jobs
+from .jobs import Jobs, Steps
 from .line import Line
-from .messages import checked
-from .project import CONTROLLER_FORMAT, Project
-from .session import PROMPT, ROW, Session, packed, to_text
-from .steps import Steps
-from .uploads import Upload
+from .project import CONTROLLER_FORMAT, Project, Upload
+from .session import PROMPT, ROW, Session, checked, packed, to_text
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response

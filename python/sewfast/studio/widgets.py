@@ -16,12 +16,10 @@ import numpy as np
 
 from ..errors import SettingError, not_installed
 from .bench import error_text
-from .jobs import Jobs
-from .messages import checked
+from .jobs import Jobs, Steps
 from .project import Project
-from .session import finite
+from .session import checked, finite
 from .step import MODEL
-from .steps import Steps
 
 if TYPE_CHECKING:
     from ..control.controller import Controller
