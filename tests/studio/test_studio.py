@@ -24,7 +24,7 @@ from cli import PROGRAM, environment
 from moments import until
 from sewfast.errors import SettingError
 from sewfast.studio import Project, Step, Studio
-from sewfast.studio.commissioning import envelope
+from sewfast.studio.requests import envelope
 from sewfast.tuning import costs, first_controller
 from studio_page import EVIL, Page, websockets
 

@@ -19,9 +19,9 @@ from commissioned import SMALL, short
 from moments import until
 from sewfast.frequency import load_response
 from sewfast.studio import Commission, Project, Step, Studio
-from sewfast.studio.commissioning import carry_out
 from sewfast.studio.loops import shown_loop, shown_response
 from sewfast.studio.project import Upload
+from sewfast.studio.requests import carry_out
 from studio_page import Page
 
 MOVE = {"model": "drive.json", "values": {"Kp": 0.03, "Ti": 0.07}}

@@ -1,18 +1,17 @@
 """Studio: from a recording to a driven machine on a local page; its files are the command line's.
 
-Read in this order: `project` and `step` (the steps on recordings, uploads), `tuning` (the settings
-of a controller, their effect, a search), `loops` (Bode plots), `commissioning` and `driving` (the
-steps that move a machine); each step is a call of the public API and can be copied. `jobs` answers
-a page's requests and runs long steps in a separate process. `server` serves all of it to browsers
+Read in this order: `requests` (a step on a recording, a commissioning), `project` (the steps and
+uploads), `tuning` (the settings of a controller, their effect, a search), `loops` (Bode plots),
+`driving` (the steps on a drive); each step is a call of the public API and can be copied. `jobs`
+answers a page and runs long steps in a separate process. `server` serves all of it to browsers
 on this computer only, with a `session` for each page, which checks its messages; `line` is its
 client of `bench`, the process that owns a drive's port. `page` holds the files for the browser,
 `widgets` shows two of its views in a notebook.
 """
 
-from .commissioning import Commission
 from .project import Project, make_demo
+from .requests import Commission, Step
 from .server import Studio
-from .step import Step
 from .tuning import Tuning
 
 __all__ = ["Commission", "Project", "Step", "Studio", "Tuning", "make_demo"]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import SettingError
-from .commissioning import Commission, carry_out, drawn
+from .requests import Commission, carry_out, drawn
 
 if TYPE_CHECKING:
     from ..commissioning import Commissioning

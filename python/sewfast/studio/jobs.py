@@ -25,10 +25,9 @@ import numpy as np
 
 from ..errors import Interrupted, SettingError
 from .bench import error_text
-from .commissioning import COMMISSIONED, Commission, carry_out
 from .loops import shown_loop, shown_response
 from .project import Project, checked_name
-from .step import Step
+from .requests import COMMISSIONED, Commission, Step, carry_out
 from .tuning import Found, Search, Tuning
 
 if TYPE_CHECKING:

@@ -15,8 +15,16 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from ..errors import SettingError, unwritable
-from .commissioning import COMMISSIONED, envelope, require, require_writable
-from .step import MODEL, Step, commands, script
+from .requests import (
+    COMMISSIONED,
+    MODEL,
+    Step,
+    commands,
+    envelope,
+    require,
+    require_writable,
+    script,
+)
 
 if TYPE_CHECKING:
     from ..dataset import Dataset

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import SettingError, not_installed
 from .bench import error_text
-from .commissioning import COMMISSIONED
 from .driving import checked_recording
 from .jobs import Jobs, Steps
 from .line import Line
 from .project import CONTROLLER_FORMAT, Project, Upload
+from .requests import COMMISSIONED
 from .session import PROMPT, ROW, Session, checked, packed, to_text
 
 if TYPE_CHECKING:

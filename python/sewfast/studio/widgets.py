@@ -18,8 +18,8 @@ from ..errors import SettingError, not_installed
 from .bench import error_text
 from .jobs import Jobs, Steps
 from .project import Project
+from .requests import MODEL
 from .session import checked, finite
-from .step import MODEL
 
 if TYPE_CHECKING:
     from ..control.controller import Controller
