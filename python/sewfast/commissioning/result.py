@@ -39,7 +39,6 @@ from .training import Rival
 from .verification import Comparison
 
 VERIFIED, VERIFIED_POORLY = "verified", "verified, prediction poor"
-VERDICTS = (VERIFIED, VERIFIED_POORLY, "refused", "interrupted")
 POOR = 2.0
 """Ratio of measured to predicted cost above which the prediction is poor."""
 
@@ -491,8 +490,11 @@ def numbers(c: Commissioning) -> dict[str, Any]:
         "small_signals": _small_signals(c),
         "acceleration_rpm_per_s": c.acceleration,
         "turn_load_v_rms": None if c.turn_load is None else c.turn_load.rms,
-        "models": {"members": 0 if c.models is None else len(c.models.members)}
-        | {"levels_rmse_rpm": list(c.rmse), "kind": _kind(c)},
+        "models": {
+            "members": 0 if c.models is None else len(c.models.members),
+            "levels_rmse_rpm": list(c.rmse),
+            "kind": None if c.models is None else c.models.members[0].kind,
+        },
         "rival": None
         if c.rival is None
         else {"order": c.rival.model.orders["na"], "levels_rmse_rpm": c.rival.rmse},
@@ -553,10 +555,6 @@ def _small_signals(c: Commissioning) -> dict[str, Any] | None:
         "fopdt": None if fopdt is None else {n: getattr(fopdt, n) for n in ("K", "T", "L")},
         "resonance": None if resonance is None else dict(vars(resonance)),
     }
-
-
-def _kind(c: Commissioning) -> str | None:
-    return None if c.models is None else c.models.members[0].kind
 
 
 def _opinion(c: Commissioning) -> dict[str, Any] | None:

@@ -8,7 +8,7 @@ time, and the step response. The catalogue of `sewfast.signals` is made for one 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -185,18 +185,14 @@ def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
             received=f"{u_min} and {u_max}", remedy="give the amplifier's limits",
         )  # fmt: skip
     reason: Exception | None = None
-    for share in _STEP_SHARES:
-        for samples in _STEP_SAMPLES:
-            u = np.zeros(samples)
-            at = samples // 20
-            u[at:] = share * size
-            try:
-                y = model.core.simulate(u[:, None], model.core.rest_state())
-                fopdt = fit_fopdt(u, y, Ts=model.Ts)
-            except (DataError, FitError) as error:
-                reason = error
-                continue
-            return DriveStep(fopdt, float(y[at - 1]), _slowest(fopdt, y[at:], model.Ts))
+    for u, at in _steps(size):
+        try:
+            y = model.core.simulate(u[:, None], model.core.rest_state())
+            fopdt = fit_fopdt(u, y, Ts=model.Ts)
+        except (DataError, FitError) as error:
+            reason = error
+            continue
+        return DriveStep(fopdt, float(y[at - 1]), _slowest(fopdt, y[at:], model.Ts))
     raise FitError(
         name="model", expected="one whose step response settles",
         received=f"none up to u = {0.5 * size:g} ({reason})",
@@ -219,24 +215,29 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
     if pole is None or not _moves_on(model, _STEP_SHARES[0] * size):
         return None
     reason: Exception | None = None
-    for share in _STEP_SHARES:
-        for samples in _STEP_SAMPLES:
-            u = np.zeros(samples)
-            at = samples // 20
-            u[at:] = share * size
-            y = model.core.simulate(u[:, None], model.core.rest_state())
-            try:
-                # exclude the decay of a pole slightly below 1 from the rate
-                rate = (y[1:] - y[0] - pole * (y[:-1] - y[0])) / model.Ts
-                fopdt = fit_fopdt(u[1:], rate, Ts=model.Ts)
-            except (DataError, FitError) as error:
-                reason = error
-                continue
-            return DriveStep(fopdt, float(y[0]), fopdt.T)
+    for u, _ in _steps(size):
+        y = model.core.simulate(u[:, None], model.core.rest_state())
+        try:
+            # exclude the decay of a pole slightly below 1 from the rate
+            rate = (y[1:] - y[0] - pole * (y[:-1] - y[0])) / model.Ts
+            fopdt = fit_fopdt(u[1:], rate, Ts=model.Ts)
+        except (DataError, FitError) as error:
+            reason = error
+            continue
+        return DriveStep(fopdt, float(y[0]), fopdt.T)
     raise FitError(
         name="model", expected="one that integrates its input and whose rate settles after a step",
         received=f"{reason}", remedy="give a controller to start from",
     ) from reason  # fmt: skip
+
+
+def _steps(size: float) -> Iterator[tuple[FloatArray, int]]:
+    """Commands with a step, and its sample: from small to large, from short to long."""
+    for share in _STEP_SHARES:
+        for samples in _STEP_SAMPLES:
+            u = np.zeros(samples)
+            u[samples // 20 :] = share * size
+            yield u, samples // 20
 
 
 def _slowest(fopdt: Fopdt, y: FloatArray, Ts: float) -> float:

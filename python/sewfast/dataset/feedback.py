@@ -200,7 +200,8 @@ def _scale(means: list[FloatArray], past: int, record: float, seconds: float) ->
     if left == 0.0 or total[j] == 0.0:
         return None
     gain = total[j] / left
-    integral = np.concatenate([_without_line(_running_sum(m[:, j])) for m in scaled])
+    inputs_of = [np.where(np.isfinite(m[:, j]), m[:, j], 0.0) for m in scaled]
+    integral = np.concatenate([_without_line(np.cumsum(u)) for u in inputs_of])
     output = np.concatenate([_without_line(m[:, -1]) for m in scaled])
     return _Scale(
         lengths=-float(theta[0]) / left * record,
@@ -250,10 +251,6 @@ def _least_squares(X: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray
 def _deviation(values: FloatArray) -> float:
     known = values[np.isfinite(values)]
     return float(known.std()) if len(known) else 0.0
-
-
-def _running_sum(column: FloatArray) -> FloatArray:
-    return np.cumsum(np.where(np.isfinite(column), column, 0.0))
 
 
 def _without_line(column: FloatArray) -> FloatArray:

@@ -166,7 +166,7 @@ def _model(model: Model, code: Code) -> tuple[str, str, str, list[str]]:
         notes.append(model_loss(model, members, embedded, combined))
     numbers = sum(len(v) for e in embedded for v in e.parts.values())
     size = 4 if code.single else 8
-    rooms = [_room(e) for e in embedded]
+    rooms = [e.orders["na"] + e.orders["inputs"] * _kept(e) for e in embedded]
     notes.append(
         f"{numbers * size} bytes of coefficients, {sum(rooms) * size} bytes of memory a model"
     )
@@ -203,10 +203,6 @@ def _digest(model: Model) -> str:
 
 def _kept(embedded: _core.EmbeddedModel) -> int:
     return embedded.orders["nk"] + embedded.orders["nb"]
-
-
-def _room(embedded: _core.EmbeddedModel) -> int:
-    return embedded.orders["na"] + embedded.orders["inputs"] * _kept(embedded)
 
 
 def _model_header(

@@ -45,7 +45,8 @@ _FOLDERS = ("recordings", "models", "controllers", "predictions", "runs", "check
 
 def require_own(folder: Path, *, overwrite: bool) -> None:
     """Raise `SettingError` for a folder with files of anything but an earlier experiment."""
-    if overwrite or _is_result(folder):
+    # of any version: results of older versions are replaced as well
+    if overwrite or numbers_in(folder / "results.json").get("format") == FORMAT:
         return
     place = first_taken(folder, (*_FOLDERS, "results.json", "report.html"))
     if place is not None:
@@ -54,11 +55,6 @@ def require_own(folder: Path, *, overwrite: bool) -> None:
             "there are some and no results.json; choose another folder, or overwrite them "
             "(--overwrite)"
         )
-
-
-def _is_result(folder: Path) -> bool:
-    # of any version: results of older versions are replaced as well
-    return numbers_in(folder / "results.json").get("format") == FORMAT
 
 
 def abandon(folder: Path) -> None:

@@ -311,7 +311,8 @@ class Drive(Unique):
         SettingError
             If the baud rate is too low for the columns asked for; it names those to leave out.
         """
-        return layout(plan, self.channels, self.identity, self._baud())
+        baud = math.inf if self.identity.on_credit else self._link.port.max_rate
+        return layout(plan, self.channels, self.identity, baud)
 
     def columns(self, plan: Plan) -> dict[str, str]:
         """Names and units of the columns that a run of `plan` will stream; moves nothing.
@@ -501,9 +502,6 @@ class Drive(Unique):
         if what == "references":
             return profiles.references(plan.values, limits)
         return profiles.commands(plan.values, self.channels[1], limits)
-
-    def _baud(self) -> float:
-        return math.inf if self.identity.on_credit else self._link.port.max_rate
 
     def _require_idle(self) -> None:
         status = self.status()

@@ -192,7 +192,7 @@ class Feed:
         self._streamed = {name: row for row, name in enumerate(columns)}
         self._per_rev = counts_per_rev if "counts" in columns else None
         self._lag = max(1, round(speed_window / Ts))
-        self.columns = _with_speed(columns, derived=self._derives)
+        self.columns = {**columns, SPEED: "RPM"} if self._derives else dict(columns)
         self._size, self.window = _extent(self.Ts, n)
         self._memory = Memory.own(len(columns), self._size)
         self._pipe: int | None = None
@@ -377,10 +377,6 @@ def _extent(Ts: float, n: int | None) -> tuple[int, int]:
     wanted = n if n is not None and whole else math.ceil(SCROLL_S / Ts)
     size = min(max(wanted + math.ceil(_SPARE_S / Ts), _LEAST), _MOST)
     return size, min(wanted, size - size // 8)
-
-
-def _with_speed(columns: Mapping[str, str], *, derived: bool) -> dict[str, str]:
-    return {**columns, SPEED: "RPM"} if derived else dict(columns)
 
 
 def _require(ok: bool, expected: str, received: object, remedy: str) -> None:
