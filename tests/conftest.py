@@ -20,6 +20,10 @@ _BESIDE = ROOT.parent / "shared" / "data"
 if "SEWFAST_DATA" not in os.environ and _BESIDE.is_dir():
     os.environ["SEWFAST_DATA"] = str(_BESIDE)
 
+# A product of small matrices on every processor waits in a loop for those that other tests
+# use: ten to sixty times as long. NumPy reads this at its import; workers and commands inherit it.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # a shell starts background jobs with SIGINT ignored, nohup with SIGHUP, and so would the tests of
 # Ctrl-C and of a closed terminal
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
