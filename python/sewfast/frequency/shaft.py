@@ -275,7 +275,7 @@ def _mark(number: int) -> str:
     return "" if number == 1 else f"_{number}"
 
 
-def _terms(theta: FloatArray, Ts: float, *, counted: bool) -> tuple[int, float, Complex, Complex]:
+def _terms(theta: FloatArray, *, counted: bool) -> tuple[int, float, Complex, Complex]:
     """Whole samples of delay, its fraction, and poles with their residues.
 
     For the speed, or for its integral if it is counted. The factors are quadratics, so their roots
@@ -310,7 +310,7 @@ def _held(p: Complex, part: float, Ts: float) -> tuple[Complex, Complex]:
 
 def _sampled(theta: FloatArray, hertz: FloatArray, Ts: float, counted: bool) -> Complex:
     """Response of the measured quantity: speed at the samples, or its mean between them."""
-    whole, part, poles, residues = _terms(theta, Ts, counted=counted)
+    whole, part, poles, residues = _terms(theta, counted=counted)
     step = np.exp(-2j * np.pi * hertz * Ts)
     now, before = _held(poles, part, Ts)
     made = np.outer(residues * before, step) + (residues * now)[:, None]
@@ -321,7 +321,7 @@ def _sampled(theta: FloatArray, hertz: FloatArray, Ts: float, counted: bool) -> 
 
 def sampled_model(theta: FloatArray, Ts: float, u_unit: str, y_unit: str) -> LinearOE:
     """G under a held command, at the samples; theta: logarithms, except the delay in samples."""
-    whole, part, continuous, residues = _terms(theta, Ts, counted=False)
+    whole, part, continuous, residues = _terms(theta, counted=False)
     poles = np.exp(continuous * Ts)
     num: Any = np.zeros(len(poles) + 2, dtype=np.complex128)
     for j, held in enumerate(zip(*_held(continuous, part, Ts), strict=True)):
