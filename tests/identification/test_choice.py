@@ -25,7 +25,7 @@ from sewfast.identification.folds import (
     folds,
     free_runs,
 )
-from sewfast.identification.orders import DELAYS, LinearTable, raised
+from sewfast.identification.linear import DELAYS, LinearTable, raised
 from sewfast.identification.search import HALVING_ITERATIONS, STILL_NEAR, Search
 from sewfast.identification.task import Clock, Pool, Stopped, Task
 from sewfast.identification.training import Start, Structure
@@ -156,7 +156,7 @@ def test_a_small_order_and_the_delay_are_found(delay: int) -> None:
     orders = []
     for seed in range(5):
         data = first_order(seed, delay, noise=0.1)
-        table = LinearTable(task(data), folds(data)[:1], pool())
+        table = LinearTable(task(data).nk, folds(data)[:1], pool())
         table.search(None)
         orders.append(table.choice.order)
         assert table.choice.rmse < 1.01 * table.best.rmse
@@ -169,7 +169,7 @@ def test_a_small_order_and_the_delay_are_found(delay: int) -> None:
 def test_a_dead_time_beyond_the_usual_delays_is_not_feigned_by_a_large_order(delay: int) -> None:
     for seed in range(3):
         data = first_order(seed, delay, noise=0.03)
-        table = LinearTable(task(data), folds(data)[:1], pool())
+        table = LinearTable(task(data).nk, folds(data)[:1], pool())
         table.search(None)
         assert table.choice.order <= 3
         assert abs(table.choice.nk - delay) <= 2
@@ -180,7 +180,7 @@ def test_a_dead_time_beyond_the_usual_delays_is_not_feigned_by_a_large_order(del
 def test_without_a_dead_time_no_long_delay_is_looked_at() -> None:
     for seed in range(3):
         data = first_order(seed, 1, noise=0.1)
-        table = LinearTable(task(data), folds(data)[:1], pool())
+        table = LinearTable(task(data).nk, folds(data)[:1], pool())
         table.search(None)
         assert max(nk for _, nk in table.candidates) == max(DELAYS)
 

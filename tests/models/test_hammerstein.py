@@ -13,7 +13,7 @@ import sewfast
 from cli import called as command
 from sewfast import Dataset, _core
 from sewfast.errors import Interrupted, ModelFileError, SettingError
-from sewfast.identification import linear
+from sewfast.identification import lagged
 from sewfast.models.hammerstein import HammersteinWiener
 
 TS = 0.01
@@ -186,7 +186,7 @@ def test_an_interrupt_of_the_choice_hands_over_the_best_so_far(tmp_path: Path) -
 def test_a_budget_that_ends_the_choice_leaves_time_for_a_model(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(linear, "SHARE_OF_CHOICE", 1e-9)
+    monkeypatch.setattr(lagged, "SHARE_OF_CHOICE", 1e-9)
     data = _plant(800, 14, before=_band)
     model = sewfast.identify(data, model="hammerstein-wiener", time_budget=600.0)
     assert model.training["tried"] == []

@@ -7,7 +7,6 @@ network is credibly better. The second best are kept with the model, in `alterna
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -31,8 +30,14 @@ from .finals import (
     Finals,
 )
 from .folds import LEAST_HELD_OUT, SHARE, compared, errors_of, folds, free_runs
-from .linear import linear_model, short
-from .orders import HELD_OUT, LEAST_GAIN, LinearCandidate, LinearTable
+from .linear import (
+    HELD_OUT,
+    LEAST_GAIN,
+    LinearCandidate,
+    LinearTable,
+    linear_provenance,
+    short,
+)
 from .search import CLIMB_ITERATIONS, Search
 from .task import (
     Look,
@@ -41,12 +46,11 @@ from .task import (
     Stopped,
     Task,
     arrays,
-    documented,
     finite,
     with_provenance,
     wrap,
 )
-from .training import Network, Request, Structure, train
+from .training import Network, Request, Structure
 from .trials import (
     STILL_WORTH_A_FEEDTHROUGH,
     Candidate,
@@ -67,26 +71,24 @@ TOGETHER = 1.25
 """On little data, or in little time, the median includes all finalists within this factor."""
 
 
-def auto(task: Task) -> Model:
-    """The network if it is credibly better, else linear output error."""
-    return _identified(task, wants_network=False)
+def searched(task: Task, *, wants_network: bool = False) -> Model:
+    """The network if it is credibly better, else linear output error.
 
-
-def neural_ss(task: Task) -> Model:
-    """The state-space network, even if it is not better."""
-    return _identified(task, wants_network=True)
-
-
-def _identified(task: Task, wants_network: bool) -> Model:
-    began = time.perf_counter()
+    If one is wanted, the state-space network, even if it is not better.
+    """
     parts = folds(task.data, task.validation)
     if not parts:
-        return _without_held_out(task, began, wants_network)
+        reason = (
+            f"the record is too short to hold out {100 * SHARE:.0f} % of every experiment, at "
+            f"least {LEAST_HELD_OUT} samples, to compare on; or nothing moves before"
+        )
+        if wants_network:
+            raise FitError(f"{task.data.source}: {reason}; record longer, or give validation data")
+        return short(task, reason)
     pool = Pool(task.threads, task.clock, task.progress)
-    search = Search(task, parts, pool, wants_network)
-    choice = Choice(search, began)
+    choice = Choice(Search(task, parts, pool, wants_network))
     try:
-        search.run()
+        choice.search.run()
         return choice.model()
     except (Stopped, KeyboardInterrupt) as stopped:
         # Ctrl-C can also arrive between two compiled calls
@@ -224,12 +226,8 @@ class Choice(Finals):
             c.structure, self.task.data, None, 6 if search.samples > 60_000 else 15,
             linear if c.structure.kind == "neural_oe" else None, initial=models,
         )  # fmt: skip
-        (found,) = search.guarded(
-            train(
-                [request], search.pool, self.task.seed, workers=self.task.workers,
-                until=self.clock.until(SHARE_OF_REFIT), share=1.0,
-            )
-        )  # fmt: skip
+        until = self.clock.until(SHARE_OF_REFIT)
+        (found,) = search.guarded(search.train([request], until, 1.0))
         kept = [s.model for s in counting(found) if s.is_sound]
         return kept if len(kept) >= min(len(models), 3) else models
 
@@ -253,7 +251,7 @@ class Choice(Finals):
         provenance["choice"]["final_free_run_rmse"] = finite(error)
         model = self._of(models, s)
         provenance["cost"] = cost_of(model, task.data)
-        model = documented(model, task, self.began, provenance)
+        model = task.documented(model, provenance)
         runners_up = [self._alternative(c) for c in others[:MOST_ALTERNATIVES]]
         return self._closed(model, error, [*runners_up, *self._linear_alternative()])
 
@@ -277,7 +275,7 @@ class Choice(Finals):
         }
         choice |= {"free_run_rmse": {c.structure.kind: finite(c.error)}}
         extra: Provenance = {"initial_state": "estimated", "choice": choice}
-        return documented(model, self.task, self.began, extra)
+        return self.task.documented(model, extra)
 
     def _network_alternative(self) -> list[Model]:
         """The best network that passed the guard, if none was chosen."""
@@ -293,7 +291,7 @@ class Choice(Finals):
         choice: Provenance = {"chosen": "oe", "reason": "the linear alternative"}
         choice |= {"free_run_rmse": {"oe": finite(chosen.rmse)}}
         extra: Provenance = {"initial_state": "estimated", "choice": choice}
-        return [documented(wrap(LinearOE, core, self.task.data), self.task, self.began, extra)]
+        return [self.task.model(LinearOE, core, extra)]
 
     def _is_motor(self) -> bool:
         """Whether a motor's equations beat linear models, on the newest part and the one before."""
@@ -303,7 +301,7 @@ class Choice(Finals):
         if motor.rmse >= WORTH_IT * linear.rmse:
             return False
         if len(motor.errors) > 1:
-            earlier = LinearTable(self.task, [search.folds[1]], search.pool)
+            earlier = LinearTable(self.task.nk, [search.folds[1]], search.pool)
             orders = sorted({search.linear.choice.order, linear.order})
             earlier.add([(o, linear.nk) for o in orders], self.clock.until(SHARE_OF_FINAL))
             if earlier.candidates and motor.errors[1].rmse >= WORTH_IT * earlier.best.rmse:
@@ -319,10 +317,11 @@ class Choice(Finals):
         task, found = self.task, self.search.motor
         assert found is not None
         until = self.clock.until(SHARE_OF_REFIT)
+        motors = grey_box.Motors(task.seed, task.iterations_or_usual)
         jobs = [] if self.split.is_given or self.is_interrupted else [found]
         part = self.split.shortened(len(task.data), HELD_OUT)
         fits = self.search.pool.map(
-            lambda c, look: grey_box.completed(task, c, part, look), jobs, until=until, share=1.0
+            lambda c, look: motors.refitted(c, task.data, part, look), jobs, until=until, share=1.0
         )
         core = next((c for c in fits if c is not None), found.core)
         provenance: Provenance = {
@@ -332,9 +331,8 @@ class Choice(Finals):
             "termination": "time budget" if self.clock.truncated else "chosen by free run",
             "choice": self._choice("grey_box", found.rmse),
         }
-        model = wrap(GreyBox, core, task.data)
-        provenance["cost"] = cost_of(model, task.data)
-        model = documented(model, task, self.began, provenance)
+        model = task.model(GreyBox, core, provenance)
+        model = with_provenance(model, {"cost": cost_of(model, task.data)})
         return self._closed(
             model, found.rmse, [*self._network_alternative(), *self._linear_alternative()]
         )
@@ -352,9 +350,9 @@ class Choice(Finals):
         if fit is None:
             # no time to fit all samples: keep the model of the excerpt
             extra = {"initial_state": "estimated", "termination": "time budget", **provenance}
-            model = documented(wrap(LinearOE, core, task.data), task, self.began, extra)
+            model = task.model(LinearOE, core, extra)
         else:
-            model = linear_model(task, fit, self.began, provenance)
+            model = task.model(LinearOE, fit.model, linear_provenance(fit) | provenance)
         return self._closed(model, chosen.rmse, self._network_alternative())
 
     def _linear_choice(self) -> LinearCandidate:
@@ -363,7 +361,7 @@ class Choice(Finals):
         if self.clock.over(SHARE_OF_VERIFYING):
             return table.choice
         likely = [c for c in table.eligible if c.order <= 3 or c.rmse <= LIKELY * table.best.rmse]
-        everywhere = LinearTable(self.task, self.search.folds, self.search.pool)
+        everywhere = LinearTable(self.task.nk, self.search.folds, self.search.pool)
         wanted = [(c.order, c.nk) for c in likely]
         everywhere.add(wanted, self.clock.until(SHARE_OF_FINAL))
         first = table.choice
@@ -381,11 +379,10 @@ class Choice(Finals):
                 "found none; check units and signs, record longer, or give more time"
             )
         self.reasons.append("no output-error fit finished; least squares instead")
-        model = wrap(LinearOE, core, task.data)
         error = errors_of(free_runs(core, self.split), self.split).rmse
         extra: Provenance = {"initial_state": "estimated", "termination": "time budget"}
         extra["choice"] = {"chosen": "oe", "reason": "; ".join(self.reasons), "candidates": []}
-        return self._closed(documented(model, task, self.began, extra), error, [])
+        return self._closed(task.model(LinearOE, core, extra), error, [])
 
     def _linear_fit(self, chosen: LinearCandidate, look: Look) -> _core.LinearFit | None:
         task = self.task
@@ -445,20 +442,8 @@ class Choice(Finals):
         if self.wants_network or linear is None or linear.models[0] is None:
             # a kind requested by name is not replaced by another
             raise KeyboardInterrupt from stopped
-        model = wrap(LinearOE, linear.models[0], self.task.data)
         provenance = {"termination": "interrupted", "initial_state": "estimated"}
-        return documented(model, self.task, self.began, provenance)
-
-
-def _without_held_out(task: Task, began: float, wants_network: bool) -> Model:
-    """The model of a record too short for held-out data, or still until its end: no network."""
-    reason = (
-        f"the record is too short to hold out {100 * SHARE:.0f} % of every experiment, at least "
-        f"{LEAST_HELD_OUT} samples, to compare on; or nothing moves before"
-    )
-    if wants_network:
-        raise FitError(f"{task.data.source}: {reason}; record longer, or give validation data")
-    return short(task, began, reason)
+        return self.task.model(LinearOE, linear.models[0], provenance)
 
 
 def cost_of(model: Model, data: Dataset) -> float:

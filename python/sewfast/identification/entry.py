@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 from ..arrays import require_whole
@@ -28,15 +29,15 @@ from .training import Structure
 from .verdict import verdict_by_name
 
 _KINDS: dict[str, Callable[[Task], Model]] = {
-    "auto": choice.auto,
+    "auto": choice.searched,
     "arx": linear.arx,
     "iv": linear.iv,
     "oe": linear.oe,
     "grey_box": grey_box.grey_box,
     "neural_oe": lagged.neural_oe,
-    "neural_ss": choice.neural_ss,
+    "neural_ss": partial(choice.searched, wants_network=True),
     "paper": lagged.paper,
-    **{cls.kind: linear.identified_as(cls) for cls in STRUCTURED},
+    **{cls.kind: lagged.identified_as(cls) for cls in STRUCTURED},
 }
 SHARE_OF_FIT = 0.9
 """Share of a time budget for the fits; the rest is for the evidence stored with the model."""
@@ -207,7 +208,7 @@ def identify(
     )
     _require_data(task, kind)
     if isinstance(model, Model):
-        found = _within_budget(lambda t: further.trained(t, model), task)
+        found = _within_budget(partial(further.trained, model), task)
         if found.core is model.core:
             # stopped before its first step: it keeps the evidence from its own data
             return found
@@ -250,11 +251,11 @@ def seeded(
         progress=progress, select=False,
     )  # fmt: skip
     _require_data(task, "neural_oe")
-    _, start = lagged.begun(task, time.perf_counter())
+    networks = lagged.Networks.of(task)
 
     def train(seed: int, progress: Progress | None = None) -> Model:
-        own = replace(task, seed=seed, progress=progress)
-        return lagged.unselected(own, start, time.perf_counter())
+        own = replace(task, seed=seed, progress=progress, began=time.perf_counter())
+        return replace(networks, task=own).unselected()
 
     return train
 
@@ -367,16 +368,33 @@ def _require_meaning(
 
 
 def _require_data(task: Task, kind: str) -> None:
-    task.data.require_measured()
-    task.data.require_excited()
-    require_fittable(task.data)
-    _require_enough(task, kind)
-    if kind == "paper" and task.data.n_inputs != 1:
-        raise DataError(f"preset 'paper' has one input, the data have {task.data.n_inputs}")
+    """Require sound data with whole regressors, and more samples than parameters."""
+    data, inputs = task.data, task.data.n_inputs
+    data.require_measured()
+    data.require_excited()
+    require_fittable(data)
+    if kind == "neural_ss":
+        smallest = Structure(task.nx or 1, 1, task.hidden or 2, 0.0)
+        lag, parameters = task.na, smallest.parameters(inputs)
+    else:
+        lag = max(task.na, task.orders["nk"] + task.nb - 1)
+        regressors = task.na + task.nb * inputs
+        parameters = regressors + 1
+        if kind in ("neural_oe", "paper"):
+            parameters += task.hidden_or_usual * (regressors + 2)
+    _require_longer(data, lag + INIT)
+    usable = sum(len(e) - e.unmeasured - lag for e in data.experiments)
+    if usable < 2 * parameters:
+        raise DataError(
+            f"{data.source}: expected at least {2 * parameters} samples for {parameters} "
+            f"parameters, received {usable}; record longer, or lower the orders"
+        )
+    if kind == "paper" and inputs != 1:
+        raise DataError(f"preset 'paper' has one input, the data have {inputs}")
     if task.validation is not None:
         task.validation.require_measured()
         require_sane(task.validation, LARGEST_FITTED)
-        Dataset.concat([task.data, task.validation])
+        Dataset.concat([data, task.validation])
         _require_longer(task.validation, INIT)
 
 
@@ -387,29 +405,3 @@ def _require_longer(data: Dataset, least: int) -> None:
                 f"{e.name} [{e.range_text}]: expected more than {least} samples, received "
                 f"{e.counted}; record longer, lower the orders, or leave this experiment out"
             )
-
-
-def _require_enough(task: Task, kind: str) -> None:
-    """Require whole regressors in every experiment, and more samples than parameters in all."""
-    lag, parameters = _sizes(task, kind)
-    _require_longer(task.data, lag + INIT)
-    usable = sum(len(e) - e.unmeasured - lag for e in task.data.experiments)
-    if usable < 2 * parameters:
-        raise DataError(
-            f"{task.data.source}: expected at least {2 * parameters} samples for {parameters} "
-            f"parameters, received {usable}; record longer, or lower the orders"
-        )
-
-
-def _sizes(task: Task, kind: str) -> tuple[int, int]:
-    """Samples before the first whole regressor, and the number of parameters."""
-    inputs = task.data.n_inputs
-    if kind == "neural_ss":
-        smallest = Structure(task.nx or 1, 1, task.hidden or 2, 0.0)
-        return task.na, smallest.parameters(inputs)
-    lag = max(task.na, task.orders["nk"] + task.nb - 1)
-    regressors = task.na + task.nb * inputs
-    parameters = regressors + 1
-    if kind in ("neural_oe", "paper"):
-        parameters += task.hidden_or_usual * (regressors + 2)
-    return lag, parameters

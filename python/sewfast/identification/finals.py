@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .folds import Split, compared, errors_of, free_runs
-from .orders import LinearCandidate, LinearTable
+from .linear import LinearCandidate, LinearTable
 from .search import STILL_NEAR, Search, decayed
-from .training import Request, Start, train
+from .training import Request, Start
 from .trials import (
     BY_FAR,
     Candidate,
@@ -57,8 +57,6 @@ class Finals:
     Attributes
     ----------
     search : Search
-    began : float
-        Start of the identification, on `time.perf_counter`.
     reasons : list of str
         Reasons for the decisions so far, for the model's file.
     is_hurried : bool
@@ -66,7 +64,6 @@ class Finals:
     """
 
     search: Search
-    began: float
     reasons: list[str] = field(default_factory=list)
     is_hurried: bool = False
 
@@ -135,7 +132,7 @@ class Finals:
         passed, parts = [(c.error, c) for c in winning], 1
         if winning and len(search.trials) > 1:
             search.share = SHARE_OF_VERIFYING
-            earlier = LinearTable(self.task, [search.folds[1]], search.pool)
+            earlier = LinearTable(self.task.nk, [search.folds[1]], search.pool)
             nk = linear.nk
             # another part can need another order, which the network has to beat as well
             orders = {1, 2, 3, search.linear.choice.order, linear.order}
@@ -257,16 +254,8 @@ class Finals:
                 break
             requests = self._leg(going, (budget - spent) / (legs - leg))
             spent += sum(r.operations for r in requests)
-            found = search.guarded(
-                train(
-                    requests,
-                    search.pool,
-                    self.task.seed,
-                    workers=self.task.workers,
-                    until=until,
-                    share=0.6 + 0.35 * (leg + 1) / legs,
-                )
-            )
+            share = 0.6 + 0.35 * (leg + 1) / legs
+            found = search.guarded(search.train(requests, until, share))
             following = [
                 self._better(c, starts, r.count)
                 for c, starts, r in zip(going, found, requests, strict=True)

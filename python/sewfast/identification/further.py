@@ -8,19 +8,19 @@ from dataclasses import replace
 from typing import Any
 
 from .. import _core
-from ..dataset import require_same_units
+from ..dataset import Dataset, require_same_units
 from ..errors import FitError, Interrupted, SettingError
 from ..models import ARX, IV, Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from ..models.base import StructuredModel
 from ..models.grey_box import GreyBox
 from .grey_box import trained_from
-from .linear import arx, iv, linear_model
-from .task import Task, arrays, documented, fit_provenance, with_provenance, wrap
+from .linear import arx, iv, linear_provenance
+from .task import Pairs, Task, arrays, completed, fit_provenance, with_provenance
 
 STARTING_SCALE = 1.0
 
 
-def trained(task: Task, model: Model) -> Model:
+def trained(model: Model, task: Task) -> Model:
     """The model after further iterations of its kind of fit on the task's data.
 
     Raises
@@ -36,26 +36,21 @@ def trained(task: Task, model: Model) -> Model:
         On Ctrl-C and at the end of a time budget. `best` is at least as good as the model: the
         model itself if no step was made, an ensemble with the members trained so far.
     """
-    for m in model.members or (model,):
+    members = list(model.members or (model,))
+    for m in members:
         _require_trainable(m)
-    _require_match(task, model)
-    if isinstance(model, Ensemble):
-        return _members(task, model)
-    try:
-        return _single(task, model)
-    except KeyboardInterrupt as e:
-        best = _best(model, e)
-        raise Interrupted(_as_given(model) if best is model else best) from None
-
-
-def _members(task: Task, model: Ensemble) -> Model:
-    """Train every member in turn, within one time budget."""
-    began = time.perf_counter()
-    members, known = list(model.members), {"initial_state": "estimated", "seed": task.seed}
-    known |= {"trained_further": True}
+    _require_match(task.data, model)
+    if not isinstance(model, Ensemble):
+        try:
+            return _single(task, model)
+        except KeyboardInterrupt as e:
+            best = _best(model, e)
+            raise Interrupted(_as_given(model) if best is model else best) from None
+    known = {"initial_state": "estimated", "seed": task.seed, "trained_further": True}
+    # every member in turn, within one time budget
     for i, member in enumerate(model.members):
         try:
-            members[i] = _single(task, member)
+            members[i] = _single(replace(task, began=time.perf_counter()), member)
         except KeyboardInterrupt as e:
             members[i] = _best(member, e)
             if members[0] is model.members[0]:
@@ -66,7 +61,7 @@ def _members(task: Task, model: Ensemble) -> Model:
                 "they were given"
             ]
             break
-    found = documented(Ensemble.of(members, model.combine), task, began, known)
+    found = task.documented(Ensemble.of(members, model.combine), known)
     if "termination" in known:
         raise Interrupted(found)
     return found
@@ -85,29 +80,6 @@ def _as_given(model: Model) -> Model:
     return with_provenance(model, {"notes": notes})
 
 
-def _single(task: Task, model: Model) -> Model:
-    began = time.perf_counter()
-    if isinstance(model, (ARX, IV)):
-        # both are solved afresh, without a start
-        o = model.orders
-        own = replace(task, na=o["na"], nb=o["nb"], nk=o["nk"])
-        return arx(own) if isinstance(model, ARX) else iv(own)
-    if isinstance(model, LinearOE):
-        return _linear(task, model, began)
-    if isinstance(model, GreyBox):
-        return _grey(task, model, began)
-    try:
-        if isinstance(model, NeuralSS):
-            return _state_space(task, model, began)
-        return _lagged(task, model, began)
-    except FitError as e:
-        # messages of the core that ask for other starts and sizes do not apply here
-        raise FitError(
-            name=f"{task.data.source}", expected="data on which the model's free run is finite",
-            received="none", remedy="check scale and signs of the data, or identify again",
-        ) from e  # fmt: skip
-
-
 def _require_trainable(model: Model) -> None:
     """Refuse models at which no fit can begin."""
     if isinstance(model, StructuredModel):
@@ -123,8 +95,7 @@ def _require_trainable(model: Model) -> None:
         )
 
 
-def _require_match(task: Task, model: Model) -> None:
-    data = task.data
+def _require_match(data: Dataset, model: Model) -> None:
     if data.n_inputs != len(model.input_names) or abs(data.Ts - model.Ts) > 0.01 * model.Ts:
         raise SettingError(
             f"model: expected data like the model's, {len(model.input_names)} input(s) at "
@@ -133,33 +104,55 @@ def _require_match(task: Task, model: Model) -> None:
     require_same_units(model, data)
 
 
-def _linear(task: Task, model: LinearOE, began: float) -> Model:
-    orders = {k: model.orders[k] for k in ("na", "nb", "nk")}
-    fit = _core.fit_oe(arrays(task.data), **task.fit_options(**orders), initial=model.core)
-    found = linear_model(task, fit, began)
-    if fit.termination == "interrupted":
-        raise Interrupted(found)
-    return found
+def _single(task: Task, model: Model) -> Model:
+    if isinstance(model, (ARX, IV)):
+        # both are solved afresh, without a start
+        o = model.orders
+        own = replace(task, na=o["na"], nb=o["nb"], nk=o["nk"])
+        return arx(own) if isinstance(model, ARX) else iv(own)
+    data = arrays(task.data)
+    if isinstance(model, LinearOE):
+        orders = {k: model.orders[k] for k in ("na", "nb", "nk")}
+        linear = _core.fit_oe(data, **task.fit_options(**orders), initial=model.core)
+        return completed(task.model(LinearOE, linear.model, linear_provenance(linear)))
+    if isinstance(model, GreyBox):
+        iterations, progress = task.iterations_or_usual, task.progress
+
+        def look(*_: object) -> None:
+            if progress is not None:
+                progress(0, iterations, math.inf)
+
+        core = trained_from(model.core, model.core.theta, task.data, iterations, look)
+        known: dict[str, Any] = {"initial_state": "estimated", "trained_further": True}
+        return task.model(GreyBox, core, known)
+    decay = model.training.get("weight_decay", 0.0)
+    decay = float(decay) if isinstance(decay, (int, float)) else 0.0
+    held = [] if task.validation is None else arrays(task.validation)
+    options = {
+        "weight_decay": decay, "max_iterations": task.iterations_or_usual, "starts": 1,
+        "seed": task.seed, "threads": 1, "progress": task.progress,
+    }  # fmt: skip
+    try:
+        fit = (_state_space if isinstance(model, NeuralSS) else _lagged)(model, data, held, options)
+    except FitError as e:
+        # messages of the core that ask for other starts and sizes do not apply here
+        raise FitError(
+            name=f"{task.data.source}", expected="data on which the model's free run is finite",
+            received="none", remedy="check scale and signs of the data, or identify again",
+        ) from e  # fmt: skip
+    known = fit_provenance(fit) | {"initial_state": "estimated", "seed": task.seed}
+    known |= {"cost_unit": "scaled output squared", "weight_decay": decay, "trained_further": True}
+    known |= {"samples_fitted": len(task.data)}
+    return completed(task.model(type(model), fit.model, known))
 
 
-def _grey(task: Task, model: GreyBox, began: float) -> Model:
-    iterations = task.iterations_or_usual
-
-    def look(*_: object) -> None:
-        if task.progress is not None:
-            task.progress(0, iterations, math.inf)
-
-    core = trained_from(model.core, model.core.theta, task.data, iterations, look)
-    found = wrap(GreyBox, core, task.data)
-    return documented(found, task, began, {"initial_state": "estimated", "trained_further": True})
-
-
-def _state_space(task: Task, model: NeuralSS, began: float) -> Model:
-    s: dict[str, Any] = model.core.settings
-    decay = _decay(model)
-    fit = _core.fit_neural_ss(
-        arrays(task.data),
-        [] if task.validation is None else arrays(task.validation),
+def _state_space(
+    model: Model, data: Pairs, held: Pairs, options: dict[str, Any]
+) -> _core.NeuralSSFit:
+    s = model.core.settings
+    return _core.fit_neural_ss(
+        data,
+        held,
         nx=s["nx"],
         nk=s["nk"],
         hidden=s["hidden"],
@@ -167,61 +160,29 @@ def _state_space(task: Task, model: NeuralSS, began: float) -> Model:
         output=s["output"],
         output_parameters=s["output_parameters"],
         integrator=s["integrator"],
-        weight_decay=decay,
         hidden_scale=STARTING_SCALE,
-        max_iterations=task.iterations_or_usual,
-        starts=1,
         first_start=0,
-        seed=task.seed,
-        threads=1,
         initial=[model.core],
-        progress=task.progress,
+        **options,
     )
-    return _network(task, wrap(NeuralSS, fit.model, task.data), fit, decay, began)
 
 
-def _lagged(task: Task, model: Model, began: float) -> Model:
+def _lagged(model: Model, data: Pairs, held: Pairs, options: dict[str, Any]) -> _core.NeuralFit:
     s = model.core.settings
-    decay = _decay(model)
-    theta = model.core.theta
-    fit = _core.fit_neural_oe(
-        arrays(task.data),
-        [] if task.validation is None else arrays(task.validation),
-        na=s["na"],
-        nb=s["nb"],
-        nk=s["nk"],
+    orders = {k: s[k] for k in ("na", "nb", "nk")}
+    return _core.fit_neural_oe(
+        data,
+        held,
+        **orders,
         hidden=s["hidden"],
         # only states that there is a linear part, and estimates initial states
-        linear=_core.fit_arx(arrays(task.data), na=s["na"], nb=s["nb"], nk=s["nk"], offset=True),
+        linear=_core.fit_arx(data, **orders, offset=True),
         u_mean=s["u_mean"],
         u_scale=s["u_scale"],
         y_mean=s["y_mean"],
         y_scale=s["y_scale"],
         saturate=1.0,
         initial_state="estimated",
-        weight_decay=decay,
-        max_iterations=task.iterations_or_usual,
-        starts=1,
-        seed=task.seed,
-        threads=1,
-        initial_theta=theta[None, :],
-        progress=task.progress,
+        initial_theta=model.core.theta[None, :],
+        **options,
     )
-    return _network(task, wrap(NeuralOE, fit.model, task.data), fit, decay, began)
-
-
-def _decay(model: Model) -> float:
-    """The weight decay with which the model was trained."""
-    known = model.training.get("weight_decay", 0.0)
-    return float(known) if isinstance(known, (int, float)) else 0.0
-
-
-def _network(
-    task: Task, model: Model, fit: _core.NeuralSSFit | _core.NeuralFit, decay: float, began: float
-) -> Model:
-    known = fit_provenance(fit) | {"initial_state": "estimated", "seed": task.seed}
-    known |= {"cost_unit": "scaled output squared", "weight_decay": decay, "trained_further": True}
-    found = documented(model, task, began, known | {"samples_fitted": len(task.data)})
-    if fit.termination == "interrupted":
-        raise Interrupted(found)
-    return found

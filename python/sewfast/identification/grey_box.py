@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,7 +18,7 @@ from ..models.grey_box import MOST_UNITS, GreyBox
 from ..motorfit import PLACE, estimated, rad_per_second, records_of
 from ..motorfit.estimation import Normal, minimised
 from .folds import Errors, Split, compared, errors_of, folds, free_runs, thinned
-from .task import Look, Pool, Provenance, Task, documented, finite, wrap
+from .task import Look, Pool, Provenance, R, Task, finite
 
 TERMS = ("lag", "delay", "coulomb", "offset", "drop", "stribeck", "limit")
 IF_CLEAR = ("sag",)
@@ -51,10 +50,21 @@ PROBED = 20_000
 
 def grey_box(task: Task) -> Model:
     """The motor, with a network if that is credibly better on held-out data."""
-    began = time.perf_counter()
     require_motor(task.data)
-    hidden, tried = _hidden(task)
-    core = fitted(task, task.data, hidden)
+    if task.hidden is not None and task.hidden > MOST_UNITS:
+        raise SettingError(
+            name="hidden", expected=f"1 to {MOST_UNITS} units beside a motor",
+            received=str(task.hidden), remedy="identify with model neural_ss for more",
+        )  # fmt: skip
+    motors = Motors(task.seed, task.iterations_or_usual)
+    hidden, tried = task.hidden or 0, list[Provenance]()
+    is_open = task.hidden is None and task.select
+    for part in folds(task.data, task.validation)[:1] if is_open else ():
+        alone = motors.alone(part)
+        more = motors.beside(alone, part)
+        hidden = (more if _is_better(more, alone) else alone).hidden
+        tried = [{"hidden": c.hidden, "held_out_rmse": finite(c.rmse)} for c in (alone, more)]
+    core = motors.fitted(task.data, hidden)
     known: Provenance = {
         "initial_state": "estimated",
         "cost": _cost(core, task.data),
@@ -63,7 +73,7 @@ def grey_box(task: Task) -> Model:
         "structure": {"hidden": hidden},
         "tried": tried,
     }
-    return documented(wrap(GreyBox, core, task.data), task, began, known)
+    return task.model(GreyBox, core, known)
 
 
 def require_motor(data: Dataset) -> None:
@@ -91,31 +101,7 @@ def require_motor(data: Dataset) -> None:
         ) from None  # fmt: skip
 
 
-def fitted(task: Task, data: Dataset, hidden: int, look: Look | None = None) -> _core.GreyBox:
-    """The motor's parameters, a network of `hidden` units beside it, and the process noise."""
-    core = _motor(data, look)
-    return _with_noise(_with_network(core, task, data, hidden, look) if hidden else core, data)
-
-
-def _hidden(task: Task) -> tuple[int, list[Provenance]]:
-    """Hidden units of the network, chosen on held-out data, and the comparison."""
-    if task.hidden is not None:
-        if task.hidden > MOST_UNITS:
-            raise SettingError(
-                name="hidden", expected=f"1 to {MOST_UNITS} units beside a motor",
-                received=str(task.hidden), remedy="identify with model neural_ss for more",
-            )  # fmt: skip
-        return task.hidden, []
-    parts = folds(task.data, task.validation)[:1] if task.select else ()
-    if not parts:
-        return 0, []
-    alone = _judged(_motor(parts[0].fitted), parts[0])
-    more = _beside(alone, task, parts[0])
-    tried = [{"hidden": c.hidden, "held_out_rmse": finite(c.rmse)} for c in (alone, more)]
-    return (more if _is_better(more, alone) else alone).hidden, tried
-
-
-# --- In a search of structures --------------------------------------------------------------------
+# --- Motors with and without a network ------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -144,63 +130,98 @@ class MotorCandidate:
         return {"kind": "grey_box", "hidden": self.hidden, "free_run_rmse": finite(self.rmse)}
 
 
-def candidate(
-    task: Task, parts: Sequence[Split], pool: Pool, until: float | None
-) -> MotorCandidate | None:
-    """A motor fitted on each of the parts; None if the data are not those of a motor.
+@dataclass(frozen=True)
+class Motors:
+    """Fits of motors; networks beside them are drawn from `seed`, in at most `iterations`."""
 
-    First without a network, which is the result if time is short.
-    """
-    try:
-        require_motor(task.data)
-    except (DataError, SettingError):
-        return None
+    seed: int
+    iterations: int
 
-    def alone(part: Split, look: Look) -> MotorCandidate | None:
-        return _or_none(lambda: _judged(_motor(part.fitted, look), part))
+    def fitted(self, data: Dataset, hidden: int, look: Look | None = None) -> _core.GreyBox:
+        """A motor's parameters, a network of `hidden` units beside it, and the process noise."""
+        core = _motor(data, look)
+        return _with_noise(self._with_network(core, data, hidden, look) if hidden else core, data)
 
-    def more(job: tuple[Split, MotorCandidate | None], look: Look) -> MotorCandidate | None:
-        part, motor = job
-        return motor and _or_none(lambda: _beside(motor, task, part, look))
+    def alone(self, part: Split, look: Look | None = None) -> MotorCandidate:
+        """A motor without a network."""
+        return _judged(_motor(part.fitted, look), part)
 
-    plain = pool.map(alone, parts, until=until)
-    if plain[0] is None:
-        return None
-    fuller = pool.map(more, list(zip(parts, plain, strict=True)), until=until)
-    first = fuller[0]
-    best = fuller if first is not None and _is_better(first, plain[0]) else plain
-    found = [c for c in best if c is not None]
-    return replace(found[0], errors=tuple(e for c in found for e in c.errors))
+    def beside(
+        self, motor: MotorCandidate, part: Split, look: Look | None = None
+    ) -> MotorCandidate:
+        """The same motor with a network."""
+        return _judged(self._with_network(motor.core, part.fitted, HIDDEN, look), part)
+
+    def candidate(
+        self, parts: Sequence[Split], pool: Pool, until: float | None
+    ) -> MotorCandidate | None:
+        """A motor fitted on each of the parts; None if the data are not those of a motor.
+
+        First without a network, which is the result if time is short.
+        """
+        try:
+            require_motor(parts[0].fitted)
+        except (DataError, SettingError):
+            return None
+
+        def alone(part: Split, look: Look) -> MotorCandidate | None:
+            return _or_none(lambda: self.alone(part, look))
+
+        def more(job: tuple[Split, MotorCandidate | None], look: Look) -> MotorCandidate | None:
+            part, motor = job
+            return motor and _or_none(lambda: self.beside(motor, part, look))
+
+        plain = pool.map(alone, parts, until=until)
+        if plain[0] is None:
+            return None
+        fuller = pool.map(more, list(zip(parts, plain, strict=True)), until=until)
+        first = fuller[0]
+        best = fuller if first is not None and _is_better(first, plain[0]) else plain
+        found = [c for c in best if c is not None]
+        return replace(found[0], errors=tuple(e for c in found for e in c.errors))
+
+    def refitted(
+        self, found: MotorCandidate, data: Dataset, part: Split, look: Look
+    ) -> _core.GreyBox:
+        """The candidate fitted to all data, unless that is worse on the part that chose it."""
+        own = _or_none(lambda: self.fitted(thinned(data, MOST_FITTED), found.hidden, look))
+        if own is None:
+            return found.core
+        ratio, deviation = compared(errors_of(free_runs(own, part), part), found.errors[0])
+        return found.core if ratio > deviation else own
+
+    def _with_network(
+        self, core: _core.GreyBox, data: Dataset, hidden: int, look: Look | None
+    ) -> _core.GreyBox:
+        """Motor and network together, at the least-squares solution of the free run.
+
+        The network begins without effect. Its starts are trained on an excerpt, the best one on all
+        data.
+        """
+        part = thinned(data, EXCERPT)
+        begun = []
+        for i in range(STARTS):
+            rng = np.random.default_rng(self.seed + i)
+            weights = rng.standard_normal((hidden, 4)) * [0.5, 1.5, 1.5, 0.0]
+            start = np.concatenate([core.theta, weights.ravel()])
+            begun.append(trained_from(core, start, part, self.iterations, look))
+        best = min(begun, key=lambda c: _cost(c, part))
+        if part is data:
+            return best
+        return trained_from(best, best.theta, data, min(POLISHING, self.iterations), look)
 
 
-def _or_none(found: Callable[[], MotorCandidate]) -> MotorCandidate | None:
-    """The candidate; None if the fit fails because the data are not those of a motor."""
+def _or_none(found: Callable[[], R]) -> R | None:
+    """What is found; None if the fit fails because the data are not those of a motor."""
     try:
         return found()
     except (DataError, FitError, SettingError, np.linalg.LinAlgError):
         return None
 
 
-def completed(task: Task, found: MotorCandidate, part: Split, look: Look) -> _core.GreyBox:
-    """The candidate fitted to all data, unless that is worse on the part by which it was chosen."""
-    try:
-        core = fitted(task, thinned(task.data, MOST_FITTED), found.hidden, look)
-    except (DataError, FitError, SettingError, np.linalg.LinAlgError):
-        return found.core
-    ratio, deviation = compared(errors_of(free_runs(core, part), part), found.errors[0])
-    return found.core if ratio > deviation else core
-
-
 def _judged(core: _core.GreyBox, part: Split) -> MotorCandidate:
     core = _with_noise(core, part.fitted)
     return MotorCandidate(core, (errors_of(free_runs(core, part), part),))
-
-
-def _beside(
-    motor: MotorCandidate, task: Task, part: Split, look: Look | None = None
-) -> MotorCandidate:
-    """The same motor with a network."""
-    return _judged(_with_network(motor.core, task, part.fitted, HIDDEN, look), part)
 
 
 def _is_better(more: MotorCandidate, alone: MotorCandidate) -> bool:
@@ -209,7 +230,12 @@ def _is_better(more: MotorCandidate, alone: MotorCandidate) -> bool:
     return ratio < min(-CREDIBLE * deviation, WORTH_IT)
 
 
-# --- The motor ------------------------------------------------------------------------------------
+# --- Their fits -----------------------------------------------------------------------------------
+
+
+def _at_any_time(look: Look | None) -> Callable[[], None]:
+    """`look` without arguments: it checks for the end but shows no progress."""
+    return (lambda: None) if look is None else lambda: look(0, 0, math.inf)
 
 
 def _motor(data: Dataset, look: Look | None = None) -> _core.GreyBox:
@@ -241,35 +267,6 @@ def _changed(core: _core.GreyBox, **values: Any) -> _core.GreyBox:
 
 
 _DERIVED = ("nx", "nk", "n_inputs", "integrator", "hidden")
-
-
-# --- The network ----------------------------------------------------------------------------------
-
-
-def _at_any_time(look: Look | None) -> Callable[[], None]:
-    """`look` without arguments: it checks for the end but shows no progress."""
-    return (lambda: None) if look is None else lambda: look(0, 0, math.inf)
-
-
-def _with_network(
-    core: _core.GreyBox, task: Task, data: Dataset, hidden: int, look: Look | None = None
-) -> _core.GreyBox:
-    """Motor and network together, at the least-squares solution of the free run.
-
-    The network begins without effect. Its starts are trained on an excerpt, the best one on all
-    data.
-    """
-    part = thinned(data, EXCERPT)
-    begun = []
-    for i in range(STARTS):
-        rng = np.random.default_rng(task.seed + i)
-        weights = rng.standard_normal((hidden, 4)) * [0.5, 1.5, 1.5, 0.0]
-        start = np.concatenate([core.theta, weights.ravel()])
-        begun.append(trained_from(core, start, part, task.iterations_or_usual, look))
-    best = min(begun, key=lambda c: _cost(c, part))
-    if part is data:
-        return best
-    return trained_from(best, best.theta, data, min(POLISHING, task.iterations_or_usual), look)
 
 
 def trained_from(

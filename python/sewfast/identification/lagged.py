@@ -1,26 +1,28 @@
-"""The lagged network: the paper's preset, and the network that starts from linear output error."""
+"""Lagged models: the paper's network, networks from a linear model, static curves."""
 
 from __future__ import annotations
 
 import math
-import time
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from .. import _core
-from ..dataset import Experiment
+from ..dataset import Dataset, Experiment
 from ..dynamic_model import INIT
 from ..errors import FitError, Interrupted
 from ..models import LinearOE, Model, NeuralOE
-from .folds import folds
-from .linear import linear_fit
-from .orders import is_misled, raised
+from ..models.base import Fitted, StructuredModel
+from .folds import Errors, compared, errors_of, folds, free_runs
+from .linear import is_misled, oe, raised
 from .task import (
+    Progress,
     Provenance,
     Task,
     arrays,
-    documented,
+    completed,
     finite,
     fit_provenance,
     free_run_rmse,
@@ -49,12 +51,10 @@ WORTH_IT = 0.98
 
 def paper(task: Task) -> Model:
     """The paper's network, from random starts and in its fixed scaling."""
-    began = time.perf_counter()
     fit = _core.fit_neural_oe(
         arrays(task.data),
         [] if task.validation is None else arrays(task.validation),
-        **task.orders,
-        hidden=task.hidden_or_usual,
+        **_options(task),
         linear=None,
         u_mean=np.zeros(1),
         u_scale=np.full(1, 10.0),
@@ -63,18 +63,9 @@ def paper(task: Task) -> Model:
         saturate=0.2,
         initial_state="measured",
         weight_decay=0.0,
-        max_iterations=task.iterations_or_usual,
-        starts=_starts(task),
-        seed=task.seed,
-        threads=task.threads,
-        initial_theta=None,
-        progress=task.progress,
     )
-    provenance = {"preset": "paper", "initial_state": "measured"}
-    model = _network_model(task, fit, began, provenance)
-    if fit.termination == "interrupted":
-        raise Interrupted(model)
-    return model
+    known = _provenance(fit, task.seed) | {"preset": "paper", "initial_state": "measured"}
+    return completed(task.model(NeuralOE, fit.model, known))
 
 
 def neural_oe(task: Task) -> Model:
@@ -84,50 +75,156 @@ def neural_oe(task: Task) -> Model:
     first step, because no step is better there than the linear model, the network is trained on
     all data instead, with a note.
     """
-    began = time.perf_counter()
-    linear, start = begun(task, began)
-    if not task.select:
-        return unselected(task, start, began)
-    trial = task if task.validation is not None else _with_blocks_held_out(task)
-    network, decays = _selected_network(trial, start, began)
-    choice = _comparison(trial, linear, network)
-    provenance = {"samples_fitted": len(trial.data), **decays}
-    if len(network.trace) > 1 and not _is_still_linear(choice):
-        return _network_model(task, network, began, provenance | _choice_provenance(choice))
-    # a strong decay would pull the network back to its linear part
-    everything = replace(task, validation=None)
-    network = _network_fit(everything, start, DECAYS[-1], began)
-    _require_trained(task, network)
-    choice["reason"] += "; no step of the training did better on held-out blocks"
-    provenance = {**decays, "samples_fitted": len(task.data), "weight_decay": DECAYS[-1]}
-    return _network_model(task, network, began, provenance | _choice_provenance(choice))
+    networks = Networks.of(task)
+    return networks.selected() if task.select else networks.unselected()
 
 
-def begun(task: Task, began: float) -> tuple[_core.LinearModel, _core.LinearModel]:
-    """The linear model of the data, and the one from which networks start."""
-    brief = replace(task, progress=task.clock.limited(task.progress, LINEAR_SHARE))
-    try:
-        linear = _linear(brief, began)
-        return linear, _start(brief, linear)
-    except Interrupted as stopped:
-        # a network requested by name is not replaced by a linear model
-        raise KeyboardInterrupt from stopped
+def _options(task: Task) -> dict[str, Any]:
+    """Settings of a network's training that every network of a task shares."""
+    return {
+        **task.fit_options(), "hidden": task.hidden_or_usual, "seed": task.seed,
+        "starts": _USUAL_STARTS if task.starts is None else task.starts, "threads": task.threads,
+    }  # fmt: skip
 
 
-def unselected(task: Task, start: _core.LinearModel, began: float) -> Model:
-    """The network trained on all data to the last iteration."""
-    fit = _network_fit(task, start, DECAYS[-1], began)
-    return _network_model(task, fit, began, {"weight_decay": DECAYS[-1], "selected": False})
+def _provenance(fit: _core.NeuralFit, seed: int) -> Provenance:
+    costs = [finite(c) for c in fit.start_costs.tolist()]
+    provenance: Provenance = {"initial_state": "estimated", "cost_unit": "scaled output squared"}
+    provenance |= {"seed": seed, "starts": len(costs), "start": fit.start, "start_costs": costs}
+    return fit_provenance(fit) | provenance | {"validation_cost": fit.validation_cost}
 
 
-def _require_trained(task: Task, network: _core.NeuralFit) -> None:
-    """Refuse a network without any training step: it is still its linear start."""
-    # J is in scaled units: a linear model without error needs no step
-    if len(network.trace) < 2 and network.cost > NOTHING_LEFT:
-        raise FitError(
-            f"{task.data.source}: expected a network that does better than its linear start, found "
-            "none; ask for model oe, or give more iterations or starts"
+@dataclass(frozen=True)
+class Networks:
+    """Lagged networks of one task, all trained in free run from the same linear model.
+
+    Attributes
+    ----------
+    task : Task
+    linear : compiled linear model
+        Linear output error of the data, with which a network is compared.
+    start : compiled linear model
+        The start of the training: `linear`, or a smaller one if that one is misled.
+    """
+
+    task: Task
+    linear: _core.LinearModel
+    start: _core.LinearModel
+
+    @classmethod
+    def of(cls, task: Task) -> Networks:
+        """The networks of a task, whose linear models are fitted here."""
+        brief = replace(task, progress=task.clock.limited(task.progress, LINEAR_SHARE))
+        try:
+            linear = _linear(brief)
+            return cls(task, linear, _start(brief, linear))
+        except Interrupted as stopped:
+            # a network requested by name is not replaced by a linear model
+            raise KeyboardInterrupt from stopped
+
+    def unselected(self) -> Model:
+        """The network trained on all data to the last iteration."""
+        known = {"weight_decay": DECAYS[-1], "selected": False}
+        return self._model(self._trained(self.task.data, None, DECAYS[-1]), known)
+
+    def selected(self) -> Model:
+        """The network that held-out data choose, compared there with the linear model."""
+        data, held = self.task.data, self.task.validation
+        if held is None:
+            lag = max(self.task.na, self.task.orders["nk"] + self.task.nb)
+            data, held = _with_blocks_held_out(data, lag)
+        network, decays = self._best(data, held)
+        choice = self._compared(network, held)
+        known: Provenance = {"samples_fitted": len(data), **decays}
+        if len(network.trace) < 2 or _is_still_linear(choice):
+            # a strong decay would pull the network back to its linear part
+            network = self._trained(self.task.data, None, DECAYS[-1])
+            # J is in scaled units: a linear model without error needs no step
+            if len(network.trace) < 2 and network.cost > NOTHING_LEFT:
+                raise FitError(
+                    f"{self.task.data.source}: expected a network that does better than its linear "
+                    "start, found none; ask for model oe, or give more iterations or starts"
+                )
+            choice["reason"] += "; no step of the training did better on held-out blocks"
+            known |= {"samples_fitted": len(self.task.data), "weight_decay": DECAYS[-1]}
+        is_better, known["choice"] = choice.pop("is_better"), choice
+        if not is_better:
+            share = f"below {100 * WORTH_IT:.0f} % of its error"
+            bound = f"not credibly better than the linear model ({share})"
+            known["notes"] = [f"{bound}: consider model oe"]
+        return self._model(network, known)
+
+    def _trained(self, data: Dataset, held: Dataset | None, decay: float) -> _core.NeuralFit:
+        """A network of some of the data, stopped by others if there are any."""
+        fit = _core.fit_neural_oe(
+            arrays(data),
+            [] if held is None else arrays(held),
+            **_options(self.task),
+            linear=self.start,
+            u_mean=None,
+            u_scale=None,
+            y_mean=None,
+            y_scale=None,
+            saturate=1.0,
+            initial_state="estimated",
+            weight_decay=decay,
         )
+        if fit.termination == "interrupted":
+            own = replace(self, task=replace(self.task, data=data))
+            known = {"weight_decay": decay, "samples_fitted": len(data)}
+            raise Interrupted(own._model(fit, known))
+        return fit
+
+    def _model(self, fit: _core.NeuralFit, extra: Provenance) -> Model:
+        known = _provenance(fit, self.task.seed)
+        return self.task.model(NeuralOE, fit.model, known | extra)
+
+    def _best(self, data: Dataset, held: Dataset | None) -> tuple[_core.NeuralFit, Provenance]:
+        """The network with the strongest weight decay that does about as well as the best.
+
+        Held-out blocks lie where the drive has been before; elsewhere a smoother network is safer
+        (the one-standard-error rule: Hastie, Tibshirani, Friedman 2009, section 7.10). A network
+        that diverges or does not forget its initial state is chosen only if all do.
+        """
+        decays = DECAYS if held is not None else DECAYS[:1]
+        fits = [self._trained(data, held, decay) for decay in decays]
+        errors = [math.sqrt(2.0 * (f.validation_cost or 0.0)) for f in fits]
+        able = [i for i, f in enumerate(fits) if f.sound] or list(range(len(fits)))
+        bound = ABOUT_AS_WELL * min(errors[i] for i in able)
+        chosen = next(i for i in able if errors[i] <= bound)
+        tried = [
+            {"weight_decay": d, "held_out_error": e or None, "sound": f.sound}
+            for d, e, f in zip(decays, errors, fits, strict=True)
+        ]
+        return fits[chosen], {"weight_decay": decays[chosen], "weight_decays": tried}
+
+    def _compared(self, network: _core.NeuralFit, held: Dataset | None) -> Provenance:
+        """Free-run errors on data not trained on, the choice and its reason."""
+        asked = "a lagged network was asked for"
+        if held is None:
+            short = f"too short to hold out blocks of {LEAST_BLOCK} samples to compare on"
+            reason = f"{asked}; the record is {short}"
+            return {"chosen": "neural_oe", "reason": reason, "is_better": False}
+        data = self.task.data
+        rmse = {
+            "oe": free_run_rmse(wrap(LinearOE, self.linear, data), held),
+            "neural_oe": free_run_rmse(wrap(NeuralOE, network.model, data), held),
+        }
+        is_better = network.sound and rmse["neural_oe"] < WORTH_IT * rmse["oe"]
+        ratio = rmse["neural_oe"] / rmse["oe"] if rmse["oe"] > 0.0 else 1.0
+        reason = (
+            f"{asked}; its free-run error on data not trained on is {100 * ratio:.1f} % of the "
+            "linear model's"
+        )
+        if not network.sound:
+            reason += "; it runs away on larger inputs or does not forget its initial state"
+        return {
+            "chosen": "neural_oe",
+            "reason": reason,
+            "is_better": is_better,
+            "free_run_rmse": {k: finite(v) for k, v in rmse.items()},
+            "held_out": sources(held),
+        }
 
 
 def _is_still_linear(choice: Provenance) -> bool:
@@ -139,26 +236,23 @@ def _is_still_linear(choice: Provenance) -> bool:
     return bool(abs(network - linear) <= SAME * linear)
 
 
-# --- fits -------------------------------------------------------------------------------------
-
-
-def _linear(task: Task, began: float) -> _core.LinearModel:
+def _linear(task: Task) -> _core.LinearModel:
     """Output error, within its share of the time budget; ARX if there is no time at all."""
     try:
-        return linear_fit(task, began).model
+        best: _core.LinearModel = oe(task).core
     except KeyboardInterrupt as e:
         if not task.clock.over(LINEAR_SHARE):
             raise
-        if isinstance(e, Interrupted):
-            best: _core.LinearModel = e.best.core
-            return best
-        return _core.fit_arx(arrays(task.data), **task.orders, offset=True)
+        if not isinstance(e, Interrupted):
+            return _core.fit_arx(arrays(task.data), **task.orders, offset=True)
+        best = e.best.core
+    return best
 
 
 def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
     """The start of the training: the linear model, or a smaller one if that one is misled.
 
-    Networks that start at a slow pole which the drive does not have (`orders.is_misled`) rarely
+    Networks that start at a slow pole which the drive does not have (`linear.is_misled`) rarely
     leave it.
     """
     orders = task.orders
@@ -169,9 +263,8 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
     learned = arrays(parts[0].fitted)
     models = []
     for a, b in ((na, nb), (orders["na"], orders["nb"])):
-        options = task.fit_options(na=a, nb=b, nk=orders["nk"])
         try:
-            fit = _core.fit_oe(learned, **options)
+            fit = _core.fit_oe(learned, **task.fit_options(na=a, nb=b))
             if fit.termination == "interrupted":
                 raise KeyboardInterrupt
         except FitError:
@@ -186,131 +279,123 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
     return raised(smaller, orders["na"]) if is_misled(own, smaller, parts[0]) else linear
 
 
-def _selected_network(
-    task: Task, linear: _core.LinearModel, began: float
-) -> tuple[_core.NeuralFit, Provenance]:
-    """The network with the strongest weight decay that does about as well as the best.
+def _with_blocks_held_out(data: Dataset, lag: int) -> tuple[Dataset, Dataset | None]:
+    """The data without two of eight blocks of every experiment, and these blocks.
 
-    Held-out blocks lie where the drive has been before; elsewhere a smoother network is safer (the
-    one-standard-error rule: Hastie, Tibshirani, Friedman 2009, section 7.10). A network that
-    diverges or does not forget its initial state is chosen only if all do.
+    None is held out if the blocks would be too short.
     """
-    decays = DECAYS if task.validation is not None else DECAYS[:1]
-    fits = [_network_fit(task, linear, decay, began) for decay in decays]
-    errors = [math.sqrt(2.0 * (f.validation_cost or 0.0)) for f in fits]
-    able = [i for i, f in enumerate(fits) if f.sound] or list(range(len(fits)))
-    bound = ABOUT_AS_WELL * min(errors[i] for i in able)
-    chosen = next(i for i in able if errors[i] <= bound)
-    tried = [
-        {"weight_decay": d, "held_out_error": e or None, "sound": f.sound}
-        for d, e, f in zip(decays, errors, fits, strict=True)
-    ]
-    return fits[chosen], {"weight_decay": decays[chosen], "weight_decays": tried}
-
-
-def _network_fit(
-    task: Task, linear: _core.LinearModel, decay: float, began: float
-) -> _core.NeuralFit:
-    fit = _core.fit_neural_oe(
-        arrays(task.data),
-        [] if task.validation is None else arrays(task.validation),
-        **task.orders,
-        hidden=task.hidden_or_usual,
-        linear=linear,
-        u_mean=None,
-        u_scale=None,
-        y_mean=None,
-        y_scale=None,
-        saturate=1.0,
-        initial_state="estimated",
-        weight_decay=decay,
-        max_iterations=task.iterations_or_usual,
-        starts=_starts(task),
-        seed=task.seed,
-        threads=task.threads,
-        initial_theta=None,
-        progress=task.progress,
-    )
-    if fit.termination == "interrupted":
-        known = {"weight_decay": decay, "samples_fitted": len(task.data)}
-        raise Interrupted(_network_model(task, fit, began, known))
-    return fit
-
-
-# --- selection --------------------------------------------------------------------------------
-
-
-def _with_blocks_held_out(task: Task) -> Task:
-    """Two of eight blocks of every experiment become validation data, if they are long enough."""
     kept: list[Experiment] = []
     held: list[Experiment] = []
-    lag = max(task.na, task.orders["nk"] + task.nb)
-    for e in task.data.experiments:
+    for e in data.experiments:
         edges = [round(i * len(e) / BLOCKS) for i in range(BLOCKS + 1)]
         if edges[1] < LEAST_BLOCK + lag:
-            return task
+            return data, None
         held += [e.cut(edges[i], edges[i + 1]) for i in HELD_OUT]
         starts, stops = (0, *(i + 1 for i in HELD_OUT)), (*HELD_OUT, BLOCKS)
         kept += [e.cut(edges[i], edges[j]) for i, j in zip(starts, stops, strict=True)]
-    kept, held = _with_enough_measured(kept), _with_enough_measured(held)
-    if not kept or not held:
-        return task
-    return replace(
-        task,
-        data=replace(task.data, experiments=tuple(kept)),
-        validation=replace(task.data, experiments=tuple(held)),
-    )
+    # pieces in which enough outputs were measured
+    able = [[e for e in some if len(e) - e.unmeasured > LEAST_BLOCK] for some in (kept, held)]
+    if not all(able):
+        return data, None
+    fitted, judged = (replace(data, experiments=tuple(some)) for some in able)
+    return fitted, judged
 
 
-def _with_enough_measured(pieces: list[Experiment]) -> list[Experiment]:
-    """The pieces in which enough outputs were measured."""
-    return [e for e in pieces if len(e) - e.unmeasured > LEAST_BLOCK]
+# --- Static curves: kinds with several structures, chosen on held-out data, then fitted to all ----
 
 
-def _comparison(task: Task, linear: _core.LinearModel, network: _core.NeuralFit) -> Provenance:
-    """Free-run errors of both on data not trained on, the choice and its reason."""
-    asked = "a lagged network was asked for"
-    if task.validation is None:
-        short = f"the record is too short to hold out blocks of {LEAST_BLOCK} samples to compare on"
-        return {"chosen": "neural_oe", "reason": f"{asked}; {short}", "is_better": False}
-    rmse = {
-        "oe": free_run_rmse(wrap(LinearOE, linear, task.data), task.validation),
-        "neural_oe": free_run_rmse(wrap(NeuralOE, network.model, task.data), task.validation),
-    }
-    is_better = network.sound and rmse["neural_oe"] < WORTH_IT * rmse["oe"]
-    ratio = rmse["neural_oe"] / rmse["oe"] if rmse["oe"] > 0.0 else 1.0
-    reason = (
-        f"{asked}; its free-run error on data not trained on is {100 * ratio:.1f} % of the linear "
-        "model's"
-    )
-    if not network.sound:
-        reason += "; it runs away on larger inputs or does not forget its initial state"
-    return {
-        "chosen": "neural_oe",
-        "reason": reason,
-        "is_better": is_better,
-        "free_run_rmse": {k: finite(v) for k, v in rmse.items()},
-        "held_out": sources(task.validation),
-    }
+_BETTER = math.log(0.98)
+"""A structure with more parameters must reduce the held-out error to this part of the best."""
+SHARE_OF_CHOICE = 0.45
+"""Share of a time budget for the choice; the rest is for the fit to all data."""
 
 
-def _choice_provenance(choice: Provenance) -> Provenance:
-    if choice.pop("is_better"):
-        return {"choice": choice}
-    bound = f"not credibly better than the linear model (below {100 * WORTH_IT:.0f} % of its error)"
-    return {"choice": choice, "notes": [f"{bound}: consider model oe"]}
+class _Stopped(Exception):
+    """Ctrl-C during the choice, with the best fit so far."""
+
+    def __init__(self, structure: Mapping[str, int], fit: Fitted) -> None:
+        super().__init__()
+        self.structure, self.fit = structure, fit
 
 
-def _network_model(
-    task: Task, fit: _core.NeuralFit, began: float, extra: Provenance | None = None
-) -> Model:
-    provenance: Provenance = {"initial_state": "estimated", "cost_unit": "scaled output squared"}
-    provenance |= {"seed": task.seed, "starts": _starts(task), "start": fit.start}
-    provenance |= {"start_costs": [finite(c) for c in fit.start_costs.tolist()]}
-    provenance |= {"validation_cost": fit.validation_cost}
-    known = fit_provenance(fit) | provenance | (extra or {})
-    return documented(wrap(NeuralOE, fit.model, task.data), task, began, known)
+def identified_as(cls: type[StructuredModel]) -> Callable[[Task], Model]:
+    """`identify` for one kind."""
+
+    def identified(task: Task) -> Model:
+        structures = cls.structures(task.hidden)
+        tried: list[Provenance] = []
+
+        def fit(data: Dataset, structure: Mapping[str, int], progress: Progress | None) -> Fitted:
+            options = {**task.orders, **structure, "max_iterations": task.iterations_or_usual}
+            return cls.fitted(arrays(data), **options, progress=progress)
+
+        def model(structure: Mapping[str, int], fit: Fitted) -> Model:
+            note = {"initial_state": "estimated", "cost_unit": "output unit squared"}
+            known = fit_provenance(fit) | note | {"structure": dict(structure), "tried": tried}
+            if task.clock.truncated and len(structures) > 1:
+                known["notes"] = [
+                    f"the time budget of {task.clock.budget:g} s ended the choice of a structure "
+                    f"early: {len(tried)} tried"
+                ]
+            return task.model(cls, fit.model, known)
+
+        try:
+            chosen = _chosen(task, structures, fit, tried)
+        except _Stopped as stopped:
+            raise Interrupted(model(stopped.structure, stopped.fit)) from None
+        return completed(model(chosen, fit(task.data, chosen, task.progress)))
+
+    return identified
 
 
-def _starts(task: Task) -> int:
-    return _USUAL_STARTS if task.starts is None else task.starts
+def _chosen(
+    task: Task,
+    structures: tuple[Mapping[str, int], ...],
+    fit: Callable[[Dataset, Mapping[str, int], Progress | None], Fitted],
+    tried: list[Provenance],
+) -> Mapping[str, int]:
+    """The structure with the least held-out error, or a simpler one that does about as well.
+
+    Unless the order was given, one pole less is tried too: a superfluous pole follows trends and
+    spoils the steady gain. If the share of a time budget is used up, the best so far.
+    """
+    parts = folds(task.data, task.validation)[:1]
+    if len(structures) == 1 or not parts:
+        return structures[-1]
+    (held,) = parts
+    progress = task.clock.limited(task.progress, SHARE_OF_CHOICE)
+    best = structures[0]
+    kept: Fitted | None = None
+    least: Errors | None = None
+
+    def tested(structure: Mapping[str, int]) -> tuple[Fitted, Errors] | None:
+        try:
+            found = fit(held.fitted, structure, progress)
+        except FitError:
+            return None
+        if found.termination == "interrupted":
+            if kept is None and found.iterations and not task.clock.over(SHARE_OF_CHOICE):
+                raise _Stopped(structure, found)
+            raise KeyboardInterrupt
+        errors = errors_of(free_runs(found.model, held), held)
+        tried.append({**structure, "held_out_rmse": finite(errors.rmse)})
+        return found, errors
+
+    try:
+        for structure in structures:
+            found = tested(structure)
+            if found and (least is None or compared(found[1], least)[0] < _BETTER):
+                best, (kept, least) = structure, found
+        if least is not None and task.na > 1 and not task.is_order_given:
+            smaller = {**best, "na": task.na - 1}
+            found = tested(smaller)
+            if found:
+                ratio, deviation = compared(found[1], least)
+                best = smaller if ratio <= max(deviation, -_BETTER) else best
+    except KeyboardInterrupt:
+        if task.clock.over(SHARE_OF_CHOICE):
+            return best
+        if kept is None:
+            raise
+        raise _Stopped(best, kept) from None
+    return best

@@ -1,11 +1,10 @@
-"""Models of a given kind: ARX, instrumental variables, output error; kinds with structures."""
+"""Linear models: ARX, instrumental variables, output error, and the order that the data need."""
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,26 +15,26 @@ from ..dataset.experiment import mean_square, weights_of
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted
 from ..models import ARX, IV, LinearOE, Model
-from ..models.base import Fitted, StructuredModel
-from .folds import RUNAWAY, Errors, Split, compared, errors_of, folds, free_runs, with_run_up
+from .delays import delay, reach
+from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs, with_run_up
 from .task import (
+    Look,
+    Pool,
     Provenance,
     Task,
     arrays,
-    documented,
+    completed,
     finite,
     fit_provenance,
     with_provenance,
-    wrap,
 )
 
 
 def arx(task: Task) -> Model:
     """Least squares of the one-step error."""
-    began = time.perf_counter()
     core = _core.fit_arx(arrays(task.data), **task.orders, offset=True)
     provenance = {"cost_horizon": "one step", "initial_state": "measured", "termination": "solved"}
-    model = documented(wrap(ARX, core, task.data), task, began, provenance)
+    model = task.model(ARX, core, provenance)
     pairs = list(zip(task.data.experiments, model.predict(task.data), strict=True))
     squares = np.concatenate([(e.y - yhat)[INIT:] ** 2 for e, yhat in pairs])
     weights = np.concatenate([weights_of(e)[INIT:] for e, _ in pairs])
@@ -45,50 +44,30 @@ def arx(task: Task) -> Model:
 
 def iv(task: Task) -> Model:
     """Refined instrumental variables."""
-    began = time.perf_counter()
     fit = _core.fit_iv(arrays(task.data), **task.fit_options())
-    settled = fit.termination == "small_step"
-    note = f"instrumental variables did not settle ({fit.termination}); consider model oe"
-    model = linear_model(task, fit, began, {} if settled else {"notes": [note]}, IV)
-    if fit.termination == "interrupted":
-        raise Interrupted(model)
-    return model
+    known = linear_provenance(fit)
+    if fit.termination != "small_step":
+        known["notes"] = [
+            f"instrumental variables did not settle ({fit.termination}); consider model oe"
+        ]
+    return completed(task.model(IV, fit.model, known))
 
 
 def oe(task: Task) -> Model:
     """Linear output error."""
-    began = time.perf_counter()
-    return linear_model(task, linear_fit(task, began), began)
-
-
-def linear_fit(task: Task, began: float) -> _core.LinearFit:
-    """Output error in the task's orders on all its data."""
     fit = _core.fit_oe(arrays(task.data), **task.fit_options())
-    if fit.termination == "interrupted":
-        raise Interrupted(linear_model(task, fit, began))
-    return fit
+    return completed(task.model(LinearOE, fit.model, linear_provenance(fit)))
 
 
-def linear_model(
-    task: Task,
-    fit: _core.LinearFit,
-    began: float,
-    extra: Provenance | None = None,
-    cls: type[IV] | type[LinearOE] = LinearOE,
-) -> Model:
-    """The model of a fit, with its provenance."""
-    provenance: Provenance = {"initial_state": "estimated", "cost_unit": "output unit squared"}
-    provenance |= {"standard_errors": _standard_errors(fit)}
-    known = fit_provenance(fit) | provenance | (extra or {})
-    return documented(wrap(cls, fit.model, task.data), task, began, known)
-
-
-def _standard_errors(fit: _core.LinearFit) -> Provenance:
-    """Standard errors for white measurement noise; None for undetermined coefficients."""
-    errors = [e if math.isfinite(e) else None for e in fit.standard_errors.tolist()]
+def linear_provenance(fit: _core.LinearFit) -> Provenance:
+    """Provenance of a linear fit, with standard errors for white measurement noise."""
+    # None for coefficients that the data do not determine
+    errors = [finite(e) for e in fit.standard_errors.tolist()]
     (na, (inputs, nb)) = (fit.model.na, fit.model.b.shape)
     b = [errors[na + j * nb :][:nb] for j in range(inputs)]
-    return {"a": errors[:na], "b": b, "offset": errors[-1]}
+    known: Provenance = {"initial_state": "estimated", "cost_unit": "output unit squared"}
+    known |= {"standard_errors": {"a": errors[:na], "b": b, "offset": errors[-1]}}
+    return fit_provenance(fit) | known
 
 
 # --- Records too short to choose by: one pole less if they cannot show it -------------------------
@@ -102,7 +81,7 @@ AS_GOOD = 1.05
 """Ratio of the smaller order's error to the larger one's up to which the smaller one is enough."""
 
 
-def short(task: Task, began: float, reason: str) -> Model:
+def short(task: Task, reason: str) -> Model:
     """Output error on all data in the task's orders, or with one pole less.
 
     A free initial state and a pole near 1 can follow any drift over a short record, and the steady
@@ -110,30 +89,45 @@ def short(task: Task, began: float, reason: str) -> Model:
     poles and it does about as well, on the whole record or on its later part when fitted to the
     earlier one. A drive that really integrates has such a pole in both, or needs the larger order.
     """
-    fit = linear_fit(task, began)
+    model, data = oe(task), task.data
+    own, smaller = task.fit_options(), task.fit_options(na=task.na - 1)
+    longest = max(len(e) for e in data.experiments)
+    if task.na > 1 and time_constant(model.core) > UNSEEN * longest:
+        try:
+            other = _tried(data, smaller)
+            if (
+                other is not None
+                and time_constant(other.model) <= longest
+                and (
+                    other.cost <= AS_GOOD**2 * model.training["cost"]
+                    or _later(data, smaller).rmse <= AS_GOOD * _later(data, own).rmse
+                )
+            ):
+                model = task.model(LinearOE, other.model, linear_provenance(other))
+                reason += "; a pole that so short a record cannot show is left out"
+        except KeyboardInterrupt:
+            raise Interrupted(model) from None
+    return with_provenance(model, {"choice": {"chosen": "oe", "reason": reason}})
+
+
+def _tried(data: Dataset, options: Mapping[str, Any]) -> _core.LinearFit | None:
     try:
-        other = _without_unseen(task, fit)
-    except KeyboardInterrupt:
-        raise Interrupted(linear_model(task, fit, began)) from None
-    if other is not None:
-        fit = other
-        reason += "; a pole that so short a record cannot show is left out"
-    return linear_model(task, fit, began, {"choice": {"chosen": "oe", "reason": reason}})
+        fit = _core.fit_oe(arrays(data), **options)
+    except (DataError, FitError):
+        return None
+    if fit.termination == "interrupted":
+        raise KeyboardInterrupt
+    return fit
 
 
-def _without_unseen(task: Task, fit: _core.LinearFit) -> _core.LinearFit | None:
-    """The fit with one pole less, if it should be used."""
-    longest = max(len(e) for e in task.data.experiments)
-    if task.na < 2 or time_constant(fit.model) <= UNSEEN * longest:
-        return None
-    smaller = replace(task, na=task.na - 1)
-    other = _tried(smaller, task.data)
-    if other is None or time_constant(other.model) > longest:
-        return None
-    about_as_good = other.cost <= AS_GOOD**2 * fit.cost
-    if about_as_good or _later(smaller).rmse <= AS_GOOD * _later(task).rmse:
-        return other
-    return None
+def _later(data: Dataset, options: Mapping[str, Any]) -> Errors:
+    """Errors on the later part of a model of the earlier one; infinite if there is no model."""
+    pairs = [(e, round(EARLIER * len(e))) for e in data.experiments]
+    fitted = replace(data, experiments=tuple(e.cut(0, at) for e, at in pairs))
+    held = tuple(with_run_up(e, at, len(e)) for e, at in pairs)
+    part = Split(fitted, replace(data, experiments=held))
+    fit = _tried(fitted, options)
+    return RUNAWAY if fit is None else errors_of(free_runs(fit.model, part), part)
 
 
 def time_constant(model: _core.LinearModel) -> float:
@@ -144,129 +138,269 @@ def time_constant(model: _core.LinearModel) -> float:
     return -1.0 / float(np.log(radius)) if radius > 0.0 else 0.0
 
 
-def _tried(task: Task, data: Dataset) -> _core.LinearFit | None:
-    try:
-        fit = _core.fit_oe(arrays(data), **task.fit_options())
-    except (DataError, FitError):
-        return None
-    if fit.termination == "interrupted":
-        raise KeyboardInterrupt
-    return fit
+# --- The order and the delay that the data need ---------------------------------------------------
+#
+# The errors on held-out data decide, by the rule used for networks too: the simplest model within
+# one standard error of the best. A larger order with a tiny gain often owes it to a slow pole that
+# no motor has, and its steady gain is wrong.
 
 
-def _later(task: Task) -> Errors:
-    """Errors on the later part of a model of the earlier one; infinite if there is no model."""
-    experiments = task.data.experiments
-    cuts = [round(EARLIER * len(e)) for e in experiments]
-    pairs = list(zip(experiments, cuts, strict=True))
-    fitted = replace(task.data, experiments=tuple(e.cut(0, at) for e, at in pairs))
-    held = tuple(with_run_up(e, at, len(e)) for e, at in pairs)
-    part = Split(fitted, replace(task.data, experiments=held))
-    fit = _tried(task, fitted)
-    return RUNAWAY if fit is None else errors_of(free_runs(fit.model, part), part)
+ORDERS = (1, 2, 3, 4, 5, 6, 7, 8)
+DELAYS = (2, 3, 4, 5, 6)
+"""Delays tried besides one sample, unless a delay is given."""
+LATE_ORDERS = (1, 2, 3)
+"""Orders tried with an estimated dead time beyond these delays."""
+SAMPLES_OF_DELAY = 2_000
+"""Confidence level of that estimate."""
+SAMPLES = 6_000
+HELD_OUT = 10 * SAMPLES
+"""Samples of a fit that is only used for a decision: blocks spread over the record."""
+ITERATIONS = 60
+WORTH_AN_ORDER = 0.98
+"""A larger order has to reduce the error to below this part to count as a gain."""
+PATIENCE = 2
+"""Number of orders without gain after which larger ones are skipped."""
+MISLED = 1.2
+"""A model whose error exceeds a smaller one's by this factor is no start for a network."""
+SPARE_POLES = (0.6, 0.8, 0.4, 0.9, 0.7, 0.5, 0.3)
+LEAST_GAIN = math.log(1.005)
+"""Differences in error below half a per cent count as zero, however significant."""
 
 
-# --- Kinds with several structures: chosen on held-out data, then fitted to all data --------------
+@dataclass(frozen=True)
+class LinearCandidate:
+    """Output error of one order and delay: a model per fold, and its errors there."""
+
+    order: int
+    nk: int
+    models: tuple[_core.LinearModel | None, ...]
+    errors: tuple[Errors, ...]
+
+    @property
+    def rmse(self) -> float:
+        """Error on the newest fold."""
+        return self.errors[0].rmse
+
+    @property
+    def parameters(self) -> int:
+        """Number of coefficients; delays do not count."""
+        return 2 * self.order + 2
+
+    def to_json(self) -> Provenance:
+        """For the table of candidates."""
+        row: Provenance = {"kind": "oe", "na": self.order, "nb": self.order + 1, "nk": self.nk}
+        return row | {"free_run_rmse": finite(self.rmse)}
 
 
-_BETTER = math.log(0.98)
-"""A structure with more parameters must reduce the held-out error to this part of the best."""
-SHARE_OF_CHOICE = 0.45
-"""Share of a time budget for the choice; the rest is for the fit to all data."""
+@dataclass
+class LinearTable:
+    """Linear models fitted for a decision.
 
-
-def identified_as(cls: type[StructuredModel]) -> Callable[[Task], Model]:
-    """`identify` for one kind."""
-
-    def identified(task: Task) -> Model:
-        began = time.perf_counter()
-        structures = cls.structures(task.hidden)
-        tried: list[Provenance] = []
-
-        def described(structure: Mapping[str, int], fit: Fitted) -> Model:
-            note = {"initial_state": "estimated", "cost_unit": "output unit squared"}
-            known = fit_provenance(fit) | note | {"structure": dict(structure), "tried": tried}
-            if task.clock.truncated and len(structures) > 1:
-                known["notes"] = [
-                    f"the time budget of {task.clock.budget:g} s ended the choice of a structure "
-                    f"early: {len(tried)} tried"
-                ]
-            return documented(wrap(cls, fit.model, task.data), task, began, known)
-
-        try:
-            chosen = _chosen(cls, task, structures, tried)
-        except _Stopped as stopped:
-            raise Interrupted(described(stopped.structure, stopped.fit)) from None
-        fit = _fit(cls, task, task.data, chosen)
-        model = described(chosen, fit)
-        if fit.termination == "interrupted":
-            raise Interrupted(model)
-        return model
-
-    return identified
-
-
-class _Stopped(Exception):
-    """Ctrl-C during the choice, with the best fit so far."""
-
-    def __init__(self, structure: Mapping[str, int], fit: Fitted) -> None:
-        super().__init__()
-        self.structure, self.fit = structure, fit
-
-
-def _fit(cls: type[StructuredModel], task: Task, data: Any, structure: Mapping[str, int]) -> Fitted:
-    options = {**task.orders, **structure, "max_iterations": task.iterations_or_usual}
-    return cls.fitted(arrays(data), **options, progress=task.progress)
-
-
-def _chosen(
-    cls: type[StructuredModel],
-    task: Task,
-    structures: tuple[Mapping[str, int], ...],
-    tried: list[Provenance],
-) -> Mapping[str, int]:
-    """The structure with the least held-out error, or a simpler one that does about as well.
-
-    Unless the order was given, one pole less is tried too: a superfluous pole follows trends and
-    spoils the steady gain. If the share of a time budget is used up, the best so far.
+    Parameters
+    ----------
+    given_nk : int or None
+        The delay, if it is given.
+    folds : sequence of Split
+        The newest first; models are fitted to thinned excerpts of their training data.
+    pool : Pool
     """
-    parts = folds(task.data, task.validation)[:1]
-    if len(structures) == 1 or not parts:
-        return structures[-1]
-    held: Split = parts[0]
-    brief = replace(task, progress=task.clock.limited(task.progress, SHARE_OF_CHOICE))
-    best = structures[0]
-    kept: Fitted | None = None
-    least: Errors | None = None
 
-    def tested(structure: Mapping[str, int]) -> tuple[Fitted, Errors] | None:
+    given_nk: int | None
+    folds: Sequence[Split]
+    pool: Pool
+    candidates: dict[tuple[int, int], LinearCandidate] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._excerpts = [f.shortened(SAMPLES, HELD_OUT) for f in self.folds]
+
+    @property
+    def nk(self) -> int:
+        """The delay that was given, else 1."""
+        return 1 if self.given_nk is None else self.given_nk
+
+    def search(self, until: float | None) -> None:
+        """Try orders upwards until two bring no gain, then delays of the best small order.
+
+        A long dead time is tried before large orders, which mimic one and take most of the time;
+        the smallest orders come first, as networks start from them. The very first is always
+        fitted, so that there is a linear model.
+        """
+        self.add([(ORDERS[0], self.nk)], None)
+        self.add([(ORDERS[1], self.nk)], until)
+        if self.given_nk is None:
+            self.add(self._late(), until)
+        best, idle = math.inf, 0
+        orders = iter(ORDERS)
+        while idle < PATIENCE:
+            # one per thread, so that none of them waits
+            some = [o for _, o in zip(range(max(2, self.pool.threads)), orders, strict=False)]
+            if not some:
+                break
+            self.add(((o, self.nk) for o in some), until)
+            for order in some:
+                error = self.error(order, self.nk)
+                idle = 0 if error < WORTH_AN_ORDER * best else idle + 1
+                best = min(best, error)
+            if until is not None and self.pool.clock.over() and self.candidates:
+                break
+        if self.given_nk is None and self.candidates:
+            # an apparent order can be a delay, so one order less is tried as well
+            small = min(self.choice.order, 3)
+            self.add(((o, nk) for nk in DELAYS for o in (small - 1, small) if o > 0), until)
+
+    def _late(self) -> list[tuple[int, int]]:
+        """Small orders with the estimated dead time, if it is longer than `DELAYS`.
+
+        Large orders mimic a dead time with poles that the drive does not have. The estimate can be
+        late by a sample.
+        """
+        data = self.folds[0].shortened(SAMPLES_OF_DELAY, SAMPLES_OF_DELAY).fitted
         try:
-            fit = _fit(cls, brief, held.fitted, structure)
-        except FitError:
-            return None
-        if fit.termination == "interrupted":
-            if kept is None and fit.iterations and not task.clock.over(SHARE_OF_CHOICE):
-                raise _Stopped(structure, fit)
-            raise KeyboardInterrupt
-        errors = errors_of(free_runs(fit.model, held), held)
-        tried.append({**structure, "held_out_rmse": finite(errors.rmse)})
-        return fit, errors
+            found = delay(data, longest=reach(data)).nk
+        except (DataError, FitError):
+            return []
+        nks = (found - 1, found) if found > max(DELAYS) else ()
+        return [(o, nk) for o in LATE_ORDERS for nk in nks]
 
-    try:
-        for structure in structures:
-            found = tested(structure)
-            if found and (least is None or compared(found[1], least)[0] < _BETTER):
-                best, (kept, least) = structure, found
-        if least is not None and task.na > 1 and not task.is_order_given:
-            smaller = {**best, "na": task.na - 1}
-            found = tested(smaller)
-            if found:
-                ratio, deviation = compared(found[1], least)
-                best = smaller if ratio <= max(deviation, -_BETTER) else best
-    except KeyboardInterrupt:
-        if task.clock.over(SHARE_OF_CHOICE):
-            return best
-        if kept is None:
-            raise
-        raise _Stopped(best, kept) from None
+    def add(self, wanted: Iterable[tuple[int, int]], until: float | None) -> None:
+        """Fit these orders and delays on every fold."""
+        todo = [w for w in dict.fromkeys(wanted) if w not in self.candidates]
+        jobs = [(o, nk, fold) for o, nk in todo for fold in range(len(self.folds))]
+
+        def fit(job: tuple[int, int, int], look: Look) -> _core.LinearModel | None:
+            order, nk, fold = job
+            return fitted(self._excerpts[fold].fitted, order, nk, look)
+
+        found = iter(self.pool.map(fit, jobs, until=until))
+        for order, nk in todo:
+            models = tuple(next(found) for _ in self.folds)
+            if models[0] is None:
+                continue
+            errors = tuple(
+                RUNAWAY if m is None else errors_of(free_runs(m, f), f)
+                for m, f in zip(models, self._excerpts, strict=True)
+            )
+            self.candidates[order, nk] = LinearCandidate(order, nk, models, errors)
+
+    def error(self, order: int, nk: int) -> float:
+        """Error on the newest fold; infinite if there is no such model."""
+        found = self.candidates.get((order, nk))
+        return math.inf if found is None else found.rmse
+
+    @property
+    def eligible(self) -> list[LinearCandidate]:
+        """Models that can be chosen.
+
+        Direct feedthrough is only a network's start, unless requested. A delay makes a model
+        smaller, and is accepted only if it does as well as the best model without.
+        """
+        usual = [c for c in self.candidates.values() if c.nk == self.nk]
+        least = min((self._pooled(c).rmse for c in usual), default=math.inf) * math.exp(LEAST_GAIN)
+        delayed = [c for c in self.candidates.values() if c.nk > self.nk]
+        return usual + [c for c in delayed if self._pooled(c).rmse <= least]
+
+    @property
+    def best(self) -> LinearCandidate:
+        """The model with the lowest error on the newest fold."""
+        return min(self.eligible, key=lambda c: c.rmse)
+
+    @property
+    def choice(self) -> LinearCandidate:
+        """The simplest one within a standard error of the best, over all folds together."""
+        return simplest(self.eligible, self._pooled)
+
+    def _pooled(self, c: LinearCandidate) -> Errors:
+        """Errors on all folds, each relative to the lowest there, so that folds count equally."""
+        if len(self.folds) == 1:
+            return c.errors[0]
+        squares, counts = [], []
+        for i, errors in enumerate(c.errors):
+            least = min(other.errors[i].rmse for other in self.candidates.values())
+            if not math.isfinite(least):  # a budget that ended before this fold's first fit
+                continue
+            squares.append(errors.squares / max(least, 1e-300) ** 2)
+            counts.append(errors.counts)
+        if not counts:
+            return c.errors[0]
+        return Errors(np.concatenate(squares), np.concatenate(counts))
+
+    def start(self, order: int, nk: int) -> _core.LinearModel | None:
+        """A model of that order as a network's start.
+
+        If the fit of that order is misled (it has found a spurious slow pole), the smaller one with
+        additional fast poles.
+        """
+        fitted_ = self.candidates.get((order, nk))
+        smaller = [c for (o, k), c in self.candidates.items() if o < order and k == nk]
+        if not smaller:
+            return None if fitted_ is None else fitted_.models[0]
+        best = min(smaller, key=lambda c: c.rmse)
+        own, model = None if fitted_ is None else fitted_.models[0], best.models[0]
+        if own is None or model is None:
+            return own if model is None else raised(model, order)
+        return raised(model, order) if is_misled(own, model, self._excerpts[0]) else own
+
+    def rows(self) -> Iterator[Provenance]:
+        """For the table of candidates."""
+        yield from (c.to_json() for _, c in sorted(self.candidates.items()))
+
+
+def simplest(
+    candidates: Sequence[LinearCandidate], errors: Callable[[LinearCandidate], Errors]
+) -> LinearCandidate:
+    """The candidate with the fewest parameters and an error not credibly above the lowest."""
+    best = min(candidates, key=lambda c: errors(c).rmse)
+    for c in sorted(candidates, key=lambda c: (c.parameters, c.nk)):
+        ratio, deviation = compared(errors(c), errors(best))
+        if ratio <= max(deviation, LEAST_GAIN):
+            return c
     return best
+
+
+def fitted(data: Dataset, order: int, nk: int, look: Look) -> _core.LinearModel | None:
+    """Output error of that order; None if there is no model."""
+    try:
+        return _core.fit_oe(
+            arrays(data),
+            na=order,
+            nb=order + 1,
+            nk=nk,
+            max_iterations=ITERATIONS,
+            progress=look,
+        ).model
+    except (FitError, DataError):
+        return None
+
+
+def is_misled(model: _core.LinearModel, smaller: _core.LinearModel, part: Split) -> bool:
+    """Whether a model is clearly worse than a smaller one, on held-out or on fitted data.
+
+    A drive that saturates can mislead a fit to a slow pole which the drive does not have: the free
+    initial state follows each record's trend. Started from a few samples, such a model fails even
+    on the record to which it was fitted.
+    """
+    for of in (part, replace(part, held=part.fitted)):
+        own, other = (errors_of(free_runs(m, of), of).rmse for m in (model, smaller))
+        if own > MISLED * other:
+            return True
+    return False
+
+
+def raised(model: _core.LinearModel, order: int) -> _core.LinearModel:
+    """The same behaviour in a larger order: further poles, each nearly cancelled by a zero."""
+    a, b = np.concatenate([[1.0], model.a]), np.array(model.b)
+    for pole in SPARE_POLES[: order - model.na]:
+        zero = pole - 0.02
+        a = np.convolve(a, [1.0, -pole])
+        # the same steady gain
+        factor = np.array([1.0, -zero]) * (1.0 - pole) / (1.0 - zero)
+        b = np.array([np.convolve(row, factor) for row in b])
+    offset = model.offset * a.sum() / (1.0 + model.a.sum())
+    return _core.LinearModel(np.ascontiguousarray(a[1:]), b, model.nk, float(offset))
+
+
+def slowest_pole(model: _core.LinearModel) -> float:
+    """The largest real pole; 0 where the slowest one oscillates."""
+    poles = model.poles()
+    slowest = poles[int(np.argmax(np.hypot(poles[:, 0], poles[:, 1])))]
+    return float(slowest[0]) if abs(slowest[1]) < 1e-9 else 0.0

@@ -14,7 +14,7 @@ from .. import _core
 from ..dataset import Diagnosis, diagnose
 from . import grey_box
 from .folds import compared
-from .orders import HELD_OUT, MISLED, slowest_pole
+from .linear import HELD_OUT, MISLED, slowest_pole
 from .outputs import ABS, LINEAR, Output, named, rms_error, suggested
 from .task import arrays
 from .training import Request, Structure
@@ -90,7 +90,8 @@ class Search(Trials):
         wanted = grey_box.PER_SAMPLE * len(parts[0].fitted)
         if until is not None and until - time.perf_counter() < wanted:
             return None  # unfinished, it would waste the networks' time
-        return grey_box.candidate(task, parts, self.pool, until)
+        motors = grey_box.Motors(task.seed, task.iterations_or_usual)
+        return motors.candidate(parts, self.pool, until)
 
     @property
     def is_exact(self) -> bool:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias, TypeVar
 
 from ..dataset import Dataset, FloatArray
-from ..errors import FitError
+from ..errors import FitError, Interrupted
 from ..models import Model
 from ..models.base import Fitted
 from ..threads import Workers
@@ -202,6 +202,7 @@ class Task:
     select: bool = True
     is_order_given: bool = False
     clock: Clock = field(default_factory=lambda: Clock(None))
+    began: float = field(default_factory=time.perf_counter)
 
     @property
     def orders(self) -> dict[str, int]:
@@ -222,6 +223,25 @@ class Task:
     def hidden_or_usual(self) -> int:
         """Hidden units of a lagged network."""
         return 8 if self.hidden is None else self.hidden
+
+    def model(self, cls: type[Model], core: Any, extra: Provenance) -> Model:
+        """A model of these data, with the provenance that every kind records, and `extra`."""
+        return self.documented(wrap(cls, core, self.data), extra)
+
+    def documented(self, model: Model, extra: Provenance) -> Model:
+        """The model with the provenance that every kind records, and `extra`."""
+        data = self.data
+        common = {
+            "data": sources(data),
+            "samples": len(data),
+            "unmeasured": sum(e.unmeasured for e in data.experiments),
+            "preparation": list(data.notes),
+            "input_range": [list(r) for r in data.input_range],
+            "output_range": list(data.output_range),
+            "settings": {"max_iterations": self.iterations_or_usual},
+            "seconds": time.perf_counter() - self.began,
+        }
+        return with_provenance(model, common | extra)
 
 
 def arrays(data: Dataset) -> Pairs:
@@ -245,20 +265,11 @@ def with_provenance(model: Model, extra: Provenance) -> Model:
     return replace(model, training={**model.training, **extra})
 
 
-def documented(model: Model, task: Task, began: float, extra: Provenance) -> Model:
-    """The model with the provenance that every kind records, and `extra`."""
-    data = task.data
-    common = {
-        "data": sources(data),
-        "samples": len(data),
-        "unmeasured": sum(e.unmeasured for e in data.experiments),
-        "preparation": list(data.notes),
-        "input_range": [list(r) for r in data.input_range],
-        "output_range": list(data.output_range),
-        "settings": {"max_iterations": task.iterations_or_usual},
-        "seconds": time.perf_counter() - began,
-    }
-    return with_provenance(model, common | extra)
+def completed(model: Model) -> Model:
+    """The model; raised as the best one so far if Ctrl-C or a deadline ended its fit."""
+    if model.training["termination"] == "interrupted":
+        raise Interrupted(model)
+    return model
 
 
 def fit_provenance(fit: Fitted) -> Provenance:

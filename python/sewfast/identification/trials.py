@@ -15,9 +15,9 @@ from typing import Any
 from .. import _core
 from ..errors import FitError
 from ..models.base import EnsembleCore
-from .folds import RUNAWAY, Errors, Split, errors_of, free_runs
+from .folds import RUNAWAY, Errors, Split, errors_of, free_runs, thinned
 from .grey_box import MotorCandidate
-from .orders import LinearTable
+from .linear import SAMPLES, LinearTable, fitted
 from .outputs import ABS, LINEAR, Output, rectified_start
 from .task import Look, Pool, Provenance, Task, arrays, finite
 from .training import Network, Request, Start, Structure, train
@@ -133,7 +133,7 @@ class Trials:
         self.inputs = self.task.data.n_inputs
         size = TRIAL_SAMPLES_LARGE if self.is_large else TRIAL_SAMPLES
         self.trials = tuple(f.shortened(size, size) for f in self.folds[:2])
-        self.linear = LinearTable(self.task, self.folds[:1], self.pool)
+        self.linear = LinearTable(self.task.nk, self.folds[:1], self.pool)
         self.most = SEARCH_OPERATIONS_LARGE if self.is_large else SEARCH_OPERATIONS
         self.budget, self.rate = self.most, 0.0
         # part of a time budget by which the present stage must be finished; 0 for the search's own
@@ -334,18 +334,18 @@ class Trials:
         began = time.perf_counter()
         if share is None:
             share = max(self.pool.share, min(0.6, 0.25 + 0.35 * self.operations / self.budget))
-        found = train(
-            requests,
-            self.pool,
-            self.task.seed,
-            workers=self.task.workers,
-            until=self.until,
-            share=share,
-        )
+        found = self.train(requests, self.until, share)
         # without training there is no speed to measure
         if wanted and not self._is_late:
             self._calibrate(time.perf_counter() - began, wanted)
         return self.guarded(found)
+
+    def train(
+        self, requests: Sequence[Request], until: float | None, share: float
+    ) -> list[list[Start]]:
+        """Starts of every request, not yet checked, outside the count of operations."""
+        seed, workers = self.task.seed, self.task.workers
+        return train(requests, self.pool, seed, workers=workers, until=until, share=share)
 
     def guarded(self, found: Sequence[Sequence[Start]]) -> list[list[Start]]:
         """The starts with the guard's findings on whole records."""
@@ -410,10 +410,7 @@ class Trials:
             try:
                 if s.output == ABS:
                     return rectified_start(data, s.nx, s.nk, look)
-                return _core.fit_oe(
-                    arrays(self.trials[fold].shortened(6_000, 6_000).fitted),
-                    na=s.nx, nb=s.nx + 1, nk=s.nk, max_iterations=60, progress=look,
-                ).model  # fmt: skip
+                return fitted(thinned(data, SAMPLES), s.nx, s.nk, look)
             except FitError:
                 return None
 
