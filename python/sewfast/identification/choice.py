@@ -29,7 +29,17 @@ from .finals import (
     WORTH_LOOKING,
     Finals,
 )
-from .folds import LEAST_HELD_OUT, SHARE, compared, errors_of, folds, free_runs
+from .folds import (
+    LEAST_HELD_OUT,
+    SHARE,
+    TEXTS,
+    compared,
+    errors_of,
+    folds,
+    free_runs,
+    verdict,
+    what_to_record,
+)
 from .linear import (
     HELD_OUT,
     LEAST_GAIN,
@@ -57,7 +67,6 @@ from .trials import (
     counting,
     median_of,
 )
-from .verdict import verdict
 
 WORTH_AN_INTEGRATOR = 0.7
 ABOUT_EQUAL = 0.02
@@ -409,7 +418,16 @@ class Choice(Finals):
                 "be closed around the model; for a controller identify with nk = 1"
             )
         extra: Provenance = {"notes": notes} if notes else {}
-        extra["verdict"] = verdict(self, model, error)
+        found = verdict(model, self.task.data, self.split, error)
+        if found["grade"] == "good" and self.search.repeats:
+            found["grade"] = "fair"
+            repeated = "good on repetitions of this record"
+            found["text"] = found["text"].replace(TEXTS["good"], repeated)
+            found["next"] += what_to_record(self.task.data)
+        if self.clock.truncated and found["grade"] != "good":
+            found["next"].insert(0, "give a longer time budget, or none")
+        found["next"] += [f"{f.text}: {f.remedy}" for f in self.search.diagnosis.findings]
+        extra["verdict"] = found
         return replace(with_provenance(model, extra), alternatives=tuple(alternatives))
 
     def _choice(self, kind: str, error: float) -> Provenance:

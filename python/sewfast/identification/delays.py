@@ -348,16 +348,10 @@ def _free_run_costs(data: Dataset, j: int, lags: range, best: list[int]) -> Floa
     """Mean square free-run errors with input `j` delayed by each lag, others by their best."""
     costs = []
     for nk in lags:
-        delays = [*best[:j], nk, *best[j + 1 :]]
-        arrays = [(_delayed(e.u, delays), e.y) for e in data.experiments]
         try:
-            fit = _core.fit_iv(arrays, na=REFINED, nb=REFINED, nk=1, max_iterations=ITERATIONS)
+            costs.append(2.0 * _refined(data, [*best[:j], nk, *best[j + 1 :]]).cost)
         except (DataError, FitError):
             costs.append(math.inf)
-            continue
-        if fit.termination == "interrupted":
-            raise KeyboardInterrupt
-        costs.append(2.0 * fit.cost)
     if not np.isfinite(costs).any():
         raise FitError(
             f"{data.source}: expected a linear model with a finite free run, found none at any "

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Literal
 
 from ..arrays import require_whole
-from ..dataset import Dataset, require_dataset
+from ..dataset import Dataset, diagnose, require_dataset
 from ..dataset.experiment import in_effect
 from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
 from ..dynamic_model import INIT
@@ -22,11 +22,10 @@ from ..models.files import STRUCTURED
 from ..progress import shown_in_notebooks
 from ..threads import Workers, available, require_workers
 from . import choice, further, grey_box, lagged, linear
-from .folds import thinned
+from .folds import TEXTS, UNSEEN_DATA, Split, thinned, verdict
 from .outputs import OUTPUTS
-from .task import Clock, Progress, Task, with_provenance
+from .task import Clock, Progress, Provenance, Task, with_provenance
 from .training import Structure
-from .verdict import verdict_by_name
 
 _KINDS: dict[str, Callable[[Task], Model]] = {
     "auto": choice.searched,
@@ -216,7 +215,7 @@ def identify(
         found = _within_budget(_KINDS[kind], task)
     try:
         if "verdict" not in found.training:
-            own = verdict_by_name(found, task.data, task.validation)
+            own = _verdict(found, task.data, task.validation)
             found = with_provenance(found, {"verdict": own})
         return with_training_evidence(found, _excerpt(found, task))
     except KeyboardInterrupt:
@@ -298,6 +297,28 @@ def _excerpt(model: Model, task: Task) -> Dataset:
         (len(m.core.theta) for m in model.members or (model,) if m.kind[:2] == "ne"), default=10
     )
     return thinned(task.data, max(LEAST_EVIDENCE, round(left * EVIDENCE_RATE / width)))
+
+
+def _verdict(model: Model, data: Dataset, validation: Dataset | None) -> Provenance:
+    """The verdict on a kind requested by name, for which no data were held out.
+
+    It is judged on the validation data, else on its training data; the text states which.
+    """
+    part = Split(data, validation or data, is_given=validation is not None)
+    where = UNSEEN_DATA if part.is_given else "its own training data"
+    found = verdict(model, data, part, where=where)
+    if model.kind in ("arx", "iv", "oe") and found["grade"] in ("good", "fair"):
+        slowest, longest = linear.time_constant(model.core), max(len(e) for e in data.experiments)
+        # a real integrator is not a superfluous pole
+        if slowest > linear.UNSEEN * longest and diagnose(data).find("integrator") is None:
+            found["grade"] = "poor"
+            measured = found["text"].partition(": ")[2]
+            found["text"] = (
+                f"{TEXTS['poor']}: its slowest pole takes {slowest * data.Ts:.3g} s, longer than "
+                f"the record can show, so that its steady gain is a guess; {measured}"
+            )
+            found["next"].insert(0, "lower na, or leave model out and let the search choose")
+    return found
 
 
 def _preset(preset: str, kind: str, orders: Mapping[str, int | None]) -> str:

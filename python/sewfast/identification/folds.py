@@ -1,4 +1,4 @@
-"""The data that models are fitted to and chosen by, and comparisons of their errors."""
+"""The data that models are fitted to and chosen by, comparisons of errors, and the verdict."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.experiment import mean_square, weights_of
 from ..dynamic_model import INIT, Core
 from ..errors import DataError, FitError
+from ..models import Model
+from ..validation import GOOD, by_input, free_run_error, judged, noise_of, without_input
 from .task import Provenance, sources
 
 SHARE = 0.2
@@ -257,3 +259,90 @@ def compared(one: Errors, other: Errors) -> tuple[float, float]:
     )
     ratio = 0.5 * np.log((one.squares.sum() + tiny) / (other.squares.sum() + tiny))
     return float(ratio), float(drawn.std())
+
+
+# --- The verdict: whether a model is good enough --------------------------------------------------
+
+
+TEXTS = {
+    "": "the output hardly moves where it was not trained on",
+    "good": "good enough to tune a controller on",
+    "fair": "good enough for a first, cautious controller",
+    "poor": "not good enough to tune a controller on",
+    "useless": "useless",
+}
+UNSEEN_DATA = "data not trained on"
+
+
+def verdict(
+    model: Model,
+    data: Dataset,
+    part: Split,
+    error: float | None = None,
+    where: str = UNSEEN_DATA,
+) -> Provenance:
+    """Whether the model is good enough to tune a controller on, in words and as values.
+
+    Parameters
+    ----------
+    model : Model
+    data : Dataset
+        Its training data.
+    part : Split
+        Data to judge by, described by `where`.
+    error : float, optional
+        Free-run error of other samples, which counts instead of that of the part [output unit].
+
+    Returns
+    -------
+    dict
+        `grade` ("good", "fair", "poor" or "useless"), `fit_percent`, `text`, and `next`: a list of
+        things to do, the most important one first.
+    """
+    # `error` can come from other samples; the share explained by the input needs the same ones
+    own = free_run_error(model, part.held, part.held, INIT)
+    error = own if error is None else error
+    spread = part.spread
+    fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")
+    noise = noise_of([e.y for e in data.experiments])
+    share = by_input(own, without_input(model, part.held, INIT))
+    grade, resting = judged(fit, error, noise, share)
+    unit = f" {data.output_unit}" if data.output_unit else ""
+    rmse = f"rmse {error:.3g}{unit}"
+    text, todo = TEXTS[grade], []
+    if not np.isfinite(error):
+        text = "useless: its free run leaves the finite numbers"
+    elif grade:
+        text += f": free run explains {fit:.1f} % of {where} ({rmse}){resting}"
+        if grade == "useless" and not resting:
+            text += "; a constant would do about as well"
+    else:
+        text += f" ({rmse})"
+    if grade == "good":
+        if fit < GOOD:
+            text += f"; what is left is measurement noise ({noise:.3g}{unit})"
+        todo.append(
+            "validate it on another recording; to tune, identify with nk = 1 (--nk 1): no loop can "
+            "be closed around a model without delay"
+            if any(m.orders["nk"] == 0 for m in model.members or (model,))
+            else "validate it on another recording, then tune"
+        )
+    else:
+        todo += what_to_record(data)
+    return {
+        "grade": grade or "useless",
+        "fit_percent": fit if np.isfinite(fit) else None,
+        "text": text,
+        "next": todo,
+    }
+
+
+def what_to_record(data: Dataset) -> list[str]:
+    """Advice on another recording."""
+    wanted = [
+        "record longer, with more levels of the input and the speeds that the controller will use"
+    ]
+    if len(data.experiments) == 1:
+        wanted.append("give several recordings: they are fitted together")
+    wanted.append("see the report card (check) for what the residual still contains")
+    return wanted
