@@ -40,33 +40,11 @@ from .folds import (
     verdict,
     what_to_record,
 )
-from .linear import (
-    HELD_OUT,
-    LEAST_GAIN,
-    LinearCandidate,
-    LinearTable,
-    linear_provenance,
-    short,
-)
+from .linear import HELD_OUT, LEAST_GAIN, LinearCandidate, LinearTable, linear_provenance, short
 from .search import CLIMB_ITERATIONS, Search
-from .task import (
-    Look,
-    Pool,
-    Provenance,
-    Stopped,
-    Task,
-    arrays,
-    finite,
-    with_provenance,
-    wrap,
-)
+from .task import Pool, Provenance, Stopped, Task, arrays, finite, with_provenance, wrap
 from .training import Network, Request, Structure
-from .trials import (
-    STILL_WORTH_A_FEEDTHROUGH,
-    Candidate,
-    counting,
-    median_of,
-)
+from .trials import STILL_WORTH_A_FEEDTHROUGH, Candidate, counting, median_of
 
 WORTH_AN_INTEGRATOR = 0.7
 ABOUT_EQUAL = 0.02
@@ -355,7 +333,11 @@ class Choice(Finals):
         core = chosen.models[0]
         provenance: Provenance = {"choice": self._choice("oe", chosen.rmse)}
         until = self.clock.until(SHARE_OF_REFIT)
-        (fit,) = self.search.pool.map(self._linear_fit, [chosen], until=until, share=1.0)
+        options = task.fit_options(na=chosen.order, nb=chosen.order + 1, nk=chosen.nk)
+        (fit,) = self.search.pool.map(
+            lambda data, look: _core.fit_oe(data, **{**options, "progress": look}),
+            [arrays(task.data)], until=until, share=1.0,
+        )  # fmt: skip
         if fit is None:
             # no time to fit all samples: keep the model of the excerpt
             extra = {"initial_state": "estimated", "termination": "time budget", **provenance}
@@ -392,11 +374,6 @@ class Choice(Finals):
         extra: Provenance = {"initial_state": "estimated", "termination": "time budget"}
         extra["choice"] = {"chosen": "oe", "reason": "; ".join(self.reasons), "candidates": []}
         return self._closed(task.model(LinearOE, core, extra), error, [])
-
-    def _linear_fit(self, chosen: LinearCandidate, look: Look) -> _core.LinearFit | None:
-        task = self.task
-        options = task.fit_options(na=chosen.order, nb=chosen.order + 1, nk=chosen.nk)
-        return _core.fit_oe(arrays(task.data), **{**options, "progress": look})
 
     def _closed(self, model: Model, error: float, alternatives: Sequence[Model]) -> Model:
         """The model with its alternatives, notes and verdict."""

@@ -217,7 +217,7 @@ def identify(
         if "verdict" not in found.training:
             own = _verdict(found, task.data, task.validation)
             found = with_provenance(found, {"verdict": own})
-        return with_training_evidence(found, _excerpt(found, task))
+        return with_training_evidence(found, _excerpt(found, task.data, clock))
     except KeyboardInterrupt:
         raise Interrupted(found) from None
 
@@ -287,16 +287,15 @@ def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
         raise too_short from None
 
 
-def _excerpt(model: Model, task: Task) -> Dataset:
+def _excerpt(model: Model, data: Dataset, clock: Clock) -> Dataset:
     """The data for the evidence stored with a model; fewer of them if time is short."""
-    clock = task.clock
     if clock.budget is None:
-        return task.data
+        return data
     left = max(0.0, clock.budget - clock.spent)
     width = max(
         (len(m.core.theta) for m in model.members or (model,) if m.kind[:2] == "ne"), default=10
     )
-    return thinned(task.data, max(LEAST_EVIDENCE, round(left * EVIDENCE_RATE / width)))
+    return thinned(data, max(LEAST_EVIDENCE, round(left * EVIDENCE_RATE / width)))
 
 
 def _verdict(model: Model, data: Dataset, validation: Dataset | None) -> Provenance:

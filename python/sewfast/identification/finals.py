@@ -12,12 +12,7 @@ from .folds import Split, compared, errors_of, free_runs
 from .linear import LinearCandidate, LinearTable
 from .search import STILL_NEAR, Search, decayed
 from .training import Request, Start
-from .trials import (
-    BY_FAR,
-    Candidate,
-    best_of_each_size,
-    median_of,
-)
+from .trials import BY_FAR, Candidate, best_of_each_size, median_of
 
 WORTH_IT = 0.9
 """A network must bring the error below this part of the best linear model's, and of a motor's."""

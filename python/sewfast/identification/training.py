@@ -151,14 +151,15 @@ class Job:
 
     def run(self, look: Look | None) -> tuple[Network, float] | None:
         """The trained network and its cost; None if it failed."""
-        fit = self._lagged if "na" in self.settings else self._state_space
         try:
-            return fit(look)
+            fit = self._lagged(look) if "na" in self.settings else self._state_space(look)
         except FitError:
             return None
+        cost = float(fit.start_costs[0])
+        return (fit.model, cost) if math.isfinite(cost) else None
 
-    def _state_space(self, look: Look | None) -> tuple[Network, float] | None:
-        fit = _core.fit_neural_ss(
+    def _state_space(self, look: Look | None) -> _core.NeuralSSFit:
+        return _core.fit_neural_ss(
             self.experiments,
             self.held,
             **self.settings,
@@ -172,12 +173,10 @@ class Job:
             guard=False,
             progress=look,
         )
-        cost = float(fit.start_costs[0])
-        return (fit.model, cost) if math.isfinite(cost) else None
 
-    def _lagged(self, look: Look | None) -> tuple[Network, float] | None:
+    def _lagged(self, look: Look | None) -> _core.NeuralFit:
         known = self.initial or {}
-        fit = _core.fit_neural_oe(
+        return _core.fit_neural_oe(
             self.experiments,
             self.held,
             **self.settings,
@@ -195,8 +194,6 @@ class Job:
             initial_theta=None if self.initial is None else known["theta"][None, :],
             progress=look,
         )
-        cost = float(fit.start_costs[0])
-        return (fit.model, cost) if math.isfinite(cost) else None
 
 
 def run_job(job: Job) -> tuple[dict[str, Any], float] | None:
@@ -283,16 +280,22 @@ def _spread(workers: Workers, jobs: Sequence[Job]) -> list[tuple[Network, float]
 
 def _jobs(request: Request, seed: int, until: float | None) -> list[Job]:
     s, linear = request.structure, request.linear
-    if s.integrator and linear is not None and not _has_slow_mode(linear):
-        linear = None  # starts begin at random states
+    if s.integrator and linear is not None:
+        poles = linear.poles()
+        slow = (abs(poles[:, 1]) <= 1e-9 * abs(poles[:, 0])) & (poles[:, 0] > 0.0)
+        if not slow.any():  # no real mode could become an integrator
+            linear = None  # starts begin at random states
     settings: dict[str, Any] = {"nk": s.nk, "hidden": s.hidden, "weight_decay": s.decay}
     settings["max_iterations"] = request.iterations
     if s.kind == "neural_oe":
         settings |= {"na": s.nx, "nb": s.nx + 1}
     else:
         settings |= {"nx": s.nx, "integrator": s.integrator, "output": s.output.name}
-        settings |= {"output_parameters": _output_parameters(request)}
-        settings |= {"hidden_scale": HIDDEN_SCALE}
+        if request.initial:
+            parameters = request.initial[0].settings["output_parameters"]
+        else:
+            parameters = s.output.parameters(*scale_of(request.fitted, s.output))
+        settings |= {"output_parameters": parameters, "hidden_scale": HIDDEN_SCALE}
     common: dict[str, Any] = {
         "experiments": arrays(request.fitted),
         "held": [] if request.held is None else arrays(request.held),
@@ -307,19 +310,6 @@ def _jobs(request: Request, seed: int, until: float | None) -> list[Job]:
             for i, model in enumerate(request.initial)
         ]
     return [Job(**common, number=request.first + i, initial=None) for i in range(request.starts)]
-
-
-def _has_slow_mode(linear: _core.LinearModel) -> bool:
-    """Whether a real mode could become an integrator."""
-    poles = linear.poles()
-    return bool(((abs(poles[:, 1]) <= 1e-9 * abs(poles[:, 0])) & (poles[:, 0] > 0.0)).any())
-
-
-def _output_parameters(request: Request) -> Any:
-    if request.initial:
-        return request.initial[0].settings["output_parameters"]
-    output = request.structure.output
-    return output.parameters(*scale_of(request.fitted, output))
 
 
 def _values(model: Network) -> dict[str, Any]:

@@ -16,15 +16,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from .estimation import CONFIDENCE, Normal, inverse, minimised
-from .problem import (
-    FINE,
-    NEAR,
-    PARAMETERS,
-    TERMS,
-    WAVES,
-    Problem,
-    State,
-)
+from .problem import FINE, NEAR, PARAMETERS, TERMS, WAVES, Problem, State
 from .records import Records
 from .starts import CLEAR, started, with_waves
 
