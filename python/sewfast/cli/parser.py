@@ -11,7 +11,6 @@ from typing import Any
 
 from ..errors import not_installed
 from . import (
-    bode,
     check,
     commission,
     control,
@@ -20,6 +19,7 @@ from . import (
     drive,
     gains,
     identify,
+    machine,
     project,
     recording,
     tune,
@@ -129,8 +129,8 @@ def build_parser() -> argparse.ArgumentParser:
         tune.add,
         control.add,
         check.add_analyse,
-        bode.add,
-        bode.add_physics,
+        machine.add,
+        machine.add_physics,
         deploy.add,
         deploy.add_pil,
         identify.add_fleet,
