@@ -293,6 +293,7 @@ def test_a_reference_that_has_nothing_to_do_with_it_is_refused() -> None:
         (np.zeros((50, 2)), "shape"),
         (np.arange(10.0), "segments"),
         (["a"] * 5000, "numbers"),
+        (np.arange(5000) % 7 * 1e-300, "differ by 1e-60"),
     ],
 )
 def test_signals_without_a_response_are_refused(u: Any, said: str) -> None:

@@ -142,6 +142,7 @@ def test_a_sparse_multisine_has_intervals_that_hold_its_lines() -> None:
         (np.zeros((50, 2)), "shape"),
         (np.arange(20.0), "at least 52"),
         (np.full(500, 1e200), "squares"),
+        (np.arange(500) % 7 * 1e-300, "differ by 1e-60"),
         (np.cos(2.0 * np.pi * 0.1 * np.arange(500)), "power at three frequencies"),
     ],
 )

@@ -215,6 +215,21 @@ def test_what_cannot_be_judged_is_refused() -> None:
         api.delay(data[:60])
     with pytest.raises(DataError, match="constant"):
         api.orders(Dataset.from_arrays(np.ones(400), data.experiments[0].y, 0.01))
+    (e,) = data.experiments
+    infinite = np.where(np.arange(len(e)) == 50, np.inf, e.y)
+    for u, y, said in (
+        (e.u * 1e200, e.y * 1e200, "below 1e\\+60"),
+        (e.u * 1e-200, e.y * 1e-200, "differ by 1e-60"),
+        (e.u, infinite, "received inf at sample 50"),
+    ):
+        unfit = Dataset.from_arrays(u, y, 0.01)
+        with pytest.raises(DataError, match=said):
+            api.delay(unfit)
+        for nk in (None, 1):
+            with pytest.raises(DataError, match=said):
+                api.orders(unfit, nk=nk)
+    with pytest.raises(DataError, match="received inf at sample 50"):
+        api.orders(data, validation=Dataset.from_arrays(e.u, infinite, 0.01))
     with pytest.raises(SettingError, match="na: expected whole numbers"):
         api.orders(data, na=0)
     with pytest.raises(SettingError, match="held_out"):

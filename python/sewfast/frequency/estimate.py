@@ -19,8 +19,9 @@ SEGMENTS = 16
 coherence of one half."""
 LEAST = 16
 """Least samples of a segment or period."""
-LARGEST = 1e150
-"""Largest magnitude of a signal, so that sums of squares do not overflow."""
+LARGEST, SMALLEST = 1e150, 1e-60
+"""Largest magnitude of a signal, so that sums of squares do not overflow, and smallest range of one
+that moves the plant, so that products of powers do not underflow."""
 
 
 def periodic(
@@ -236,6 +237,14 @@ def record_of(u: ArrayLike, y: ArrayLike, r: ArrayLike | None) -> list[FloatArra
             name="r", expected="a reference that moves", received="a constant one",
             remedy="name the column that the controller follows",
         )  # fmt: skip
+    for name in [n for n in signals if n != "y"]:
+        low, high = signals[name].min(), signals[name].max()
+        # the product of two spectra would be 0, and their quotient no number, at every line
+        if high - low < SMALLEST:
+            raise DataError(
+                name=name, expected=f"values that differ by {SMALLEST:g} or more",
+                received=f"{low:g} to {high:g}", remedy="change their units",
+            )  # fmt: skip
     return list(signals.values())
 
 

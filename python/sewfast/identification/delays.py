@@ -15,6 +15,7 @@ from .. import _core
 from ..arrays import require_whole
 from ..dataset import Dataset, Experiment, FloatArray, require_dataset
 from ..dataset.experiment import in_effect
+from ..dataset.pieces import require_fittable
 from ..errors import DataError, FitError, SettingError
 from ..plotting import SHADE, lettered, stacked
 from ..tables import html_of
@@ -283,7 +284,7 @@ def delay(
     Raises
     ------
     DataError
-        If the data are too short or never move.
+        If the data are too short, never move, or are so large or small that squares overflow.
     SettingError
         If a setting is out of its range.
 
@@ -294,6 +295,8 @@ def delay(
     """
     _require(data, longest, least, confidence)
     data = in_effect(data)
+    data.require_measured(0)
+    require_fittable(data)
     regression = LaggedRegression(data, ORDER, longest + ORDER)
     needed = 2 * regression.triangle.shape[1]
     if regression.samples < needed:

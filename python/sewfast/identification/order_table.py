@@ -14,6 +14,7 @@ import numpy as np
 from .. import _core
 from ..dataset import Dataset, Experiment, FloatArray, labelled, require_dataset
 from ..dataset.experiment import in_effect
+from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, SettingError
 from ..plotting import legend, lettered, stacked
@@ -255,6 +256,9 @@ def orders(
     require_dataset(data, "data")
     data.require_inputs()
     data.require_excited()
+    judged = in_effect(data)
+    judged.require_measured(0)
+    require_fittable(judged)
     train, later = (in_effect(part) for part in _parts(data, validation, held_out))
     found = delay(train, longest=reach(train)) if nk is None else None
     grid = _Grid(_upto("na", na, 1), _upto("nb", nb, 1), _delays(nk, found))
@@ -311,7 +315,8 @@ def _parts(data: Dataset, validation: Dataset | None, held_out: float) -> tuple[
         train, later = _split(data, 1.0 - held_out)
     else:
         require_dataset(validation, "validation")
-        validation.require_inputs()
+        in_effect(validation).require_measured(0)
+        require_sane(in_effect(validation), LARGEST_FITTED)
         Dataset.concat([data, validation])
         train, later = data, validation
     for e in later.experiments:
