@@ -1,4 +1,4 @@
-"""Draws assets/free_run.svg: a network and a linear model on a recording they were not trained on.
+"""Draws assets/free_run.svg: the model that `identify` chooses and a linear one, on new data.
 
     python docs/free_run.py [MODEL.json]
 
@@ -32,8 +32,11 @@ def record(signal: str) -> sewfast.Dataset:
 
 def main() -> None:
     training = sewfast.Dataset.concat(map(record, ["chirp_lo_hi", "saturating"]))
-    network = sewfast.load_model(sys.argv[1]) if len(sys.argv) > 1 else sewfast.identify(training)
-    models = {"network": network, "linear output error": sewfast.identify(training, model="oe")}
+    chosen = sewfast.load_model(sys.argv[1]) if len(sys.argv) > 1 else sewfast.identify(training)
+    models = {
+        "chosen by identify": chosen,
+        "linear output error": sewfast.identify(training, model="oe"),
+    }
     random = record("random")
     t = random.Ts * np.arange(SHOWN.start, SHOWN.stop, STEP)
     y = random.experiments[0].y[SHOWN][::STEP]

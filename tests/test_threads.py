@@ -17,6 +17,7 @@ import pytest
 
 import sewfast
 from sewfast import _core
+from sewfast.arrays import gram, product
 from sewfast.errors import SettingError
 from sewfast.threads import available
 
@@ -238,3 +239,33 @@ def test_loads_in_an_interpreter_of_its_own() -> None:
     code = "import sewfast._core as c; print(c.cpu, c.NeuralOE.__name__)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == [_core.cpu, "NeuralOE"]
+
+
+@pytest.mark.parametrize(
+    ("n", "p", "q"), [(0, 3, 2), (1, 1, 1), (7, 0, 2), (5000, 19, 23), (3, 600, 400)]
+)
+def test_products_in_blocks_are_those_of_whole_matrices(n: int, p: int, q: int) -> None:
+    rng = np.random.default_rng(n)
+    a, b, x = rng.normal(size=(n, p)), rng.normal(size=(n, q)), rng.normal(size=(p, q))
+    for found, expected in ((gram(a, b), a.T @ b), (gram(a), a.T @ a), (product(a, x), a @ x)):
+        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-10)
+
+
+_BITS = """
+import sys, numpy as np
+from sewfast.arrays import gram, product
+a = np.random.default_rng(1).normal(size=(20_000, 30))
+sys.stdout.buffer.write(gram(a).tobytes() + product(a, gram(a)).tobytes())
+"""
+
+
+def test_products_in_blocks_have_the_same_bits_on_any_number_of_blas_threads() -> None:
+    run = [
+        subprocess.run(
+            [sys.executable, "-c", _BITS], env={**os.environ, "OPENBLAS_NUM_THREADS": threads},
+            check=True, capture_output=True,
+        ).stdout
+        for threads in ("1", "2")
+    ]  # fmt: skip
+    assert len(run[0]) == 8 * (30 * 30 + 20_000 * 30)
+    assert run[0] == run[1]

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 
 
 def main() -> int:
     """Run one command, with the process's own arguments; its exit code."""
-    # NumPy's products of matrices are small here. On every processor at once they are no faster,
-    # and on a busy computer take many times as long: OpenBLAS waits in a loop for its threads.
-    # Read when NumPy is imported, inherited by worker processes; a user's own setting stays.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # While modules are read nothing is lost by Ctrl-C: the process ends as any other does, without
     # a traceback. Where SIGINT is ignored (a job in the background) it stays ignored.
     listening = signal.getsignal(signal.SIGINT)

@@ -21,6 +21,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import gram, product
 from ..dataset import FloatArray
 from .residuals import Noise
 
@@ -228,15 +229,15 @@ class Sums:
         """
         power = sum(float(e @ e) for e in target)
         squares = np.sum([np.square(z).sum(axis=0) for z in instruments], axis=0)
-        overlap = np.sum([d.T @ z for d, z in zip(directions, instruments, strict=True)], axis=0)
-        freed = [z - d @ overlap for d, z in zip(directions, instruments, strict=True)]
+        overlap = np.sum([gram(d, z) for d, z in zip(directions, instruments, strict=True)], axis=0)
+        freed = [z - product(d, overlap) for d, z in zip(directions, instruments, strict=True)]
         values = np.sum([z.T @ e for z, e in zip(freed, target, strict=True)], axis=0)
-        gram = np.sum([z.T @ z for z in freed], axis=0)
+        own = np.sum([gram(z) for z in freed], axis=0)
         shaped = (noise.shaped(z) for z in freed)
-        covariance = np.sum([v.T @ v for v in shaped], axis=0)
+        covariance = np.sum([gram(v) for v in shaped], axis=0)
         reference = squares * noise.variance
         scales = np.sqrt(np.maximum(squares * power, 1e-300))
-        explained = _explained(values, gram, covariance, squares, power)
+        explained = _explained(values, own, covariance, squares, power)
         room = sum(int(np.count_nonzero(e)) for e in target) - directions[0].shape[1]
         return cls(values, covariance, scales, reference, explained, float(room))
 
@@ -340,7 +341,7 @@ def independent_directions(
     scaled = [c[:, used] / scale[used] for c in columns]
     if not used.any():
         return scaled
-    sizes, vectors = np.linalg.eigh(np.sum([c.T @ c for c in scaled], axis=0))
+    sizes, vectors = np.linalg.eigh(np.sum([gram(c) for c in scaled], axis=0))
     kept = sizes > determined * sizes[-1]
     turn = vectors[:, kept] / np.sqrt(sizes[kept])
-    return [c @ turn for c in scaled]
+    return [product(c, turn) for c in scaled]

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from ..arrays import gram
 from ..dataset import FloatArray
 from ..dynamic_model import DynamicModel
 from .residuals import Noise, Residuals, representative
@@ -125,8 +126,8 @@ class Information:
 
     @classmethod
     def of(cls, model: DynamicModel, residuals: Residuals) -> Information:
-        gram = np.sum([r.sensitivity.T @ r.sensitivity for r in residuals.runs], axis=0)
-        return cls(gram, penalty(model, residuals))
+        total = np.sum([gram(r.sensitivity) for r in residuals.runs], axis=0)
+        return cls(total, penalty(model, residuals))
 
     @property
     def scale(self) -> FloatArray:
@@ -273,7 +274,7 @@ def _meat(residuals: Residuals, noise: Noise) -> FloatArray:
     total = np.zeros((residuals.width, residuals.width))
     for run in residuals.runs:
         shaped = noise.shaped(run.sensitivity)
-        total += shaped.T @ shaped
+        total += gram(shaped)
     return total
 
 

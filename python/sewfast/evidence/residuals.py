@@ -12,6 +12,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import gram, product
 from ..dataset import Dataset, Experiment, FloatArray, require_dataset
 from ..dynamic_model import INIT, DynamicModel, FreeRunJacobian, require_init
 from ..errors import DataError, FitError
@@ -139,7 +140,7 @@ def _gram(series: Sequence[tuple[FloatArray, NDArray[np.bool_]]], order: int) ->
         rows = np.lib.stride_tricks.sliding_window_view(e, order + 1)[:, ::-1]
         whole = np.lib.stride_tricks.sliding_window_view(known, order + 1).all(axis=1)
         kept = rows[whole]
-        total[:-1] += kept.T @ kept
+        total[:-1] += gram(kept)
         total[-1, 0] += len(kept)
     return total
 
@@ -216,8 +217,9 @@ class Run:
 
     def without_state(self, columns: FloatArray) -> FloatArray:
         """Columns (N,) or (N, m) with the effect of the initial state projected out."""
-        left: FloatArray = columns - self.state @ (self.state.T @ columns)
-        return left
+        wide = columns.reshape(len(columns), -1)
+        left = wide - product(self.state, gram(self.state, wide))
+        return left.reshape(columns.shape)
 
 
 @dataclass(frozen=True, eq=False)

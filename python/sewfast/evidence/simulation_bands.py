@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import gram
 from ..dataset import Dataset, FloatArray
 from ..dynamic_model import INIT, DynamicModel
 from ..errors import FitError, SettingError
@@ -263,11 +264,11 @@ def stored_uncertainty(model: DynamicModel) -> Uncertainty | None:
 
 def _factor(found: Parameters, residuals: Residuals) -> FloatArray:
     """F with FF' close to P, from the directions that move the free run most."""
-    gram = np.sum([r.sensitivity.T @ r.sensitivity for r in residuals.runs], axis=0)
+    total = np.sum([gram(r.sensitivity) for r in residuals.runs], axis=0)
     sizes, vectors = np.linalg.eigh(found.covariance)
     root = vectors * np.sqrt(np.maximum(sizes, 0.0))
     # directions of P^(1/2), sorted by their contribution to the free run's variance
-    moved, turn = np.linalg.eigh(root.T @ gram @ root)
+    moved, turn = np.linalg.eigh(root.T @ total @ root)
     order = np.argsort(moved)[::-1]
     share = np.cumsum(moved[order]) / max(moved.sum(), 1e-300)
     kept = order[: int(np.searchsorted(share, _KEPT_VARIANCE)) + 1]
@@ -288,7 +289,7 @@ def _left_out(model: DynamicModel, residuals: Residuals) -> list[FloatArray]:
     for run, e, out in zip(residuals.runs, errors, found, strict=True):
         for a, b in _blocks(len(e), residuals.n):
             psi = run.sensitivity[a:b]
-            inverse = information.inverse(psi.T @ psi, _FOLLOWED)
+            inverse = information.inverse(gram(psi), _FOLLOWED)
             change = psi @ (inverse @ (psi.T @ e[a:b]))
             out[a:b] = e[a:b] + _bounded(change, e[a:b])
     return found

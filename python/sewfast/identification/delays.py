@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import _core
-from ..arrays import require_whole
+from ..arrays import gram, require_whole
 from ..dataset import Dataset, Experiment, FloatArray, require_dataset
 from ..dataset.experiment import in_effect
 from ..dataset.pieces import require_fittable
@@ -460,10 +460,10 @@ def _autoregression(series: list[FloatArray]) -> FloatArray:
     order = min(WHITENING, *(max((len(s) - 1) // 4, 0) for s in series))
     mean = np.mean(np.concatenate(series))
     rows = [np.lib.stride_tricks.sliding_window_view(s - mean, order + 1)[:, ::-1] for s in series]
-    gram = np.sum([r.T @ r for r in rows], axis=0)
+    sums = np.sum([gram(r) for r in rows], axis=0)
     # the ridge bounds the filter for inputs that few parameters describe (steps, sines)
-    ridge = 1e-8 * gram[0, 0] * np.eye(order)
-    return np.concatenate([[1.0], -np.linalg.solve(gram[1:, 1:] + ridge, gram[1:, 0])])
+    ridge = 1e-8 * sums[0, 0] * np.eye(order)
+    return np.concatenate([[1.0], -np.linalg.solve(sums[1:, 1:] + ridge, sums[1:, 0])])
 
 
 def _normal_quantile(p: float) -> float:

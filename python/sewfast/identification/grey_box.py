@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import _core
+from ..arrays import gram
 from ..dataset import Dataset, Experiment, FloatArray
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, SettingError
@@ -295,15 +296,15 @@ def trained_from(
         asked()
         own = at(x)
         assert own is not None
-        cost, slope, gram = float((prior * x) @ (prior * x)), prior**2 * x, np.diag(prior**2)
+        cost, slope, total = float((prior * x) @ (prior * x)), prior**2 * x, np.diag(prior**2)
         for e, state in zip(data.experiments, states, strict=True):
             y, rows = own.jacobian(e.u, state)
             known = _weights(e)
             error, rows = (known * (y - np.nan_to_num(e.y))), known[:, None] * rows[:, : len(x)]
             cost += float(error @ error)
-            slope = slope + rows.T @ error
-            gram = gram + rows.T @ rows
-        return cost, slope, gram
+            whole = gram(np.c_[rows, error])
+            slope, total = slope + whole[:-1, -1], total + whole[:-1, :-1]
+        return cost, slope, total
 
     def cost(x: FloatArray) -> float:
         asked()

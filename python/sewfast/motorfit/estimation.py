@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, gram
 from ..errors import FitError
 
 CONFIDENCE = 1.96
@@ -81,7 +81,7 @@ def covariance_of(
     before = np.zeros((n, n))
     if known is not None:
         before[: len(known), : len(known)] = known
-    half, unknown = _root(jacobian.T @ jacobian + before)
+    half, unknown = _root(gram(jacobian) + before)
     middle, at, total = half.T @ before @ half, 0, 0.0
     for length, window in zip(lengths, windows, strict=True):
         rows = slice(at, at + channels * length)

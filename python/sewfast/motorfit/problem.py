@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .. import _core
-from ..arrays import FloatArray
+from ..arrays import FloatArray, gram
 from ..errors import SettingError
 from .estimation import Normal, covariance_of, filtered, inverse, minimised, whitener
 from .records import Records, spikes_of
@@ -299,7 +299,7 @@ class Problem:
             if not moving:
                 return
             J = np.concatenate([self.jacobian(state), columns], axis=1)
-            matrix, slope, n = J.T @ J, J.T @ self.residuals(state), len(state.names())
+            matrix, slope, n = gram(J), J.T @ self.residuals(state), len(state.names())
             _, by, curvature = self._expected(state)
             matrix[:n, :n] += curvature
             slope[:n] += by

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, gram
 from ..errors import DataError, FitError
 from .estimation import filtered
 from .problem import NOTHING, PLACE, WAVES, Problem, State
@@ -136,7 +136,7 @@ def _solved(A: FloatArray, b: FloatArray) -> FloatArray:
     scale = np.sqrt(np.einsum("ij,ij->j", A, A))
     scale[scale == 0.0] = 1.0
     A = A / scale
-    found: FloatArray = np.linalg.lstsq(A.T @ A, A.T @ b, rcond=None)[0] / scale
+    found: FloatArray = np.linalg.lstsq(gram(A), A.T @ b, rcond=None)[0] / scale
     return found
 
 
