@@ -147,11 +147,15 @@ def read(path: str | os.PathLike[str], format: str, versions: Collection[int]) -
     document = _parse(path, _text(path))
     if not isinstance(document, dict):
         raise ModelFileError(
-            f"{path}: expected a JSON object of format {format!r}, got {type(document).__name__}"
+            f"{path}: expected a JSON object of format {format!r}, got {type(document).__name__}; "
+            "give a file that sewfast has written"
         )
     received = document.pop("format", None)
     if received != format:
-        raise ModelFileError(f"{path}: expected a file of format {format!r}, got {received!r}")
+        raise ModelFileError(
+            f"{path}: expected a file of format {format!r}, got {received!r}; give one that "
+            "sewfast has written in this format"
+        )
     version = document.get("version")
     # True == 1 and 1.0 == 1, yet neither is a version.
     if type(version) is not int or version not in versions:

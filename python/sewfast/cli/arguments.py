@@ -174,4 +174,6 @@ def require_place(path: Path | None, suffixes: tuple[str, ...], *, option: str =
             remedy=f"create {path.parent}",
         )  # fmt: skip
     if path.is_dir():
-        raise SettingError(f"{option} {path}: expected a file, received a folder")
+        raise SettingError(
+            f"{option} {path}: expected a file, received a folder; name a file in it"
+        )

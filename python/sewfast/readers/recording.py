@@ -244,7 +244,7 @@ def _zipped(path: Path, raw: bytes) -> Table:
 
 def _bytes(path: Path) -> bytes:
     if path.is_dir():
-        raise DataError(f"{path}: expected a file, received a folder")
+        raise DataError(f"{path}: expected a file, received a folder; name a file in it")
     try:
         raw = path.read_bytes()
     except (OSError, ValueError) as e:
