@@ -1,4 +1,4 @@
-"""Draws assets/studio/tune.png and bode.png for README and studio.md: the page, in Chromium.
+"""Draws assets/studio/tune.png, bode.png and look.png for README and studio.md, in Chromium.
 
     python docs/studio_pictures.py [FOLDER]
 
@@ -58,7 +58,10 @@ def draw_studio(place: Path) -> list[Path]:
             page = webdriver.Chrome(options=options, service=service)
             try:
                 page.get(studio.address)
-                return [_tune(page, place / "tune.png"), _bode(page, place / "bode.png")]
+                return [
+                    _tune(page, place / "tune.png"), _bode(page, place / "bode.png"),
+                    _look(page, place / "look.png"),
+                ]  # fmt: skip
             finally:
                 page.quit()
 
@@ -79,6 +82,16 @@ def _bode(page: Any, file: Path) -> Path:
     page.find_element("id", "bode-start").click()
     _until(lambda: "measured: " in _text(page, "loop-text"))
     return _taken(page, file, 1200, 2130)
+
+
+def _look(page: Any, file: Path) -> Path:
+    page.find_element("id", "view-data").click()
+    page.find_element("id", "look").click()
+    _until(lambda: len(page.find_elements("css selector", "#signals canvas")) == 2)
+    page.find_element("css selector", "#model option:nth-child(2)").click()
+    page.find_element("id", "identify").click()
+    _until(lambda: page.find_element("id", "modeltext").is_displayed())
+    return _taken(page, file, 1200, 1900)
 
 
 def _taken(page: Any, file: Path, width: int, height: int) -> Path:
