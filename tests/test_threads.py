@@ -8,8 +8,10 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import tracemalloc
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -269,3 +271,24 @@ def test_products_in_blocks_have_the_same_bits_on_any_number_of_blas_threads() -
     ]  # fmt: skip
     assert len(run[0]) == 8 * (30 * 30 + 20_000 * 30)
     assert run[0] == run[1]
+
+
+class _Deadline(KeyboardInterrupt):
+    pass
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("kind", [_Deadline, KeyboardInterrupt])
+def test_a_fit_that_is_done_outlives_a_deadline_and_not_ctrl_c(kind: type[BaseException]) -> None:
+    def late(done: int, *_: object) -> None:
+        time.sleep(2.0)  # the fit, of a fifth of a second, ends meanwhile
+        raise kind
+
+    ((u, y),) = _drive(20_000)
+    data = [(np.tile(u, (10, 1)), np.tile(y, 10))]
+    fit = partial(_core.fit_oe, data, na=1, nb=1, nk=1, max_iterations=3)
+    if kind is KeyboardInterrupt:
+        with pytest.raises(KeyboardInterrupt):
+            fit(progress=late)
+    else:
+        assert fit(progress=late).termination != "interrupted"

@@ -74,9 +74,13 @@ class Clock:
                 progress(done, total, best)
             if time.perf_counter() >= until:
                 self.truncated = True
-                raise KeyboardInterrupt
+                raise TimeUp
 
         return look
+
+
+class TimeUp(KeyboardInterrupt):
+    """End of a time budget: a fit that is done meanwhile is kept, as after Ctrl-C it is not."""
 
 
 class Stopped(Exception):

@@ -135,8 +135,9 @@ const PERIOD: Duration = Duration::from_millis(20);
 /// Runs `work` on a thread of its own, calls `progress(done, total, best_cost)` meanwhile and forwards Ctrl-C.
 ///
 /// After Ctrl-C the work is asked to stop and its best result so far is returned, marked as interrupted by
-/// the work itself; where it has none, or was done before it heard, `KeyboardInterrupt` is raised. Any other exception, of a signal handler
-/// or of `progress`, stops the work and is raised.
+/// the work itself; where it has none, or was done before it heard, `KeyboardInterrupt` is raised. A child class of it, which `progress`
+/// raises at a deadline, does the same, but a result that was done before the work heard is whole and is returned. Any other exception, of a
+/// signal handler or of `progress`, stops the work and is raised.
 pub fn watched<T: Send>(
     py: Python<'_>,
     progress: Option<&Bound<'_, PyAny>>,
@@ -166,10 +167,18 @@ pub fn watched<T: Send>(
         let result = outcome.unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         match raised {
             Some(error) if !error.is_instance_of::<PyKeyboardInterrupt>(py) => Err(error),
-            Some(interrupt) => result.ok().filter(|_| monitor.heard()).ok_or(interrupt),
+            Some(interrupt) => result
+                .ok()
+                .filter(|_| monitor.heard() || !is_ctrl_c(py, &interrupt))
+                .ok_or(interrupt),
             None => result.map_err(|e| raise(py, e)),
         }
     })
+}
+
+/// Whether an exception is Ctrl-C itself, and not a child class of it.
+pub fn is_ctrl_c(py: Python<'_>, error: &PyErr) -> bool {
+    error.get_type(py).is(py.get_type::<PyKeyboardInterrupt>())
 }
 
 /// So many samples of one loop or machine take a few milliseconds, in which nobody misses Ctrl-C.

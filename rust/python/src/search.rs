@@ -4,7 +4,6 @@
 use std::sync::Mutex;
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
-use pyo3::exceptions::PyKeyboardInterrupt;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_core::least_squares::{self, Residuals, Settings, Solution, Termination};
@@ -12,7 +11,7 @@ use sewfast_core::search::nsga2::{self, Objectives, Values};
 use sewfast_core::search::{Candidate, Judgement, Options, Problem, cma_es, genetic};
 use sewfast_core::{Error, Monitor};
 
-use crate::seam::{array1, array2, raise, rows, slice};
+use crate::seam::{array1, array2, is_ctrl_c, raise, rows, slice};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(search_least, module)?)?;
@@ -344,10 +343,6 @@ fn least_squares_fit<'py>(
         Some(error) if !is_ctrl_c(py, &error) => Err(error),
         _ => story(py, solution.map_err(|e| raise(py, e))?),
     }
-}
-
-fn is_ctrl_c(py: Python<'_>, error: &PyErr) -> bool {
-    error.get_type(py).is(py.get_type::<PyKeyboardInterrupt>())
 }
 
 fn story(py: Python<'_>, solution: Solution) -> PyResult<Bound<'_, PyDict>> {
