@@ -29,6 +29,14 @@ _shown = threading.local()
 """Whether a bar is shown already: work that starts other work shows only its own bar."""
 
 
+class TimeUp(KeyboardInterrupt):
+    """Raised by a progress callback at the end of a time budget.
+
+    Compiled work stops and returns its best result, as after Ctrl-C. A result that is complete by
+    then is kept, whereas Ctrl-C still interrupts the caller.
+    """
+
+
 class Progress:
     """Shows `done/total`, the best cost or the stage, and the elapsed seconds.
 

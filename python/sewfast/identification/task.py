@@ -14,6 +14,7 @@ from ..dataset import Dataset, FloatArray
 from ..errors import FitError, Interrupted
 from ..models import Model
 from ..models.base import Fitted
+from ..progress import TimeUp
 from ..threads import Workers
 from ..validation import validate
 
@@ -79,10 +80,6 @@ class Clock:
         return look
 
 
-class TimeUp(KeyboardInterrupt):
-    """End of a time budget: a fit that is done meanwhile is kept, as after Ctrl-C it is not."""
-
-
 class Stopped(Exception):
     """Ctrl-C during the work; the search holds the results so far."""
 
@@ -136,7 +133,7 @@ class Pool:
 
         def look(*_: object) -> None:
             if stopping.is_set() or (until is not None and time.perf_counter() >= until):
-                raise KeyboardInterrupt
+                raise TimeUp
 
         def one(item: T) -> R | None:
             try:

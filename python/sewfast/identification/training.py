@@ -18,6 +18,7 @@ import numpy as np
 from .. import _core
 from ..dataset import Dataset
 from ..errors import FitError
+from ..progress import TimeUp
 from ..threads import Workers, spread
 from .outputs import LINEAR, Output, scale_of
 from .task import Look, Pairs, Pool, Provenance, Stopped, arrays
@@ -211,7 +212,7 @@ def run_job(job: Job) -> tuple[dict[str, Any], float] | None:
 
     def look(*_: object) -> None:
         if job.deadline is not None and time.time() >= job.deadline:
-            raise KeyboardInterrupt
+            raise TimeUp
 
     try:
         found = own.run(look)

@@ -38,6 +38,7 @@ from ..control.margins import sampled
 from ..errors import FitError, SettingError
 from ..gains import Gains, real, vector, whole
 from ..models import Model
+from ..progress import TimeUp
 from ..rules import Fopdt, Rule, table_1
 from ..threads import available
 from ..units import revolutions_per_second, spelled
@@ -232,10 +233,6 @@ def budget(seconds: Any) -> float:
     if not 0.0 < time < math.inf:
         raise SettingError(f"expected a time_budget above 0 s, got {time:g}; None for none")
     return time
-
-
-class TimeUp(KeyboardInterrupt):
-    """Makes the core stop and return its best result."""
 
 
 @dataclass
