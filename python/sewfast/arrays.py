@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Protocol, TypeAlias, TypeGuard
 
 import numpy as np
@@ -163,17 +163,22 @@ def gram(a: FloatArray, b: FloatArray | None = None) -> FloatArray:
     eight times as long.
     """
     b = a if b is None else b
-    rows = max(1, _AT_ONCE // max(1, a.shape[1] * b.shape[1]))
     total = np.zeros((a.shape[1], b.shape[1]))
-    for at in range(0, len(a), rows):
-        total += a[at : at + rows].T @ b[at : at + rows]
+    for rows in _blocks(len(a), total.size):
+        total += a[rows].T @ b[rows]
     return total
 
 
 def product(a: FloatArray, x: FloatArray) -> FloatArray:
     """a x of a tall matrix (N, p) and a small one (p, q), in blocks of rows as `gram`."""
-    rows = max(1, _AT_ONCE // max(1, x.size))
     found = np.empty((len(a), x.shape[1]))
-    for at in range(0, len(a), rows):
-        np.matmul(a[at : at + rows], x, out=found[at : at + rows])
+    for rows in _blocks(len(a), x.size):
+        np.matmul(a[rows], x, out=found[rows])
     return found
+
+
+def _blocks(n: int, per_row: int) -> Iterator[slice]:
+    """Blocks of n rows, each with so many multiplications per row."""
+    rows = max(1, _AT_ONCE // max(1, per_row))
+    for at in range(0, n, rows):
+        yield slice(at, at + rows)

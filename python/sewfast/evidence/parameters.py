@@ -126,8 +126,7 @@ class Information:
 
     @classmethod
     def of(cls, model: DynamicModel, residuals: Residuals) -> Information:
-        total = np.sum([gram(r.sensitivity) for r in residuals.runs], axis=0)
-        return cls(total, penalty(model, residuals))
+        return cls(residuals.gram, penalty(model, residuals))
 
     @property
     def scale(self) -> FloatArray:

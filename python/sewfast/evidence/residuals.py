@@ -281,6 +281,12 @@ class Residuals:
         """Parameters."""
         return int(self.runs[0].psi.shape[1])
 
+    @cached_property
+    def gram(self) -> FloatArray:
+        """Psi'Psi over all experiments, shape (p, p)."""
+        found: FloatArray = np.sum([gram(r.sensitivity) for r in self.runs], axis=0)
+        return found
+
     @property
     def errors(self) -> list[FloatArray]:
         """Residuals without mean and initial state's effect, one array (N,) per experiment."""

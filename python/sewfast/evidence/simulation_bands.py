@@ -264,11 +264,10 @@ def stored_uncertainty(model: DynamicModel) -> Uncertainty | None:
 
 def _factor(found: Parameters, residuals: Residuals) -> FloatArray:
     """F with FF' close to P, from the directions that move the free run most."""
-    total = np.sum([gram(r.sensitivity) for r in residuals.runs], axis=0)
     sizes, vectors = np.linalg.eigh(found.covariance)
     root = vectors * np.sqrt(np.maximum(sizes, 0.0))
     # directions of P^(1/2), sorted by their contribution to the free run's variance
-    moved, turn = np.linalg.eigh(root.T @ total @ root)
+    moved, turn = np.linalg.eigh(root.T @ residuals.gram @ root)
     order = np.argsort(moved)[::-1]
     share = np.cumsum(moved[order]) / max(moved.sum(), 1e-300)
     kept = order[: int(np.searchsorted(share, _KEPT_VARIANCE)) + 1]
