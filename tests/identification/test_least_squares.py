@@ -89,39 +89,48 @@ def test_standard_errors_are_the_certified_ones(recordings: Path) -> None:
             assert nist.lre(fit.standard_errors, problem.deviations) >= 8, problem.name
 
 
-CASES = list(mgh.cases())
+LISTED = [case for case in mgh.cases() if case.listed]
+FAR = [case for case in mgh.cases() if not case.listed]
 
 
-def _minpack(case: mgh.Case) -> float:
+def _no_higher_than_minpack(case: mgh.Case, fit: LeastSquaresResult) -> bool:
     from scipy.optimize import least_squares as scipy_least_squares
 
     tolerances = {"ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12}
     known = scipy_least_squares(
         case.residuals, case.start, case.jacobian, method="lm", max_nfev=4000, **tolerances
     )
-    return float(known.cost)
+    return fit.cost <= float(known.cost) * (1 + 1e-8) + 1e-25
 
 
-#: Starts outside MINPACK's own list from which it comes lower, or that overflow.
-ELSEWHERE = {
-    "Jennrich Sampson, x0 * 10",
-    "Jennrich Sampson, x0 * 100",
-    "Chebyquad 9x9, x0 * 10",
-    "Chebyquad 10x10, x0 * 100",
-}
+def _fit(case: mgh.Case) -> LeastSquaresResult:
+    with np.errstate(all="ignore"):
+        return least_squares(case.residuals, case.start, case.jacobian, max_nfev=4000)
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda c: c.name)
-@pytest.mark.filterwarnings("ignore:.*encountered in:RuntimeWarning")
+@pytest.mark.parametrize("case", LISTED, ids=lambda c: c.name)
 def test_no_cost_above_minpack(case: mgh.Case) -> None:
     pytest.importorskip("scipy")
-    fit = least_squares(case.residuals, case.start, case.jacobian, max_nfev=4000)
-    if case.name in ELSEWHERE:
-        assert not fit.success
-        return
-    assert fit.cost <= _minpack(case) * (1 + 1e-8) + 1e-25
+    fit = _fit(case)
+    assert _no_higher_than_minpack(case, fit)
     if fit.success:
         _is_minimum(case, fit)
+
+
+@pytest.mark.filterwarnings("ignore:.*encountered in:RuntimeWarning")
+def test_far_starts_end_in_a_minimum_or_say_so() -> None:
+    """From ten or a hundred times x0 the last bits of the function choose among the minima.
+
+    With those changed at random, 4 to 7 of the 31 starts end above MINPACK.
+    """
+    pytest.importorskip("scipy")
+    fits = [_fit(case) for case in FAR]
+    for case, fit in zip(FAR, fits, strict=True):
+        if fit.success:
+            _is_minimum(case, fit)
+    as_low = sum(map(_no_higher_than_minpack, FAR, fits))
+    assert len(FAR) == 31
+    assert as_low >= 22
 
 
 def _is_minimum(case: mgh.Case, fit: LeastSquaresResult) -> None:
@@ -135,10 +144,9 @@ def _is_minimum(case: mgh.Case, fit: LeastSquaresResult) -> None:
 
 
 def test_most_of_minpacks_starts_are_successes() -> None:
-    listed = [c for c in CASES if c.listed]
-    assert len(listed) == 53
+    assert len(LISTED) == 53
     with np.errstate(all="ignore"):
-        ends = [least_squares(c.residuals, c.start, c.jacobian).termination for c in listed]
+        ends = [least_squares(c.residuals, c.start, c.jacobian).termination for c in LISTED]
     assert sum(end.startswith("small") for end in ends) >= 37
     assert {"max_evaluations", "interrupted", "not_finite"}.isdisjoint(ends)
 
