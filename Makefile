@@ -64,7 +64,8 @@ types: $(DEV)
 stubs: $(DEV)
 	MYPYPATH=python $(BIN)/python -m mypy.stubtest --allowlist tests/support/stubtest.txt sewfast._core
 
-# the seed of every property comes from the commit: a build that passed passes again, and the next commit tries others
+# the seed of every property, in Rust and in Python, comes from the commit: a build that passed passes again, and the next
+# commit tries others
 SEED ?= $(shell printf '%d' "0x$$(git rev-parse HEAD 2>/dev/null | cut -c1-8 | grep . || echo 1)")
 
 rust-test: rust-units rust-rest ## unit, property and documentation tests of the crates (SEED=N; by default of the commit)
@@ -164,8 +165,8 @@ firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian:
 
 # first the tests that compute, then those that wait: beside compilers, even at the lowest priority, some come too late
 python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not alone'
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m alone
+	$(BIN)/python -m pytest -n 2 --dist worksteal --hypothesis-seed=$(SEED) -m 'not alone'
+	$(BIN)/python -m pytest -n 2 --dist worksteal --hypothesis-seed=$(SEED) -m alone
 
 docs: $(DEV) $(OUT)/results.json ## the site, in site/index.html, its pictures drawn from demo/; works offline
 	$(BIN)/python docs/build.py --results $(OUT)

@@ -24,6 +24,7 @@ _FILE = re.compile(r'^<!-- file (\w+) (\S+)(?: from "(.+)" to "(.+)")? -->$', re
 _HELP = re.compile(r"^<!-- help(?: (\w+))? -->$", re.MULTILINE)
 _FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _DISPLAY = re.compile(r"^\$\$\n(.*?)\n\$\$$", re.MULTILINE | re.DOTALL)
+_INLINE = re.compile(r"\$\$.*|\$[^$\n]+\$")
 _TAG = re.compile(r"\s*\\tag\{(\w+)\}")
 _LINK = re.compile(r"\]\((?!https?:|#)([^)]+?)\.md(#[^)]*)?\)")
 
@@ -52,7 +53,18 @@ def complete(text: str) -> str:
     text = _HELP.sub(lambda m: f"```text\n{help_of(m[1])}```", text)
     # a formula within a fence is an example
     parts = re.split(r"(^```.*?^```$)", text, flags=re.MULTILINE | re.DOTALL)
-    return "".join(p if p.startswith("```") else _DISPLAY.sub(_formula, p) for p in parts)
+    return "".join(p if p.startswith("```") else _with_formulas(p) for p in parts)
+
+
+def _with_formulas(prose: str) -> str:
+    """Prose with MathML; ValueError where a formula would stay as its LaTeX."""
+    prose = _DISPLAY.sub(_formula, prose)
+    left = _INLINE.search(re.sub(r"`[^`]*`", "", prose))
+    if left:
+        raise ValueError(
+            f"{left[0]}: expected a formula between lines of $$; write one inside a line as code"
+        )
+    return prose
 
 
 def _formula(match: re.Match[str]) -> str:

@@ -156,3 +156,10 @@ def test_formulas_are_numbered_and_examples_are_left_alone() -> None:
     assert '<div class="formula" id="equation-7"><math' in shown
     assert "(7)</span></div>" in shown
     assert "```text\n$$\ny\n$$\n```" in shown
+
+
+@pytest.mark.parametrize("left", ["$$x^2$$", "the square $x^2$ of"])
+def test_a_formula_that_would_stay_latex_is_refused(left: str) -> None:
+    with pytest.raises(ValueError, match="formula"):
+        BUILD["complete"](f"first\n\n{left}\n")
+    assert BUILD["complete"](f"`{left}` is code\n") == f"`{left}` is code\n"
