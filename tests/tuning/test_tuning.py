@@ -4,12 +4,14 @@ import math
 import re
 import signal
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from kinds import model_of
 from loops import QUIET
 from sewfast import _core, pareto, signals
 from sewfast.control import Controller, Gains
@@ -19,7 +21,7 @@ from sewfast.dataset import Dataset
 from sewfast.errors import DataError, FitError, Interrupted, SettingError
 from sewfast.identification import identify
 from sewfast.machine import VirtualMachine
-from sewfast.models import LinearOE
+from sewfast.models import LinearOE, Model
 from sewfast.tuning import costs, default_variations, first_controller, tune
 from sewfast.tuning.objective import Constraints, Cost, terms
 
@@ -372,3 +374,39 @@ def test_references_beyond_what_the_least_gain_reaches_are_said(
         low, high = re.search(r"reaches (\S+) to (\S+) at", found.warning).groups()  # type: ignore[union-attr]
         assert [float(low), float(high)] == pytest.approx([-7840.0, 7840.0], rel=0.02)
         assert found.warning in str(found)
+
+
+def with_ms_of_2(plant: Model, level: float, start: Controller) -> Controller:
+    """The controller with the share of its gain at which Ms is 2."""
+    low, high = 1e-3, 30.0
+    for _ in range(50):
+        middle = math.sqrt(low * high)
+        scaled = replace(start, gains=replace(start.gains, Kp=middle * start.gains.Kp))
+        is_calm = margins(scaled, plant, speed=level).Ms < 2.0
+        low, high = (middle, high) if is_calm else (low, middle)
+    return scaled
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+@pytest.mark.parametrize("kind", ["linear", "neural_oe"])
+def test_a_loop_close_to_instability_is_said(kind: str, share: float) -> None:
+    """Gains just below and just above an Ms of 2; searched is only what does not change it."""
+    plant, level, start = drive(), 500.0, QUIET
+    if kind != "linear":
+        plant, level = model_of(kind), 1.0
+        gains = Gains.standard(0.5, 0.2, u_unit="V", y_unit=plant.output_unit)
+        start = Controller(gains, Ts=plant.Ts, u_min=-20, u_max=20)
+    at_limit = with_ms_of_2(plant, level, start)
+    start = replace(at_limit, gains=replace(at_limit.gains, Kp=share * at_limit.gains.Kp))
+    options: dict[str, Any] = {"start": start, "variables": ["alpha"], "evaluations": 10}
+    r = 2.0 * level * np.repeat([0.0, 1.0], 200)
+    found = tune(plant, [r], **options)
+    assert (found.warning is not None) is (share > 1.0)
+    if found.warning is not None:
+        assert f"Ms is {margins(start, plant, speed=level).Ms:.3g}" in found.warning
+        assert found.warning in str(found)
+        limit = {"linear": "Ms=2", "neural_oe": f"Ms=2 --speed {level:g}"}[kind]
+        assert f"--constraint {limit})" in found.warning
+        # who limits Ms has been heard
+        limited = Constraints(Ms=9.0, plant=plant, speed=level)
+        assert tune(plant, [r], **options, constraints=limited).warning is None

@@ -242,7 +242,7 @@ def search(
     """
     asked = requirements or Requirements()
     try:
-        return tune(
+        found = tune(
             models,
             list(references.values()),
             start=start,
@@ -259,6 +259,8 @@ def search(
             time_budget=demands.time_budget,
             progress=lambda done, total, best: progress(done, total),
         )
+        # a limit of Ms is one of the demands, and without one nobody wants to hear of it
+        return replace(found, close=None)
     except FitError as error:
         raise Refusal(
             f"expected gains under which every member of the ensemble does what is required "

@@ -29,6 +29,7 @@ from .task import (
     Variable,
     Wanted,
     budget,
+    close_to_instability,
     out_of_reach,
     threads_or_all,
 )
@@ -76,6 +77,8 @@ class TuningResult:
         The comparison with a rival; None without one, or if no gains suit it.
     beyond : str or None
         References that are out of reach with the least gain of the variations, in words.
+    close : str or None
+        An Ms above 2 that no constraint limits, in words: the loop is close to instability.
     """
 
     controller: SampledController
@@ -91,16 +94,18 @@ class TuningResult:
     method: str
     opinion: SecondOpinion | None = None
     beyond: str | None = None
+    close: str | None = None
 
     @property
     def warning(self) -> str | None:
         """Objections to the gains, and what to do; None if there are none.
 
-        They are models of two kinds that contradict each other about good gains, and references
-        that the drive cannot follow with the least gain of the variations.
+        They are models of two kinds that contradict each other about good gains, references that
+        the drive cannot follow with the least gain of the variations, and a loop that is close to
+        instability.
         """
         opinion = None if self.opinion is None else self.opinion.warning
-        return "; ".join(text for text in (opinion, self.beyond) if text) or None
+        return "; ".join(text for text in (opinion, self.beyond, self.close) if text) or None
 
     @property
     def pid(self) -> Controller:
@@ -326,7 +331,9 @@ def tune(
     result = search.on(task, variables)
     if references is not None:
         result = replace(result, beyond=out_of_reach(task))
-    return result if other is None else _asked(result, task, other, search, variables)
+    if other is not None:
+        result = _asked(result, task, other, search, variables)
+    return replace(result, close=close_to_instability(task, result.controller))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -34,7 +35,7 @@ from ..control.loop import (
     plant_units,
     reference_samples,
 )
-from ..control.margins import sampled
+from ..control.margins import margins, sampled
 from ..errors import FitError, SettingError
 from ..gains import Gains, real, vector, whole
 from ..models import Model
@@ -190,6 +191,44 @@ def out_of_reach(task: TuningTask) -> str | None:
         f"drive reaches {low:.4g} to {high:.4g} at the limits of its command: there no gains help, "
         "and those found look for the least loss; lower the references, raise the limits, or give "
         "variations without that gain"
+    )
+
+
+LARGEST_MS = 2.0
+"""Ms above which a loop is called close to instability: phase margins from 29 degrees down."""
+
+
+def close_to_instability(task: TuningTask, controller: SampledController) -> str | None:
+    """A warning about a loop whose Ms on one of the models is above `LARGEST_MS`, or None.
+
+    Nonlinear models are linearised in the middle of the references. References that a calm command
+    can follow do not show how close the loop is, and the search then uses all that they allow.
+    """
+    if task.constraints.Ms is not None or not isinstance(controller, Controller):
+        return None
+    level = 0.5 * (
+        min(float(r.min()) for r in task.references) + max(float(r.max()) for r in task.references)
+    )
+    found, linear = 0.0, True
+    for plant in task.plants:
+        if isinstance(plant, Model):
+            # a model without a steady state there has no Ms
+            with contextlib.suppress(SettingError, FitError):
+                found = max(found, margins(controller, plant, speed=level).Ms)
+                linear = linear and hasattr(plant, "to_tf")
+    if found <= LARGEST_MS:
+        return None
+    limit = f"Ms={LARGEST_MS:g}"
+    if linear:
+        remedy = f"Constraints({limit}), --constraint {limit}"
+    else:
+        remedy = (
+            f"Constraints({limit}, plant=model, speed={level:.4g}), "
+            f"--constraint {limit} --speed {level:.4g}"
+        )
+    return (
+        f"Ms is {found:.3g}: the loop amplifies some disturbances as much and is close to "
+        f"instability; limit it ({remedy}), or see which (sewfast analyse)"
     )
 
 
