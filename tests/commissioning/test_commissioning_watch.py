@@ -69,7 +69,9 @@ def on_drive(watch: Watch) -> None:
             assert there.status().state == "idle"
 
 
-@pytest.mark.parametrize("followed", [on_virtual, on_stepped, on_drive])
+@pytest.mark.parametrize(
+    "followed", [on_virtual, on_stepped, pytest.param(on_drive, marks=pytest.mark.alone)]
+)
 def test_a_loop_that_swings_is_ended_within_a_second(followed: Callable[[Watch], None]) -> None:
     with pytest.raises(Aborted, match=r"'hold', ended after .* as in a loop that swings") as stop:
         followed(watching(FIERCE))
