@@ -276,10 +276,11 @@ $(REPORT): $(BUILT)
 	$(BIN)/pip install --quiet 'sewfast[report,link]'
 	@touch $@
 
-# with --jobs=2 while the core is compiled, which keeps one processor busy
+# with --jobs=2 while the core is compiled, which keeps one processor busy; to compile all that is never imported takes as
+# long as to install it
 $(LIBRARIES): pyproject.toml packaging/constraints.txt | $(VENV)/maturin.stamp
 	$(BIN)/python packaging/extras.py dev docs > $(VENV)/libraries.txt
-	$(BIN)/pip install --quiet -r $(VENV)/libraries.txt
+	$(BIN)/pip install --quiet --no-compile -r $(VENV)/libraries.txt
 	@touch $@
 
 $(DEV): $(BUILT) $(LIBRARIES)
