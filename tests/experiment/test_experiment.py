@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from commissioned import short_experiment
+from effort import FULL
 from sewfast import Commissioning, signals
 from sewfast.control import Controller, Gains, load_controller
 from sewfast.errors import DataError, SettingError
@@ -138,6 +139,9 @@ def test_progress_names_every_stage_and_ends_full(
     assert stages == [*((i, n, name) for i, name in enumerate(STAGES)), (n, n, "done")]
 
 
+@pytest.mark.skipif(
+    not FULL, reason="the experiment once more, of whose parts each repeats: SEWFAST_SOAK=1"
+)
 def test_the_same_seed_gives_the_same_numbers(
     demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -81,6 +81,7 @@ def test_of_many_short_experiments_the_last_ones_are_held_out() -> None:
     assert [len(f.fitted.experiments) for f in found] == [8, 6, 4]
 
 
+@pytest.mark.skipif(not FULL, reason="a search over networks of half a minute: SEWFAST_SOAK=1")
 def test_many_short_experiments_are_enough_for_a_network() -> None:
     data = Dataset.concat([bent_data(120, seed=i, noise=0.01) for i in range(12)])
     test = bent_data(1000, seed=99)
