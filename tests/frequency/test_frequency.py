@@ -387,6 +387,15 @@ def test_the_command_shows_the_resonance(
     counts = ["--input", "u", "--counts", "counts", "--counts-per-rev", "1572"]
     assert main(["bode", "run.csv", *counts]) == 0
     assert "frequency response" in capsys.readouterr().out
+    # again over its own model, and over nothing else
+    assert main(["bode", "r.json", "--model", "m.json"]) == 0
+    assert main(["identify", "run.csv", *counts, "--model", "arx", "-o", "identified.json"]) == 0
+    for other in ("identified.json", "controller.json"):
+        before = Path(other).read_bytes()
+        for command in (["bode", "r.json"], ["physics", "run.csv", *counts]):
+            assert main([*command, "--model", other]) == 2
+            assert "choose another name" in capsys.readouterr().err
+        assert Path(other).read_bytes() == before
     for wrong in (["bode"], ["bode", "run.csv", "--on", "virtual"], ["bode", "controller.json"]):
         assert main(wrong) == 2
     assert main(["bode", "run.csv", *counts, "--amplitude", "3"]) == 2

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from ..errors import DataError, FitError, SettingError
+from ..errors import DataError, FitError, SettingError, SewfastError
 from .arguments import (
     Commands,
     add_columns,
@@ -136,12 +136,39 @@ def _speeds(text: str) -> float | list[float]:
     return found[0] if len(found) == 1 else found
 
 
+def _require_place_of_model(path: Path | None) -> None:
+    """Refuse a file that holds what was not computed here.
+
+    Other commands read a model that `--model` or a first argument names: whoever means that would
+    lose a model that took minutes to train.
+
+    Raises
+    ------
+    SettingError
+        As `require_place`, and for a file that is there and no model of these commands.
+    """
+    from ..models import load_model
+
+    require_place(path, (".json",), option="--model")
+    if path is None or not path.exists():
+        return
+    try:
+        is_own = not load_model(path).training
+    except SewfastError:
+        is_own = False
+    if not is_own:
+        raise SettingError(
+            name=f"--model {path}", expected="a new file for the model to be written",
+            received="one with something else", remedy="choose another name, or remove that file",
+        )  # fmt: skip
+
+
 def command(args: argparse.Namespace) -> int | None:
     from ..control.files import load_pid
     from ..frequency import ResponsesOverSpeed, fit_shaft
 
     require_place(args.out, (".json",))
-    require_place(args.model, (".json",), option="--model")
+    _require_place_of_model(args.model)
     require_place(args.propose, (".json",), option="--propose")
     require_plot(args.plot)
     for name in ("Ms", "u_max"):
@@ -386,7 +413,7 @@ def physics_command(args: argparse.Namespace) -> None:
     from ..greybox.exports import BOARDS, Target
 
     require_place(args.out, (".json",))
-    require_place(args.model, (".json",), option="--model")
+    _require_place_of_model(args.model)
     require_plot(args.plot)
     target, place = args.export or (None, "")
     if target not in (None, *get_args(Target)):
