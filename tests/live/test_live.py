@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from sewfast.cli.arguments import add_view
 from sewfast.errors import DataError, SettingError
-from sewfast.live import Feed, Kind
+from sewfast.live import Feed, ViewKind
 from sewfast.live.feed import _MOST, speed_over_window
 from sewfast.live.view import fitted, status
 
@@ -271,18 +271,18 @@ def test_status_before_the_first_sample() -> None:
 @pytest.mark.parametrize(
     ("text", "kind"),
     [
-        ("auto", Kind("auto")),
-        ("none", Kind("none")),
-        ("terminal", Kind("terminal")),
-        ("plotjuggler", Kind("plotjuggler", "127.0.0.1", 9870)),
-        ("plotjuggler:desk:1234", Kind("plotjuggler", "desk", 1234)),
-        ("plotjuggler:[::1]:1234", Kind("plotjuggler", "::1", 1234)),
-        ("foxglove", Kind("foxglove", "127.0.0.1", 8765)),
-        ("foxglove:0", Kind("foxglove", "127.0.0.1", 0)),
+        ("auto", ViewKind("auto")),
+        ("none", ViewKind("none")),
+        ("terminal", ViewKind("terminal")),
+        ("plotjuggler", ViewKind("plotjuggler", "127.0.0.1", 9870)),
+        ("plotjuggler:desk:1234", ViewKind("plotjuggler", "desk", 1234)),
+        ("plotjuggler:[::1]:1234", ViewKind("plotjuggler", "::1", 1234)),
+        ("foxglove", ViewKind("foxglove", "127.0.0.1", 8765)),
+        ("foxglove:0", ViewKind("foxglove", "127.0.0.1", 0)),
     ],
 )
-def test_kind(text: str, kind: Kind) -> None:
-    assert Kind.parse(text) == kind
+def test_kind(text: str, kind: ViewKind) -> None:
+    assert ViewKind.parse(text) == kind
 
 
 @pytest.mark.parametrize(
@@ -292,14 +292,14 @@ def test_kind(text: str, kind: Kind) -> None:
 )  # fmt: skip
 def test_other_kinds_are_refused(text: str) -> None:
     with pytest.raises(SettingError, match="expected a live view out of auto, terminal"):
-        Kind.parse(text)
+        ViewKind.parse(text)
 
 
 def test_argument_of_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     parser = argparse.ArgumentParser()
     add_view(parser)
-    assert parser.parse_args([]).live == Kind("auto")
-    assert parser.parse_args(["--live", "foxglove:7000"]).live == Kind(
+    assert parser.parse_args([]).live == ViewKind("auto")
+    assert parser.parse_args(["--live", "foxglove:7000"]).live == ViewKind(
         "foxglove", "127.0.0.1", 7000
     )
     with pytest.raises(SystemExit):

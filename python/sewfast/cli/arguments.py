@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from ..errors import SettingError
 
 if TYPE_CHECKING:
-    from ..live import Kind
+    from ..live import ViewKind
 
     Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
 else:
@@ -85,7 +85,7 @@ def add_weights(parser: argparse.ArgumentParser) -> None:
 
 
 def add_view(parser: argparse._ActionsContainer) -> None:
-    """`--live`: the view of a running record or run, a `sewfast.live.Kind`."""
+    """`--live`: the view of a running record or run, a `sewfast.live.ViewKind`."""
     parser.add_argument(
         "--live", metavar="KIND", type=_kind, default="auto",
         help="watch it run: terminal, none, plotjuggler[:HOST:PORT], foxglove[:PORT]; auto (the "
@@ -93,11 +93,11 @@ def add_view(parser: argparse._ActionsContainer) -> None:
     )  # fmt: skip
 
 
-def _kind(text: str) -> Kind:
-    from ..live import Kind
+def _kind(text: str) -> ViewKind:
+    from ..live import ViewKind
 
     try:
-        return Kind.parse(text)
+        return ViewKind.parse(text)
     except SettingError as e:
         raise argparse.ArgumentTypeError(str(e)) from e
 

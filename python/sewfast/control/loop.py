@@ -25,7 +25,7 @@ from .controller import Controller, SampledController, pid_of
 from .defaults import default_references, drive_references
 
 if TYPE_CHECKING:
-    from ..live import Kind
+    from ..live import ViewKind
     from .machine import Machine
 
 Plant: TypeAlias = Model | VirtualMachine
@@ -199,7 +199,7 @@ def run(
     seed: int = 0,
     name: str | None = None,
     file: str | os.PathLike[str] | None = None,
-    live: str | Kind = "none",
+    live: str | ViewKind = "none",
     overwrite: bool = False,
     cancel: threading.Event | None = None,
 ) -> ClosedLoopRun:

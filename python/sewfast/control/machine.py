@@ -29,7 +29,7 @@ from .controller import SampledController
 from .loop import ClosedLoopRun, run
 
 if TYPE_CHECKING:
-    from ..live import Kind
+    from ..live import ViewKind
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +220,7 @@ def record(
     name: str = "array",
     method: Method = "kalman",
     file: str | os.PathLike[str] | None = None,
-    live: str | Kind = "none",
+    live: str | ViewKind = "none",
     settings: Mapping[str, Any] | None = None,
     overwrite: bool = False,
     cancel: threading.Event | None = None,

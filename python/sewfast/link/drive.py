@@ -19,7 +19,7 @@ from ..control.controller import Controller, SampledController
 from ..control.machine import RecordedRun, Watch
 from ..errors import LinkError, SettingError
 from ..gains import real
-from ..live import Kind as View
+from ..live import ViewKind
 from ..recording import Recording
 from ..speed import Method
 from . import run as profiles
@@ -366,7 +366,7 @@ class Drive(Unique):
         *,
         method: Method = "kalman",
         file: str | os.PathLike[str] | None = None,
-        live: str | View = "none",
+        live: str | ViewKind = "none",
         settings: Mapping[str, Any] | None = None,
         overwrite: bool = False,
         cancel: threading.Event | None = None,
@@ -399,7 +399,7 @@ class Drive(Unique):
         name: str = "reference",
         *,
         file: str | os.PathLike[str] | None = None,
-        live: str | View = "none",
+        live: str | ViewKind = "none",
         overwrite: bool = False,
         watch: Watch | None = None,
         cancel: threading.Event | None = None,

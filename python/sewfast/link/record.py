@@ -16,7 +16,7 @@ from ..arrays import FloatArray
 from ..control.controller import SampledController
 from ..control.machine import RecordedRun, Watch, cancelled_by
 from ..errors import Interrupted, LinkError, SettingError, SewfastError
-from ..live import Feed, Kind, open_view
+from ..live import Feed, ViewKind, open_view
 from ..recordfile import Header, RecordWriter, read_recording
 from ..recordfile.writer import require_ending, require_replaceable
 from ..recording import Recording
@@ -196,7 +196,7 @@ def run_plan(
     *,
     name: str,
     file: str | os.PathLike[str] | None = None,
-    live: str | Kind = "none",
+    live: str | ViewKind = "none",
     overwrite: bool = False,
     settings: Mapping[str, Any] | None = None,
     watch: Watch | None = None,
@@ -214,7 +214,7 @@ def run_plan(
         An MCAP recording, written as the samples arrive; without it they are only in memory. It is
         created when the device has accepted the start: a refused run leaves no file, and an
         existing one unchanged.
-    live : str or Kind
+    live : str or ViewKind
         See `sewfast.live.open_view`.
     overwrite : bool
         Whether to replace a recording of a drive; one of a virtual machine is replaced anyway.

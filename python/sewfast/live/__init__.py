@@ -5,6 +5,6 @@ views, each in its own process; the one on a terminal), `stream` (PlotJuggler an
 """
 
 from .feed import Feed
-from .view import Kind, View, open_view
+from .view import View, ViewKind, open_view
 
-__all__ = ["Feed", "Kind", "View", "open_view"]
+__all__ = ["Feed", "View", "ViewKind", "open_view"]

@@ -21,7 +21,7 @@ import numpy as np
 from ..errors import SettingError
 from .feed import SPEED, Feed
 
-# --- Kind: a view by its name on the command line -------------------------------------------------
+# --- ViewKind: a view by its name on the command line ---------------------------------------------
 
 
 KINDS = ("auto", "terminal", "none", "plotjuggler[:HOST:PORT]", "foxglove[:PORT]")
@@ -34,7 +34,7 @@ LOCAL = "127.0.0.1"
 
 
 @dataclass(frozen=True)
-class Kind:
+class ViewKind:
     """A view by name; streams have an address.
 
     Attributes
@@ -52,7 +52,7 @@ class Kind:
     port: int = 0
 
     @classmethod
-    def parse(cls, text: str) -> Kind:
+    def parse(cls, text: str) -> ViewKind:
         """The view named by a text such as `plotjuggler:HOST:PORT`; see `KINDS`.
 
         Raises
@@ -112,7 +112,7 @@ def main() -> None:
         os.nice(_NICE)
     feed = Feed.attached(int(sys.argv[1]), json.loads(sys.argv[2]))
     try:
-        view = make(Kind(**json.loads(sys.argv[3])), feed)
+        view = make(ViewKind(**json.loads(sys.argv[3])), feed)
     except SettingError as e:
         print(json.dumps({"error": str(e)}), flush=True)
         return
@@ -158,7 +158,9 @@ class Shown:
 
 
 @contextmanager
-def open_view(kind: str | Kind, feed: Feed, *, own_process: bool = True) -> Iterator[Shown | None]:
+def open_view(
+    kind: str | ViewKind, feed: Feed, *, own_process: bool = True
+) -> Iterator[Shown | None]:
     """Show a feed for the duration of a `with`.
 
     The view is a separate process with a lower priority, so that it does not hold up the link by
@@ -167,7 +169,7 @@ def open_view(kind: str | Kind, feed: Feed, *, own_process: bool = True) -> Iter
 
     Parameters
     ----------
-    kind : str or Kind
+    kind : str or ViewKind
         `auto` (a status line if standard error is a terminal, else nothing), `terminal`, `none`,
         `plotjuggler[:HOST:PORT]`, `foxglove[:PORT]`.
     feed : Feed
@@ -186,7 +188,7 @@ def open_view(kind: str | Kind, feed: Feed, *, own_process: bool = True) -> Iter
         On entry: for another kind, `terminal` if standard error is not one, a host without an
         address, a port that is taken, a missing package, a view that does not start.
     """
-    asked = kind if isinstance(kind, Kind) else Kind.parse(kind)
+    asked = kind if isinstance(kind, ViewKind) else ViewKind.parse(kind)
     chosen = resolve(asked)
     with contextlib.ExitStack() as open_things:
         open_things.callback(feed.close)
@@ -205,7 +207,7 @@ def open_view(kind: str | Kind, feed: Feed, *, own_process: bool = True) -> Iter
 
 
 @contextmanager
-def _process(kind: Kind, feed: Feed) -> Iterator[Shown]:
+def _process(kind: ViewKind, feed: Feed) -> Iterator[Shown]:
     ours, theirs = os.pipe()
     os.set_blocking(theirs, False)
     try:
@@ -223,7 +225,7 @@ def _process(kind: Kind, feed: Feed) -> Iterator[Shown]:
             os.close(theirs)
 
 
-def _started(kind: Kind, feed: Feed, memory: int, pipe: int) -> subprocess.Popen[bytes]:
+def _started(kind: ViewKind, feed: Feed, memory: int, pipe: int) -> subprocess.Popen[bytes]:
     """Start the viewer, which takes over the read end of the pipe."""
     encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
     try:
@@ -272,7 +274,7 @@ def _end(program: subprocess.Popen[bytes]) -> None:
 
 
 @contextmanager
-def _thread(kind: Kind, feed: Feed) -> Iterator[Shown]:
+def _thread(kind: ViewKind, feed: Feed) -> Iterator[Shown]:
     view = make(kind, feed)
     assert view is not None
     failures: list[Exception] = []
@@ -312,7 +314,7 @@ class View(Protocol):
         ...
 
 
-def resolve(kind: Kind) -> Kind:
+def resolve(kind: ViewKind) -> ViewKind:
     """Replace `auto` by `terminal` or `none`.
 
     Raises
@@ -322,7 +324,7 @@ def resolve(kind: Kind) -> Kind:
     """
     terminal = sys.stderr is not None and sys.stderr.isatty()
     if kind.name == "auto":
-        return Kind("terminal" if terminal else "none")
+        return ViewKind("terminal" if terminal else "none")
     if kind.name == "terminal" and not terminal:
         raise SettingError(
             "the live view expected standard error to be a terminal, received a file or a pipe; "
@@ -331,7 +333,7 @@ def resolve(kind: Kind) -> Kind:
     return kind
 
 
-def make(kind: Kind, feed: Feed) -> View | None:
+def make(kind: ViewKind, feed: Feed) -> View | None:
     """The view of a kind; None for `none`.
 
     Raises
