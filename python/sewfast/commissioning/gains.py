@@ -260,7 +260,7 @@ def search(
             progress=lambda done, total, best: progress(done, total),
         )
         # a limit of Ms is one of the demands, and without one nobody wants to hear of it
-        return replace(found, close=None)
+        return replace(found, sensitive=None)
     except FitError as error:
         raise Refusal(
             f"expected gains under which every member of the ensemble does what is required "

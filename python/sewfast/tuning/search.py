@@ -77,7 +77,7 @@ class TuningResult:
         The comparison with a rival; None without one, or if no gains suit it.
     beyond : str or None
         References that are out of reach with the least gain of the variations, in words.
-    close : str or None
+    sensitive : str or None
         An Ms above 2 that no constraint limits, in words: the loop is close to instability.
     """
 
@@ -94,7 +94,7 @@ class TuningResult:
     method: str
     opinion: SecondOpinion | None = None
     beyond: str | None = None
-    close: str | None = None
+    sensitive: str | None = None
 
     @property
     def warning(self) -> str | None:
@@ -105,7 +105,7 @@ class TuningResult:
         instability.
         """
         opinion = None if self.opinion is None else self.opinion.warning
-        return "; ".join(text for text in (opinion, self.beyond, self.close) if text) or None
+        return "; ".join(text for text in (opinion, self.beyond, self.sensitive) if text) or None
 
     @property
     def pid(self) -> Controller:
@@ -333,7 +333,7 @@ def tune(
         result = replace(result, beyond=out_of_reach(task))
     if other is not None:
         result = _asked(result, task, other, search, variables)
-    return replace(result, close=close_to_instability(task, result.controller))
+    return replace(result, sensitive=close_to_instability(task, result.controller))
 
 
 @dataclass(frozen=True)
