@@ -24,7 +24,8 @@ _FILE = re.compile(r'^<!-- file (\w+) (\S+)(?: from "(.+)" to "(.+)")? -->$', re
 _HELP = re.compile(r"^<!-- help(?: (\w+))? -->$", re.MULTILINE)
 _FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _DISPLAY = re.compile(r"^\$\$\n(.*?)\n\$\$$", re.MULTILINE | re.DOTALL)
-_INLINE = re.compile(r"\$\$.*|\$[^$\n]+\$")
+_INLINE = re.compile(r"\$\$.*|(?<!\\)\$(?=[^\s\d$])[^$]{0,200}(?<=\S)\$(?!\w)")
+_CODE = re.compile(r"(`+).*?\1")
 _TAG = re.compile(r"\s*\\tag\{(\w+)\}")
 _LINK = re.compile(r"\]\((?!https?:|#)([^)]+?)\.md(#[^)]*)?\)")
 
@@ -44,7 +45,11 @@ def main(folder: Path, results: Path | None = None) -> None:
             place.parent.mkdir(exist_ok=True)
             place.write_text(notebook(text), encoding="utf-8")
             text += f"\nThis page as a notebook: [{place.name}](notebooks/{place.name}).\n"
-        (folder / page.name).write_text(complete(text), encoding="utf-8")
+        try:
+            whole = complete(text)
+        except ValueError as e:
+            raise ValueError(f"{page.name}: {e}") from e
+        (folder / page.name).write_text(whole, encoding="utf-8")
 
 
 def complete(text: str) -> str:
@@ -59,10 +64,11 @@ def complete(text: str) -> str:
 def _with_formulas(prose: str) -> str:
     """Prose with MathML; ValueError where a formula would stay as its LaTeX."""
     prose = _DISPLAY.sub(_formula, prose)
-    left = _INLINE.search(re.sub(r"`[^`]*`", "", prose))
+    left = _INLINE.search(_CODE.sub("", prose))
     if left:
         raise ValueError(
-            f"{left[0]}: expected a formula between lines of $$; write one inside a line as code"
+            f"{left[0]}: expected a formula between lines of $$; write one inside a line as code, "
+            "and a dollar as \\$"
         )
     return prose
 

@@ -171,7 +171,7 @@ def real_data(file: Path) -> None:
             ax.bar_label(bars, fmt="%.0f", padding=1, fontsize=8)
         ax.set_xticks(np.arange(len(rows)), names, fontsize=8)
         ax.set_ylabel("fit in free run [%]")
-        ax.set_ylim(min(map(min, fits)) - 14.0, 118.0)
+        ax.set_ylim(min(0.0, *map(min, fits)) - 14.0, 118.0)
         ax.axhline(0.0, color="0.6", linewidth=0.8)
         ax.legend(frameon=False, ncols=3, loc="upper right")
 

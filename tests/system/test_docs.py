@@ -158,8 +158,14 @@ def test_formulas_are_numbered_and_examples_are_left_alone() -> None:
     assert "```text\n$$\ny\n$$\n```" in shown
 
 
-@pytest.mark.parametrize("left", ["$$x^2$$", "the square $x^2$ of"])
+@pytest.mark.parametrize("left", ["$$x^2$$", "the square $x^2$ of", "the sum $x +\ny$ of"])
 def test_a_formula_that_would_stay_latex_is_refused(left: str) -> None:
     with pytest.raises(ValueError, match="formula"):
         BUILD["complete"](f"first\n\n{left}\n")
-    assert BUILD["complete"](f"`{left}` is code\n") == f"`{left}` is code\n"
+
+
+@pytest.mark.parametrize(
+    "other", ["`$$x^2$$` or ``$x$``", "$5 to $9", "\\$x and y\\$", "a $HOME and a $PATH"]
+)
+def test_other_dollars_stay_as_they_are(other: str) -> None:
+    assert BUILD["complete"](f"first {other}\n") == f"first {other}\n"

@@ -114,7 +114,12 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--segment", type=int, metavar="N", help="samples of a record's segments (a ninth of it)"
     )
-    parser.add_argument("--model", metavar="FILE.json", type=Path, help="write the fit as a model")
+    parser.add_argument(
+        "--model",
+        metavar="FILE.json",
+        type=Path,
+        help="write the fit as a model; keeps an identified one",
+    )
     parser.add_argument(
         "--propose", metavar="FILE.json", type=Path,
         help="write a controller for the machine: PID gains of the largest bandwidth, with a notch "
@@ -137,20 +142,20 @@ def _speeds(text: str) -> float | list[float]:
 
 
 def _require_place_of_model(path: Path | None) -> None:
-    """Refuse a file that holds what was not computed here.
+    """Refuse to replace an identified model, or a file that is no model.
 
-    Other commands read a model that `--model` or a first argument names: whoever means that would
-    lose a model that took minutes to train.
+    In other commands `--model`, or the first argument, names a model to read: given here by
+    mistake, it would be lost.
 
     Raises
     ------
     SettingError
-        As `require_place`, and for a file that is there and no model of these commands.
+        As `require_place`, and for such a file.
     """
     from ..models import load_model
 
     require_place(path, (".json",), option="--model")
-    if path is None or not path.exists():
+    if path is None or not path.is_file():
         return
     try:
         is_own = not load_model(path).training
@@ -158,8 +163,9 @@ def _require_place_of_model(path: Path | None) -> None:
         is_own = False
     if not is_own:
         raise SettingError(
-            name=f"--model {path}", expected="a new file for the model to be written",
-            received="one with something else", remedy="choose another name, or remove that file",
+            name=f"--model {path}", expected="a new file for the model that is written",
+            received="an identified model, or a file that is none",
+            remedy="choose another name, or remove that file",
         )  # fmt: skip
 
 

@@ -441,6 +441,7 @@ def _show_front(args: argparse.Namespace, front: ParetoFront) -> None:
                 "values": front.values.tolist(),
                 "pick": front.pick,
                 "evaluations": front.evaluations,
+                "warning": front.sensitive,
                 **_controller(front.picked),
             }
         )

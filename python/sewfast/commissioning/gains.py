@@ -259,7 +259,7 @@ def search(
             time_budget=demands.time_budget,
             progress=lambda done, total, best: progress(done, total),
         )
-        # a limit of Ms is one of the demands, and without one nobody wants to hear of it
+        # the demands limit Ms, unless the caller has chosen to have no limit
         return replace(found, sensitive=None)
     except FitError as error:
         raise Refusal(

@@ -23,7 +23,14 @@ from ..storage import write_table
 from ..tables import Table, significant
 from .objective import Constraints, Cost, LoadStep
 from .search import tune
-from .task import Aggregate, Progress, TuningTask, Wanted, threads_or_all
+from .task import (
+    Aggregate,
+    Progress,
+    TuningTask,
+    Wanted,
+    close_to_instability,
+    threads_or_all,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,6 +61,8 @@ class ParetoFront(Plotted):
         its range on the front, on a logarithmic scale for ranges wider than 1 to 10.
     evaluations : int
         Controllers tried.
+    sensitive : str or None
+        As `TuningResult.sensitive`, of the knee; None if Ms is an objective.
     """
 
     controllers: tuple[Controller, ...]
@@ -62,6 +71,7 @@ class ParetoFront(Plotted):
     values: NDArray[np.float64]
     pick: int
     evaluations: int
+    sensitive: str | None = None
 
     def __len__(self) -> int:
         return len(self.controllers)
@@ -137,7 +147,8 @@ class ParetoFront(Plotted):
             for i, row in enumerate(self.values)
         ]
         note = "* the knee: closest to the best of every objective, in shares of its range here"
-        return "\n".join([f"{len(self)} controllers", head, *rows, note])
+        warning = [] if self.sensitive is None else [f"  warning   {self.sensitive}"]
+        return "\n".join([f"{len(self)} controllers", head, *rows, note, *warning])
 
 
 @shown_in_notebooks("pareto")
@@ -260,16 +271,19 @@ def _front(
     notes = "on the front of " + ", ".join(objectives) + task.assumed
     # keep one of several controllers with the same values
     values, rows = np.unique(np.array(found["values"]), axis=0, return_index=True)
+    controllers = tuple(
+        start.with_values(dict(zip(names, found["controllers"][i], strict=True)), notes)
+        for i in rows
+    )
+    pick = knee(values)
     front = ParetoFront(
-        controllers=tuple(
-            start.with_values(dict(zip(names, found["controllers"][i], strict=True)), notes)
-            for i in rows
-        ),
+        controllers=controllers,
         objectives=tuple(objectives),
         units=_units(objectives, start),
         values=values,
-        pick=knee(values),
+        pick=pick,
         evaluations=before + int(found["evaluations"]),
+        sensitive=None if "Ms" in objectives else close_to_instability(task, controllers[pick]),
     )
     if interrupted:
         raise Interrupted(front)

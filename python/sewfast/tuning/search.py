@@ -78,7 +78,8 @@ class TuningResult:
     beyond : str or None
         References that are out of reach with the least gain of the variations, in words.
     sensitive : str or None
-        An Ms above 2 that no constraint limits, in words: the loop is close to instability.
+        An Ms above 2 that no constraint limits, in words: the loop is close to instability. Only
+        for PIDs and models, about the levels of the references and of a gain schedule.
     """
 
     controller: SampledController
@@ -333,7 +334,10 @@ def tune(
         result = replace(result, beyond=out_of_reach(task))
     if other is not None:
         result = _asked(result, task, other, search, variables)
-    return replace(result, sensitive=close_to_instability(task, result.controller))
+    try:
+        return replace(result, sensitive=close_to_instability(task, result.controller))
+    except KeyboardInterrupt:
+        raise Interrupted(result.controller) from None
 
 
 @dataclass(frozen=True)

@@ -149,6 +149,7 @@ class TuningTask:
             plants = [p for p in self.plants if hasattr(p, "to_tf")]
         else:
             plants = list(given) if isinstance(given, (list, tuple)) else [given]
+            plants = [m for plant in plants for m in (getattr(plant, "members", ()) or (plant,))]
         if not plants:
             raise SettingError(
                 "expected a linear plant to take Ms on, got none among the plants; give "
@@ -195,40 +196,53 @@ def out_of_reach(task: TuningTask) -> str | None:
 
 
 LARGEST_MS = 2.0
-"""Ms above which a loop is called close to instability: phase margins from 29 degrees down."""
+"""Ms up to which a loop surely has a gain margin of 2 and a phase margin of 29 degrees."""
 
 
 def close_to_instability(task: TuningTask, controller: SampledController) -> str | None:
-    """A warning about a loop whose Ms on one of the models is above `LARGEST_MS`, or None.
+    """A warning about a PID whose Ms on one of the models is above `LARGEST_MS`, or None.
 
-    Nonlinear models are linearised in the middle of the references. References that a calm command
-    can follow do not show how close the loop is, and the search then uses all that they allow.
+    The cost does not show how close a loop is to instability, and the search goes as close as calm
+    references allow. None as well if the task limits Ms, and where no model has a linear loop.
     """
     if task.constraints.Ms is not None or not isinstance(controller, Controller):
         return None
-    level = 0.5 * (
-        min(float(r.min()) for r in task.references) + max(float(r.max()) for r in task.references)
-    )
-    found, linear = 0.0, True
+    low = min(float(r.min()) for r in task.references)
+    high = max(float(r.max()) for r in task.references)
+    # at 0, in the middle of references of both signs, a motor stands in its dry friction
+    levels = [0.5 * (low + high), 0.5 * high, 0.5 * low, *(v for v, _ in controller.schedule)]
+    found, about, linear = 0.0, 0.0, True
     for plant in task.plants:
-        if isinstance(plant, Model):
+        if not isinstance(plant, Model):
+            continue
+        depends = bool(controller.schedule) or not hasattr(plant, "to_tf")
+        for level in levels if depends else levels[:1]:
             # a model without a steady state there has no Ms
             with contextlib.suppress(SettingError, FitError):
-                found = max(found, margins(controller, plant, speed=level).Ms)
+                Ms = margins(controller, plant, speed=level).Ms
                 linear = linear and hasattr(plant, "to_tf")
+                if Ms > found:
+                    found, about = Ms, level
     if found <= LARGEST_MS:
         return None
     limit = f"Ms={LARGEST_MS:g}"
-    if linear:
-        remedy = f"Constraints({limit}), --constraint {limit}"
-    else:
-        remedy = (
-            f"Constraints({limit}, plant=model, speed={level:.4g}), "
-            f"--constraint {limit} --speed {level:.4g}"
+    python, command, place = limit, limit, ""
+    if not linear:
+        python, command = (
+            f"{limit}, plant=models, speed={about:.4g}",
+            f"{limit} --speed={about:.4g}",
         )
+    if controller.schedule or not linear:
+        place = f" about {about:.4g} {controller.y_unit}".rstrip()
+    remedy = (
+        f"limit it (Constraints({python}), --constraint {command}), or look at the margins "
+        "(sewfast analyse)"
+    )
+    if math.isinf(found):
+        return f"on one of the models the linear loop{place} is unstable: Ms is infinite; {remedy}"
     return (
-        f"Ms is {found:.3g}: the loop amplifies some disturbances as much and is close to "
-        f"instability; limit it ({remedy}), or see which (sewfast analyse)"
+        f"Ms is {found:.3g}{place}: at one frequency the loop amplifies disturbances "
+        f"{found:.3g} times, which is close to instability; {remedy}"
     )
 
 
