@@ -210,7 +210,8 @@ def close_to_instability(task: TuningTask, controller: SampledController) -> str
     low = min(float(r.min()) for r in task.references)
     high = max(float(r.max()) for r in task.references)
     # at 0, in the middle of references of both signs, a motor stands in its dry friction
-    levels = [0.5 * (low + high), 0.5 * high, 0.5 * low, *(v for v, _ in controller.schedule)]
+    levels = [0.5 * (low + high), *(0.5 * end for end in (high, low) if end != 0.0)]
+    levels += [speed for speed, _ in controller.schedule]
     found, about, linear = 0.0, 0.0, True
     for plant in task.plants:
         if not isinstance(plant, Model):
