@@ -168,8 +168,8 @@ python-test: $(DEV) ## pytest, with every snippet of the documentation and every
 	$(BIN)/python -m pytest -n 2 --dist worksteal --hypothesis-seed=$(SEED) -m 'not alone'
 	$(BIN)/python -m pytest -n 2 --dist worksteal --hypothesis-seed=$(SEED) -m alone
 
-docs: $(DEV) $(OUT)/results.json ## the site, in site/index.html, its pictures drawn from demo/; works offline
-	$(BIN)/python docs/build.py --results $(OUT)
+docs: $(DEV) ## the site, in site/index.html; works offline
+	$(BIN)/python docs/build.py
 	$(BIN)/mkdocs build --strict --quiet
 
 # the wheel comes from the source archive alone and is imported where only numpy is installed; that nothing is missing

@@ -1,12 +1,12 @@
 """Writes the site's sources into target/docs, complete: what a builder then reads needs no hooks.
 
-    python docs/build.py [FOLDER] [--results DEMO]
+    python docs/build.py [FOLDER]
 
 Pages are copied; `<!-- help COMMAND -->` becomes what `sewfast COMMAND --help` prints,
 `<!-- file LANGUAGE PATH from "TEXT" to "TEXT" -->` the lines of a file, and every `$$ .. $$`
 MathML, which browsers draw without a script and without a network. A formula that ends with
-`\\tag{7}` has its number at the right edge. Some executed pages become notebooks as well. With the
-results of `sewfast demo` the pictures are drawn anew; without, those in docs/assets are taken.
+`\\tag{7}` has its number at the right edge. Some executed pages become notebooks as well. Pictures
+are those of docs/assets (`make pictures`).
 """
 
 from __future__ import annotations
@@ -30,14 +30,10 @@ _TAG = re.compile(r"\s*\\tag\{(\w+)\}")
 _LINK = re.compile(r"\]\((?!https?:|#)([^)]+?)\.md(#[^)]*)?\)")
 
 
-def main(folder: Path, results: Path | None = None) -> None:
+def main(folder: Path) -> None:
     """Write the whole tree anew; what was in the folder before goes."""
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(ROOT / "docs" / "assets", folder / "assets")
-    if results is not None:
-        from pictures import draw_all
-
-        draw_all(results, folder / "assets")
     for page in sorted((ROOT / "docs").glob("*.md")):
         text = page.read_text(encoding="utf-8")
         if page.stem in NOTEBOOKS:
@@ -144,6 +140,5 @@ def _elsewhere(prose: str) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Writes the site's sources.")
     parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "target" / "docs")
-    parser.add_argument("--results", type=Path, help="of sewfast demo, to draw the pictures from")
     given = parser.parse_args()
-    main(given.folder, given.results)
+    main(given.folder)

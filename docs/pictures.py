@@ -2,8 +2,7 @@
 
     sewfast demo --out demo && python docs/pictures.py demo      (or: make pictures)
 
-`make docs` draws them anew for the site (docs/build.py); those in docs/assets are for readers of
-the repository.
+They go to docs/assets, where README, pages and site have them from.
 """
 
 from __future__ import annotations
