@@ -411,9 +411,11 @@ def test_a_loop_close_to_instability_is_said(kind: str, share: float) -> None:
     assert (found.warning is not None) is (share > 1.0)
     if found.warning is None:
         return
-    Ms, place, limit = re.search(  # type: ignore[union-attr]
+    said = re.search(
         r"Ms is (\S+?)(?: about (\S+) .*)?: at one.*Constraints\((.*?)\)", found.warning
-    ).groups()
+    )
+    assert said is not None
+    Ms, place, limit = said.groups()
     about = level if place is None else float(place)
     assert float(Ms) == pytest.approx(margins(start, model, speed=about).Ms, rel=0.01)
     assert float(Ms) > 2.0

@@ -115,11 +115,9 @@ def add(commands: Commands) -> None:
         "--segment", type=int, metavar="N", help="samples of a record's segments (a ninth of it)"
     )
     parser.add_argument(
-        "--model",
-        metavar="FILE.json",
-        type=Path,
+        "--model", metavar="FILE.json", type=Path,
         help="write the fit as a model; keeps an identified one",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--propose", metavar="FILE.json", type=Path,
         help="write a controller for the machine: PID gains of the largest bandwidth, with a notch "
@@ -407,7 +405,7 @@ def add_physics(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--model", metavar="FILE.json", type=Path,
-        help="write the turning motor as a linear model for tuning",
+        help="write the turning motor as a linear model for tuning; keeps an identified one",
     )  # fmt: skip
     add_output(parser, "FILE.json", "write the motor")
     add_plot(parser, "draw the free run and the command over the speed")

@@ -292,8 +292,7 @@ def _about(args: argparse.Namespace, constraints: Constraints, models: list[Any]
         raise SettingError(
             "--speed: expected a limit of Ms to linearise for; give --constraint Ms=1.7"
         )
-    plants = [plant for model in models for plant in (model.members or (model,))]
-    return replace(constraints, plant=plants, speed=args.speed)
+    return replace(constraints, plant=models, speed=args.speed)
 
 
 def _started(args: argparse.Namespace, models: list[Any]) -> dict[str, Any]:

@@ -499,7 +499,7 @@ class Search:
 
         if "Ms" not in self.constraints or _is_linear(model):
             return Constraints(**self.constraints)
-        return Constraints(**self.constraints, plant=model.members or model, speed=level)
+        return Constraints(**self.constraints, plant=model, speed=level)
 
     def python(self, model: Model, level: float) -> str:
         """Arguments of `sewfast.tune`."""
@@ -509,8 +509,7 @@ class Search:
         if self.constraints:
             limits = _named(self.constraints)
             if "Ms" in self.constraints and not _is_linear(model):
-                plant = "model.members" if model.members else "model"
-                limits += f", plant={plant}, speed={level!r}"
+                limits += f", plant=model, speed={level!r}"
             words.append(f"constraints=sewfast.Constraints({limits})")
         return ", ".join(words)
 
