@@ -24,7 +24,8 @@ BUILT := $(VENV)/built.stamp
 REPORT := $(VENV)/report.stamp
 LIBRARIES := $(VENV)/libraries.stamp
 DEV := $(VENV)/dev.stamp
-MARKED := test lint rust-lint rust-test rust-units rust-rest no-std c-test python-lint types stubs python-test docs package
+MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest no-std c-test python-lint types stubs \
+  python-test python-core docs package package-source
 
 .DEFAULT_GOAL := help
 .PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
@@ -43,16 +44,30 @@ dev: $(DEV) ## builds and installs what the checks need (--jobs=2: in parallel)
 # compilers side by side: one that optimises a crate keeps one processor busy
 SYNC := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
 FIRST ?= dev rust-units
-test: ## every check; ends with pytest's summary
+test: ## every check of the day; ends with pytest's summary, which names what is left to `make nightly`
 	$(MAKE) --no-print-directory --jobs=3 $(SYNC) $(FIRST)
-	$(MAKE) --no-print-directory --jobs=2 $(SYNC) rust-rest docs lint no-std c-test counts package
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) rust-rest lint no-std c-test package
 	$(MAKE) --no-print-directory python-test
+
+test-core: ## the crates and the package without documentation, extras, ports and browser
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) dev rust-units
+	$(MAKE) --no-print-directory python-core
+
+# an hour at the most; what takes longer goes on where the night before stopped
+NIGHT := target/nightly
+nightly: $(DEV) ## the long proofs: counts, every page, emulated boards, browser, wheel from source, a portion of laws and bits
+	$(MAKE) --no-print-directory counts package-source
+	$(BIN)/python tests/support/laws.py --state $(NIGHT)/laws --minutes 8
+	$(BIN)/python tests/support/deployed.py --state $(NIGHT)/bits --minutes 8
+	$(BIN)/python tests/support/fuzzed_logs.py --seconds 20
+	$(PYTEST) --nightly -m 'not alone'
+	$(BIN)/python -m pytest --hypothesis-seed=$(SEED) --nightly -m alone
 
 lint: rust-lint python-lint types stubs ## formatting, clippy, ruff, mypy, stubs
 
 rust-lint: $(DEV)
 	cargo fmt --all --check
-	cargo clippy --workspace --all-targets --release --quiet -- -D warnings
+	cargo clippy --workspace --all-targets --profile built --quiet -- -D warnings
 
 python-lint: $(DEV)
 	$(BIN)/ruff check .
@@ -77,8 +92,8 @@ rust-units:
 	PROPTEST_RNG_SEED=$(SEED) cargo test $(WITH_CORE:%=--package %) --tests --profile checked --quiet
 
 rust-rest: $(DEV)
-	PROPTEST_RNG_SEED=$(SEED) cargo test --workspace $(WITH_CORE:%=--exclude %) --release --quiet
-	cargo test --workspace --doc --release --quiet
+	PROPTEST_RNG_SEED=$(SEED) cargo test --workspace $(WITH_CORE:%=--exclude %) --profile built --quiet
+	cargo test --workspace --doc --profile built --quiet
 
 fleet: $(DEV) ## 2,000 recordings on one worker, on two, and with a worker killed every 10 s
 	$(BIN)/python benches/fleet.py
@@ -106,13 +121,13 @@ laws: $(DEV) ## every property of the crates under 20 seeds with 10,000 cases ea
 	$(BIN)/python tests/support/laws.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(CASES),--cases $(CASES)) $(if $(ONLY),--only $(ONLY))
 
 no-std: ## links the controller crate without the standard library, and its frames without a path that can panic
-	cargo build --package sewfast-control --release --quiet
+	cargo build --package sewfast-control --profile built --quiet
 	rustc --edition 2024 --crate-type staticlib -C panic=abort -D warnings \
-	  --extern sewfast_control=target/release/libsewfast_control.rlib \
+	  --extern sewfast_control=target/built/libsewfast_control.rlib \
 	  --out-dir target/bare rust/control/tests/bare/staticlib.rs
 ifeq ($(shell uname),Linux)
 	rustc --edition 2024 --crate-type cdylib -C panic=abort -C opt-level=s -C lto=fat -C embed-bitcode=yes -D warnings \
-	  --extern sewfast_control=target/release/libsewfast_control.rlib -C link-args='-nostdlib -lc -Wl,-z,defs' \
+	  --extern sewfast_control=target/built/libsewfast_control.rlib -C link-args='-nostdlib -lc -Wl,-z,defs' \
 	  --out-dir target/bare rust/control/tests/bare/no_panic.rs
 endif
 
@@ -164,30 +179,44 @@ firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian:
 	done
 
 # first the tests that compute, then those that wait: beside compilers, even at the lowest priority, some come too late
-python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
-	$(BIN)/python -m pytest -n 2 --dist worksteal --hypothesis-seed=$(SEED) -m 'not alone'
-	$(BIN)/python -m pytest -n 2 --dist worksteal --hypothesis-seed=$(SEED) -m alone
+PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal --hypothesis-seed=$(SEED)
+python-test: $(DEV) ## pytest, with the snippets of the documentation and every example
+	$(PYTEST) -m 'not alone'
+	$(PYTEST) -m alone
+
+CORE_TESTS := $(addprefix tests/,analysis control dataset evidence files greybox identification models tuning) \
+  $(wildcard tests/test_*.py)
+python-core: $(DEV)
+	$(PYTEST) -m 'not alone' $(filter-out tests/test_fleet.py,$(CORE_TESTS))
 
 docs: $(DEV) ## the site, in site/index.html; works offline
 	$(BIN)/python docs/build.py
 	$(BIN)/mkdocs build --strict --quiet
 
-# the wheel comes from the source archive alone and is imported where only numpy is installed; that nothing is missing
-# is seen without optimisation as well, in a third of the time
-package: export CARGO_PROFILE_RELEASE_OPT_LEVEL = 0
-package: export CARGO_PROFILE_RELEASE_LTO = off
-package: export CARGO_PROFILE_RELEASE_CODEGEN_UNITS = 16
-package: $(DEV) ## source archive -> wheel -> import in a clean environment
+# the wheel of what is installed here already, imported where only numpy is; the source archive must have every file that
+# it was compiled from (a build from the archive alone takes minutes: package-source)
+package: $(DEV) ## wheel -> import in a clean environment; source archive is whole
+	rm -rf target/package && mkdir -p target/package
+	$(BIN)/maturin sdist --out target/package
+	$(BIN)/python packaging/archive.py target/package/sewfast-*.tar.gz target/built/lib_core.d
+	VIRTUAL_ENV=$(VENV) $(BIN)/maturin build --profile built --quiet --out target/package/wheels
+	$(CLEAN_IMPORT)
+
+package-source: $(DEV) ## source archive -> wheel as released -> import in a clean environment
 	rm -rf target/package && mkdir -p target/package
 	$(BIN)/maturin sdist --out target/package
 	tar -xzf target/package/sewfast-*.tar.gz -C target/package
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir target/package/wheels target/package/sewfast-*/
+	$(CLEAN_IMPORT)
+
+define CLEAN_IMPORT
 	$(PYTHON) -m venv target/package/venv
 	target/package/venv/bin/pip install --quiet target/package/wheels/sewfast-*.whl
 	cd target/package/venv && bin/python -I $(CURDIR)/tests/support/clean_import.py
+endef
 
 # actionlint is no Python package: it is asked where it is installed
-publishable: package $(VENV)/release.stamp ## checks the parts of a release: archives, crates, workflows (twine, cargo publish --dry-run, zizmor, actionlint)
+publishable: package-source $(VENV)/release.stamp ## checks the parts of a release: archives, crates, workflows (twine, cargo publish --dry-run, zizmor, actionlint)
 	$(BIN)/twine check --strict target/package/sewfast-*.tar.gz target/package/wheels/*.whl
 	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
 	$(BIN)/check-jsonschema --builtin-schema vendor.renovate renovate.json
@@ -240,7 +269,7 @@ motors: $(DEV) ## commissioning on 20 motors of MuJoCo, compared with an oracle 
 SOAKED := $(shell grep -rl --include='test_*.py' 'import FULL' tests)
 
 soak: $(DEV) ## every case, seed and second of the tests that take a part otherwise: faults, kills, flips, hostile bytes, searches (hours)
-	SEWFAST_SOAK=1 cargo test --package sewfast-control --package sewfast-link --release --quiet
+	SEWFAST_SOAK=1 cargo test --package sewfast-control --package sewfast-link --profile built --quiet
 	SEWFAST_SOAK=1 $(BIN)/python -m pytest -s $(SOAKED)
 
 counts: $(DEV) ## compares the kernels' instruction counts with those in benches/counts.json (valgrind; Linux)
@@ -268,7 +297,7 @@ $(VENV)/maturin.stamp: | $(VENV)/bin/python
 $(BUILT): $(RUST) pyproject.toml | $(VENV)/maturin.stamp
 	@echo 'compiling the core; the first time this takes some minutes'
 	@# pip would name every extra that is not asked for
-	PIP_QUIET=1 VIRTUAL_ENV=$(VENV) $(BIN)/maturin develop --release --quiet
+	PIP_QUIET=1 VIRTUAL_ENV=$(VENV) $(BIN)/maturin develop --profile built --quiet
 	@touch $@
 
 # sewfast itself is there already, so that pip only adds what its extras name

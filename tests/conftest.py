@@ -1,7 +1,8 @@
-"""What every test may ask for: the folder of public recordings."""
+"""What every test may ask for, and which tests run: in `make test`, alone, or at night."""
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import os
 import re
@@ -57,10 +58,97 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return None
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+SLOW = 10.0
+"""Seconds from which a test of `make test` needs `@pytest.mark.slow("reason")`."""
+LEFT = pytest.StashKey[list[str]]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    text = "run the tests marked `nightly`, and only those"
+    parser.addoption("--nightly", action="store_true", help=text)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[LEFT] = []
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
         if ALONE.match(item.path.name):
             item.add_marker("alone")
+    _expect_cases(config, items)
+    at_night = [_is_for_the_night(item) for item in items]
+    wanted = config.getoption("--nightly")
+    left = [item for item, night in zip(items, at_night, strict=True) if night != wanted]
+    items[:] = [item for item, night in zip(items, at_night, strict=True) if night == wanted]
+    config.hook.pytest_deselected(items=left)
+    if not wanted:
+        config.stash[LEFT] = [item.nodeid for item in left]
+
+
+def _case(item: pytest.Item) -> str:
+    return item.name.partition("[")[2].removesuffix("]")
+
+
+def _is_for_the_night(item: pytest.Item) -> bool:
+    """Of a family, the cases that `by_day` names run in `make test`."""
+    mark = item.get_closest_marker("nightly")
+    return mark is not None and _case(item) not in mark.kwargs.get("by_day", ())
+
+
+def _expect_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """A case that was renamed would leave `make test` without a word."""
+    if any("::" in argument for argument in config.args):
+        return
+    missing: dict[str, set[str]] = {}
+    for item in items:
+        mark = item.get_closest_marker("nightly")
+        for case in mark.kwargs.get("by_day", ()) if mark is not None else ():
+            missing.setdefault(item.nodeid.partition("[")[0], set()).add(case)
+    for item in items:
+        missing.get(item.nodeid.partition("[")[0], set()).discard(_case(item))
+    lost = [f"{name}[{case}]" for name, cases in missing.items() for case in sorted(cases)]
+    if lost:
+        raise pytest.UsageError(f"by_day names cases that are not there: {', '.join(lost)}")
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if hasattr(session.config, "workeroutput"):  # only this process knows what it left
+        session.config.workeroutput["left"] = session.config.stash[LEFT]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Every worker of pytest-xdist has collected all tests."""
+    node.config.stash[LEFT] = getattr(node, "workeroutput", {}).get("left", [])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
+    report = yield
+    report.is_slow = item.get_closest_marker("slow") is not None
+    return report
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Name the tests that need a mark, and what is left to `make nightly`."""
+    seconds: dict[str, float] = collections.defaultdict(float)
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            if not getattr(report, "is_slow", True):
+                seconds[report.nodeid] += report.duration
+    long = sorted((s, name) for name, s in seconds.items() if s > SLOW)
+    if long and not config.getoption("--nightly"):
+        terminalreporter.section(
+            f"over {SLOW:g} s without a mark: slow (with its reason) or nightly"
+        )
+        for taken, name in reversed(long):
+            terminalreporter.line(f"{taken:6.1f} s  {name}")
+    left = collections.Counter(name.partition("[")[0] for name in config.stash[LEFT])
+    if left:
+        terminalreporter.section(f"left to `make nightly`: {left.total()} tests")
+        for name, count in sorted(left.items()):
+            terminalreporter.line(f"{name}{f' ({count} cases)' if count > 1 else ''}")
 
 
 @pytest.fixture

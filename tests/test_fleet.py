@@ -113,6 +113,7 @@ def test_a_cluster_gives_the_same_bits_and_loses_no_row(folder: Path, alone: Fle
     assert bits(fleet(folder, workers=2)) == bits(alone)
 
 
+@pytest.mark.nightly("kills workers until all rows are there")
 @pytest.mark.usefixtures("quiet")
 def test_workers_that_are_killed_cost_nothing(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="needs dask")
@@ -135,6 +136,7 @@ def test_workers_that_are_killed_cost_nothing(tmp_path: Path) -> None:
         assert set(client.run(os.getpid).values()) != set(pids)
 
 
+@pytest.mark.nightly("waits until workers count as lost")
 @pytest.mark.usefixtures("quiet")
 def test_workers_that_are_gone_for_good_are_missed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -156,6 +158,7 @@ def test_workers_that_are_gone_for_good_are_missed(
     assert caught.value.name == "workers"
 
 
+@pytest.mark.nightly("waits for slow workers")
 @pytest.mark.usefixtures("quiet")
 @pytest.mark.parametrize("own", [True, False], ids=["own cluster", "client's cluster"])
 def test_a_worker_that_starts_slowly_is_not_given_up(
@@ -261,6 +264,7 @@ def test_a_look_that_takes_long_is_no_absence(
             running._ended({"task"}, client)
 
 
+@pytest.mark.nightly("ends workers with their tasks")
 @pytest.mark.usefixtures("quiet")
 def test_recordings_that_share_a_task_do_not_share_its_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -530,6 +534,7 @@ def test_ctrl_c_says_what_is_kept(
     assert "2 recordings are done and kept" in capsys.readouterr().err
 
 
+@pytest.mark.nightly("workers of a terminal of its own, started and ended several times")
 @pytest.mark.usefixtures("another_cluster")
 @pytest.mark.skipif(sys.platform == "win32", reason="no process group to send Ctrl-C to")
 def test_ctrl_c_at_a_terminal_ends_the_workers_without_a_word_of_theirs(

@@ -53,6 +53,7 @@ def test_an_oscillating_response_is_told(damping: float, rise: float, scatter: f
     assert found.warning in str(found)
 
 
+@pytest.mark.nightly("a thousand noisy steps", by_day=["0.02-0.0-20.0-0.0"])
 @pytest.mark.parametrize(
     ("T", "L", "scatter", "memory"), [(0.02, 0.0, 20.0, 0.0), (0.06, 0.005, 10.0, 0.9)]
 )

@@ -22,6 +22,7 @@ import pytest
 
 from cli import called as sewfast
 from commissioned import SMALL, short
+from fitted import fitted, made
 from moments import once_on
 from sewfast import (
     Commissioning,
@@ -58,17 +59,25 @@ def _short() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")
-def whole(_short: None) -> Commissioning:
-    return commission(VirtualMachine(), **SMALL)
+def on_the_virtual_machine() -> Commissioning:
+    with short():
+        return commission(VirtualMachine(), **SMALL)
+
+
+def with_page(folder: Path) -> None:
+    whole = fitted(on_the_virtual_machine)
+    assert whole.save(folder / "out") == folder / "out" / "report.html"
 
 
 @pytest.fixture(scope="module")
-def saved(whole: Commissioning, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole() -> Commissioning:
+    return fitted(on_the_virtual_machine)
+
+
+@pytest.fixture(scope="module")
+def saved() -> Path:
     """Its folder, written once; a test that changes it takes a copy."""
-    folder = tmp_path_factory.mktemp("whole") / "out"
-    assert whole.save(folder) == folder / "report.html"
-    return folder
+    return made(with_page) / "out"
 
 
 @pytest.fixture
@@ -160,6 +169,7 @@ def test_report_card_and_judgement_are_evidence(whole: Commissioning, saved: Pat
     assert "Required besides the cost" in page
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_without_a_load_or_ms_nothing_is_required() -> None:
     found = commission(VirtualMachine(2), load=0.0, Ms=None, time_budget=1e6, **SMALL)
     assert found.met == {"Ms_limit": None, "Ms": [], "load": None}
@@ -206,11 +216,13 @@ def test_excitation_stays_within_command_and_speed(whole: Commissioning) -> None
         assert np.max(recording.speed_true) < 1.25 * 1.2 * 2000.0
 
 
+@pytest.mark.nightly("a commissioning, made again")
 def test_a_seed_gives_the_same_controller_again(whole: Commissioning) -> None:
     again = commission(VirtualMachine(), **SMALL, threads=1)
     assert again.controller == whole.controller
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_another_range_and_limit_are_kept() -> None:
     found = commission(VirtualMachine(3), u_max=12.0, speed=1200.0, **SMALL)
     assert found.controller is not None
@@ -219,6 +231,7 @@ def test_another_range_and_limit_are_kept() -> None:
     assert all(np.max(np.abs(r.u)) <= 12.0 for r in found.recordings.values())
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_own_references_are_verified_on() -> None:
     r = np.concatenate([np.linspace(0.0, 900.0, 400), np.full(800, 900.0)])
     found = commission(VirtualMachine(), references={"mine": r}, **SMALL)
@@ -287,6 +300,7 @@ def test_the_page_says_of_every_stage_what_was_done() -> None:
 # --- Ctrl-C -------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly("a commissioning for each stage", by_day=["training"])
 @pytest.mark.parametrize("stage", ["closed loop", "training", "tuning", "verification"])
 def test_an_interruption_keeps_what_there_is(stage: str, tmp_path: Path) -> None:
     def interrupt(done: int, total: int, text: str) -> None:
@@ -345,6 +359,7 @@ def test_ctrl_c_does_not_wait_for_what_cannot_be_stopped(monkeypatch: pytest.Mon
     assert caught.value.best.stage == "training"
 
 
+@pytest.mark.nightly("a commissioning for each stage", by_day=["tuning"])
 @pytest.mark.parametrize("stage", ["step response", "training", "tuning", "verification"])
 def test_cancelled_it_ends_as_after_ctrl_c(stage: str) -> None:
     cancel = threading.Event()
@@ -375,6 +390,7 @@ def test_cancelled_it_stops_a_drive_that_runs() -> None:
     assert caught.value.best.stage == "first motion"
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_between_stages_somebody_is_asked(whole: Commissioning) -> None:
     seen: list[tuple[str, Commissioning]] = []
     found = commission(
@@ -387,6 +403,7 @@ def test_between_stages_somebody_is_asked(whole: Commissioning) -> None:
     assert found.controller == whole.controller
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_an_interrupted_search_keeps_its_best_gains(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -402,6 +419,7 @@ def test_an_interrupted_search_keeps_its_best_gains(
 # --- the folder ---------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_the_folder_holds_everything_and_its_page_is_written_anew(
     whole: Commissioning, out: Path
 ) -> None:
@@ -424,6 +442,7 @@ def test_the_folder_holds_everything_and_its_page_is_written_anew(
     assert page.read_text() == text
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_a_linear_rival_is_asked_and_shown(whole: Commissioning, out: Path) -> None:
     assert whole.rival is not None
     assert whole.rival.is_fit
@@ -453,6 +472,7 @@ def test_a_folder_of_somebody_else_is_left_alone(whole: Commissioning, tmp_path:
     assert (tmp_path / "models" / "mine.json").read_text() == "mine"
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_nothing_of_an_earlier_commissioning_stays(whole: Commissioning, out: Path) -> None:
     assert list((out / "runs").iterdir())
     replace(whole, comparisons=(), recordings={}).save(out)

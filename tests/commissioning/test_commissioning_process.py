@@ -264,6 +264,7 @@ COMPUTED = ("training", "tuning")
 """Stages that do not move the machine."""
 
 
+@pytest.mark.nightly("a commissioning for each trip")
 def test_it_goes_on_after_every_trip_to_the_same_controller(
     whole: tuple[Commissioning, list[str]], tmp_path: Path
 ) -> None:

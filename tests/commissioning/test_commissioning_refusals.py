@@ -127,6 +127,7 @@ def test_a_step_that_does_not_settle_is_refused() -> None:
     assert refused(bent(slips=True), "expected a s").stage in ("first motion", "step response")
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_where_networks_and_rival_do_not_predict_it_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -147,6 +148,7 @@ def score_networks(
     monkeypatch.setattr(training, "validate_member", of)
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_where_networks_alone_do_not_predict_the_linear_model_stands_in(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -164,6 +166,7 @@ def test_where_networks_alone_do_not_predict_the_linear_model_stands_in(
     assert told["second_opinion"] is None
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_networks_far_behind_the_best_have_no_say(monkeypatch: pytest.MonkeyPatch) -> None:
     def score(model: Model, data: Dataset) -> tuple[float, float]:
         seed = model.training["seed"]
@@ -175,6 +178,7 @@ def test_networks_far_behind_the_best_have_no_say(monkeypatch: pytest.MonkeyPatc
     assert [m.training["seed"] for m in found.models.members] == [1]
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_a_machine_that_changed_is_not_verified() -> None:
     class Changes(Bent):
         def follow(self, controller: Controller, r: np.ndarray, name: str) -> Followed:

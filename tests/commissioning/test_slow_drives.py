@@ -152,6 +152,7 @@ def test_a_load_over_the_turn_is_averaged_and_not_folded() -> None:
     assert Thinning(10).pushes(None, r, 1e-3) is None
 
 
+@pytest.mark.nightly("a commissioning of a slow drive")
 def test_a_commissioning_on_every_third_sample(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -265,6 +265,7 @@ def test_a_response_alone_or_a_variable_of_no_notch_is_refused() -> None:
         )  # fmt: skip
 
 
+@pytest.mark.nightly("a search for filters; the command's runs in `make test`")
 def test_filters_are_proposed_where_the_shaft_swings() -> None:
     _, measured = two_masses()
     fit = fitted_shaft()

@@ -427,6 +427,7 @@ NOISES: dict[str, Callable[[np.random.Generator, tuple[int, int]], FloatArray]] 
 }
 
 
+@pytest.mark.nightly("many drives")
 def test_open_loops_are_not_called_closed() -> None:
     """Fewer than 2 % false alarms, over every input, plant and noise."""
     random, n, closed, records = np.random.default_rng(6), 3000, [], 0

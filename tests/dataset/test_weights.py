@@ -189,6 +189,7 @@ def test_instrumental_variables_take_masks_and_no_weights() -> None:
     np.testing.assert_allclose(found.core.a, A, atol=0.01)
 
 
+@pytest.mark.nightly("a default search")
 def test_the_search_for_a_structure_is_weighted_throughout() -> None:
     u, y = recording()
     w = weights(1e-3)

@@ -32,6 +32,18 @@ EMULATED = ("neural_oe", "neural_ss, saturation", "ensemble of mixed kinds", "ev
 SAMPLES = 20_000
 
 
+@pytest.mark.nightly(
+    "the same for every kind",
+    by_day=[
+        "oe-f64",
+        "oe-f32",
+        "oe, three inputs-f64",
+        "neural_oe-f32",
+        "neural_ss, saturation-f64",
+        "neural_ss, nk 2-f32",
+        "ensemble of mixed kinds-f64",
+    ],
+)
 @needs_compiler
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", CASES)

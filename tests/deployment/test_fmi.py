@@ -291,6 +291,7 @@ def test_a_foreign_plant_is_recorded_identified_and_run(motor: Path) -> None:
     assert abs(found.y[-1] - 1000.0) < 20.0
 
 
+@pytest.mark.nightly("a commissioning of an FMU")
 def test_a_foreign_plant_is_commissioned(motor: Path) -> None:
     found = sewfast.commission(fmu_bench(motor, **OF_MOTOR), speed=1500, members=2, evaluations=200)
     assert found.is_verified, found.verdict
@@ -416,6 +417,7 @@ def _faulty(folder: Path, fault: str) -> Path:
 OF_FAULTY: dict[str, Any] = {"volt": 5.0, "Ts": kinds.TS, "counts_per_rev": 1000.0}
 
 
+@pytest.mark.nightly("waits for each fault")
 @pytest.mark.parametrize(
     ("fault", "options", "received"),
     [

@@ -28,6 +28,17 @@ def session(path: Path) -> Any:
     return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
+@pytest.mark.nightly(
+    "the same for every kind",
+    by_day=[
+        "oe, three inputs",
+        "neural_oe, nk 2, no bypass",
+        "neural_ss, saturation",
+        "neural_ss, integrator",
+        "ensemble of mixed kinds",
+        "ensemble, no delay",
+    ],
+)
 @pytest.mark.parametrize("name", kinds.DEPLOYED)
 def test_the_free_run_is_that_of_the_package(name: str, tmp_path: Path) -> None:
     model = kinds.model_of(name)

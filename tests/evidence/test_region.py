@@ -177,6 +177,21 @@ JUDGED = [
 ]
 
 
+@pytest.mark.nightly(
+    "every signal with every plant, two seeds",
+    by_day=[
+        "1-prbs-first order",
+        "1-prbs-saturated input",
+        "1-steps-second order",
+        "1-multisine-first order",
+        "1-chirp-saturated input",
+        "1-noise-third order",
+        "1-noise-resonance",
+        "1-varied_steps-Ts of a thousandth",
+        "1-trapezoids-fifth order",
+        "1-two_tones-third order",
+    ],
+)
 @pytest.mark.parametrize(("excite", "system"), [*RULES, *JUDGED])
 @pytest.mark.parametrize("inputs", [1, 2])
 def test_a_new_stretch_is_inside_and_twice_the_amplitude_is_not(

@@ -104,6 +104,7 @@ def binomial_tail(n: int, p: float, least: int) -> float:
 JUDGES = ("input", "squared_input", "cubed_input", "output", "squares", "product", "feedback")
 
 
+@pytest.mark.nightly("hundreds of records", by_day=["coloured-white"])
 @pytest.mark.parametrize(("noise", "inputs"), CASES if FULL else CASES[::3])
 def test_false_alarms(noise: str, inputs: str) -> None:
     found = trials(noise, inputs)

@@ -5,6 +5,7 @@ Training and tuning are cut short: what is tested is how the pieces fit, not how
 
 import json
 import math
+import pickle
 import shutil
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 
 from commissioned import short_experiment
 from effort import FULL
+from fitted import made
 from sewfast import Commissioning, signals
 from sewfast.control import Controller, Gains, load_controller
 from sewfast.errors import DataError, SettingError
@@ -35,35 +37,35 @@ def _short() -> Any:
         yield
 
 
-@pytest.fixture(scope="module")
-def stages() -> list[tuple[int, int, str]]:
-    return []
-
-
-@pytest.fixture(scope="module")
-def commissioned() -> list[Commissioning]:
-    """What the experiment below has commissioned."""
-    return []
-
-
-@pytest.fixture(scope="module")
-def demo(
-    tmp_path_factory: pytest.TempPathFactory,
-    _short: None,
-    stages: list[tuple[int, int, str]],
-    commissioned: list[Commissioning],
-) -> Path:
-    out = tmp_path_factory.mktemp("demo") / "results"
+def experiment_of_seed_3(folder: Path) -> None:
+    """The results, and beside them the stages it named and what it commissioned."""
+    stages: list[tuple[int, int, str]] = []
+    found: list[Commissioning] = []
     commission = loops.commissioned
 
     def kept(*given: Any) -> Commissioning:
-        commissioned.append(commission(*given))
-        return commissioned[-1]
+        found.append(commission(*given))
+        return found[-1]
 
-    with pytest.MonkeyPatch.context() as patch:
+    with short_experiment(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(loops, "commissioned", kept)
-        run_demo(out, seed=3, progress=lambda *told: stages.append(told))
-    return out
+        run_demo(folder / "results", seed=3, progress=lambda *told: stages.append(told))
+    (folder / "seen").write_bytes(pickle.dumps((stages, found)))
+
+
+@pytest.fixture(scope="module")
+def demo() -> Path:
+    return made(experiment_of_seed_3) / "results"
+
+
+@pytest.fixture(scope="module")
+def stages(demo: Path) -> list[tuple[int, int, str]]:
+    return pickle.loads((demo.parent / "seen").read_bytes())[0]  # type: ignore[no-any-return]
+
+
+@pytest.fixture(scope="module")
+def commissioned(demo: Path) -> list[Commissioning]:
+    return pickle.loads((demo.parent / "seen").read_bytes())[1]  # type: ignore[no-any-return]
 
 
 @pytest.fixture(scope="module")
@@ -123,9 +125,11 @@ def test_the_saved_controller_gives_the_saved_run_again(demo: Path) -> None:
     np.testing.assert_array_equal(again.y, saved["y"])
 
 
-def test_the_folder_makes_its_report_again(demo: Path) -> None:
+@pytest.mark.nightly("the experiment's report once more")
+def test_the_folder_makes_its_report_again(demo: Path, tmp_path: Path) -> None:
     first = (demo / "report.html").read_text(encoding="utf-8")
-    assert report(demo).read_text(encoding="utf-8") == first
+    again = report(shutil.copytree(demo, tmp_path / "again"))
+    assert again.read_text(encoding="utf-8") == first
 
 
 def test_no_temporary_file_is_left(demo: Path) -> None:
@@ -157,6 +161,7 @@ def _timeless(text: str) -> list[str]:
     return [line for line in text.splitlines() if "seconds" not in line]
 
 
+@pytest.mark.nightly("the experiment once more")
 def test_an_interruption_leaves_an_earlier_experiment_as_it_was(
     demo: Path, commissioned: list[Commissioning], monkeypatch: pytest.MonkeyPatch
 ) -> None:

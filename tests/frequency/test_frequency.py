@@ -54,6 +54,7 @@ def test_a_shaken_machine_shows_its_small_signals(compliant: FrequencyResponse) 
     assert np.percentile(np.abs(np.rad2deg(np.angle(ratio))), 90) < 3.0
 
 
+@pytest.mark.nightly("a measurement for each shaft", by_day=["150.0-0.001"])
 @pytest.mark.parametrize(("stiffness", "load"), [(40.0, 2e-3), (150.0, 1e-3), (600.0, 2e-3)])
 def test_the_shaft_is_found_within_its_intervals(stiffness: float, load: float) -> None:
     from bode import modes, virtual
@@ -72,6 +73,7 @@ def test_the_shaft_is_found_within_its_intervals(stiffness: float, load: float) 
     assert "two masses" in str(fit)
 
 
+@pytest.mark.nightly("a measurement for each seed", by_day=["3"])
 @pytest.mark.parametrize("seed", [None, 1, 3, 12, 13] if FULL else [None, 3])
 def test_a_rigid_machine_has_no_shaft(seed: int | None) -> None:
     fit = fit_shaft(bode(VirtualMachine(seed), speed=1500.0, seed=seed or 0))
@@ -79,6 +81,7 @@ def test_a_rigid_machine_has_no_shaft(seed: int | None) -> None:
     assert "resonance_hertz" not in fit.parameters
 
 
+@pytest.mark.nightly("a record for each signal", by_day=["random-1"])
 @pytest.mark.parametrize(("signal", "seed"), [("random", 1), ("prbs", 1)])
 def test_a_few_frequencies_of_an_ordinary_record_are_no_shaft(signal: str, seed: int) -> None:
     u = sewfast.signals.excitation(signal, seed)
@@ -115,6 +118,7 @@ def test_margins_agree_with_those_of_the_fit_and_of_the_loop(compliant: Frequenc
     assert remeasured.Ms == pytest.approx(predicted.Ms, rel=0.05)
 
 
+@pytest.mark.nightly("the measurement once more on a machine of Python")
 def test_a_machine_of_the_users_own_is_shaken_the_same_way() -> None:
     class Own:
         """Gain 100 RPM/V, time constant 50 ms, delay of a sample."""
@@ -335,6 +339,7 @@ def test_files_come_back(compliant: FrequencyResponse, tmp_path: Path) -> None:
             load_response(place)
 
 
+@pytest.mark.nightly("pictures of a response; `test_plotting` draws the others")
 def test_a_response_draws_itself(compliant: FrequencyResponse, tmp_path: Path) -> None:
     panels = compliant.plot(fit=fit_shaft(compliant))
     assert [ax.get_ylabel() for ax in panels][1:] == ["phase [deg]", "coherence"]

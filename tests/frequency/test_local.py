@@ -67,6 +67,7 @@ def test_a_record_that_begins_in_motion_shows_the_response_without_leakage(
     assert np.percentile(errors(found), 90) < 0.1 * np.percentile(errors(averaged), 90)
 
 
+@pytest.mark.nightly("counts coverage over many records")
 def test_bands_hold_the_truth_as_often_as_they_say() -> None:
     inside = []
     for seed in range(40):

@@ -56,6 +56,7 @@ def test_several_speeds_are_one_result(speeds: sewfast.ResponsesOverSpeed) -> No
         speeds[1500.0]
 
 
+@pytest.mark.nightly("a third measurement at several speeds")
 def test_their_files_come_back(speeds: sewfast.ResponsesOverSpeed, tmp_path: Path) -> None:
     place = tmp_path / "speeds.json"
     speeds.save(place)
@@ -85,6 +86,7 @@ def test_speeds_that_are_none_are_refused(wrong: Any) -> None:
         bode(VirtualMachine(), speed=wrong)
 
 
+@pytest.mark.nightly("a second measurement at several speeds; the library's runs in `make test`")
 def test_the_command_takes_several_speeds(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -105,6 +107,7 @@ def test_the_command_takes_several_speeds(
 # --- A resonance beyond what was measured ---------------------------------------------------------
 
 
+@pytest.mark.nightly("a measurement for each shaft", by_day=["470.0-0.03"])
 @pytest.mark.parametrize(("hertz", "near"), [(470.0, 0.03), (700.0, 0.05), (None, None)])
 def test_a_resonance_beyond_the_measured_frequencies_is_said_to_be_there(
     hertz: float | None, near: float | None
@@ -166,6 +169,7 @@ def tripping(after: float) -> Tripping:
     return Tripping(MachineBench(VirtualMachine(**COMPLIANT)), after)
 
 
+@pytest.mark.nightly("a measurement for each limit", by_day=["12.5-3.0"])
 @pytest.mark.parametrize(("after", "blocks"), [(25.0, 2.0), (12.5, 3.0)])
 def test_a_trip_in_mid_shake_keeps_the_whole_periods(after: float, blocks: float) -> None:
     """Two of four multisines, or three periods of the first."""

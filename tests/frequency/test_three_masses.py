@@ -69,6 +69,7 @@ CASES = [
 ]
 
 
+@pytest.mark.nightly("a search for two shafts")
 @pytest.mark.parametrize(("inertias", "stiffness"), CASES if FULL else CASES[:1])
 def test_both_shafts_are_found_where_they_swing(
     inertias: list[float], stiffness: list[float]
@@ -108,6 +109,7 @@ def row(seed: int) -> tuple[list[float], list[float]]:
             return inertias, stiffness
 
 
+@pytest.mark.nightly("shafts of whole rows of masses")
 @pytest.mark.parametrize("seed", range(40) if FULL else [3, 10])
 def test_of_any_row_every_shaft_is_found_and_no_other(seed: int) -> None:
     """The search was made on seeds 0 to 11 of a like family."""
@@ -119,6 +121,7 @@ def test_of_any_row_every_shaft_is_found_and_no_other(seed: int) -> None:
     assert fit_shaft(chain(inertias[:2], stiffness[:1], seed)).resonances == 1
 
 
+@pytest.mark.nightly("a search for two shafts")
 @pytest.mark.parametrize("load", [3e-4, 1e-3, 4e-3] if FULL else [1e-3])
 def test_two_masses_stay_two(load: float) -> None:
     assert fit_shaft(chain([1e-3, load], [100.0])).resonances == 1
@@ -130,6 +133,7 @@ def test_a_machine_with_one_shaft_has_one(seed: int) -> None:
     assert fit_shaft(bode(machine, speed=1500.0)).resonances == 1
 
 
+@pytest.mark.nightly("a search for shafts for each change", by_day=["changed0"])
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     "changed",
@@ -164,6 +168,7 @@ def test_a_response_that_is_none_is_refused(changed: dict[str, Any]) -> None:
     assert caught.value.name == "response"
 
 
+@pytest.mark.nightly("a search for four filters")
 def test_filters_take_both_shafts_on(tmp_path: Path) -> None:
     fit = fit_shaft(chain(*CASES[1]))
     found = propose(fit, Ms=1.7)

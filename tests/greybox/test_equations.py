@@ -81,6 +81,7 @@ def test_a_second_state_is_the_winding() -> None:
         assert fit.value(name) == pytest.approx(true, rel=0.02), name
 
 
+@pytest.mark.nightly("counts coverage over many records")
 def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
     def plain(x: Any, u: Any, p: Any) -> Any:
         return (u - p["kv"] * x) / p["ka"]

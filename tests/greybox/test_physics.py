@@ -116,6 +116,7 @@ def test_a_start_that_takes_all_back_emf_for_friction_is_fitted_on() -> None:
     assert motor.value("k_a") == pytest.approx(truth["k_a"], rel=0.01)
 
 
+@pytest.mark.nightly("fits of MuJoCo's motors")
 def test_a_motor_of_another_simulator_is_told() -> None:
     pytest.importorskip("mujoco")
     from physics import hinge

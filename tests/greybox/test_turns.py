@@ -112,6 +112,7 @@ def test_a_twin_has_the_torque_ripple_of_its_motor() -> None:
     )
 
 
+@pytest.mark.nightly("a motor of its own")
 def test_profiles_have_ends_of_their_own_to_either_side() -> None:
     machine = VirtualMachine(7)
     recording, _ = recorded(machine, steps(5.0, 0.001, 7))

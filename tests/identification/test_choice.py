@@ -152,6 +152,7 @@ def first_order(seed: int, delay: int, n: int = 1500, noise: float = 0.3) -> Dat
     return Dataset.from_arrays(u, y + noise * rng.normal(size=n), 0.01)
 
 
+@pytest.mark.nightly("a search for each delay", by_day=["4"])
 @pytest.mark.parametrize("delay", [1, 4])
 def test_a_small_order_and_the_delay_are_found(delay: int) -> None:
     orders = []
@@ -166,6 +167,7 @@ def test_a_small_order_and_the_delay_are_found(delay: int) -> None:
     assert sorted(orders)[2] <= 2
 
 
+@pytest.mark.nightly("default searches on long delays")
 @pytest.mark.parametrize("delay", [12, 25] if FULL else [12])
 def test_a_dead_time_beyond_the_usual_delays_is_not_feigned_by_a_large_order(delay: int) -> None:
     for seed in range(3):
@@ -178,6 +180,7 @@ def test_a_dead_time_beyond_the_usual_delays_is_not_feigned_by_a_large_order(del
         assert table.choice.rmse < 0.9 * feigned
 
 
+@pytest.mark.nightly("a default search")
 def test_without_a_dead_time_no_long_delay_is_looked_at() -> None:
     for seed in range(3):
         data = first_order(seed, 1, noise=0.1)
@@ -186,6 +189,7 @@ def test_without_a_dead_time_no_long_delay_is_looked_at() -> None:
         assert max(nk for _, nk in table.candidates) == max(DELAYS)
 
 
+@pytest.mark.nightly("a default search on a long record")
 def test_the_steady_gain_of_a_motor_is_not_lost_to_a_slow_pole() -> None:
     for seed in SEEDS:
         model = identify(first_order(seed, 1, noise=1.0), seed=seed)
@@ -234,6 +238,7 @@ def test_direct_feedthrough_has_to_be_worth_it() -> None:
     assert search.best is better
 
 
+@pytest.mark.nightly("a default search for each seed", by_day=["1"])
 @pytest.mark.parametrize("nk", [0, 1])
 def test_feedthrough_is_found_before_further_states_make_up_for_it(nk: int) -> None:
     # a bent oscillator under a slow input, whose next sample can be told from the last ones
@@ -329,6 +334,7 @@ def test_an_error_in_a_pool_is_raised_and_an_interrupt_stops_all() -> None:
 # --- the choice -----------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly("a default search")
 def test_a_network_that_fails_on_an_earlier_part_is_not_chosen() -> None:
     won = identify(bent_data(1000, noise=0.3), **SMALL).training["choice"]
     assert won["chosen"] == "neural_ss"
@@ -368,6 +374,7 @@ def test_a_linear_truth_without_noise_stays_linear() -> None:
         assert "rounding" in model.training["choice"]["reason"]
 
 
+@pytest.mark.nightly("a default search for each noise", by_day=["3.0-good"])
 @pytest.mark.parametrize(("noise", "grade"), [(0.02, "good"), (3.0, "good")])
 def test_the_verdict_knows_noise_from_ignorance(noise: float, grade: str) -> None:
     model = identify(linear_data(1500, noise=noise))
@@ -376,6 +383,7 @@ def test_the_verdict_knows_noise_from_ignorance(noise: float, grade: str) -> Non
     assert "verdict: good enough" in str(model)
 
 
+@pytest.mark.nightly("a default search on noise")
 def test_a_useless_model_is_called_useless() -> None:
     rng = np.random.default_rng(3)
     u = np.repeat(rng.uniform(-1, 1, 60), 20)

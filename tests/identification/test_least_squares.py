@@ -117,6 +117,7 @@ def test_no_cost_above_minpack(case: mgh.Case) -> None:
         _is_minimum(case, fit)
 
 
+@pytest.mark.nightly("31 far starts; the listed ones run in `make test`")
 @pytest.mark.filterwarnings("ignore:.*encountered in:RuntimeWarning")
 def test_far_starts_end_in_a_minimum_or_say_so() -> None:
     """From ten or a hundred times x0 the last bits of the function choose among the minima.

@@ -57,6 +57,7 @@ def test_a_motor_is_found_without_a_network(seed: int) -> None:
     assert model.validate(fresh).simulation.rmse < 1.15 * 2.0
 
 
+@pytest.mark.nightly("a default search for each seed", by_day=["2"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_network_is_taken_where_something_is_left(seed: int) -> None:
     model = _model(6e-5, seed)
@@ -209,6 +210,7 @@ def test_the_search_takes_a_motor_for_a_motor(seed: int) -> None:
     assert model.validate(fresh).simulation.rmse < 1.15 * 2.0  # rpm, the noise is 2
 
 
+@pytest.mark.nightly("default searches in several units")
 def test_what_is_linear_stays_linear_whatever_its_unit() -> None:
     for seed in range(3 if FULL else 1):
         u, rng = _steps(3000, seed), np.random.default_rng(seed)

@@ -332,6 +332,7 @@ def test_an_integrator_stays_one() -> None:
     assert percent(angle, found.model.simulate(u, found.initial_states[0])) > 95
 
 
+@pytest.mark.nightly("trains six networks")
 @pytest.mark.parametrize("hidden", [2, 4])
 @pytest.mark.parametrize("friction", [0.15, 0.25, 0.35])
 def test_an_integrator_finds_dry_friction(friction: float, hidden: int) -> None:

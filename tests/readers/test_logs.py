@@ -424,6 +424,9 @@ OWN = ("run.wpilog", "run.bbl", "run.bin")
 """Read here and not by a library in a process of its own."""
 
 
+@pytest.mark.nightly(
+    "damages every kind of log many times", by_day=["run.tdms", "run.ulg", "run.wpilog", "run.mcap"]
+)
 @pytest.mark.parametrize("name", [*KINDS, "run.bbl", "run.bin"])
 def test_a_damaged_log_is_refused_or_read(name: str, tmp_path: Path) -> None:
     """Cut, flipped, filled: a table or a DataError, nothing else."""

@@ -406,6 +406,7 @@ def test_columns_are_saved_whole_or_not_at_all(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
 
 
+@pytest.mark.nightly("an hour of samples")
 def test_a_long_recording_needs_little_memory(tmp_path: Path) -> None:
     short, longer = (growth(tmp_path / f"{n}.mcap", n) for n in (20, 120))
     # 100,000 samples more, of the 3,600,000 of an hour at 1 kHz

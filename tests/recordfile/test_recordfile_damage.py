@@ -62,6 +62,7 @@ def assert_nothing_false(found: RecordedFile, whole: RecordedFile) -> None:
     assert len(kinds) == len(set(kinds))
 
 
+@pytest.mark.nightly("flips every bit", by_day=["zstd"])
 def test_every_flipped_bit_is_found(made: Made, whole: RecordedFile) -> None:
     random = np.random.default_rng(1)
     for bit in random.integers(0, 8 * len(made.raw), 10_000 if FULL else 500):
@@ -74,6 +75,7 @@ def test_every_flipped_bit_is_found(made: Made, whole: RecordedFile) -> None:
         assert whole.received - found.received <= 100
 
 
+@pytest.mark.nightly("flips every bit", by_day=["plain"])
 def test_every_bit_of_the_structure_counts(made: Made, whole: RecordedFile) -> None:
     """All bits outside of the JSON: opcodes, lengths, checksums, index."""
     heads = structure(made.raw)

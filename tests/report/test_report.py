@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import result_folder
+from fitted import made
 from sewfast.errors import DataError, ModelFileError, SewfastError
 from sewfast.plotting import thin
 from sewfast.report import report
@@ -27,14 +28,18 @@ PAPER_FIGURES = [*range(2, 6), *range(7, 16), *range(19, 23)]
 VOID = {"meta", "link", "br", "img", "input", "hr"}
 
 
+def with_report(folder: Path) -> None:
+    report(result_folder.make(folder / "demo"))
+
+
 @pytest.fixture(scope="module")
-def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return result_folder.make(tmp_path_factory.mktemp("results") / "demo")
+def original() -> Path:
+    return made(with_report) / "demo"
 
 
 @pytest.fixture(scope="module")
 def page(original: Path) -> str:
-    return report(original).read_text(encoding="utf-8")
+    return (original / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.fixture
@@ -137,8 +142,9 @@ def test_the_assumptions_about_the_paper_are_stated(page: str) -> None:
         assert word in page
 
 
-def test_the_same_artefacts_give_the_same_page(original: Path, page: str) -> None:
-    assert report(original).read_text(encoding="utf-8") == page
+@pytest.mark.nightly("two more reports")
+def test_the_same_artefacts_give_the_same_page(folder: Path, page: str) -> None:
+    assert report(folder).read_text(encoding="utf-8") == page
 
 
 def test_figures_fit_on_a_printed_page(page: str) -> None:
@@ -195,6 +201,7 @@ def changed(original: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.nightly("another report")
 def test_an_undefined_number_is_no_success(changed: Path) -> None:
     verdicts = [g.verdict for g in goals(load(changed))]
     assert verdicts.count("undefined") == 1

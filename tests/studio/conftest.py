@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import sewfast
+from fitted import made
 from sewfast.studio import Project, Studio, make_demo
 from studio_page import EVIL, Page
 
@@ -40,10 +41,8 @@ def page(studio: Studio) -> Iterator[Page]:
 
 
 @pytest.fixture(scope="session")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("demo")
-    make_demo(place)
-    return place
+def demo() -> Path:
+    return made(make_demo)
 
 
 @pytest.fixture

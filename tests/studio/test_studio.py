@@ -256,6 +256,7 @@ def _run_copies(folder: Path, script: str, commands: str) -> list[bytes]:
     return found
 
 
+@pytest.mark.nightly("a search, made twice")
 def test_copies_of_a_controller_give_the_same_file(tuned: Studio) -> None:
     folder = tuned.project.folder
     with Page(tuned) as page:
@@ -264,6 +265,7 @@ def test_copies_of_a_controller_give_the_same_file(tuned: Studio) -> None:
     assert _run_copies(folder, said["python"], said["commands"]) == [written, written]
 
 
+@pytest.mark.nightly("a search, made twice; controllers' copies run in `make test`")
 def test_copies_of_a_search_give_the_same_file(tuned: Studio) -> None:
     folder = tuned.project.folder
     with Page(tuned) as page:
@@ -311,6 +313,7 @@ def test_an_unstable_loop_is_said_to_be_one(tuned: Studio) -> None:
 BRIEF = {"machine": "virtual:1", "seed": 0, "members": 1, "evaluations": 100}
 
 
+@pytest.mark.nightly("a commissioning, made twice")
 @pytest.mark.alone
 def test_the_machine_is_commissioned_and_the_copies_do_the_same(tuned: Studio) -> None:
     folder = tuned.project.folder
@@ -399,6 +402,7 @@ def _model(folder: Path) -> dict[str, Any]:
     return dict(found)
 
 
+@pytest.mark.nightly("a process for each kind", by_day=["oe"])
 @pytest.mark.parametrize("kind", ["oe", "neural_oe"])
 def test_copies_give_the_same_bits(folder: Path, tmp_path: Path, kind: str) -> None:
     project, step = Project(folder), Step("run.csv", ("u",), "y", 0.02, kind, 3)

@@ -125,6 +125,7 @@ def test_a_drive_by_clicks(studio: Studio, device: VirtualDevice, browser: Any) 
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
 
 
+@pytest.mark.nightly("every way of being gone", by_day=["killed"])
 @pytest.mark.parametrize("fault", ["hung", "closed", "killed", "frozen"])
 def test_a_browser_that_is_gone_stops_it(
     studio: Studio, device: VirtualDevice, browser: Any, fault: str
@@ -277,6 +278,7 @@ def test_a_recording_is_seen_kept_and_can_be_copied(studio: Studio, tmp_path: Pa
         np.testing.assert_array_equal(again.columns["counts"], kept.columns["counts"])
 
 
+@pytest.mark.nightly("runs, made twice")
 def test_a_controller_runs_and_the_copies_do_the_same(studio: Studio, tmp_path: Path) -> None:
     gains = sewfast.Gains.standard(0.02, 0.2, 0.004, u_unit="V", y_unit="RPM")
     sewfast.Controller(gains, u_min=-20.0, u_max=20.0).save(tmp_path / "mine.json")
@@ -340,6 +342,7 @@ def test_stop_goes_ahead_of_a_long_question(studio: Studio, device: VirtualDevic
     assert read_recording(studio.project.folder / "long.mcap").outcome == "cancelled"
 
 
+@pytest.mark.nightly("every way of being gone", by_day=["closed"])
 @pytest.mark.parametrize("fault", ["frozen", "closed"])
 def test_a_page_that_is_gone_stops_it(studio: Studio, device: VirtualDevice, fault: str) -> None:
     with Watching(studio) as other, Watching(studio) as page:
@@ -406,6 +409,7 @@ def test_a_port_that_vanishes_disarms(studio: Studio) -> None:
 # --- Commissioning --------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly("a commissioning")
 def test_a_drive_is_commissioned_stage_by_stage(studio: Studio) -> None:
     with VirtualDevice(fast=True) as device, Watching(studio) as page:
         page.armed(device.port)

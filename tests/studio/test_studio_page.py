@@ -215,6 +215,7 @@ class Keys:
         self.send(text)
 
 
+@pytest.mark.nightly("the whole way; by day `test_the_way_by_clicks`")
 @pytest.mark.alone
 def test_the_whole_way_by_keyboard(studio: Studio, browser: Any) -> None:
     """From a recording to a report; every view is opened and used."""
@@ -365,6 +366,7 @@ def test_a_notch_is_put_in_and_taken_out(tuned: Studio, browser: Any) -> None:
     until(lambda: browser.execute_script(NUMBER, "noise gain") == before)
 
 
+@pytest.mark.nightly("searches from a browser")
 @pytest.mark.alone
 def test_a_search_has_the_limits_weights_and_seconds_of_the_page(
     tuned: Studio, browser: Any

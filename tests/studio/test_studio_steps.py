@@ -42,6 +42,7 @@ def _run(folder: Path, python: str, commands: str, file: str) -> list[bytes]:
 # --- Searches -------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly("a long search, made twice")
 def test_a_search_with_weights_limits_and_a_notch_is_copied(tuned: Studio) -> None:
     folder = tuned.project.folder
     asked = {**MOVE, "notches": [NOTCH]}
@@ -59,6 +60,7 @@ def test_a_search_with_weights_limits_and_a_notch_is_copied(tuned: Studio) -> No
     assert _run(folder, said["python"], said["commands"], "controller.json") == [written] * 2
 
 
+@pytest.mark.nightly("trains a network")
 def test_ms_of_a_network_is_that_about_the_level(tmp_path: Path) -> None:
     data = sewfast.record(
         sewfast.VirtualMachine(seed=1), sewfast.signals.excitation("saturating")[:4000]
@@ -75,6 +77,7 @@ def test_ms_of_a_network_is_that_about_the_level(tmp_path: Path) -> None:
     assert _run(tmp_path, said["python"], said["commands"], "controller.json") == [written] * 2
 
 
+@pytest.mark.nightly("another search")
 def test_a_search_that_ran_out_of_time_is_copied_as_what_it_found(tuned: Studio) -> None:
     folder = tuned.project.folder
     with Page(tuned) as page:
@@ -137,6 +140,7 @@ def shaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.mark.nightly("a response measured three times")
 def test_a_response_is_that_of_the_library_and_its_copies(shaken: Path) -> None:
     step = Step("run.csv", ("u",), "y")
     project = Project(shaken)
@@ -158,6 +162,7 @@ def test_a_response_is_that_of_the_library_and_its_copies(shaken: Path) -> None:
     np.testing.assert_array_equal(load_response(shaken / "response.json").value, response.value)
 
 
+@pytest.mark.nightly("another response")
 def test_a_response_from_counts_does_not_look_ahead(shaken: Path) -> None:
     step = Step("run.csv", ("u",), None, counts="counts", counts_per_rev=1572.0)
     project = Project(shaken)
@@ -448,6 +453,7 @@ def test_a_csv_without_times_is_read_with_its_sample_time(folder: Path) -> None:
     assert "--ts=0.001" in found["commands"]
 
 
+@pytest.mark.nightly("a whole report; `test_report` makes one in `make test`")
 def test_a_report_is_made_and_served_in_a_sandbox(tuned: Studio) -> None:
     import http.client
 

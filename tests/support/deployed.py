@@ -1,6 +1,7 @@
 """Deployed code against the step of the core, bit by bit: here and on an emulated Cortex-M4.
 
-`make bits` runs every kind over ten million samples. Both sides compute their inputs from a
+`make bits` runs every kind over ten million samples; with a state file, some minutes of it, from
+where the last run stopped. Both sides compute their inputs from a
 counter, and every result goes into one sum of its bits, each times an odd number of its own: equal
 sums are equal results in equal order.
 """
@@ -14,12 +15,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from portions import portion
 from sewfast import Biquad, Controller, Gains, Model, deploy
 from sewfast.deployment.precision import combined_run, embedded_members
 
@@ -381,31 +383,51 @@ def print_costs() -> int:
     return 0
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """A deployed model or controller in one precision."""
+
+    name: str
+    what: Model | Controller
+    precision: str
+
+    def __str__(self) -> str:
+        return f"{self.name}, {self.precision}"
+
+    def same(self, samples: int, emulated: int) -> dict[str, bool]:
+        """Whether it computes the core's bits, by compiler and on the emulated processor."""
+        found = {}
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place)
+            expected = prepared(self.what, folder, self.precision, samples)
+            for compiler in compilers():
+                found[compiler] = host(folder, "code", compiler) == expected
+            if emulator():
+                few = emulated if self.precision == "f32" else emulated // 10
+                expected = prepared(self.what, folder, self.precision, few)
+                found["cortex-m4"] = cortex_m4(folder, "code") == expected
+        return found
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--costs", action="store_true", help="instructions and sizes instead")
     parser.add_argument("--samples", type=int, default=10_000_000)
     parser.add_argument("--emulated", type=int, default=1_000_000, help="a tenth of it in f64")
+    parser.add_argument("--state", type=Path, help="file that says where to go on")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="begin none later")
     args = parser.parse_args()
     if args.costs:
         return print_costs()
     wrong = total = 0
-    for name, what in cases():
-        for precision in ("f64", "f32"):
-            began, found = time.perf_counter(), {}
-            with tempfile.TemporaryDirectory() as place:
-                folder = Path(place)
-                expected = prepared(what, folder, precision, args.samples)
-                for compiler in compilers():
-                    found[compiler] = host(folder, "code", compiler) == expected
-                if emulator():
-                    few = args.emulated if precision == "f32" else args.emulated // 10
-                    expected = prepared(what, folder, precision, few)
-                    found["cortex-m4"] = cortex_m4(folder, "code") == expected
-            total += len(found)
-            wrong += sum(not same for same in found.values())
-            words = ", ".join(f"{k} {'same' if v else 'DIFFERS'}" for k, v in found.items())
-            print(f"{name}, {precision}: {words} ({time.perf_counter() - began:.1f} s)", flush=True)
+    work = [Comparison(name, what, p) for name, what in cases() for p in ("f64", "f32")]
+    for comparison in portion(work, args.state, args.minutes):
+        began = time.perf_counter()
+        found = comparison.same(args.samples, args.emulated)
+        total += len(found)
+        wrong += sum(not same for same in found.values())
+        words = ", ".join(f"{k} {'same' if v else 'DIFFERS'}" for k, v in found.items())
+        print(f"{comparison}: {words} ({time.perf_counter() - began:.1f} s)", flush=True)
     print(f"{wrong} of {total} comparisons differ")
     return wrong != 0
 

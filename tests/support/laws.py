@@ -1,9 +1,11 @@
 """Every property of the Rust crates under many seeds: what `make laws` runs.
 
 python tests/support/laws.py [--seeds 20] [--cases 10000] [--package NAME ...] [--only WORD]
+    [--state FILE --minutes 10]
 
 Each law runs in a process of its own, `--jobs` of them at a time, and all laws under one seed
-before the next seed: an interrupted run has whole seeds. A law that holds for one seed may fail for
+before the next seed: an interrupted run has whole seeds. With a state file, a run of some minutes
+goes on where the last one stopped. A law that holds for one seed may fail for
 the next. Cases that fail are kept by proptest in the crate's proptest-regressions, and are tried
 first from then on: commit them with what mends them.
 """
@@ -11,7 +13,7 @@ first from then on: commit them with what mends them.
 from __future__ import annotations
 
 import argparse
-import functools
+import itertools
 import json
 import os
 import re
@@ -22,6 +24,8 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+
+from portions import portion
 
 ROOT = Path(__file__).resolve().parents[2]
 CRATES = {"sewfast-control": "control", "sewfast-core": "core", "sewfast-link": "link"}
@@ -73,26 +77,52 @@ def laws(program: Path, package: str, only: str) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Law:
-    """What came of one under one seed: what its process said where it failed, else nothing."""
+class Trial:
+    """One law under one seed."""
 
+    seed: int
+    package: str
+    law: str
+
+    def __str__(self) -> str:
+        return f"{self.package} {self.law} (seed {self.seed})"
+
+
+@dataclass(frozen=True)
+class Found:
+    """What came of a trial: what its process said where it failed, else nothing."""
+
+    trial: Trial
     said: str
     seconds: float
 
 
-def try_law(program: Path, package: str, seed: int, cases: int, name: str) -> Law:
+def try_law(program: Path, trial: Trial, cases: int) -> Found:
     """Run one under one seed."""
     began = time.monotonic()
     done = subprocess.run(
-        [program, "--exact", name],
-        cwd=ROOT / "rust" / CRATES[package],
-        env={**os.environ, "PROPTEST_RNG_SEED": str(seed), "PROPTEST_CASES": str(cases)},
+        [program, "--exact", trial.law],
+        cwd=ROOT / "rust" / CRATES[trial.package],
+        env={**os.environ, "PROPTEST_RNG_SEED": str(trial.seed), "PROPTEST_CASES": str(cases)},
         capture_output=True,
         text=True,
     )
     ran = done.returncode == 0 and "1 passed" in done.stdout
-    said = "" if ran else f"{name} ended with {done.returncode}\n{done.stdout}{done.stderr}"
-    return Law(said, time.monotonic() - began)
+    said = "" if ran else f"{trial} ended with {done.returncode}\n{done.stdout}{done.stderr}"
+    return Found(trial, said, time.monotonic() - began)
+
+
+def summary(found: Sequence[Found], package: str, cases: int) -> str:
+    mine = [f for f in found if f.trial.package == package]
+    took: dict[str, float] = {}
+    for f in mine:
+        took[f.trial.law] = took.get(f.trial.law, 0.0) + f.seconds
+    slowest = sorted(took, key=lambda name: -took[name])[:3]
+    return (
+        f"{package:<16} {len(mine)} trials of {len(took)} laws, {cases} cases each: "
+        f"{sum(bool(f.said) for f in mine)} failed; slowest "
+        + ", ".join(f"{name.rpartition('::')[2]} {took[name]:.0f} s" for name in slowest)
+    )
 
 
 def main() -> int:
@@ -103,32 +133,27 @@ def main() -> int:
     parser.add_argument("--package", action="append", choices=CRATES)
     parser.add_argument("--only", default="", help="properties with this in their name")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at a time")
+    parser.add_argument("--state", type=Path, help="file that says where to go on")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no law later")
     asked = parser.parse_args()
-    failed: list[str] = []
-    rows: list[str] = []
-    for package, program in binaries(asked.package or list(CRATES)).items():
-        names = laws(program, package, asked.only)
-        began, broken = time.monotonic(), 0
-        took = dict.fromkeys(names, 0.0)
-        for seed in range(asked.first, asked.first + asked.seeds) if names else ():
-            with ThreadPoolExecutor(asked.jobs) as pool:
-                tried = functools.partial(try_law, program, package, seed, asked.cases)
-                found = dict(zip(names, pool.map(tried, names), strict=True))
-            bad = [name for name, law in found.items() if law.said]
-            took = {name: took[name] + law.seconds for name, law in found.items()}
-            broken += len(bad)
-            failed += [f"{name} (seed {seed})" for name in bad]
-            print(f"{package} seed {seed}: {len(names)} laws, {len(bad)} failed", flush=True)
-            for name in bad:
-                print(found[name].said[-4000:], flush=True)
-        seconds = time.monotonic() - began
-        slowest = sorted(took, key=lambda name: -took[name])[:3]
-        rows.append(
-            f"{package:<16} {len(names):>4} laws x {asked.seeds} seeds x {asked.cases} cases: "
-            f"{broken} failed, {seconds:.0f} s; slowest "
-            + ", ".join(f"{name.rpartition('::')[2]} {took[name]:.0f} s" for name in slowest)
-        )
-    print("\n".join(["", *rows, *failed]))
+    programs = binaries(asked.package or list(CRATES))
+    named = {package: laws(p, package, asked.only) for package, p in programs.items()}
+    seeds = range(asked.first, asked.first + asked.seeds)
+    work = [
+        Trial(seed, package, law) for seed in seeds for package in named for law in named[package]
+    ]
+    found: list[Found] = []
+    with ThreadPoolExecutor(asked.jobs) as pool:
+        todo = portion(work, asked.state, asked.minutes)
+        while some := list(itertools.islice(todo, asked.jobs)):
+            for f in pool.map(lambda t: try_law(programs[t.package], t, asked.cases), some):
+                found.append(f)
+                print(f"{f.trial}: {'FAILED' if f.said else 'ok'}, {f.seconds:.1f} s", flush=True)
+                if f.said:
+                    print(f.said[-4000:], flush=True)
+    failed = [f for f in found if f.said]
+    rows = [summary(found, package, asked.cases) for package in programs]
+    print("\n".join(["", *rows, *(str(f.trial) for f in failed)]))
     return 1 if failed else 0
 
 

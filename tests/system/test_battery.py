@@ -264,6 +264,7 @@ def test_references_are_kept_for_the_same_data_only(tmp_path: Path) -> None:
     assert scoring.outcome(stale).references.oracle == kept.oracle
 
 
+@pytest.mark.nightly("the whole program of the battery")
 def test_the_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main = runpy.run_path(str(BENCHES / "battery.py"))["main"]
     out = tmp_path / "out.json"

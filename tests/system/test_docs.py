@@ -25,9 +25,12 @@ _ELSEWHERE = (
 )
 """Tags that would load something from the network."""
 RUN = [p for p in PAGES if any(b.language in ("python", "console") for b in blocks(p))]
+MINUTES = pytest.mark.nightly("a walk that takes minutes of processor; `examples/` run by day")
+LONG = ("README", "real-data", "tutorial", "commissioning", "bode")
+RUN_WHEN = [pytest.param(p, id=p.stem, marks=MINUTES if p.stem in LONG else ()) for p in RUN]
 
 
-@pytest.mark.parametrize("page", RUN, ids=lambda p: p.stem)
+@pytest.mark.parametrize("page", RUN_WHEN)
 def test_page_runs(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:

@@ -43,6 +43,7 @@ def controller() -> sewfast.Controller:
     )  # fmt: skip
 
 
+@pytest.mark.nightly("measures the link for half a minute")
 @needs_board
 @pytest.mark.parametrize("clock", ["credit", "real"])
 @pytest.mark.parametrize("name", BOARDS)

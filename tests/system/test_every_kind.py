@@ -45,6 +45,18 @@ def refusal(model: Model) -> str | None:
     return late if any(m.orders["nk"] == 0 for m in singles(model)) else None
 
 
+@pytest.mark.nightly(
+    "the same for every kind",
+    by_day=[
+        "oe",
+        "hammerstein_wiener",
+        "grey_box",
+        "neural_oe",
+        "neural_ss, two inputs",
+        "ensemble of mixed kinds",
+        "oe without evidence",
+    ],
+)
 @every_kind
 def test_check_gives_a_card(name: str) -> None:
     model = model_of(name)
@@ -64,6 +76,10 @@ def test_check_gives_a_card(name: str) -> None:
         assert not re.search(r"\b(training|inputs|model|sewfast)[=.(]", str(card))
 
 
+@pytest.mark.nightly(
+    "the same for every kind",
+    by_day=["oe", "grey_box", "neural_ss, two inputs", "ensemble of mixed kinds"],
+)
 @every_kind
 def test_figures_are_drawn(name: str) -> None:
     pytest.importorskip("matplotlib", reason="needs the report extra")
@@ -94,6 +110,19 @@ def test_validate_predict_simulate_and_bands(name: str) -> None:
     assert band.n == 380
 
 
+@pytest.mark.nightly(
+    "the same for every kind",
+    by_day=[
+        "oe",
+        "hammerstein_wiener",
+        "grey_box",
+        "neural_oe",
+        "neural_ss, integrator",
+        "neural_ss, two inputs",
+        "ensemble of mixed kinds",
+        "ensemble, no delay",
+    ],
+)
 @every_kind
 def test_run_analyse_tune_and_judge(name: str) -> None:
     model = model_of(name)
@@ -112,6 +141,19 @@ def test_run_analyse_tune_and_judge(name: str) -> None:
                 call()
 
 
+@pytest.mark.nightly(
+    "the same for every kind",
+    by_day=[
+        "oe",
+        "hammerstein_wiener",
+        "grey_box",
+        "neural_oe",
+        "neural_ss, integrator",
+        "neural_ss, two inputs",
+        "ensemble of mixed kinds",
+        "ensemble, no delay",
+    ],
+)
 @every_kind
 def test_tune_finds_its_own_start_or_says_why_not(name: str) -> None:
     model = model_of(name)

@@ -55,6 +55,7 @@ def test_every_run_ends_at_0_volts() -> None:
     assert on.machine.data.ctrl[0] == 0.0
 
 
+@pytest.mark.nightly("responses of MuJoCo's motors")
 @pytest.mark.parametrize("number", [4, 17])
 def test_load_over_the_turn_behind_a_gear_is_no_resonance(number: int) -> None:
     motor = motors.drawn(number)

@@ -34,6 +34,7 @@ def memory() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
+@pytest.mark.nightly("half a minute of faults")
 @dataclass
 class Checked:
     """A sink that compares every sample with what the device was told to apply."""

@@ -171,6 +171,7 @@ def test_a_position_that_cannot_return_needs_references() -> None:
         sewfast.tune(servo(0.01, 0.1, 5.0, (0.0, 10.0)), evaluations=4)
 
 
+@pytest.mark.nightly("many drives")
 @settings(max_examples=25, deadline=None)
 @given(
     Ts=st.floats(1e-4, 0.1),

@@ -102,6 +102,7 @@ def by_pymoo(number: int, seed: int, size: int, evaluations: int) -> Any:
         return minimize(problem, algorithm, ("n_eval", evaluations), seed=seed + 1).F
 
 
+@pytest.mark.nightly("seven problems against pymoo")
 @pytest.mark.parametrize("number", [1, 2, 3, 6])
 def test_fronts_are_as_large_as_pymoos(number: int) -> None:
     size, evaluations, dimensions = 50, 8000, 10 if number == 6 else 30
