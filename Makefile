@@ -43,10 +43,11 @@ dev: $(DEV) ## builds and installs what the checks need (--jobs=2: in parallel)
 
 # compilers side by side: one that optimises a crate keeps one processor busy
 SYNC := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
-FIRST ?= dev rust-units
+# package before lint: clippy sets pyo3 up in another way than maturin, and each compiles it anew after the other
+FIRST ?= dev package rust-units
 test: ## every check of the day; ends with pytest's summary, which names what is left to `make nightly`
 	$(MAKE) --no-print-directory --jobs=3 $(SYNC) $(FIRST)
-	$(MAKE) --no-print-directory --jobs=2 $(SYNC) rust-rest lint no-std c-test package
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) rust-rest lint no-std c-test
 	$(MAKE) --no-print-directory python-test
 
 test-core: ## the crates and the package without documentation, extras, ports and browser
@@ -121,13 +122,13 @@ laws: $(DEV) ## every property of the crates under 20 seeds with 10,000 cases ea
 	$(BIN)/python tests/support/laws.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(CASES),--cases $(CASES)) $(if $(ONLY),--only $(ONLY))
 
 no-std: ## links the controller crate without the standard library, and its frames without a path that can panic
-	cargo build --package sewfast-control --profile built --quiet
+	cargo build --package sewfast-control --profile firmware --quiet
 	rustc --edition 2024 --crate-type staticlib -C panic=abort -D warnings \
-	  --extern sewfast_control=target/built/libsewfast_control.rlib \
+	  --extern sewfast_control=target/firmware/libsewfast_control.rlib \
 	  --out-dir target/bare rust/control/tests/bare/staticlib.rs
 ifeq ($(shell uname),Linux)
 	rustc --edition 2024 --crate-type cdylib -C panic=abort -C opt-level=s -C lto=fat -C embed-bitcode=yes -D warnings \
-	  --extern sewfast_control=target/built/libsewfast_control.rlib -C link-args='-nostdlib -lc -Wl,-z,defs' \
+	  --extern sewfast_control=target/firmware/libsewfast_control.rlib -C link-args='-nostdlib -lc -Wl,-z,defs' \
 	  --out-dir target/bare rust/control/tests/bare/no_panic.rs
 endif
 

@@ -344,6 +344,7 @@ def test_drift_is_seen_and_nothing_else(tmp_path: Path, alone: Fleet) -> None:
     assert "drift   m1.npz: gain" in str(found)
 
 
+@pytest.mark.nightly("many recordings")
 def test_no_machine_drifts_by_itself(tmp_path: Path, alone: Fleet) -> None:
     """48 comparisons of three quantities, none of which has changed."""
     for seed in range(6):

@@ -70,6 +70,7 @@ def results() -> dict[str, tuple[Any, int]]:
 NAMES = ["data", "summary", "validation", "card", "run", "orders", "delay", "margins"]
 
 
+@pytest.mark.nightly("every result", by_day=["data", "validation", "run", "margins"])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_result_draws_itself(name: str, tmp_path: Path) -> None:
     result, count = results()[name]

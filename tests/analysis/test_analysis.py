@@ -301,6 +301,7 @@ def test_refusals_say_what_to_give() -> None:
         analyse(replace(IDEAL, Ts=0.002), drive())
 
 
+@pytest.mark.nightly("another report")
 def test_the_page_shows_the_analysis_in_its_folder(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="needs the report extra")
     folder = result_folder.make(tmp_path / "demo")

@@ -53,6 +53,7 @@ def commissioning(folder: Path, on: str = "virtual") -> Iterator[subprocess.Pope
             process.kill()
 
 
+@pytest.mark.nightly("a commissioning for each bench", by_day=["process"])
 @pytest.mark.alone
 @pytest.mark.parametrize("behind", ["process", "port"])
 def test_a_killed_commissioning_leaves_its_recordings(tmp_path: Path, behind: str) -> None:
@@ -95,6 +96,7 @@ def test_ctrl_c_says_at_once_that_it_writes(tmp_path: Path) -> None:
     assert (tmp_path / "out/recordings/trapezoids.csv").exists()
 
 
+@pytest.mark.nightly("a commissioning for each moment", by_day=["0.2"])
 @pytest.mark.alone
 @pytest.mark.parametrize("after", [0.2, 0.6])
 def test_ctrl_c_is_heard_while_linear_models_are_fitted(tmp_path: Path, after: float) -> None:

@@ -35,6 +35,7 @@ def arrays(parts: list[Dataset]) -> list[tuple[Any, Any]]:
     return [(e.u, e.y) for e in experiments]
 
 
+@pytest.mark.nightly("a fit of every kind", by_day=["arx", "neural_oe"])
 @pytest.mark.parametrize("kind", ["arx", "oe", "neural_oe", "auto"])
 def test_each_run_keeps_its_own_start(kind: Any) -> None:
     data = Dataset.concat(runs())

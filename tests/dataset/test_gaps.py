@@ -161,6 +161,7 @@ def data_of(y: FloatArray, u: FloatArray) -> Dataset:
     return Dataset.from_arrays(u, y, 0.01, name="run")
 
 
+@pytest.mark.nightly("a fit of every kind", by_day=["arx", "neural_oe"])
 @pytest.mark.parametrize("kind", ["arx", "oe", "neural_oe", "auto"])
 def test_what_stood_in_a_gap_changes_nothing(kind: Any) -> None:
     """Garbage that is masked gives the same bits as NaN from the beginning."""
@@ -174,6 +175,7 @@ def test_what_stood_in_a_gap_changes_nothing(kind: Any) -> None:
     assert texts[0] == texts[1]
 
 
+@pytest.mark.nightly("a network for each kind of gap", by_day=["long gaps"])
 @pytest.mark.parametrize("kind", ["random", "long gaps", "first samples"])
 def test_identify_takes_gaps(kind: str) -> None:
     u, y = recording(0)

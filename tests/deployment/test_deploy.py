@@ -95,6 +95,10 @@ def test_the_sketch_controls_a_motor_as_the_core_would(tmp_path: Path) -> None:
     assert abs(speeds[-100:].mean() - 1000.0) < 10.0
 
 
+@pytest.mark.nightly(
+    "the same for every controller",
+    by_day=["pi-f32", "everything-f64", "everything-f32", "ramp-f64"],
+)
 @needs_compiler
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", deployed.CONTROLLERS)
@@ -132,6 +136,9 @@ def test_hostile_inputs_and_changes_of_mode_keep_the_bits(
 CHANGING = ("pi", "paper", "p alone", "lag", "tracking", "slew", "biquads")
 
 
+@pytest.mark.nightly(
+    "the same for every controller", by_day=["pi-f64", "paper-f32", "tracking-f64", "biquads-f32"]
+)
 @needs_compiler
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", CHANGING)

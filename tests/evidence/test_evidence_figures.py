@@ -62,6 +62,7 @@ def test_figures_are_written_whole(tmp_path: Path) -> None:
         save(card(), tmp_path / "file")
 
 
+@pytest.mark.nightly("another card")
 def test_the_command_prints_the_card(tmp_path: Path) -> None:
     data = linear_data(900, noise=0.5)
     e = data.experiments[0]
@@ -88,6 +89,7 @@ def _with_card(folder: Path, drawing: str) -> Path:
     return made
 
 
+@pytest.mark.nightly("another report")
 def test_the_report_shows_the_card(tmp_path: Path) -> None:
     drawing = '<svg viewBox="0 0 100 50" role="img" aria-label="Bode"><path d="M0 0"/></svg>'
     page = report(_with_card(tmp_path / "a", drawing)).read_text()

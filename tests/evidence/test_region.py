@@ -304,6 +304,7 @@ def test_a_region_of_an_older_version_is_not_known_and_no_error() -> None:
     assert card.line("outside training region").verdict == "info"
 
 
+@pytest.mark.nightly("every seed", by_day=["1.0-0", "0.9998-1"])
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("pole", [1.0, 0.9998])
 def test_an_axis_at_rest_is_at_home_wherever_it_has_been(seed: int, pole: float) -> None:

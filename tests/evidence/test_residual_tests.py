@@ -135,6 +135,7 @@ SHAPES = {
 }
 
 
+@pytest.mark.nightly("records of every nonlinearity", by_day=["saturation"])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_missing_nonlinearity_is_detected(shape: str) -> None:
     """A linear model of a Hammerstein plant: at least one test refuses nearly every time."""

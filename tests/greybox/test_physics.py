@@ -59,6 +59,7 @@ def linear(n: int = 1500, Ts: float = 0.02, seed: int = 0, noise: float = 1.0) -
 # --- Motors whose truth is known ------------------------------------------------------------------
 
 
+@pytest.mark.nightly("a fit for each record", by_day=["12"])
 @pytest.mark.parametrize("seed", [12, 170, 181])
 def test_a_ramp_that_shows_no_inertia_says_so(seed: int) -> None:
     """Eight steps a sample overshoot a motor as fast as the least inertia makes it."""

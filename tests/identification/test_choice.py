@@ -238,7 +238,7 @@ def test_direct_feedthrough_has_to_be_worth_it() -> None:
     assert search.best is better
 
 
-@pytest.mark.nightly("a default search for each seed", by_day=["1"])
+@pytest.mark.nightly("a default search for each seed")
 @pytest.mark.parametrize("nk", [0, 1])
 def test_feedthrough_is_found_before_further_states_make_up_for_it(nk: int) -> None:
     # a bent oscillator under a slow input, whose next sample can be told from the last ones

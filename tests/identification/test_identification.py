@@ -169,6 +169,7 @@ def process_pool() -> Iterator[ProcessPoolExecutor]:
         yield pool
 
 
+@pytest.mark.nightly("a cluster; by day that of `test_fleet`")
 def test_a_dask_cluster_gives_the_same_bits() -> None:
     distributed = pytest.importorskip("distributed")
     with warnings.catch_warnings():

@@ -48,6 +48,10 @@ def _plant(
     )
 
 
+@pytest.mark.nightly(
+    "every structure, three seeds",
+    by_day=["_band-None-structure0-1", "None-_sensor-structure1-2", "_band-_sensor-structure2-3"],
+)
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize(
     ("before", "behind", "structure"),

@@ -462,6 +462,7 @@ def test_a_recording_is_locked_where_only_windows_locks_are(
     assert len(read_recording(path)) == 10
 
 
+@pytest.mark.nightly("a long recording")
 def test_a_compressed_recording_is_smaller_and_the_same(tmp_path: Path) -> None:
     pytest.importorskip("zstandard", reason="needs the extra zstd")
     plain = make(tmp_path / "plain.mcap", 5000)

@@ -75,7 +75,7 @@ def test_every_flipped_bit_is_found(made: Made, whole: RecordedFile) -> None:
         assert whole.received - found.received <= 100
 
 
-@pytest.mark.nightly("flips every bit", by_day=["plain"])
+@pytest.mark.nightly("flips every bit")
 def test_every_bit_of_the_structure_counts(made: Made, whole: RecordedFile) -> None:
     """All bits outside of the JSON: opcodes, lengths, checksums, index."""
     heads = structure(made.raw)

@@ -67,6 +67,7 @@ class Kernel:
         )
 
 
+@pytest.mark.nightly("starts a kernel of Jupyter")
 def test_sliders_in_a_real_kernel(demo: Path) -> None:
     model = sewfast.load_model(demo / "drive.json")
     with Kernel() as kernel:

@@ -77,6 +77,19 @@ def test_the_split_is_that_of_the_docstring() -> None:
     assert {name.strip() for name in held} == set(families.HELD)
 
 
+@pytest.mark.nightly(
+    "every family, two seeds",
+    by_day=[
+        "hammerstein-0",
+        "wiener_hammerstein-1",
+        "first_order_encoder-0",
+        "dead_time-1",
+        "two_mass-0",
+        "three_inputs-1",
+        "motor_friction-0",
+        "drive_limit-0",
+    ],
+)
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("name", families.FAMILIES)
 def test_a_case_is_what_it_claims_to_be(name: str, seed: int) -> None:

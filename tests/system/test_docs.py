@@ -26,7 +26,7 @@ _ELSEWHERE = (
 """Tags that would load something from the network."""
 RUN = [p for p in PAGES if any(b.language in ("python", "console") for b in blocks(p))]
 MINUTES = pytest.mark.nightly("a walk that takes minutes of processor; `examples/` run by day")
-LONG = ("README", "real-data", "tutorial", "commissioning", "bode")
+LONG = ("README", "bode", "cli", "commissioning", "physics", "real-data", "tutorial")
 RUN_WHEN = [pytest.param(p, id=p.stem, marks=MINUTES if p.stem in LONG else ()) for p in RUN]
 
 

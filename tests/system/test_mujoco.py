@@ -85,6 +85,7 @@ def test_record_identify_tune_run() -> None:
     assert measured < 2.0 * tuned.cost
 
 
+@pytest.mark.nightly("a commissioning of a motor of MuJoCo")
 def test_motor_is_commissioned() -> None:
     motor = motors.drawn(17)
     found = commission(motors.bench_of(motor), speed=motor.speed, members=1, evaluations=150)

@@ -124,6 +124,14 @@ SERVOS = [
 ]
 
 
+@pytest.mark.nightly(
+    "every axis",
+    by_day=[
+        "0.0002-0.004-3000.0-u0-1-0.0",
+        "0.005-0.06-40.0-u3-1-2e-05",
+        "0.02-0.4-100.0-u5-2-0.0",
+    ],
+)
 @pytest.mark.parametrize(("Ts", "T", "gain", "u", "delay", "drift"), SERVOS)
 def test_a_position_is_tuned_with_no_option(
     Ts: float, T: float, gain: float, u: tuple[float, float], delay: int, drift: float
@@ -154,6 +162,9 @@ def test_a_spare_pole_at_1_is_no_position() -> None:
     assert drive_references(model, -5.0, 5.0)["trapezoid"].max() < 0.5
 
 
+@pytest.mark.nightly(
+    "every pole between the two", by_day=["0.02-0.0", "0.02-0.0002", "0.08-0.00012", "0.08-0.0004"]
+)
 @pytest.mark.parametrize("drift", [0.0, 8e-5, 1.2e-4, 2e-4, 2.4e-4, 2.6e-4, 4e-4])
 @pytest.mark.parametrize("T", [0.02, 0.08])
 def test_between_a_position_and_a_slow_lag_there_is_no_gap(T: float, drift: float) -> None:
@@ -261,6 +272,7 @@ def test_a_drive_without_a_brake_is_not_asked_to_fall_faster_than_it_coasts() ->
     assert np.all(np.diff(r[peak:]) / 0.01 >= -r[peak + 1 :] / 0.3 - 1e-9)
 
 
+@pytest.mark.nightly("every seed", by_day=["0-12.0", "0--0.4", "3-12.0"])
 @pytest.mark.parametrize("gain", [12.0, -0.4])
 @pytest.mark.parametrize("seed", range(6))
 def test_levels_of_a_drive_without_a_brake_are_held_where_its_record_was(

@@ -391,6 +391,9 @@ FIXED: dict[str, Any] = {"variables": ["alpha"], "evaluations": 10, "seed": 0}
 """A search that changes nothing in the loop."""
 
 
+@pytest.mark.nightly(
+    "every kind on both sides", by_day=["linear-1.1", "neural_oe-0.9", "ensemble of neural_oe-1.1"]
+)
 @pytest.mark.parametrize("share", [0.9, 1.1])
 @pytest.mark.parametrize("kind", ["linear", "neural_oe", "ensemble of neural_oe"])
 def test_a_loop_close_to_instability_is_said(kind: str, share: float) -> None:
