@@ -34,7 +34,6 @@ def memory() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-@pytest.mark.nightly("half a minute of faults")
 @dataclass
 class Checked:
     """A sink that compares every sample with what the device was told to apply."""
@@ -60,6 +59,7 @@ class Checked:
         self.writer.event(kind, index)
 
 
+@pytest.mark.nightly("half a minute of faults")
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from /proc")
 def test_a_long_run_under_faults_lists_every_gap(tmp_path: Path) -> None:
     period = np.round(signals.excitation("random", 1), 3)
