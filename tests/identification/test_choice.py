@@ -326,6 +326,25 @@ def test_an_error_in_a_pool_is_raised_and_an_interrupt_stops_all() -> None:
         Pool(2, Clock(None), interrupt).map(lambda item, look: time.sleep(0.05), range(2))
 
 
+def test_a_clock_keeps_time_for_the_evidence_and_more_of_it_beside_other_work() -> None:
+    alone, beside = Clock(100.0), Clock(100.0)
+    beside.worked(1.0, 10.0)
+    assert (alone.pace, beside.pace) == (1.0, 0.1)
+    kept = [100.0 - c.for_fits for c in (alone, beside)]
+    assert kept[1] == pytest.approx(10.0 * kept[0])
+    assert kept[0] > 0.0
+    assert alone.until(0.5) is not None
+    assert Clock(None).until(0.5) is None
+
+
+def test_a_clock_says_once_what_was_lost() -> None:
+    clock = Clock(1e-9)
+    assert clock.over(1.0, "networks")
+    assert clock.over(0.5, "networks")
+    assert clock.lost == ["networks"]
+    assert not Clock(1e9).over(0.5, "networks")
+
+
 # --- the choice -----------------------------------------------------------------------------------
 
 
