@@ -227,16 +227,18 @@ class Motors:
         The network begins without effect. Its starts are trained on an excerpt, the best one on all
         data.
         """
-        part = thinned(data, EXCERPT)
-        begun = []
+        part, asked, begun = thinned(data, EXCERPT), _at_any_time(look), []
         for i in range(STARTS):
             rng = np.random.default_rng(self.seed + i)
             weights = rng.standard_normal((hidden, 4)) * [0.5, 1.5, 1.5, 0.0]
             start = np.concatenate([core.theta, weights.ravel()])
             try:
-                begun.append(trained_from(core, start, part, self.iterations, look))
+                one = trained_from(core, start, part, self.iterations, look)
+                asked()
             except TimeUp:
-                begun.append(_changed(core, theta=start))
+                # cut short, it fits this part and nothing else: as it began, it has no effect
+                one = _changed(core, theta=start)
+            begun.append(one)
         best = min(begun, key=lambda c: _cost(c, part))
         if part is data:
             return best
