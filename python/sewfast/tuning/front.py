@@ -273,8 +273,10 @@ def pareto(
     if deadline.passed and found["termination"] == "interrupted":
         if not found["controllers"]:
             raise _unfinished(time, size)
-        time.lose(f"{rest - int(found['evaluations'])} of {total} controllers")
         found["termination"] = "time"
+    if "time" in (found["termination"], tuned.termination):
+        left = total - tuned.evaluations - int(found["evaluations"])
+        time.lose(f"{left} of {total} controllers")
     front = _front(found, task, names, tuned, time)
     return replace(front, lost=tuple(time.lost), grade=grade_of(task.plants))
 
