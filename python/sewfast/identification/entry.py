@@ -309,7 +309,7 @@ def _excerpt(model: Model, data: Dataset, clock: Clock) -> Dataset:
     """The data for the evidence stored with a model; fewer of them if time is short."""
     if clock.budget is None:
         return data
-    left = max(0.0, clock.for_fits - clock.spent) * clock.pace
+    left = max(0.0, clock.left(clock.budget))
     width = max(
         (len(m.core.theta) for m in model.members or (model,) if m.kind[:2] == "ne"), default=10
     )

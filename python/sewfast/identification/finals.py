@@ -16,6 +16,7 @@ from .trials import (
     BY_FAR,
     SHARE_OF_FINAL,
     SHARE_OF_VERIFYING,
+    TRAINING,
     Candidate,
     best_of_each_size,
     median_of,
@@ -114,7 +115,7 @@ class Finals:
     def _why_no_network(self, found: Sequence[Candidate]) -> str:
         if found:
             return "no network forgets its initial state and withstands larger inputs"
-        if self.clock.truncated:
+        if TRAINING in self.clock.lost:
             return "the time budget left no time for a network"
         return "no network could be trained: too few samples, or no start had a finite free run"
 

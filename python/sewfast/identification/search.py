@@ -20,6 +20,7 @@ from .training import Request, Structure
 from .trials import (
     SHARE_OF_FINAL,
     SHARE_OF_LINEAR,
+    TRAINING,
     WORTH_A_FEEDTHROUGH,
     Candidate,
     Trials,
@@ -79,7 +80,7 @@ class Search(Trials):
         if self.is_exact:
             return
         if self._is_late and not self.wants_network:
-            self.pool.clock.lose("networks")
+            self.pool.clock.lose(TRAINING)
             return
         alive = self.screen()
         for iterations in HALVING_ITERATIONS:

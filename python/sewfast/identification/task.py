@@ -81,15 +81,23 @@ class Clock:
 
     @property
     def for_fits(self) -> float:
-        """The budget without the time that verdict and evidence take at this pace [s]."""
-        return math.inf if self.budget is None else max(0.0, self.budget - CLOSING / self.pace)
+        """The part of the budget for fits [s]: verdict and evidence follow in time (`latest`).
+
+        They get at most half of it: if they take longer, it is the evidence that is lost.
+        """
+        if self.budget is None:
+            return math.inf
+        ends = latest(self.budget) - CLOSING / self.pace
+        return min(max(ends, 0.5 * self.budget), self.budget)
+
+    def left(self, end: float) -> float:
+        """Processor time until then without that of verdict and evidence [s]."""
+        return (end - self.spent) * self.pace - CLOSING
 
     @property
     def can_close(self) -> bool:
         """Whether there is still time for evidence."""
-        if self.budget is None:
-            return True
-        return self.spent + CLOSING / self.pace <= latest(self.budget)
+        return self.budget is None or self.left(latest(self.budget)) >= 0.0
 
     def until(self, share: float) -> float | None:
         """Time at which this share of the budget is used up (`time.perf_counter`); None without."""

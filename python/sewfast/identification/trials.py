@@ -40,6 +40,8 @@ WORTH_A_FEEDTHROUGH, STILL_WORTH_A_FEEDTHROUGH = 0.5, 0.9
 """Error ratios required of nk = 0, compared with equal size, and with the best with a delay (whose
 additional states can compensate). nk = 0 is no plant for a loop, and a smoothed speed anticipates
 the input a little."""
+TRAINING = "training of networks"
+"""What is lost if a time budget ends before a network is trained, or while one is."""
 SHARE_OF_GUARD = 0.95
 SHARE_OF_LINEAR = 0.12
 """Part of a time budget for linear models but the smallest."""
@@ -347,7 +349,7 @@ class Trials:
         requests: Sequence[Request],
         until: float | None,
         share: float,
-        what: str = "training of networks",
+        what: str = TRAINING,
     ) -> list[list[Start]]:
         """Starts of every request, not yet checked, outside the count of operations."""
         seed, workers = self.task.seed, self.task.workers
