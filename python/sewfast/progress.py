@@ -37,6 +37,11 @@ class TimeUp(KeyboardInterrupt):
     """
 
 
+def latest(seconds: float) -> float:
+    """When a call with this time budget has to be back, whatever else the computer does [s]."""
+    return 1.1 * seconds + 0.5
+
+
 class Progress:
     """Shows `done/total`, the best cost or the stage, and the elapsed seconds.
 

@@ -331,6 +331,27 @@ def test_an_error_in_a_pool_is_raised_and_an_interrupt_stops_all() -> None:
         Pool(2, Clock(None), interrupt).map(lambda item, look: time.sleep(0.05), range(2))
 
 
+@pytest.mark.parametrize("budget", [0.01, 1.0, 10.0, 100.0])
+@pytest.mark.parametrize("pace", [1.0, 0.4, 0.1, 0.01])
+def test_a_clock_keeps_time_for_the_evidence_or_loses_it(budget: float, pace: float) -> None:
+    clock = Clock(budget)
+    clock.worked(pace, 1.0)
+    assert clock.pace == pytest.approx(pace)
+    assert 0.5 * budget <= clock.for_fits <= budget
+    evidence = 0.25 / pace
+    in_time = clock.for_fits + evidence <= 1.1 * budget + 0.5
+    assert in_time or clock.for_fits == 0.5 * budget
+    assert Clock(None).until(0.5) is None
+
+
+def test_a_clock_says_once_what_was_lost() -> None:
+    clock = Clock(1e-9)
+    assert clock.over(1.0, "networks")
+    assert clock.over(0.5, "networks")
+    assert clock.lost == ["networks"]
+    assert not Clock(1e9).over(0.5, "networks")
+
+
 # --- the choice -----------------------------------------------------------------------------------
 
 

@@ -191,6 +191,12 @@ def test_a_time_budget_that_bites_is_told_and_leaves_a_model() -> None:
     model = identify(bent_data(), time_budget=1e-6, **SMALL)
     assert "time budget" in str(model.training["notes"])
     assert np.isfinite(model.simulate(bent_data())[0]).all()
+    cut = model.training["time_budget"]
+    assert cut["seconds"] == 1e-6
+    assert "networks" in " ".join(cut["lost"])
+    assert cut["grade"] == model.training["verdict"]["grade"]
+    note = next(n for n in model.training["notes"] if "time budget" in n)
+    assert all(what in note for what in (*cut["lost"], cut["grade"]))
 
 
 def test_a_time_budget_that_does_not_bite_changes_nothing() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from functools import cache
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from effort import FULL
 from sewfast import Dataset, _core
 from sewfast.analysis.changes import with_delay, with_time_constants
 from sewfast.errors import DataError, ModelFileError, SettingError
+from sewfast.identification.task import Clock
 from sewfast.models.grey_box import NAMES, GreyBox
 
 TS = 0.002
@@ -242,6 +244,45 @@ def test_a_search_in_a_hurry_and_one_interrupted_keep_the_motor(
     assert e.value.best.kind == "grey_box"
     assert e.value.best.training["termination"] == "interrupted"
     assert e.value.best.validate(_plant(3000, 41)).simulation.rmse < 1.2 * 2.0
+
+
+def test_a_motor_is_tried_before_any_larger_linear_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+
+    def motor(*_: object) -> None:
+        order.append("motor")
+
+    def linear(self: Any, *_: object) -> None:
+        order.append(f"linear after {len(self.candidates)}")
+
+    def ends(self: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sewfast.identification.grey_box.Motors.candidate", motor)
+    monkeypatch.setattr("sewfast.identification.linear.LinearTable.search", linear)
+    monkeypatch.setattr("sewfast.identification.search.Search.screen", ends)
+    with pytest.raises(sewfast.Interrupted):
+        sewfast.identify(_plant(1000, 1))
+    assert order == ["motor", "linear after 1"]
+
+
+def test_a_budget_ends_the_fit_of_a_motor_with_the_motor_so_far(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data, looks = _plant(1500, 1), count()
+    # a clock that counts: every look takes a second
+    monkeypatch.setattr(Clock, "spent", property(lambda self: float(next(looks))))
+    with pytest.raises(sewfast.FitError, match="time_budget"):  # before there is a motor
+        sewfast.identify(data, model="grey_box", hidden=2, time_budget=3.0)
+    errors = []
+    for budget in (100.0, 1e9):
+        looks = count()
+        model = sewfast.identify(data, model="grey_box", hidden=2, time_budget=budget)
+        errors.append(model.validate(data).simulation.rmse)
+        lost = model.training.get("time_budget", {}).get("lost", [])
+        assert ("iterations of the fit" in lost) == (budget < 1e9)
+    assert errors[0] < 0.5 * float(np.std(data.experiments[0].y))
+    assert errors[1] <= 1.01 * errors[0]
 
 
 def test_it_is_trained_further_alone_and_with_its_network() -> None:

@@ -1,5 +1,6 @@
 """Load steps in tuning: what they are, that they bind, what is refused."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,17 @@ from sewfast import (
     FitError,
     LoadStep,
     SettingError,
+    _core,
     load_controller,
     pareto,
     signals,
     tune,
 )
 from sewfast.control.loop import run
+from sewfast.models import LinearOE
+from sewfast.progress import TimeUp
 from sewfast.tuning import costs, recoveries
+from sewfast.tuning.task import Budget, Deadline
 
 STEP = LoadStep(1500.0, -2.0)
 SHORT = signals.reference("trapezoid")[:900]
@@ -143,15 +148,75 @@ def test_bounds_the_wrong_way_round_are_refused() -> None:
         tune(drive(), [SHORT], start=QUIET, variables=[("Ti", 0.5, 0.02)], evaluations=5)
 
 
+@pytest.mark.alone
 def test_a_search_ends_in_time_with_its_best() -> None:
     found = tune(
-        drive(), [SHORT], start=QUIET, evaluations=10**7, time_budget=0.2, threads=2
+        drive(), [SHORT], start=QUIET, evaluations=10**7, time_budget=0.5, threads=2
     )  # fmt: skip
     assert found.termination == "time"
     assert 1 <= found.evaluations < 10**7
     assert found.cost <= found.start_cost
+    assert f"{10**7 - found.evaluations} of {10**7} controllers" in found.lost
+    assert found.cut is not None
+    assert found.cut in str(found)
     whole = tune(drive(), [SHORT], start=QUIET, evaluations=5, time_budget=1e6, threads=2)
     assert whole.termination == "evaluations"
+    assert (whole.lost, whole.cut) == ((), None)
+
+
+@pytest.mark.alone
+def test_a_search_ends_in_time_where_every_loop_diverges() -> None:
+    a = np.poly([1.2, 0.976 + 0.173j, 0.976 - 0.173j, 0.79]).real
+    core = _core.LinearModel(a[1:].copy(), np.array([[1e-3, 0.0]]), 1, 0.0)
+    unstable = LinearOE(core, 1e-3, ("u",), "y", ("V",), "rpm", None)
+    start = replace(QUIET, u_min=-1e9, u_max=1e9, counts_per_rev=None)
+    with pytest.raises(FitError) as caught:
+        tune(unstable, [np.ones(5000)], start=start, evaluations=10**9, time_budget=0.5, threads=2)
+    assert caught.value.name == "time_budget"
+    assert "more time" in caught.value.remedy
+
+
+def test_a_deadline_asks_for_no_cost_but_for_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    monkeypatch.setattr("sewfast.tuning.task.time.monotonic", lambda: now)
+    time = Budget(10.0)
+    deadline = Deadline(time, time.share(0.5), None)
+    now = 4.9
+    deadline(1, 9, np.inf)
+    now = 5.1
+    deadline(0, 9, np.inf)  # the start
+    with pytest.raises(TimeUp):
+        deadline(1, 9, np.inf)
+    now = 11.6
+    with pytest.raises(TimeUp):
+        deadline(0, 9, np.inf)
+    assert time.over("looks")
+    assert time.lost == ["looks"]
+
+
+@pytest.mark.alone
+def test_what_was_lost_is_said_with_the_worst_grade_of_the_models() -> None:
+    fair, good = (
+        replace(drive(), training={"verdict": {"grade": grade}}) for grade in ("fair", "good")
+    )
+    found = tune(
+        [good, fair], [SHORT], start=QUIET, evaluations=10**7, time_budget=0.5, threads=2
+    )  # fmt: skip
+    assert found.grade == "fair"
+    assert found.cut is not None
+    assert found.cut.endswith("the model is graded fair")
+
+
+@pytest.mark.alone
+def test_a_front_ends_in_time() -> None:
+    given: dict[str, Any] = {"start": QUIET, "threads": 2, "size": 4}
+    front = pareto(drive(), [SHORT], evaluations=10**7, time_budget=1.0, **given)
+    assert 1 <= front.evaluations < 10**7
+    assert f"{10**7 - front.evaluations} of {10**7} controllers" in front.lost
+    assert front.cut is not None
+    assert front.cut in str(front)
+    with pytest.raises(SettingError, match="time_budget"):
+        pareto(drive(), [SHORT], time_budget=0.0, **given)
 
 
 @pytest.mark.parametrize("budget", [0.0, -1.0, float("nan"), float("inf"), "long"])
@@ -160,11 +225,12 @@ def test_a_time_budget_that_makes_no_sense_is_refused(budget: Any) -> None:
         tune(drive(), [SHORT], start=QUIET, evaluations=5, time_budget=budget)
 
 
+@pytest.mark.alone
 def test_constraints_that_are_not_met_in_time_are_said() -> None:
     with pytest.raises(FitError, match="constraints"):
         tune(
             drive(), [SHORT], start=QUIET, loads=[STEP], constraints=Constraints(recovery=1.0),
-            evaluations=10**7, time_budget=0.2, threads=2,
+            evaluations=10**7, time_budget=0.5, threads=2,
         )  # fmt: skip
 
 
@@ -179,8 +245,15 @@ def test_the_command_takes_a_load(tmp_path: Path) -> None:
     for bad in ("--load=1500", "--load=a:b"):
         told = sewfast(tmp_path, "tune", "drive.json", bad, "-o", "firm.json", done=2)
         assert "LEVEL:COMMAND" in told.err
-    told = sewfast(
-        tmp_path, "tune", "drive.json", "--pareto", "tracking,chatter", "--time-budget", "1",
-        "-o", "firm.json", done=2,
-    )  # fmt: skip
-    assert "--time-budget" in told.err
+
+
+@pytest.mark.alone
+def test_the_command_says_what_a_time_budget_cut_short(tmp_path: Path) -> None:
+    drive().save(tmp_path / "drive.json")
+    given = ("tune", "drive.json", "--evaluations", 10**7, "--time-budget", 1, "-o", "c.json")
+    given += ("--reference", "trapezoid")
+    for more in ((), ("--pareto", "tracking,chatter")):
+        told = sewfast(tmp_path, *given, *more)
+        assert "the time budget left no time for" in told.out
+        lost = json.loads(sewfast(tmp_path, *given, *more, "--json").out)["lost"]
+        assert any("controllers" in what for what in lost)

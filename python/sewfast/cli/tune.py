@@ -169,7 +169,7 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--time-budget", type=float, metavar="S",
-        help="time of the search, after which the best so far is used (no limit)",
+        help="time of the whole search, after which the best so far is used (no limit)",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search (0)")
     parser.add_argument(
@@ -190,11 +190,6 @@ def tune_command(args: argparse.Namespace) -> int | None:
     require_plot(args.plot)
     if args.front is not None and args.pareto is None:
         raise SettingError("--front: expected --pareto with the objectives of the front as well")
-    if args.pareto is not None and args.time_budget is not None:
-        raise SettingError(
-            name="--time-budget", expected="no --pareto, as a front has no best so far to end with",
-            received="both", remedy="leave one of them out",
-        )  # fmt: skip
     if args.pareto is not None and args.method != "genetic":
         raise SettingError(
             name="--method", expected="no --pareto, as a front is searched by NSGA-II",
@@ -394,7 +389,7 @@ def _front(
     with Progress("tune", quiet=args.quiet) as progress:
         return pareto(
             models, references, objectives=args.pareto.split(","), start=start, **settings,
-            progress=progress,
+            time_budget=args.time_budget, progress=progress,
         )  # fmt: skip
 
 
@@ -409,6 +404,8 @@ def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
                 "evaluations": found.evaluations,
                 "termination": found.termination,
                 "method": found.method,
+                "lost": list(found.lost),
+                "grade": found.grade,
                 "warning": found.warning,
                 "plot": None if args.plot is None else str(args.plot),
                 "weights": found.weights.named(),
@@ -440,6 +437,8 @@ def _show_front(args: argparse.Namespace, front: ParetoFront) -> None:
                 "values": front.values.tolist(),
                 "pick": front.pick,
                 "evaluations": front.evaluations,
+                "lost": list(front.lost),
+                "grade": front.grade,
                 "warning": front.sensitive,
                 **_controller(front.picked),
             }

@@ -513,6 +513,7 @@ def numbers(c: Commissioning) -> dict[str, Any]:
             "cost": c.tuning.cost,
             "start_cost": c.tuning.start_cost,
             "termination": c.tuning.termination,
+            "lost": list(c.tuning.lost),
             "constraints": str(c.tuning.constraints),
         },
         "cost": None if c.cost is None else dict(vars(c.cost)),

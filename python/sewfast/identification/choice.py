@@ -18,13 +18,9 @@ from ..dataset.experiment import mean_square, weights_of
 from ..errors import FitError, Interrupted
 from ..models import Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from ..models.grey_box import GreyBox
-from . import grey_box
 from .finals import (
     ALONE,
     ENOUGH_TO_CHOOSE_BY,
-    SHARE_OF_FINAL,
-    SHARE_OF_REFIT,
-    SHARE_OF_VERIFYING,
     WORTH_IT,
     WORTH_LOOKING,
     Finals,
@@ -44,7 +40,15 @@ from .linear import HELD_OUT, LEAST_GAIN, LinearCandidate, LinearTable, linear_p
 from .search import CLIMB_ITERATIONS, Search
 from .task import Pool, Provenance, Stopped, Task, arrays, finite, with_provenance, wrap
 from .training import Network, Request, Structure
-from .trials import STILL_WORTH_A_FEEDTHROUGH, Candidate, counting, median_of
+from .trials import (
+    SHARE_OF_FINAL,
+    SHARE_OF_REFIT,
+    SHARE_OF_VERIFYING,
+    STILL_WORTH_A_FEEDTHROUGH,
+    Candidate,
+    counting,
+    median_of,
+)
 
 WORTH_AN_INTEGRATOR = 0.7
 ABOUT_EQUAL = 0.02
@@ -54,6 +58,9 @@ MOST_MEMBERS = 15
 MOST_ALTERNATIVES = 2
 LIKELY = 1.5
 """Linear models with an error on the newest part within this factor are tested on earlier ones."""
+_FINALISTS, _REFIT = "training of the finalists to the end", "the fit to all samples"
+_DIAGNOSIS = "the diagnosis of the record"
+"""Work that a time budget can cut short, in words."""
 TOGETHER = 1.25
 """On little data, or in little time, the median includes all finalists within this factor."""
 
@@ -105,7 +112,7 @@ class Choice(Finals):
                 return self._network(chosen, others)
             asked = [c for c in asked if c.structure not in {f.structure for f in finalists}]
             # if the best candidates do not beat a motor, the next ones do not either
-            if not self._beats_motor(finished[0]) or self.clock.over(SHARE_OF_FINAL):
+            if not self._beats_motor(finished[0]) or self.clock.over(SHARE_OF_FINAL, _FINALISTS):
                 break
         if self.wants_network:
             return self._network(self._any_network(), [])
@@ -172,7 +179,7 @@ class Choice(Finals):
         """The best network even if it is not sound, or one that is trained in the time left."""
         found = self._state_space_networks()
         asked = [s for s in self.search.candidates if s.kind == "neural_ss"]
-        if asked and not found and not self.clock.over(SHARE_OF_FINAL):
+        if asked and not found and not self.clock.over(SHARE_OF_FINAL, _FINALISTS):
             # slow linear fits have used up the search's share of a time budget
             self.search.share = SHARE_OF_FINAL
             self.search.tried([(asked[0], CLIMB_ITERATIONS, 1)])
@@ -205,8 +212,10 @@ class Choice(Finals):
         """
         search, models = self.search, c.models[:most]
         is_early = self.is_hurried and not search.is_small
-        is_late = self.is_interrupted or is_early or self.clock.over(SHARE_OF_REFIT)
-        if self.split.is_given or is_late:
+        if self.split.is_given or self.is_interrupted:
+            return models
+        if is_early or self.clock.over(SHARE_OF_REFIT, _REFIT):
+            self.clock.lose(_REFIT)
             return models
         linear = search.start(c.structure.nx, c.structure.nk, c.structure.output)
         request = Request(
@@ -214,7 +223,7 @@ class Choice(Finals):
             linear if c.structure.kind == "neural_oe" else None, initial=models,
         )  # fmt: skip
         until = self.clock.until(SHARE_OF_REFIT)
-        (found,) = search.guarded(search.train([request], until, 1.0))
+        (found,) = search.guarded(search.train([request], until, 1.0, _REFIT))
         kept = [s.model for s in counting(found) if s.is_sound]
         return kept if len(kept) >= min(len(models), 3) else models
 
@@ -287,12 +296,15 @@ class Choice(Finals):
             return motor is not None
         if motor.rmse >= WORTH_IT * linear.rmse:
             return False
-        if len(motor.errors) > 1:
-            earlier = LinearTable(self.task.nk, [search.folds[1]], search.pool)
-            orders = sorted({search.linear.choice.order, linear.order})
-            earlier.add([(o, linear.nk) for o in orders], self.clock.until(SHARE_OF_FINAL))
-            if earlier.candidates and motor.errors[1].rmse >= WORTH_IT * earlier.best.rmse:
-                return False
+        if len(search.folds) > 1 and not self.is_interrupted:
+            until = self.clock.until(SHARE_OF_FINAL)
+            again = search.motors.again(motor, search.part_of_motor(1), search.pool, until)
+            if again is not None:
+                earlier = LinearTable(self.task.nk, [search.folds[1]], search.pool)
+                orders = sorted({search.linear.choice.order, linear.order})
+                earlier.add([(o, linear.nk) for o in orders], until)
+                if earlier.candidates and again >= WORTH_IT * earlier.best.rmse:
+                    return False
         self.reasons.append(
             "the equations of a motor: their free-run error on data not trained on is "
             f"{100 * motor.rmse / max(linear.rmse, 1e-300):.1f} % of the best linear model's"
@@ -304,12 +316,13 @@ class Choice(Finals):
         task, found = self.task, self.search.motor
         assert found is not None
         until = self.clock.until(SHARE_OF_REFIT)
-        motors = grey_box.Motors(task.seed, task.iterations_or_usual)
+        motors = self.search.motors
         jobs = [] if self.split.is_given or self.is_interrupted else [found]
         part = self.split.shortened(len(task.data), HELD_OUT)
         fits = self.search.pool.map(
-            lambda c, look: motors.refitted(c, task.data, part, look), jobs, until=until, share=1.0
-        )
+            lambda c, look: motors.refitted(c, task.data, part, look),
+            jobs, until=until, share=1.0, what=_REFIT,
+        )  # fmt: skip
         core = next((c for c in fits if c is not None), found.core)
         provenance: Provenance = {
             "initial_state": "estimated",
@@ -336,7 +349,7 @@ class Choice(Finals):
         options = task.fit_options(na=chosen.order, nb=chosen.order + 1, nk=chosen.nk)
         (fit,) = self.search.pool.map(
             lambda data, look: _core.fit_oe(data, **{**options, "progress": look}),
-            [arrays(task.data)], until=until, share=1.0,
+            [arrays(task.data)], until=until, share=1.0, what=_REFIT,
         )  # fmt: skip
         if fit is None:
             # no time to fit all samples: keep the model of the excerpt
@@ -349,7 +362,7 @@ class Choice(Finals):
     def _linear_choice(self) -> LinearCandidate:
         """The simplest linear model within a standard error of the best on all later parts."""
         table = self.search.linear
-        if self.clock.over(SHARE_OF_VERIFYING):
+        if self.clock.over(SHARE_OF_VERIFYING, "linear models on earlier parts"):
             return table.choice
         likely = [c for c in table.eligible if c.order <= 3 or c.rmse <= LIKELY * table.best.rmse]
         everywhere = LinearTable(self.task.nk, self.search.folds, self.search.pool)
@@ -378,11 +391,6 @@ class Choice(Finals):
     def _closed(self, model: Model, error: float, alternatives: Sequence[Model]) -> Model:
         """The model with its alternatives, notes and verdict."""
         notes = list(model.training.get("notes", []))
-        if self.clock.truncated:
-            notes.append(
-                f"the time budget of {self.clock.budget:g} s ended the search early: the result "
-                "depends on the speed of the machine"
-            )
         linear = self.linear
         if self.wants_network and linear is not None and error >= WORTH_IT * linear.rmse:
             notes.append(
@@ -396,14 +404,16 @@ class Choice(Finals):
             )
         extra: Provenance = {"notes": notes} if notes else {}
         found = verdict(model, self.task.data, self.split, error)
-        if found["grade"] == "good" and self.search.repeats:
+        is_known = self.search.is_diagnosed or not self.clock.over(SHARE_OF_REFIT, _DIAGNOSIS)
+        if found["grade"] == "good" and is_known and self.search.repeats:
             found["grade"] = "fair"
             repeated = "good on repetitions of this record"
             found["text"] = found["text"].replace(TEXTS["good"], repeated)
             found["next"] += what_to_record(self.task.data)
         if self.clock.truncated and found["grade"] != "good":
             found["next"].insert(0, "give a longer time budget, or none")
-        found["next"] += [f"{f.text}: {f.remedy}" for f in self.search.diagnosis.findings]
+        if is_known:
+            found["next"] += [f"{f.text}: {f.remedy}" for f in self.search.diagnosis.findings]
         extra["verdict"] = found
         return replace(with_provenance(model, extra), alternatives=tuple(alternatives))
 

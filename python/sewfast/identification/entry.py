@@ -40,9 +40,10 @@ _KINDS: dict[str, Callable[[Task], Model]] = {
 }
 SHARE_OF_FIT = 0.9
 """Share of a time budget for the fits; the rest is for the evidence stored with the model."""
+_FIT = "iterations of the fit"
 NETWORKS = ("neural_oe", "neural_ss")
 EVIDENCE_RATE, LEAST_EVIDENCE = 2.5e5, 2_000
-"""Samples times parameters whose evidence takes a second on a slow machine."""
+"""Samples times parameters whose evidence takes a second of a slow processor."""
 _SEARCHED = ("auto", "neural_ss")
 """Kinds without given lags: their structure is searched."""
 _LAGS = 2
@@ -199,7 +200,7 @@ def identify(
         seed=seed,
         iterations=iterations,
         threads=available() if threads is None else threads,
-        progress=progress if kind in _SEARCHED else clock.limited(progress, SHARE_OF_FIT),
+        progress=progress if kind in _SEARCHED else clock.limited(progress, SHARE_OF_FIT, _FIT),
         workers=workers,
         clock=clock,
         select=select,
@@ -210,14 +211,17 @@ def identify(
         found = _within_budget(partial(further.trained, model), task)
         if found.core is model.core:
             # stopped before its first step: it keeps the evidence from its own data
-            return found
+            return _with_losses(found, clock)
     else:
         found = _within_budget(_KINDS[kind], task)
     try:
         if "verdict" not in found.training:
             own = _verdict(found, task.data, task.validation)
             found = with_provenance(found, {"verdict": own})
-        return with_training_evidence(found, _excerpt(found, task.data, clock))
+        if not clock.can_close:
+            clock.lose("evidence")
+            return _with_losses(found, clock)
+        return with_training_evidence(_with_losses(found, clock), _excerpt(found, task.data, clock))
     except KeyboardInterrupt:
         raise Interrupted(found) from None
 
@@ -265,7 +269,7 @@ def _in_effect(data: Dataset, what: str) -> Dataset:
 
 
 def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
-    """The model, or with a note the best one when the time is up; Ctrl-C goes on to the caller."""
+    """The model, or the best one when the time is up; Ctrl-C goes on to the caller."""
     too_short = FitError(
         f"time_budget: expected time for at least one iteration, received "
         f"{task.clock.budget} s; give more, fewer data, or leave the budget out"
@@ -273,25 +277,39 @@ def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
     try:
         return identified(task)
     except Interrupted as e:
-        if not task.clock.over(SHARE_OF_FIT):
+        if not task.clock.over(SHARE_OF_FIT, _FIT):
             raise
         # without a step these are still their linear start
         begins_linear = e.best.kind in (*NETWORKS, *(cls.kind for cls in STRUCTURED))
         if begins_linear and e.best.training.get("iterations") == 0:
             raise too_short from None
-        note = f"the time budget of {task.clock.budget:g} s ended the training early"
-        return with_provenance(e.best, {"notes": [*e.best.training.get("notes", []), note]})
+        best: Model = e.best
+        return best
     except KeyboardInterrupt:
-        if not task.clock.over(SHARE_OF_FIT):
+        if not task.clock.over(SHARE_OF_FIT, _FIT):
             raise
         raise too_short from None
+
+
+def _with_losses(model: Model, clock: Clock) -> Model:
+    """The model with a note on what a time budget cut short, and the grade that it has."""
+    if not clock.lost:
+        return model
+    grade = model.training.get("verdict", {}).get("grade", "unknown")
+    note = (
+        f"the time budget of {clock.budget:g} s cut short: {', '.join(clock.lost)}; the result, "
+        f"graded {grade}, depends on the speed of the machine and on what else runs on it"
+    )
+    record = {"seconds": clock.budget, "lost": list(clock.lost), "grade": grade}
+    notes = [*model.training.get("notes", []), note]
+    return with_provenance(model, {"notes": notes, "time_budget": record})
 
 
 def _excerpt(model: Model, data: Dataset, clock: Clock) -> Dataset:
     """The data for the evidence stored with a model; fewer of them if time is short."""
     if clock.budget is None:
         return data
-    left = max(0.0, clock.budget - clock.spent)
+    left = max(0.0, clock.left(clock.budget))
     width = max(
         (len(m.core.theta) for m in model.members or (model,) if m.kind[:2] == "ne"), default=10
     )

@@ -12,7 +12,15 @@ from .folds import Split, compared, errors_of, free_runs
 from .linear import LinearCandidate, LinearTable
 from .search import STILL_NEAR, Search, decayed
 from .training import Request, Start
-from .trials import BY_FAR, Candidate, best_of_each_size, median_of
+from .trials import (
+    BY_FAR,
+    SHARE_OF_FINAL,
+    SHARE_OF_VERIFYING,
+    TRAINING,
+    Candidate,
+    best_of_each_size,
+    median_of,
+)
 
 WORTH_IT = 0.9
 """A network must bring the error below this part of the best linear model's, and of a motor's."""
@@ -41,8 +49,6 @@ BEHIND_LARGE = 1.01
 """The same on much data, where held-out errors are reliable and iterations expensive."""
 FINISHED = 0.995
 """A leg that does not reduce the error to below this part ends the training."""
-SHARE_OF_VERIFYING, SHARE_OF_FINAL, SHARE_OF_REFIT = 0.64, 0.89, 0.94
-"""Parts of a time budget by which each stage must be finished."""
 
 
 @dataclass
@@ -109,7 +115,7 @@ class Finals:
     def _why_no_network(self, found: Sequence[Candidate]) -> str:
         if found:
             return "no network forgets its initial state and withstands larger inputs"
-        if self.clock.truncated:
+        if TRAINING in self.clock.lost:
             return "the time budget left no time for a network"
         return "no network could be trained: too few samples, or no start had a finite free run"
 
@@ -245,7 +251,7 @@ class Finals:
         legs = 1 if self.is_hurried else LEGS
         for leg in range(legs):
             going = [c for c in alive if not c.converged]
-            if not going or self.clock.over(SHARE_OF_FINAL):
+            if not going or self.clock.over(SHARE_OF_FINAL, "training of the finalists to the end"):
                 break
             requests = self._leg(going, (budget - spent) / (legs - leg))
             spent += sum(r.operations for r in requests)

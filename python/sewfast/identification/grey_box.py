@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from ..models import Model
 from ..models.grey_box import MOST_UNITS, GreyBox
 from ..motorfit import PLACE, estimated, rad_per_second, records_of
 from ..motorfit.estimation import Normal, minimised
+from ..progress import TimeUp
 from .folds import Errors, Split, compared, errors_of, folds, free_runs, thinned
 from .task import Look, Pool, Provenance, R, Task, finite
 
@@ -32,8 +34,8 @@ EXCERPT, POLISHING = 8_000, 10
 """Samples on which the starts are trained, and iterations of the best one on all samples."""
 SEARCHED, MOST_FITTED = 10_000, 100_000
 """Samples to which a motor is fitted during a search of structures, and at its end."""
-PER_SAMPLE = 2e-4
-"""Time of a motor's fits on one processor, including the final one to all data [s]."""
+EARLIER = "the motor on an earlier part"
+"""What is lost if a time budget ends before a motor is fitted to a second part."""
 ENOUGH = 1.0
 """Squared distance to the minimum in standard errors at which the descent ends."""
 ARGUMENTS, OUTPUTS = 3.0, 0.1
@@ -60,12 +62,26 @@ def grey_box(task: Task) -> Model:
     motors = Motors(task.seed, task.iterations_or_usual)
     hidden, tried = task.hidden or 0, list[Provenance]()
     is_open = task.hidden is None and task.select
-    for part in folds(task.data, task.validation)[:1] if is_open else ():
-        alone = motors.alone(part)
-        more = motors.beside(alone, part)
-        hidden = (more if _is_better(more, alone) else alone).hidden
-        tried = [{"hidden": c.hidden, "held_out_rmse": finite(c.rmse)} for c in (alone, more)]
-    core = motors.fitted(task.data, hidden)
+
+    def look(*_: object) -> None:
+        if task.progress is not None:
+            task.progress(0, task.iterations_or_usual, math.inf)
+
+    found: MotorCandidate | None = None
+    try:
+        for part in folds(task.data, task.validation)[:1] if is_open else ():
+            found = motors.alone(part, look)
+            tried = [found.held_out()]
+            more = motors.beside(found, part, look)
+            tried.append(more.held_out())
+            found = more if _is_better(more, found) else found
+            hidden = found.hidden
+        core = motors.fitted(task.data, hidden, look)
+    except TimeUp:
+        # without time for all data, the motor of the earlier part
+        if found is None:
+            raise
+        core = found.core
     known: Provenance = {
         "initial_state": "estimated",
         "cost": _cost(core, task.data),
@@ -107,13 +123,10 @@ def require_motor(data: Dataset) -> None:
 
 @dataclass(frozen=True)
 class MotorCandidate:
-    """The motor's equations, with or without a network, and their errors on held-out data.
-
-    `errors` has those of every tested part, the newest first.
-    """
+    """The motor's equations, with or without a network, and their errors on held-out data."""
 
     core: _core.GreyBox
-    errors: tuple[Errors, ...]
+    errors: Errors
 
     @property
     def hidden(self) -> int:
@@ -123,8 +136,12 @@ class MotorCandidate:
 
     @property
     def rmse(self) -> float:
-        """Error on the newest part."""
-        return self.errors[0].rmse
+        """Error on held-out data."""
+        return self.errors.rmse
+
+    def held_out(self) -> Provenance:
+        """What a choice between both records."""
+        return {"hidden": self.hidden, "held_out_rmse": finite(self.rmse)}
 
     def row(self) -> Provenance:
         """The candidate's row of the table."""
@@ -153,33 +170,44 @@ class Motors:
         """The same motor with a network."""
         return _judged(self._with_network(motor.core, part.fitted, HIDDEN, look), part)
 
-    def candidate(
-        self, parts: Sequence[Split], pool: Pool, until: float | None
-    ) -> MotorCandidate | None:
-        """A motor fitted on each of the parts; None if the data are not those of a motor.
+    def candidate(self, part: Split, pool: Pool, until: float | None) -> MotorCandidate | None:
+        """A motor fitted to a part; None if the data are not those of a motor.
 
         First without a network, which is the result if time is short.
         """
         try:
-            require_motor(parts[0].fitted)
+            require_motor(part.fitted)
         except (DataError, SettingError):
             return None
-
-        def alone(part: Split, look: Look) -> MotorCandidate | None:
-            return _or_none(lambda: self.alone(part, look))
-
-        def more(job: tuple[Split, MotorCandidate | None], look: Look) -> MotorCandidate | None:
-            part, motor = job
-            return motor and _or_none(lambda: self.beside(motor, part, look))
-
-        plain = pool.map(alone, parts, until=until)
-        if plain[0] is None:
+        plain = pool.map(
+            lambda part, look: _or_none(lambda: self.alone(part, look)),
+            [part], until=until, what="the equations of a motor",
+        )[0]  # fmt: skip
+        if plain is None:
             return None
-        fuller = pool.map(more, list(zip(parts, plain, strict=True)), until=until)
-        first = fuller[0]
-        best = fuller if first is not None and _is_better(first, plain[0]) else plain
-        found = [c for c in best if c is not None]
-        return replace(found[0], errors=tuple(e for c in found for e in c.errors))
+        fuller = self._beside(plain, part, pool, until)
+        return fuller if fuller is not None and _is_better(fuller, plain) else plain
+
+    def again(
+        self, found: MotorCandidate, part: Split, pool: Pool, until: float | None
+    ) -> float | None:
+        """The error of the same candidate fitted to another part; None if there is none."""
+        plain = pool.map(
+            lambda part, look: _or_none(lambda: self.alone(part, look)),
+            [part], until=until, what=EARLIER,
+        )[0]  # fmt: skip
+        if plain is None or not found.hidden:
+            return None if plain is None else plain.rmse
+        fuller = self._beside(plain, part, pool, until)
+        return None if fuller is None else fuller.rmse
+
+    def _beside(
+        self, motor: MotorCandidate, part: Split, pool: Pool, until: float | None
+    ) -> MotorCandidate | None:
+        return pool.map(
+            lambda part, look: _or_none(lambda: self.beside(motor, part, look)),
+            [part], until=until, what="a network beside the motor",
+        )[0]  # fmt: skip
 
     def refitted(
         self, found: MotorCandidate, data: Dataset, part: Split, look: Look
@@ -188,7 +216,7 @@ class Motors:
         own = _or_none(lambda: self.fitted(thinned(data, MOST_FITTED), found.hidden, look))
         if own is None:
             return found.core
-        ratio, deviation = compared(errors_of(free_runs(own, part), part), found.errors[0])
+        ratio, deviation = compared(errors_of(free_runs(own, part), part), found.errors)
         return found.core if ratio > deviation else own
 
     def _with_network(
@@ -199,17 +227,24 @@ class Motors:
         The network begins without effect. Its starts are trained on an excerpt, the best one on all
         data.
         """
-        part = thinned(data, EXCERPT)
-        begun = []
+        part, asked, begun = thinned(data, EXCERPT), _at_any_time(look), []
         for i in range(STARTS):
             rng = np.random.default_rng(self.seed + i)
             weights = rng.standard_normal((hidden, 4)) * [0.5, 1.5, 1.5, 0.0]
             start = np.concatenate([core.theta, weights.ravel()])
-            begun.append(trained_from(core, start, part, self.iterations, look))
+            try:
+                one = trained_from(core, start, part, self.iterations, look)
+                asked()
+            except TimeUp:
+                # cut short, it fits this part and nothing else: as it began, it has no effect
+                one = _changed(core, theta=start)
+            begun.append(one)
         best = min(begun, key=lambda c: _cost(c, part))
         if part is data:
             return best
-        return trained_from(best, best.theta, data, min(POLISHING, self.iterations), look)
+        with contextlib.suppress(TimeUp):
+            return trained_from(best, best.theta, data, min(POLISHING, self.iterations), look)
+        return best
 
 
 def _or_none(found: Callable[[], R]) -> R | None:
@@ -222,12 +257,12 @@ def _or_none(found: Callable[[], R]) -> R | None:
 
 def _judged(core: _core.GreyBox, part: Split) -> MotorCandidate:
     core = _with_noise(core, part.fitted)
-    return MotorCandidate(core, (errors_of(free_runs(core, part), part),))
+    return MotorCandidate(core, errors_of(free_runs(core, part), part))
 
 
 def _is_better(more: MotorCandidate, alone: MotorCandidate) -> bool:
     """Whether a network makes the motor credibly better."""
-    ratio, deviation = compared(more.errors[0], alone.errors[0])
+    ratio, deviation = compared(more.errors, alone.errors)
     return ratio < min(-CREDIBLE * deviation, WORTH_IT)
 
 

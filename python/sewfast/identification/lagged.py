@@ -45,6 +45,7 @@ NOTHING_LEFT = 1e-6
 _USUAL_STARTS = 4
 LINEAR_SHARE = 0.4
 """Share of a time budget for the linear fits, so that some is left for the network."""
+_LINEAR_FITS = "linear fits at which the network begins"
 WORTH_IT = 0.98
 """The network must reduce the free-run error to below this part of the linear model's."""
 
@@ -114,7 +115,9 @@ class Networks:
     @classmethod
     def of(cls, task: Task) -> Networks:
         """The networks of a task, whose linear models are fitted here."""
-        brief = replace(task, progress=task.clock.limited(task.progress, LINEAR_SHARE))
+        brief = replace(
+            task, progress=task.clock.limited(task.progress, LINEAR_SHARE, _LINEAR_FITS)
+        )
         try:
             linear = _linear(brief)
             return cls(task, linear, _start(brief, linear))
@@ -241,7 +244,7 @@ def _linear(task: Task) -> _core.LinearModel:
     try:
         best: _core.LinearModel = oe(task).core
     except KeyboardInterrupt as e:
-        if not task.clock.over(LINEAR_SHARE):
+        if not task.clock.over(LINEAR_SHARE, _LINEAR_FITS):
             raise
         if not isinstance(e, Interrupted):
             return _core.fit_arx(arrays(task.data), **task.orders, offset=True)
@@ -258,7 +261,7 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
     orders = task.orders
     na, nb = orders["na"] - 1, orders["nb"] - 1
     parts = folds(task.data, task.validation)
-    if na < 1 or nb < 1 or not parts or task.clock.over(LINEAR_SHARE):
+    if na < 1 or nb < 1 or not parts or task.clock.over(LINEAR_SHARE, _LINEAR_FITS):
         return linear
     learned = arrays(parts[0].fitted)
     models = []
@@ -271,7 +274,7 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
             return linear
         except KeyboardInterrupt:
             # Ctrl-C, or the end of the linear fits' share of a time budget
-            if not task.clock.over(LINEAR_SHARE):
+            if not task.clock.over(LINEAR_SHARE, _LINEAR_FITS):
                 raise
             return linear
         models.append(fit.model)
@@ -308,6 +311,7 @@ _BETTER = math.log(0.98)
 """A structure with more parameters must reduce the held-out error to this part of the best."""
 SHARE_OF_CHOICE = 0.45
 """Share of a time budget for the choice; the rest is for the fit to all data."""
+_CHOICE = "structures"
 
 
 class _Stopped(Exception):
@@ -332,11 +336,6 @@ def identified_as(cls: type[StructuredModel]) -> Callable[[Task], Model]:
         def model(structure: Mapping[str, int], fit: Fitted) -> Model:
             note = {"initial_state": "estimated", "cost_unit": "output unit squared"}
             known = fit_provenance(fit) | note | {"structure": dict(structure), "tried": tried}
-            if task.clock.truncated and len(structures) > 1:
-                known["notes"] = [
-                    f"the time budget of {task.clock.budget:g} s ended the choice of a structure "
-                    f"early: {len(tried)} tried"
-                ]
             return task.model(cls, fit.model, known)
 
         try:
@@ -363,7 +362,7 @@ def _chosen(
     if len(structures) == 1 or not parts:
         return structures[-1]
     (held,) = parts
-    progress = task.clock.limited(task.progress, SHARE_OF_CHOICE)
+    progress = task.clock.limited(task.progress, SHARE_OF_CHOICE, _CHOICE)
     best = structures[0]
     kept: Fitted | None = None
     least: Errors | None = None
@@ -374,7 +373,7 @@ def _chosen(
         except FitError:
             return None
         if found.termination == "interrupted":
-            if kept is None and found.iterations and not task.clock.over(SHARE_OF_CHOICE):
+            if kept is None and found.iterations and not task.clock.over(SHARE_OF_CHOICE, _CHOICE):
                 raise _Stopped(structure, found)
             raise KeyboardInterrupt
         errors = errors_of(free_runs(found.model, held), held)
@@ -393,7 +392,7 @@ def _chosen(
                 ratio, deviation = compared(found[1], least)
                 best = smaller if ratio <= max(deviation, -_BETTER) else best
     except KeyboardInterrupt:
-        if task.clock.over(SHARE_OF_CHOICE):
+        if task.clock.over(SHARE_OF_CHOICE, _CHOICE):
             return best
         if kept is None:
             raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -218,16 +219,19 @@ class LinearTable:
         """The delay that was given, else 1."""
         return 1 if self.given_nk is None else self.given_nk
 
+    def begin(self) -> None:
+        """Fit the smallest order whatever the time is, so that there is a model."""
+        self.add([(ORDERS[0], self.nk)], None)
+
     def search(self, until: float | None) -> None:
         """Try orders upwards until two bring no gain, then delays of the best small order.
 
         A long dead time is tried before large orders, which mimic one and take most of the time;
-        the smallest orders come first, as networks start from them. The very first is always
-        fitted, so that there is a linear model.
+        the smallest orders come first, as networks start from them.
         """
-        self.add([(ORDERS[0], self.nk)], None)
+        self.begin()
         self.add([(ORDERS[1], self.nk)], until)
-        if self.given_nk is None:
+        if self.given_nk is None and not self._is_over(until):
             self.add(self._late(), until)
         best, idle = math.inf, 0
         orders = iter(ORDERS)
@@ -241,12 +245,16 @@ class LinearTable:
                 error = self.error(order, self.nk)
                 idle = 0 if error < WORTH_AN_ORDER * best else idle + 1
                 best = min(best, error)
-            if until is not None and self.pool.clock.over() and self.candidates:
+            if self._is_over(until):
                 break
         if self.given_nk is None and self.candidates:
             # an apparent order can be a delay, so one order less is tried as well
             small = min(self.choice.order, 3)
             self.add(((o, nk) for nk in DELAYS for o in (small - 1, small) if o > 0), until)
+
+    @staticmethod
+    def _is_over(until: float | None) -> bool:
+        return until is not None and time.perf_counter() >= until
 
     def _late(self) -> list[tuple[int, int]]:
         """Small orders with the estimated dead time, if it is longer than `DELAYS`.
@@ -271,7 +279,7 @@ class LinearTable:
             order, nk, fold = job
             return fitted(self._excerpts[fold].fitted, order, nk, look)
 
-        found = iter(self.pool.map(fit, jobs, until=until))
+        found = iter(self.pool.map(fit, jobs, until=until, what="larger linear models"))
         for order, nk in todo:
             models = tuple(next(found) for _ in self.folds)
             if models[0] is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -13,14 +12,15 @@ import numpy as np
 from .. import _core
 from ..dataset import Diagnosis, diagnose
 from . import grey_box
-from .folds import compared
+from .folds import Split, compared
 from .linear import HELD_OUT, MISLED, slowest_pole
 from .outputs import ABS, LINEAR, Output, named, rms_error, suggested
 from .task import arrays
 from .training import Request, Structure
 from .trials import (
+    SHARE_OF_FINAL,
     SHARE_OF_LINEAR,
-    SHARE_OF_MOTOR,
+    TRAINING,
     WORTH_A_FEEDTHROUGH,
     Candidate,
     Trials,
@@ -68,30 +68,42 @@ class Search(Trials):
         return self.samples >= DECAY_MATTERS
 
     def run(self) -> None:
-        """Linear models, then networks of every likely size, then larger ones from the best."""
-        self.linear.search(self.pool.clock.until(SHARE_OF_LINEAR))
+        """Linear models, then networks of every likely size, then larger ones from the best.
+
+        The equations of a motor come after the smallest linear model: where they hold, no other
+        second of the search gains as much, and a time budget must not end before it.
+        """
+        self.linear.begin()
+        if not self.is_exact:
+            self._try_motor()
+        self.linear.search(self.pool.clock.within(SHARE_OF_LINEAR, SHARE_OF_FINAL))
         if self.is_exact:
             return
-        self.motor = self._as_motor()
+        if self._is_late and not self.wants_network:
+            self.pool.clock.lose(TRAINING)
+            return
         alive = self.screen()
         for iterations in HALVING_ITERATIONS:
             alive = self.halve(alive, iterations)
         if not self.is_hopeless:
             self.climb()
 
-    def _as_motor(self) -> grey_box.MotorCandidate | None:
-        """The equations of a motor, on the two latest parts, unless another kind was requested."""
+    def _try_motor(self) -> None:
+        """Fit the equations of a motor to the newest part, unless another kind was requested."""
         task = self.task
         if self.wants_network or {task.nk, task.nx, task.hidden, task.output} != {None}:
-            return None
-        # the same data as for linear models, so that both can be compared block by block
-        parts = [f.shortened(grey_box.SEARCHED, HELD_OUT) for f in self.folds[:2]]
-        until = self.pool.clock.until(SHARE_OF_MOTOR)
-        wanted = grey_box.PER_SAMPLE * len(parts[0].fitted)
-        if until is not None and until - time.perf_counter() < wanted:
-            return None  # unfinished, it would waste the networks' time
-        motors = grey_box.Motors(task.seed, task.iterations_or_usual)
-        return motors.candidate(parts, self.pool, until)
+            return
+        until = self.pool.clock.until(SHARE_OF_FINAL)
+        self.motor = self.motors.candidate(self.part_of_motor(0), self.pool, until)
+
+    @property
+    def motors(self) -> grey_box.Motors:
+        """The fits of motors."""
+        return grey_box.Motors(self.task.seed, self.task.iterations_or_usual)
+
+    def part_of_motor(self, fold: int) -> Split:
+        """The same data as for linear models, so that both can be compared block by block."""
+        return self.folds[fold].shortened(grey_box.SEARCHED, HELD_OUT)
 
     @property
     def is_exact(self) -> bool:
@@ -304,6 +316,11 @@ class Search(Trials):
     def diagnosis(self) -> Diagnosis:
         """Properties of the record that decide what can be identified from it."""
         return diagnose(self.task.data)
+
+    @property
+    def is_diagnosed(self) -> bool:
+        """Whether `diagnosis` is known already."""
+        return "diagnosis" in self.__dict__
 
     @property
     def repeats(self) -> bool:

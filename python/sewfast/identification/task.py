@@ -14,7 +14,7 @@ from ..dataset import Dataset, FloatArray
 from ..errors import FitError, Interrupted
 from ..models import Model
 from ..models.base import Fitted
-from ..progress import TimeUp
+from ..progress import TimeUp, latest
 from ..threads import Workers
 from ..validation import validate
 
@@ -31,6 +31,8 @@ PERIOD = 0.02
 """Interval at which the calling thread checks for Ctrl-C and shows progress [s]."""
 STEPS = 1000
 """Total of the progress count."""
+CLOSING = 0.3
+"""Processor time that is kept for verdict and evidence [s]; the evidence takes .25 s or more."""
 
 
 class Clock:
@@ -40,41 +42,98 @@ class Clock:
     ----------
     budget : float or None
         Seconds.
-    truncated : bool
-        Whether the budget has cut anything short: the result then depends on the machine.
+    lost : list of str
+        The work that the budget cut short, in words: the result then depends on the machine.
     """
 
     def __init__(self, budget: float | None) -> None:
         self.budget = budget
-        self.truncated = False
+        self.lost: list[str] = []
         self._began = time.perf_counter()
+        self._processor = self._waited = 0.0
+
+    def lose(self, what: str) -> None:
+        """Note that the budget cut this work short."""
+        if what not in self.lost:
+            self.lost.append(what)
+
+    @property
+    def truncated(self) -> bool:
+        """Whether the budget has cut anything short."""
+        return bool(self.lost)
+
+    def worked(self, processor: float, waited: float) -> None:
+        """Count processor time that took so long to come [s]."""
+        self._processor += processor
+        self._waited += waited
+
+    @property
+    def pace(self) -> float:
+        """Seconds of one processor in a second, at most 1; less beside other work."""
+        if not self._processor > 0.0 < self._waited:
+            return 1.0
+        return min(1.0, self._processor / self._waited)
 
     @property
     def spent(self) -> float:
         """Seconds since the beginning."""
         return time.perf_counter() - self._began
 
+    @property
+    def for_fits(self) -> float:
+        """The part of the budget for fits [s]: verdict and evidence follow in time (`latest`).
+
+        They get at most half of it: if they take longer, it is the evidence that is lost.
+        """
+        if self.budget is None:
+            return math.inf
+        ends = latest(self.budget) - CLOSING / self.pace
+        return min(max(ends, 0.5 * self.budget), self.budget)
+
+    def left(self, end: float) -> float:
+        """Processor time until then without that of verdict and evidence [s]."""
+        return (end - self.spent) * self.pace - CLOSING
+
+    @property
+    def can_close(self) -> bool:
+        """Whether there is still time for evidence."""
+        return self.budget is None or self.left(latest(self.budget)) >= 0.0
+
     def until(self, share: float) -> float | None:
         """Time at which this share of the budget is used up (`time.perf_counter`); None without."""
-        return None if self.budget is None else self._began + share * self.budget
+        return None if self.budget is None else self._began + share * self.for_fits
 
-    def over(self, share: float = 1.0) -> bool:
-        """Whether this share of the budget is used up; if so, sets `truncated`."""
-        is_over = self.budget is not None and self.spent >= share * self.budget
-        self.truncated = self.truncated or is_over
+    def within(self, share: float, most: float) -> float | None:
+        """Time at which this share of the budget has passed from now on, but `most` of it at most;
+        None without a budget.
+        """
+        until = self.until(most)
+        return until and min(until, time.perf_counter() + share * self.for_fits)
+
+    def over(self, share: float, what: str) -> bool:
+        """Whether this share of the budget is used up; if so, `what` is lost."""
+        is_over = self.budget is not None and self.spent >= share * self.for_fits
+        if is_over:
+            self.lose(what)
         return is_over
 
-    def limited(self, progress: Progress | None, share: float) -> Progress | None:
-        """`progress` that ends a fit, as Ctrl-C would, when this share of the budget is used up."""
-        until = self.until(share)
-        if until is None:
+    def limited(self, progress: Progress | None, share: float, what: str) -> Progress | None:
+        """`progress` that ends a fit, as Ctrl-C would, when this share of the budget is used up.
+
+        Then `what` is lost.
+        """
+        if self.budget is None:
             return progress
+        last = (time.process_time(), time.perf_counter())
 
         def look(done: int, total: int, best: float) -> None:
+            nonlocal last
             if progress is not None:
                 progress(done, total, best)
-            if time.perf_counter() >= until:
-                self.truncated = True
+            (processor, clock), last = last, (time.process_time(), time.perf_counter())
+            self.worked(last[0] - processor, last[1] - clock)
+            if self.spent >= share * self.for_fits:
+                self.lose(what)
                 raise TimeUp
 
         return look
@@ -109,6 +168,7 @@ class Pool:
         *,
         until: float | None = None,
         share: float | None = None,
+        what: str = "",
     ) -> list[R | None]:
         """`work(item, look)` of every item, in the order of the items.
 
@@ -122,6 +182,8 @@ class Pool:
             Deadline on `time.perf_counter`; items not begun by then give None.
         share : float or None
             Part of the whole identification that is done after the items, for the progress.
+        what : str
+            The work in words, which is lost if the deadline comes first.
 
         Raises
         ------
@@ -142,6 +204,7 @@ class Pool:
             except KeyboardInterrupt:
                 return None
 
+        start, processor = time.perf_counter(), time.process_time()
         with ThreadPoolExecutor(min(self.threads, max(len(items), 1))) as threads:
             futures = [threads.submit(one, item) for item in items]
             try:
@@ -152,8 +215,10 @@ class Pool:
             except BaseException:
                 stopping.set()
                 raise
-        if until is not None and time.perf_counter() >= until:
-            self.clock.truncated = True
+        now = time.perf_counter()
+        self.clock.worked(time.process_time() - processor, now - start)
+        if items and until is not None and now >= until:
+            self.clock.lose(what)
         self.share = ended
         return [f.result() for f in futures]
 

@@ -229,6 +229,7 @@ def train(
     workers: Workers | None = None,
     until: float | None = None,
     share: float | None = None,
+    what: str,
 ) -> list[list[Start]]:
     """Starts with a finite free run of every request, in their order.
 
@@ -243,6 +244,7 @@ def train(
     until : float or None
         Deadline on `time.perf_counter`; starts then return their best so far.
     share : float or None
+    what : str
         As in `Pool.map`.
 
     Raises
@@ -252,11 +254,11 @@ def train(
     """
     jobs = [job for request in requests for job in _jobs(request, seed, until)]
     if workers is None:
-        found = pool.map(lambda job, look: job.run(look), jobs, until=until, share=share)
+        found = pool.map(lambda job, look: job.run(look), jobs, until=until, share=share, what=what)
     else:
         found = _spread(workers, jobs)
-        if until is not None and time.perf_counter() >= until:
-            pool.clock.truncated = True
+        if jobs and until is not None and time.perf_counter() >= until:
+            pool.clock.lose(what)
     left = iter(found)
     starts = [[next(left) for _ in range(request.count)] for request in requests]
     return [[Start(*values) for values in some if values is not None] for some in starts]

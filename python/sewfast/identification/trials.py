@@ -40,10 +40,15 @@ WORTH_A_FEEDTHROUGH, STILL_WORTH_A_FEEDTHROUGH = 0.5, 0.9
 """Error ratios required of nk = 0, compared with equal size, and with the best with a delay (whose
 additional states can compensate). nk = 0 is no plant for a loop, and a smoothed speed anticipates
 the input a little."""
+TRAINING = "training of networks"
+"""What is lost if a time budget ends before a network is trained, or while one is."""
 SHARE_OF_GUARD = 0.95
-SHARE_OF_LINEAR, SHARE_OF_MOTOR = 0.12, 0.4
+SHARE_OF_LINEAR = 0.12
+"""Part of a time budget for linear models but the smallest."""
 SHARE_OF_SEARCH, SHARE_OF_SEARCH_VERIFIED = 0.58, 0.45
-"""Parts of a time budget after which no further linear model, motor and network is tried."""
+"""Parts of it after which no further network is tried."""
+SHARE_OF_VERIFYING, SHARE_OF_FINAL, SHARE_OF_REFIT = 0.64, 0.89, 0.94
+"""Parts of it by which the stages after the search must be finished."""
 SHARE_OF_LINEAR_STARTS = 0.1
 """Part of it for fitting the linear models at which the next networks start; networks whose model
 is not ready start at a smaller one."""
@@ -178,10 +183,8 @@ class Trials:
     @property
     def _until_started(self) -> float | None:
         """Deadline of the linear models at which networks start."""
-        until, budget = self.until, self.pool.clock.budget
-        if until is None or budget is None:
-            return None
-        return min(until, time.perf_counter() + SHARE_OF_LINEAR_STARTS * budget)
+        most = self.share or self._share_of_search
+        return self.pool.clock.within(SHARE_OF_LINEAR_STARTS, most)
 
     def able(self, operations: float) -> float:
         """Part of these operations for which the present stage has time, at most 1."""
@@ -193,7 +196,8 @@ class Trials:
     @property
     def is_over(self) -> bool:
         """Whether the search has used up its operations or its share of the time budget."""
-        self.pool.clock.truncated |= self._is_late
+        if self._is_late:
+            self.pool.clock.lose("larger networks")
         return self._is_late or self.operations >= self.budget
 
     @property
@@ -341,11 +345,17 @@ class Trials:
         return self.guarded(found)
 
     def train(
-        self, requests: Sequence[Request], until: float | None, share: float
+        self,
+        requests: Sequence[Request],
+        until: float | None,
+        share: float,
+        what: str = TRAINING,
     ) -> list[list[Start]]:
         """Starts of every request, not yet checked, outside the count of operations."""
         seed, workers = self.task.seed, self.task.workers
-        return train(requests, self.pool, seed, workers=workers, until=until, share=share)
+        return train(
+            requests, self.pool, seed, workers=workers, until=until, share=share, what=what
+        )
 
     def guarded(self, found: Sequence[Sequence[Start]]) -> list[list[Start]]:
         """The starts with the guard's findings on whole records."""
@@ -357,7 +367,10 @@ class Trials:
 
         late = "not asked within the time budget"
         until = self.pool.clock.until(SHARE_OF_GUARD)
-        faults = (late if f is None else f for f in self.pool.map(fault, flat, until=until))
+        faults = (
+            late if f is None else f
+            for f in self.pool.map(fault, flat, until=until, what="the guard of networks")
+        )
         return [[replace(s, fault=next(faults)) for s in starts] for starts in found]
 
     @property
@@ -415,6 +428,8 @@ class Trials:
                 return None
 
         for (key, _), model in zip(
-            missing, self.pool.map(fit, missing, until=self.until), strict=True
+            missing,
+            self.pool.map(fit, missing, until=self.until, what="linear starts of networks"),
+            strict=True,
         ):
             self._starts[key] = model

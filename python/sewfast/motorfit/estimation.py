@@ -6,6 +6,7 @@ West 1987, Econometrica 55), since the residuals are unmodelled friction and loa
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray, gram
 from ..errors import FitError
+from ..progress import TimeUp
 
 CONFIDENCE = 1.96
 SINGULAR = 1e-11
@@ -209,12 +211,38 @@ def minimised(
         Squared distance in standard errors at which the descent ends.
     iterations : int
         Most Jacobians.
+
+    Raises
+    ------
+    TimeUp
+        If one of the functions raises it at the start. Raised later, it ends the descent where it
+        is.
     """
+    reached: list[Minimum] = []
+    with contextlib.suppress(TimeUp):
+        return _descended(normal, cost, start, bounds, count, enough, iterations, reached)
+    if not reached:
+        raise TimeUp
+    return reached[-1]
+
+
+def _descended(
+    normal: Callable[[FloatArray], Normal],
+    cost: Callable[[FloatArray], float],
+    start: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+    count: int,
+    enough: float,
+    iterations: int,
+    reached: list[Minimum],
+) -> Minimum:
+    """As `minimised`; every point on the way is appended to `reached`."""
     low, high = bounds
     x, mu = start, DAMPING
     now, gradient, matrix = normal(x)
     left = math.inf
     for _ in range(iterations):
+        reached.append(Minimum(x, now, left))
         variance = max(now / count, 1e-300)
         held = ((x <= low) & (gradient > 0.0)) | ((x >= high) & (gradient < 0.0))
         free = ~held & (np.diag(matrix) > 0.0)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import FloatArray
+from ..progress import TimeUp
 from .estimation import CONFIDENCE, Normal, inverse, minimised
 from .problem import FINE, NEAR, PARAMETERS, TERMS, WAVES, Problem, State
 from .records import Records
@@ -87,7 +88,8 @@ def estimated(
     """The parameters, and which of the terms the records show.
 
     Terms in `if_clear` are fitted only if the residuals without them show them clearly. `look` is
-    called from time to time; an exception of it ends the fit.
+    called from time to time; an exception of it ends the fit. If it raises `TimeUp` when a motor is
+    known, the result is the motor so far, whose covariance is infinite.
 
     Raises
     ------
@@ -106,9 +108,26 @@ def estimated(
         reasons["offset"] = (
             "the speed has one sign, so that k_s holds friction and constant load together"
         )
-    part = records.liveliest(STRETCH)
-    first = Problem(part, look=look)
-    state = first.fitted(started(first, terms))
+    first = Problem(records.liveliest(STRETCH), look=look)
+    so_far = [first.fitted(started(first, terms))]
+    try:
+        return _refined(first, records, so_far, terms, reasons, if_clear)
+    except TimeUp:
+        state = so_far[-1]
+        n = len(state.names())
+        return Estimated(state, np.full((n, n), np.inf), reasons, first.records, first)
+
+
+def _refined(
+    first: Problem,
+    records: Records,
+    so_far: list[State],
+    terms: tuple[str, ...],
+    reasons: dict[str, str],
+    if_clear: tuple[str, ...],
+) -> Estimated:
+    """The motor with all terms, on all records; each better state is appended to `so_far`."""
+    part, look, (state,) = first.records, first.look, so_far
     steps, first.steps = first.steps, min(first.steps, ON_THE_WAY)
     # so few steps diverge only if the motor is too fast for the record to show its inertia
     if not math.isfinite(first.cost(state)):
@@ -116,8 +135,10 @@ def estimated(
     first.settle_starts(state)
     first.leave_out_spikes(state)
     state = _with_limit(first, first.fitted(state), terms)
+    so_far.append(state)
     first.leave_out_spikes(state)
     state = _all_terms(first, state, tuple(t for t in terms if t not in WAVES))
+    so_far.append(state)
     given = terms
     state = _with_clear(first, state, if_clear)
     true = functools.partial(_trued, c=state.value("eccentric_c"), s=state.value("eccentric_s"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -15,20 +15,26 @@ from numpy.typing import NDArray
 from .. import _core
 from ..control.controller import Controller, pid_of
 from ..control.loop import Plants, References
-from ..errors import Interrupted, SettingError
+from ..errors import FitError, Interrupted, SettingError
 from ..gains import whole
 from ..plotting import Drawing, Panel, Plotted, lettered
-from ..progress import shown_in_notebooks
+from ..progress import TimeUp, shown_in_notebooks
 from ..storage import write_table
 from ..tables import Table, significant
 from .objective import Constraints, Cost, LoadStep
-from .search import tune
+from .search import TuningResult, tune
 from .task import (
+    LOOK,
     Aggregate,
+    Budget,
+    Deadline,
     Progress,
     TuningTask,
     Wanted,
+    budget,
     close_to_instability,
+    cut_short,
+    grade_of,
     threads_or_all,
 )
 
@@ -63,6 +69,9 @@ class ParetoFront(Plotted):
         Controllers tried.
     sensitive : str or None
         As `TuningResult.sensitive`, of the knee; None if Ms is an objective.
+    lost : tuple of str
+    grade : str
+        As of `TuningResult`.
     """
 
     controllers: tuple[Controller, ...]
@@ -72,6 +81,13 @@ class ParetoFront(Plotted):
     pick: int
     evaluations: int
     sensitive: str | None = None
+    lost: tuple[str, ...] = ()
+    grade: str = ""
+
+    @property
+    def cut(self) -> str | None:
+        """As `TuningResult.cut`."""
+        return cut_short(self.lost, self.grade)
 
     def __len__(self) -> int:
         return len(self.controllers)
@@ -147,7 +163,8 @@ class ParetoFront(Plotted):
             for i, row in enumerate(self.values)
         ]
         note = "* the knee: closest to the best of every objective, in shares of its range here"
-        warning = [] if self.sensitive is None else [f"  warning   {self.sensitive}"]
+        remarks = (("in time", self.cut), ("warning", self.sensitive))
+        warning = [f"  {name:<9} {text}" for name, text in remarks if text is not None]
         return "\n".join([f"{len(self)} controllers", head, *rows, note, *warning])
 
 
@@ -166,6 +183,7 @@ def pareto(
     loads: Sequence[LoadStep] = (),
     size: int = SIZE,
     evaluations: int = EVALUATIONS,
+    time_budget: float | None = None,
     seed: int = 0,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -188,6 +206,8 @@ def pareto(
         Most controllers on the front.
     evaluations : int
         Candidates tried.
+    time_budget : float, optional
+        As of `tune`; a quarter of it is for the first controller.
     progress : callable, optional
         Called with (done, total, lowest cost). By default a notebook shows a bar; None shows
         nothing.
@@ -201,10 +221,12 @@ def pareto(
     SettingError, DataError
         For plants, references or settings that cannot be used.
     FitError
-        If no candidate stays bounded within the constraints.
+        If no candidate stays bounded within the constraints, or a time budget ends before the
+        first population is tried.
     Interrupted
         After Ctrl-C; its `best` is the front so far, or the best controller if there is none.
     """
+    time = Budget(None if time_budget is None else budget(time_budget))
     total, names = whole("evaluations", evaluations), _checked(objectives)
     if total < 2:
         raise SettingError(
@@ -226,21 +248,45 @@ def pareto(
         evaluations=first,
         seed=seed,
         threads=threads,
+        time_budget=None if time.seconds is None else _TUNED * time.seconds,
         progress=_shifted(progress, 0, total),
         **settings,
     )
     task = TuningTask.of(models, references, start=tuned.start, first={}, **settings)
-    found = _core.pareto(
-        task.core(variables, ms="Ms" in names),
-        others=[tuned.pid.core()],
-        objectives=names,
-        size=whole("size", size),
-        evaluations=max(1, total - first),
-        seed=whole("seed", seed),
-        threads=threads_or_all(threads),
-        progress=_shifted(progress, first, total),
-    )
-    return _front(found, task, names, first, tuned.pid)
+    rest = max(1, total - first)
+    deadline = Deadline(time, time.share(1.0 - LOOK), _shifted(progress, first, total))
+    try:
+        found = _core.pareto(
+            task.core(variables, ms="Ms" in names),
+            others=[tuned.pid.core()],
+            objectives=names,
+            size=whole("size", size),
+            evaluations=rest,
+            seed=whole("seed", seed),
+            threads=threads_or_all(threads),
+            progress=deadline,
+        )
+    except (FitError, TimeUp):
+        if deadline.passed:
+            raise _unfinished(time, size) from None
+        raise
+    if deadline.passed and found["termination"] == "interrupted":
+        if not found["controllers"]:
+            raise _unfinished(time, size)
+        found["termination"] = "time"
+    if "time" in (found["termination"], tuned.termination):
+        left = total - tuned.evaluations - int(found["evaluations"])
+        time.lose(f"{left} of {total} controllers")
+    front = _front(found, task, names, tuned, time)
+    return replace(front, lost=tuple(time.lost), grade=grade_of(task.plants))
+
+
+def _unfinished(time: Budget, size: int) -> FitError:
+    """The error if the time is up before the first population."""
+    return FitError(
+        name="time_budget", expected=f"time for a first population of {size} controllers",
+        received=f"{time.seconds:g} s", remedy="give more time, or a smaller size",
+    )  # fmt: skip
 
 
 def _checked(objectives: Sequence[str]) -> list[str]:
@@ -261,11 +307,11 @@ def _shifted(progress: Progress | None, before: int, total: int) -> Progress | N
 
 
 def _front(
-    found: Any, task: TuningTask, objectives: list[str], before: int, tuned: Controller
+    found: Any, task: TuningTask, objectives: list[str], tuned: TuningResult, time: Budget
 ) -> ParetoFront:
     interrupted = found["termination"] == "interrupted"
     if interrupted and not found["controllers"]:
-        raise Interrupted(tuned)
+        raise Interrupted(tuned.pid)
     start = pid_of(task.start, "pareto")
     names = [name for name, _, _ in found["variables"]]
     notes = "on the front of " + ", ".join(objectives) + task.assumed
@@ -282,8 +328,10 @@ def _front(
         units=_units(objectives, start),
         values=values,
         pick=pick,
-        evaluations=before + int(found["evaluations"]),
-        sensitive=None if "Ms" in objectives else close_to_instability(task, controllers[pick]),
+        evaluations=tuned.evaluations + int(found["evaluations"]),
+        sensitive=(
+            None if "Ms" in objectives else close_to_instability(task, controllers[pick], time)
+        ),
     )
     if interrupted:
         raise Interrupted(front)

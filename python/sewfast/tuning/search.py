@@ -16,12 +16,14 @@ from ..control.controller import Controller, SampledController, pid_of
 from ..control.loop import Plant, Plants, References, check_fits, each_plant, run
 from ..errors import FitError, Interrupted, SettingError
 from ..gains import whole
-from ..progress import shown_in_notebooks
+from ..progress import TimeUp, shown_in_notebooks
 from ..tables import Table, significant
 from .objective import Constraints, Cost, LoadStep
 from .opinion import SHARE, SecondOpinion, second_opinion
 from .task import (
+    LOOK,
     Aggregate,
+    Budget,
     Deadline,
     Encoder,
     Progress,
@@ -30,6 +32,8 @@ from .task import (
     Wanted,
     budget,
     close_to_instability,
+    cut_short,
+    grade_of,
     out_of_reach,
     threads_or_all,
 )
@@ -45,6 +49,7 @@ _ENDED_BY = {
     "interrupted": "Ctrl-C",
 }
 """The terminations in words."""
+_RIVAL = "the second opinion of the rival"
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +78,10 @@ class TuningResult:
         The constraints that applied.
     method : str
         ``genetic`` or ``cma-es``.
+    lost : tuple of str
+        The work that a time budget cut short, in words; empty if it cut nothing.
+    grade : str
+        The worst grade that the models' verdicts give; empty if they have none.
     opinion : SecondOpinion or None
         The comparison with a rival; None without one, or if no gains suit it.
     beyond : str or None
@@ -93,6 +102,8 @@ class TuningResult:
     aggregate: str
     constraints: Constraints
     method: str
+    lost: tuple[str, ...] = ()
+    grade: str = ""
     opinion: SecondOpinion | None = None
     beyond: str | None = None
     sensitive: str | None = None
@@ -107,6 +118,11 @@ class TuningResult:
         """
         opinion = None if self.opinion is None else self.opinion.warning
         return "; ".join(text for text in (opinion, self.beyond, self.sensitive) if text) or None
+
+    @property
+    def cut(self) -> str | None:
+        """What a time budget cut short, and the grade of the models; None if it cut nothing."""
+        return cut_short(self.lost, self.grade)
 
     @property
     def pid(self) -> Controller:
@@ -171,7 +187,11 @@ class TuningResult:
             f"controllers tried, ended by {_ENDED_BY.get(self.termination, self.termination)}",
             ("searched", "found", "from", "to"),
             rows,
-        ).to_html([] if self.warning is None else [f"warning: {self.warning}"])
+        ).to_html([f"{name}: {text}" for name, text in self._remarks()])
+
+    def _remarks(self) -> list[tuple[str, str]]:
+        pairs = (("in time", self.cut), ("warning", self.warning))
+        return [(name, text) for name, text in pairs if text is not None]
 
     def __str__(self) -> str:
         unit = self.controller.y_unit or "y"
@@ -182,8 +202,7 @@ class TuningResult:
         ]
         if self.constraints != Constraints():
             lines.append(f"  within    {self.constraints}")
-        if self.warning is not None:
-            lines.append(f"  warning   {self.warning}")
+        lines += [f"  {name:<9} {text}" for name, text in self._remarks()]
         return "\n".join([*lines, str(self.controller)])
 
 
@@ -279,8 +298,10 @@ def tune(
     evaluations : int
         Candidates tried.
     time_budget : float, optional
-        Time of the search [s], after which the best so far is the result (`termination` is
-        ``time``). Then the same seed no longer gives the same bits.
+        Time of the whole call [s], with first gains and second opinion, after which the best so
+        far is the result (`termination` is ``time``; `TuningResult.cut` says what was lost). Then
+        the same seed no longer gives the same bits. It returns within a tenth of it and half a
+        second more.
     seed : int
         Seed of the search.
     threads : int, optional
@@ -294,10 +315,11 @@ def tune(
     SettingError, DataError
         For plants, references or settings that cannot be used.
     FitError
-        If every candidate diverges or breaks a constraint.
+        If every candidate diverges or breaks a constraint, or all do until the time is up.
     Interrupted
         After Ctrl-C; its `best` is the best controller so far.
     """
+    time = Budget(None if time_budget is None else budget(time_budget))
     first = {
         "u_min": u_min,
         "u_max": u_max,
@@ -320,49 +342,55 @@ def tune(
         loads=loads,
         disturbances=disturbances,
     )
-    seconds = None if time_budget is None else budget(time_budget)
-    if rival is not None and seconds is not None:
-        seconds *= 1.0 - SHARE
     search = _Search(
-        method, whole("evaluations", evaluations), seconds, whole("seed", seed),
-        threads_or_all(threads), progress,
+        method, whole("evaluations", evaluations), time, whole("seed", seed),
+        threads_or_all(threads), progress, 1.0 - LOOK - (0.0 if rival is None else SHARE),
     )  # fmt: skip
     # check the rival before the search, which may take long
     other = None if rival is None else replace(task, plants=_rivals(rival, task))
     result = search.on(task, variables)
     if references is not None:
         result = replace(result, beyond=out_of_reach(task))
-    if other is not None:
+    if other is not None and not time.over(_RIVAL):
         result = _asked(result, task, other, search, variables)
     try:
-        return replace(result, sensitive=close_to_instability(task, result.controller))
+        result = replace(result, sensitive=close_to_instability(task, result.controller, time))
     except KeyboardInterrupt:
         raise Interrupted(result.controller) from None
+    return replace(result, lost=tuple(time.lost), grade=grade_of(task.plants))
 
 
 @dataclass(frozen=True)
 class _Search:
-    """The settings of a search."""
+    """The settings of a search; `part` is how much of the time that is left it may take."""
 
     method: str
     evaluations: int
-    seconds: float | None
+    budget: Budget
     seed: int
     threads: int
     progress: Progress | None
+    part: float
 
     def on(self, task: TuningTask, variables: Sequence[Wanted] | None) -> TuningResult:
-        deadline = Deadline(self.seconds, self.progress)
-        found = _core.tune(
-            task.core(variables),
-            method=self.method,
-            evaluations=self.evaluations,
-            seed=self.seed,
-            threads=self.threads,
-            progress=deadline,
-        )
+        deadline = Deadline(self.budget, self.budget.share(self.part), self.progress)
+        try:
+            found = _core.tune(
+                task.core(variables),
+                method=self.method,
+                evaluations=self.evaluations,
+                seed=self.seed,
+                threads=self.threads,
+                progress=deadline,
+            )
+        except (FitError, TimeUp):
+            if deadline.passed:
+                raise self.budget.refusal(deadline.tried) from None
+            raise
         result = _result(found, task, self.method)
         if deadline.passed and result.termination == "interrupted":
+            left = self.evaluations - result.evaluations
+            self.budget.lose(f"{left} of {self.evaluations} controllers")
             return _in_time(result, found["violation"])
         if result.termination == "interrupted":
             raise Interrupted(result.controller)
@@ -370,9 +398,8 @@ class _Search:
 
     def brief(self) -> _Search:
         """The search of a second opinion: shorter, and without progress; Ctrl-C ends it, too."""
-        rest = None if self.seconds is None else 0.5 * SHARE / (1.0 - SHARE) * self.seconds
         few = max(1, round(SHARE * self.evaluations))
-        return replace(self, evaluations=few, seconds=rest, progress=None)
+        return replace(self, evaluations=few, progress=None, part=0.5)
 
 
 def _rivals(rival: Plants, task: TuningTask) -> list[Plant]:
@@ -406,6 +433,10 @@ def _asked(
             found.append(search.brief().on(on, variables))
         except Interrupted:
             raise Interrupted(result.controller) from None
+        except FitError as error:
+            if error.name == "time_budget":
+                search.budget.lose(_RIVAL)
+            raise
         return found[-1].controller
 
     opinion = second_opinion(result.controller, task, rival, brief)
@@ -422,10 +453,10 @@ def _asked(
 def _in_time(result: TuningResult, violation: float) -> TuningResult:
     if violation > 0.0:
         raise FitError(
-            "expected a controller that keeps to the constraints within the time_budget, the best "
-            f"of {result.evaluations} exceeds them by {violation:.3g} of their limits in sum; give "
-            "more time, or relax them"
-        )
+            name="time_budget", expected="time for a controller that keeps to the constraints",
+            received=f"the best of {result.evaluations}, which exceeds them by {violation:.3g} of "
+            "their limits in sum", remedy="give more time, or relax them",
+        )  # fmt: skip
     return replace(result, termination="time")
 
 

@@ -39,7 +39,7 @@ from ..control.margins import margins, sampled
 from ..errors import FitError, SettingError
 from ..gains import Gains, real, vector, whole
 from ..models import Model
-from ..progress import TimeUp
+from ..progress import TimeUp, latest
 from ..rules import Fopdt, Rule, table_1
 from ..threads import available
 from ..units import revolutions_per_second, spelled
@@ -199,7 +199,9 @@ LARGEST_MS = 2.0
 """Ms up to which a loop surely has a gain margin of 2 and a phase margin of 29 degrees."""
 
 
-def close_to_instability(task: TuningTask, controller: SampledController) -> str | None:
+def close_to_instability(
+    task: TuningTask, controller: SampledController, time: Budget
+) -> str | None:
     """A warning about a PID whose Ms on one of the models is above `LARGEST_MS`, or None.
 
     The cost does not show how close a loop is to instability, and the search goes as close as calm
@@ -218,6 +220,8 @@ def close_to_instability(task: TuningTask, controller: SampledController) -> str
             continue
         depends = bool(controller.schedule) or not hasattr(plant, "to_tf")
         for level in levels if depends else levels[:1]:
+            if time.over("all looks at the largest sensitivity Ms"):
+                break
             # a model without a steady state there has no Ms
             with contextlib.suppress(SettingError, FitError):
                 Ms = margins(controller, plant, speed=level).Ms
@@ -275,6 +279,25 @@ def _instance(given: Any, kind: type[Any], example: str) -> Any:
     return kind() if given is None else given
 
 
+GRADES = ("useless", "poor", "fair", "good")
+"""Grades of a model's verdict, the worst first."""
+
+
+def grade_of(plants: Sequence[Any]) -> str:
+    """The worst grade of the models' verdicts; empty if none has one."""
+    known = [p.training.get("verdict") or {} for p in plants if isinstance(p, Model)]
+    grades = [v["grade"] for v in known if v.get("grade") in GRADES]
+    return min(grades, key=GRADES.index, default="")
+
+
+def cut_short(lost: Sequence[str], grade: str) -> str | None:
+    """What a time budget cut short, in words; None if nothing."""
+    if not lost:
+        return None
+    graded = f"; the model is graded {grade}" if grade else ""
+    return f"the time budget left no time for {', '.join(lost)}{graded}"
+
+
 def budget(seconds: Any) -> float:
     """The time budget of a search [s], checked.
 
@@ -289,25 +312,83 @@ def budget(seconds: Any) -> float:
     return time
 
 
+LOOK = 0.1
+"""Part of a time budget for the looks at a tuned controller, as of `identify` for evidence."""
+
+
+class Budget:
+    """The time of a search, from now on, with everything that belongs to it.
+
+    Attributes
+    ----------
+    seconds : float or None
+        None never ends.
+    lost : list of str
+        The work that it cut short, in words.
+    """
+
+    def __init__(self, seconds: float | None) -> None:
+        self.seconds = seconds
+        self.lost: list[str] = []
+        self._began = time.monotonic()
+
+    @property
+    def spent(self) -> float:
+        """Seconds since the beginning."""
+        return time.monotonic() - self._began
+
+    def share(self, part: float) -> float:
+        """When this part of what is left will be over, as seconds since the beginning."""
+        if self.seconds is None:
+            return math.inf
+        spent = self.spent
+        return spent + part * max(0.0, self.seconds - spent)
+
+    def over(self, what: str) -> bool:
+        """Whether the time is up; if so, `what` is lost."""
+        is_over = self.seconds is not None and self.spent > self.seconds
+        if is_over:
+            self.lose(what)
+        return is_over
+
+    def lose(self, what: str) -> None:
+        """Note that the time was too short for this work."""
+        if what not in self.lost:
+            self.lost.append(what)
+
+    def refusal(self, tried: int) -> FitError:
+        """The error if no loop is bounded with any controller tried until the time is up."""
+        return FitError(
+            name="time_budget",
+            expected="time for a controller with which no loop diverges",
+            received=f"{self.seconds:g} s, enough for {tried} controllers, of which none is one",
+            remedy="give more time, begin with smaller gains, or check the model on new data first",
+        )  # fmt: skip
+
+
 @dataclass
 class Deadline:
-    """A progress callback that ends a search after a time."""
+    """A progress callback that ends a search at a time, whatever its costs are.
 
-    seconds: float | None
+    The start is tried in any case, unless the whole call would be late (`latest`).
+    """
+
+    budget: Budget
+    ends: float
     inner: Progress | None
-
-    def __post_init__(self) -> None:
-        self._began = time.monotonic()
-        self.passed = False
+    passed: bool = False
+    tried: int = 0
 
     def __call__(self, done: int, total: int, best: float) -> None:
         if self.inner is not None:
             self.inner(done, total, best)
-        # before the first gains are known there is no result to return
-        if self.seconds is not None and math.isfinite(best) and done > 0:
-            self.passed = time.monotonic() - self._began > self.seconds
-            if self.passed:
-                raise TimeUp
+        self.tried = done
+        seconds = self.budget.seconds
+        if seconds is None:
+            return
+        self.passed = self.budget.spent > (self.ends if done > 0 else latest(seconds))
+        if self.passed:
+            raise TimeUp
 
 
 def _load_steps(given: Sequence[LoadStep]) -> list[LoadStep]:
