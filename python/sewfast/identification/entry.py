@@ -24,6 +24,7 @@ from ..threads import Workers, available, require_workers
 from . import choice, further, grey_box, lagged, linear
 from .folds import TEXTS, UNSEEN_DATA, Split, thinned, verdict
 from .outputs import OUTPUTS
+from .rest import with_rest
 from .task import Clock, Progress, Provenance, Task, with_provenance
 from .training import Structure
 
@@ -217,7 +218,8 @@ def identify(
         if "verdict" not in found.training:
             own = _verdict(found, task.data, task.validation)
             found = with_provenance(found, {"verdict": own})
-        return with_training_evidence(found, _excerpt(found, task.data, clock))
+        excerpt = _excerpt(found, task.data, clock)
+        return with_rest(with_training_evidence(found, excerpt), excerpt)
     except KeyboardInterrupt:
         raise Interrupted(found) from None
 

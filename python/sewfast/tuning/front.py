@@ -232,7 +232,7 @@ def pareto(
     task = TuningTask.of(models, references, start=tuned.start, first={}, **settings)
     found = _core.pareto(
         task.core(variables, ms="Ms" in names),
-        others=[tuned.pid.core()],
+        others=[tuned.pid.about(task.rest).core()],
         objectives=names,
         size=whole("size", size),
         evaluations=max(1, total - first),
