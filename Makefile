@@ -179,11 +179,11 @@ firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian:
 	  arm-none-eabi-size target/bare/$$1.elf; \
 	done
 
-# first the tests that compute, then those that wait: beside compilers, even at the lowest priority, some come too late
+# first the tests that compute, then those that wait, one by one: beside compilers, or tests of time budgets, some come too late
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal --hypothesis-seed=$(SEED)
 python-test: $(DEV) ## pytest, with the snippets of the documentation and every example
 	$(PYTEST) -m 'not alone'
-	$(PYTEST) -m alone
+	$(BIN)/python -m pytest --hypothesis-seed=$(SEED) -m alone
 
 CORE_TESTS := $(addprefix tests/,analysis control dataset evidence files greybox identification models tuning) \
   $(wildcard tests/test_*.py)
