@@ -354,7 +354,8 @@ def _judgement(
 
 def text(a: Analysis) -> str:
     """Margins, steps, cost, sensitivities, what-if, guards."""
-    y, u = a.controller.gains.y_unit, a.controller.gains.u_unit
+    # y and u stand for unknown units, as in the units of gains
+    y, u = a.controller.gains.y_unit or "y", a.controller.gains.u_unit or "u"
     lines = [f"Analysis on {_plants(a.plants)}", "", "margins (worst plant)"]
     lines += rows([["about", "Ms", "Mt", "gain", "phase", "delay", "noise gain"]]
                   + [_margin_row(loop, u, y) for loop in a.loops])  # fmt: skip

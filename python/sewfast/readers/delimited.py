@@ -14,7 +14,7 @@ import numpy as np
 from ..dataset import FloatArray
 from ..errors import DataError
 from ..units import is_unit, split_unit
-from .containers import MAX_COLUMNS, Table, from_headers
+from .containers import MAX_COLUMNS, Table, from_headers, split_units
 from .timebase import is_moment, seconds_of_texts
 
 MAX_LINE = 1_000_000
@@ -354,17 +354,23 @@ def _slow_pass(layout: _Layout) -> Table:
         raise DataError(f"{layout.path}: a header but no rows; expected rows of numbers below it")
     layout = _written(layout, rows)
     header, columns, bad = list(layout.header), [], {}
+    moments = []
     for i, cells in enumerate(zip(*rows, strict=True)):
         column = _column(layout, cells)
         if column is None and is_moment(cells[0]):
             column = seconds_of_texts(cells)
-            header[i] = f"{split_unit(header[i])[0]} [s]" if column is not None else header[i]
+            if column is not None:
+                header[i] = f"{split_unit(header[i])[0]} [s]"
+                moments.append(i)
         if column is None:
             k, column = _spoiled(layout, cells)
             bad[i] = _complaint(layout, lines[k], i, cells[k])
         columns.append(column)
     table = from_headers(layout.path, header, columns, bad, lines)
-    return replace(table, notes=(*layout.notes, *below))
+    names = split_units(header)[0]
+    return replace(
+        table, notes=(*layout.notes, *below), moments=tuple(names[i] for i in moments)
+    )
 
 
 def _rows(layout: _Layout) -> tuple[list[int], list[list[str]], tuple[str, ...]]:

@@ -32,7 +32,7 @@ _SECONDS = {
 }  # fmt: skip
 _UNIT = r"s|sec|seconds|ms|msec|millis(?:econds)?|us|µs|usec|micros(?:econds)?|ns|nanos(?:econds)?"
 _TIME = re.compile(
-    r"(?:t|(?:(?:elapsed|relative|rel|unix|epoch|system|sys|log|run)[_ ]?)?time|time[_ ]?stamp|"
+    r"(?:t|(?:(?:elapsed|relative|rel|unix|epoch|system|sys|log|run)[_ ]?)?time|time[_ ]?stamp|stamp|"
     r"(?:elapsed|relative|rel|unix|epoch)|time[_ ]since[_ ](?:start|boot|power[_ ]?on)|seconds?|"
     rf"zeit|laufzeit|zeitstempel|temps|tiempo|tempo|x-axis|x_value)(?:[_ ]({_UNIT}))?"
     r"|(ms|us|millis(?:econds)?|micros(?:econds)?|nanos(?:econds)?)"
@@ -179,10 +179,14 @@ def _means(values: FloatArray, edges: FloatArray, ends: FloatArray) -> FloatArra
 
 
 def time_column(table: Table) -> str | None:
-    """The column with a name for time: t, time, timestamp, seconds, also time_ms and the like."""
+    """The column with a name for time: t, time, timestamp, seconds, also time_ms and the like.
+
+    Where there is none, dates with times of day are the time, whatever the name.
+    """
     names = [n for n in table.names if _is_time(n)] or [
-        n for n in table.names if _DATE.fullmatch(n.lower()) and table.unit(n) == "s"
-    ]
+        n for n in table.names
+        if n in table.moments or (_DATE.fullmatch(n.lower()) and table.unit(n) == "s")
+    ]  # fmt: skip
     return next((n for n in names if n.lower() in ("t", "time")), next(iter(names), None))
 
 

@@ -245,20 +245,16 @@ class Project:
     # --- Steps ------------------------------------------------------------------------------------
 
     def columns(self, step: Step) -> dict[str, Any]:
-        """Columns of a recording, and the probable input and output among them."""
-        from ..readers import read_table
+        """Columns of a recording, and its input and output where names and units show them."""
+        from ..readers import read_table, roles
 
         table = read_table(self.path_of(step.file))
-        rest = [n for n in table.names if n != "t"]
-        inputs = [n for n in ("u", "input", "voltage") if n in table][:1] or rest[:1]
-        outputs = [n for n in ("y", "speed", "output") if n in table and n not in inputs]
-        outputs = outputs or [n for n in rest if n not in inputs]
-        encoder = table.counts_per_rev is not None and "counts" in table
+        found = roles(table)
         return {
             "names": list(table.names),
-            "inputs": inputs,
-            "output": outputs[0] if outputs and not encoder else None,
-            "encoder": encoder,
+            "inputs": [] if found is None else [found.input],
+            "output": None if found is None else found.output,
+            "encoder": table.counts_per_rev is not None and "counts" in table,
         }
 
     def look(self, step: Step) -> dict[str, Any]:
