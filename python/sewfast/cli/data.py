@@ -21,7 +21,33 @@ def read_training(args: argparse.Namespace, channels: Sequence[str] = ()) -> Dat
     """Every DATA argument as an experiment; columns from `FILE:IN:OUT` or the options."""
     from ..dataset import Dataset
 
-    return Dataset.concat([_read_named(source, args, channels) for source in args.data])
+    read = (_read_named(source, args, channels) for source in args.data)
+    return Dataset.concat([shifted(data, args) for data in read])
+
+
+def shifted(data: Dataset, args: argparse.Namespace) -> Dataset:
+    """The data with the inputs read `--shift-input` samples earlier."""
+    return data.shift_inputs(getattr(args, "shift_input", 0))
+
+
+def alive(data: Dataset) -> Dataset:
+    """The data without what a dead sensor said, with a warning; refused as by `identify`."""
+    from ..dataset.faults import sound
+
+    data, found = sound(data)
+    for fault in found:
+        # the model prints the others
+        if fault.kind == "dead_sensor":
+            note(fault.warning)
+    return data
+
+
+def warn_of_faults(data: Dataset) -> None:
+    """Print what is wrong with the columns of a record to standard error."""
+    from ..dataset.faults import faults
+
+    for fault in faults(data):
+        note(f"warning: {fault.text}: {fault.remedy}")
 
 
 def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) -> Dataset:
@@ -103,7 +129,7 @@ def read_for_model(
     columns["weights"] = getattr(args, "weights", None)
     columns["time"] = args.time
     data = read_columns(table, Ts=_sample_time(args.ts, table, model), **columns)
-    return _with_notes(data), table
+    return shifted(_with_notes(data), args), table
 
 
 def _output_columns(

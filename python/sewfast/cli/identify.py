@@ -29,6 +29,7 @@ from .arguments import (
 from .data import (
     add_hold,
     add_preparation,
+    alive,
     held,
     masked,
     prepared,
@@ -228,6 +229,7 @@ def identify_command(args: argparse.Namespace) -> int | None:
     train, held = split(masked(read_training(args), args), args.train, args.validate)
     train = prepared(train, args, cut=True)
     held = None if held is None else prepared(held, args, like=train, cut=True)
+    train = alive(train)
     try:
         with Progress("identify", quiet=args.quiet) as progress:
             model = _identify(args, train, held, progress)

@@ -429,8 +429,12 @@ def physics_command(args: argparse.Namespace) -> None:
             remedy="line: volts and amperes between two terminals; q: amplitudes along the q axis",
         )  # fmt: skip
     structure = args.structure
+    from .data import warn_of_faults
+
+    data = _motor_data(args)
+    warn_of_faults(data)
     motor = physics(
-        _motor_data(args),
+        data,
         structure=structure.split(","),
         current=args.current,
         volts=args.volts,

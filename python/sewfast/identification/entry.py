@@ -12,6 +12,7 @@ from typing import Literal
 from ..arrays import require_whole
 from ..dataset import Dataset, diagnose, require_dataset
 from ..dataset.experiment import in_effect
+from ..dataset.faults import sound
 from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted, SettingError
@@ -146,7 +147,8 @@ def identify(
     Raises
     ------
     DataError
-        If an input is NaN, data never move, or are too short for the orders.
+        If an input is NaN, data never move, or are too short for the orders; if the output is the
+        input times a number, or input and output are exchanged.
     SettingError
         If a setting is out of its range or contradicts another.
     FitError
@@ -187,8 +189,9 @@ def identify(
     if not isinstance(select, bool):
         raise SettingError(f"select: expected True or False, received {select!r}")
     clock = Clock(time_budget)
+    used, faults = sound(_in_effect(data, "data"))
     task = Task(
-        data=_in_effect(data, "data"),
+        data=used,
         validation=None if validation is None else _in_effect(validation, "validation"),
         na=_LAGS if na is None else na,
         nb=_LAGS if nb is None else nb,
@@ -214,6 +217,9 @@ def identify(
             return _with_losses(found, clock)
     else:
         found = _within_budget(_KINDS[kind], task)
+    if faults:
+        said = [*found.training.get("notes", []), *(f.warning for f in faults)]
+        found = with_provenance(found, {"notes": said})
     try:
         if "verdict" not in found.training:
             own = _verdict(found, task.data, task.validation)

@@ -136,7 +136,12 @@ class Grid:
         lies in a gap or belongs to a row without a value.
         """
         if self.exact:
-            return self.output(column)
+            found = self.output(column)
+            place = np.rint(self.t / self.Ts).astype(np.intp)
+            for before, steps in zip(place, np.diff(place), strict=False):
+                if 1 < steps <= GAP:
+                    found[before + 1 : before + steps] = found[before]
+            return found
         cut = self.t[:-1][np.diff(self.t) > GAP * self.period] + self.period
         starts = np.concatenate([self.t, cut])
         order = np.argsort(starts, kind="stable")
@@ -167,7 +172,10 @@ class Grid:
         if len(gaps):
             text += f"; {len(gaps)} gaps, the longest {gaps.max():.4g} s, are not known (NaN)"
         elif self.exact:
-            text += ": these samples are not known (NaN)"
+            text += (
+                ": their outputs are not known (NaN), inputs are held for up to "
+                f"{math.floor(GAP) - 1} samples"
+            )
         return text
 
 

@@ -1,0 +1,461 @@
+"""Faults of a record: a sensor that died, columns without dynamics, exchanged or late columns.
+
+All tests compare a record with itself, and take the side of the record in doubt.
+
+- A dead sensor: the output keeps one value to the last bit while a linear model of the rest, whose
+  output is limited to the recorded range, moves; the input has the levels there at which the output
+  moves elsewhere, so that friction or a dead zone is no explanation; and a limit of the output was
+  not reached by motion, so that a saturation or an end stop is none either.
+- No dynamics: in one sample and for the whole record, the output is the input times a number.
+- The order in time: the past of a cause helps to predict its effect beyond the effect's own past,
+  and not the other way (Granger 1969).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..arrays import FloatArray, labelled, runs
+from ..errors import DataError
+from .outliers import quantum
+from .pieces import LARGEST
+
+if TYPE_CHECKING:
+    from .dataset import Dataset
+    from .experiment import Experiment
+
+PAST = 10
+"""Past outputs and inputs in the regressions, and largest lead in samples."""
+MOST = 20_000
+"""Most samples that a regression uses."""
+SURE = 60.0
+"""Twice the log-likelihood that a cause must add. By chance the 10 coefficients of a lead add 10,
+and 60 in one of 3e8 records."""
+OCTAVES = 6
+"""Means of an input over 10, 20, 40 .. samples before these: plants with long dead times."""
+
+
+# --- A sensor that died -----------------------------------------------------------------------------
+
+ORDER = 4
+"""Past outputs and inputs of the model of the rest."""
+LEAST_PART = 0.01
+"""Least part of its experiment for a dead stretch."""
+WINDOWS = 8
+"""Least number of windows of the rest with which a stretch is compared."""
+APART = 4.0
+"""Ratio of squared errors, in the stretch to the worst window of the rest."""
+
+
+@dataclass(frozen=True)
+class Dead:
+    """A stretch in which the output's sensor says nothing: samples `start` to `stop`, excluded.
+
+    Samples are those of the file, 0-based; `experiment` is the index in the data set.
+    """
+
+    experiment: int
+    start: int
+    stop: int
+    value: float
+
+
+def dead_stretches(data: Dataset) -> tuple[Dead, ...]:
+    """Stretches in which the output stands still while the rest says that it cannot."""
+    return tuple(
+        Dead(i, e.start + first, e.start + first + count, float(e.y[first]))
+        for i, e in enumerate(data.experiments)
+        for first, count in _dead_in(e)
+    )
+
+
+def _dead_in(e: Experiment) -> list[tuple[int, int]]:
+    n, y = len(e), e.y
+    with np.errstate(invalid="ignore"):
+        same = np.concatenate([[False], np.diff(y) == 0.0])
+    still = [(a - 1, count + 1) for a, count in runs(same)]
+    least = max(4 * ORDER, LEAST_PART * n)
+    still = sorted((s for s in still if s[1] >= least), key=lambda s: -s[1])[:20]
+    if not still or not (np.abs(e.u) < LARGEST).all():
+        return []
+    rest = np.abs(y) < LARGEST
+    for first, count in still:
+        rest[first : first + count] = False
+    model = _Rest.of(e, rest)
+    return [] if model is None else sorted(s for s in still if model.contradicts(*s))
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """A linear model of the part of an experiment in which the output moves."""
+
+    u: FloatArray
+    y: FloatArray
+    theta: FloatArray
+    pieces: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, e: Experiment, rest: np.ndarray) -> _Rest | None:
+        pieces = tuple(p for p in runs(rest) if p[1] > 4 * ORDER)
+        rows = [_regressors(e.u[a : a + n], e.y[a : a + n]) for a, n in pieces]
+        if sum(map(len, rows)) < 10 * ORDER * (2 + e.u.shape[1]):
+            return None
+        X = np.concatenate(rows)
+        y = np.concatenate([e.y[a + ORDER : a + n] for a, n in pieces])
+        theta = np.asarray(np.linalg.lstsq(X, y, rcond=1e-10)[0])
+        return cls(e.u, e.y, theta, pieces)
+
+    def contradicts(self, first: int, count: int) -> bool:
+        """Whether the output moves in this stretch, by everything known from the rest."""
+        length = min(count, sum(n for _, n in self.pieces) // WINDOWS)
+        if length <= 2 * ORDER:
+            return False
+        others = np.array([
+            k for a, n in self.pieces for k in range(a, a + n - length + 1, max(1, length // 2))
+        ])  # fmt: skip
+        if len(others) < WINDOWS // 2:
+            return False
+        if not (self._covers(first, count) and self._jumps(first, count)):
+            return False
+        own = np.arange(first, first + count - length + 1, length)
+        errors = self._errors(others, length)
+        return bool(np.median(self._errors(own, length)) > APART * errors.max())
+
+    def _covers(self, first: int, count: int) -> bool:
+        """Whether an input reaches the levels here that it has while the output moves.
+
+        Friction, a dead zone or a closed valve keep an output still at some levels, but not at the
+        middle half of those at which it moves.
+        """
+        own = self.u[first : first + count]
+        rest = np.concatenate([self.u[a : a + n] for a, n in self.pieces])
+        low, high = np.quantile(rest, [0.25, 0.75], axis=0)
+        moves = np.ptp(rest, axis=0) > 0.0
+        inside = (own.min(axis=0) <= low) & (own.max(axis=0) >= high)
+        return bool((moves & inside & (np.ptp(own, axis=0) > 0.0)).any())
+
+    def _jumps(self, first: int, count: int) -> bool:
+        """Whether the output can be at no limit: it is inside the range, or reached it at a jump.
+
+        A saturated output and an end stop are reached by motion.
+        """
+        y, value = self.y, self.y[first]
+        if np.nanmin(y) < value < np.nanmax(y):
+            return True
+        ends = [abs(y[k] - y[k - 1]) for k in (first, first + count) if 0 < k < len(y)]
+        usual = max(float(np.abs(np.diff(y[a : a + n])).max()) for a, n in self.pieces)
+        return max(ends, default=0.0) > usual
+
+    def _errors(self, starts: np.ndarray, length: int) -> FloatArray:
+        """Mean square errors of free runs from the measured start of each window."""
+        low, high = np.nanmin(self.y), np.nanmax(self.y)
+        past = [self.y[starts + i] for i in range(ORDER)][::-1]
+        total = np.zeros(len(starts))
+        for k in range(ORDER, length):
+            columns = [*past, *(self.u[starts + k - i, j] for j in range(self.u.shape[1])
+                                for i in range(1, ORDER + 1)), np.ones(len(starts))]  # fmt: skip
+            y = np.clip(np.stack(columns, axis=1) @ self.theta, low, high)
+            total += (self.y[starts + k] - y) ** 2
+            past = [y, *past[:-1]]
+        return total / (length - ORDER)
+
+
+def _regressors(u: FloatArray, y: FloatArray) -> FloatArray:
+    k = np.arange(ORDER, len(y))
+    past = [y[k - i] for i in range(1, ORDER + 1)]
+    inputs = [u[k - i, j] for j in range(u.shape[1]) for i in range(1, ORDER + 1)]
+    return np.stack([*past, *inputs, np.ones(len(k))], axis=1)
+
+
+# --- Columns of which one is computed from the other, exchanged, or late ----------------------------
+
+
+@dataclass(frozen=True)
+class Copy:
+    """The output is `gain` times the input `delay` samples before, plus `offset`."""
+
+    input: int
+    gain: float
+    offset: float
+    delay: int
+
+
+def copied(data: Dataset) -> Copy | None:
+    """An input that the output repeats to rounding, up to `PAST` samples later."""
+    for j in range(data.n_inputs):
+        for delay in range(PAST + 1):
+            parts = [(e.u[: len(e) - delay, j], e.y[delay:]) for e in data.experiments]
+            u, y = (np.concatenate(c) for c in zip(*parts, strict=True))
+            known = (np.abs(u) < LARGEST) & (np.abs(y) < LARGEST)
+            u, y = u[known], y[known]
+            if len(np.unique(u[:MOST])) < 3 or len(y) < 4 * PAST:
+                continue
+            spread = float(u.std() * y.std())
+            covariance = float(np.mean((u - u.mean()) * (y - y.mean())))
+            if not (spread > 0.0 and abs(covariance) > 0.999 * spread):
+                continue
+            gain = covariance / float(u.var())
+            offset = float(y.mean() - gain * u.mean())
+            # what the rounding of either column leaves; printed to six digits where no step is seen
+            rounding = 0.5 * (quantum(y) or 1e-5 * np.ptp(y)) + 0.5 * abs(gain) * (
+                quantum(u) or 1e-5 * np.ptp(u)
+            )
+            coarse = rounding > 0.02 * float(y.std())
+            if not coarse and float(np.abs(y - gain * u - offset).max()) <= 1.01 * rounding:
+                return Copy(j, gain, offset, delay)
+    return None
+
+
+@dataclass(frozen=True)
+class Order:
+    """Which of two signals moves first.
+
+    Attributes
+    ----------
+    kind : "exchanged", "late" or "at_once"
+        The input answers the output; the input was logged `shift` samples late; or the output moves
+        in the sample in which the input does.
+    input : int
+    shift : int
+        Samples by which the input is to be read earlier, so that the output moves one sample after.
+    evidence : float
+        Twice the log-likelihood that shows it.
+    """
+
+    kind: str
+    input: int
+    shift: int
+    evidence: float
+
+
+def order_in_time(data: Dataset) -> Order | None:
+    """Whether an input moves after the output that it should drive; None if no input does.
+
+    An input that keeps its value to the last bit for most samples is no answer to a noisy output:
+    if the output moves before it, it was logged late. Of other inputs, late ones cannot be told
+    from those that a controller computed, so only exchanged columns are found: the past of the
+    output predicts the input, and the past of the input says nothing about the output.
+    """
+    if data.looks_ahead:
+        return None
+    pieces = _pieces(data)
+    if sum(map(len, pieces)) < 10 * PAST * (2 + data.n_inputs):
+        return None
+    for j in range(data.n_inputs):
+        found = _late(pieces, j) if _is_held(pieces, j) else _exchanged(pieces, j)
+        if found is not None:
+            return found
+    return None
+
+
+def _pieces(data: Dataset) -> list[FloatArray]:
+    pieces, left = [], MOST
+    for e in sorted(data.experiments, key=len, reverse=True):
+        columns = np.column_stack([e.u, e.y])
+        known = np.logical_and.reduce(np.abs(columns) < LARGEST, axis=1)
+        for first, count in runs(known):
+            if min(count, left) > 4 * PAST:
+                pieces.append(columns[first : first + min(count, left)])
+                left -= len(pieces[-1])
+    if not pieces:
+        return []
+    everything = np.concatenate(pieces)
+    middle, size = everything.mean(axis=0), everything.std(axis=0)
+    return [(p - middle) / np.where(size > 0.0, size, 1.0) for p in pieces]
+
+
+def _is_held(pieces: list[FloatArray], j: int) -> bool:
+    still = sum(int((np.diff(p[:, j]) == 0.0).sum()) for p in pieces)
+    moving = sum(int((np.diff(p[:, -1]) != 0.0).sum()) for p in pieces)
+    count = sum(len(p) - 1 for p in pieces)
+    return 2 * still > count and 2 * moving > count
+
+
+def _squares(
+    pieces: list[FloatArray],
+    of: int,
+    past: tuple[int, ...],
+    leads: tuple[int, ...] = (),
+    j: int = 0,
+    *,
+    far: bool = False,
+) -> tuple[float, int]:
+    """Mean square error of column `of` by the past of some columns and column j at `leads`.
+
+    With `far` also by the distant past of column j.
+    """
+    rows, targets = [], []
+    for p in pieces:
+        k = np.arange(PAST, len(p) - PAST)
+        columns = [p[k - i, c] for c in past for i in range(1, PAST + 1)]
+        columns += _distant(p[:, j], k) if far else []
+        rows.append(np.stack([*columns, *(p[k + i, j] for i in leads), np.ones(len(k))], axis=1))
+        targets.append(p[k, of])
+    X, y = np.concatenate(rows), np.concatenate(targets)
+    theta = np.linalg.lstsq(X, y, rcond=1e-10)[0]
+    error = y - X @ theta
+    # below this only the rounding of the columns is left
+    return max(float(error @ error) / len(y), 1e-12), len(y)
+
+
+def _distant(column: FloatArray, k: np.ndarray) -> list[FloatArray]:
+    """Means over octaves of lags from `PAST` on, 0 before the first sample."""
+    total = np.concatenate([[0.0], np.cumsum(column)])
+    edges = [PAST * 2**i for i in range(OCTAVES + 1)]
+    at = [total[np.maximum(k - edge, 0)] for edge in edges]
+    return [(a - b) / (d - c) for a, b, c, d in zip(at, at[1:], edges, edges[1:], strict=False)]
+
+
+def _late(pieces: list[FloatArray], j: int) -> Order | None:
+    """How many samples the output leads an input that no controller computed."""
+    everything = tuple(range(pieces[0].shape[1]))
+    of = len(everything) - 1
+    ahead = tuple(range(PAST + 1))
+    full, n = _squares(pieces, of, everything, ahead, j)
+    # the last lead without which something is lost
+    for lead in range(PAST, -1, -1):
+        less, _ = _squares(pieces, of, everything, tuple(range(lead)), j)
+        if n * math.log(less / full) > SURE:
+            # the farthest lead matters: the record differs from this model in another way
+            if lead == PAST:
+                return None
+            kind = "late" if lead > 0 else "at_once"
+            return Order(kind, j, lead + 1, n * math.log(less / full))
+    return None
+
+
+def _exchanged(pieces: list[FloatArray], j: int) -> Order | None:
+    of = pieces[0].shape[1] - 1
+    own, n = _squares(pieces, of, (of,))
+    driven, _ = _squares(pieces, of, (of, j), j=j, far=True)
+    if n * math.log(own / driven) > SURE:
+        return None
+    alone, _ = _squares(pieces, j, (j,))
+    answering, _ = _squares(pieces, j, (j, of))
+    evidence = n * math.log(alone / answering)
+    if evidence > SURE:
+        return Order("exchanged", j, 0, evidence)
+    return None
+
+
+# --- The three in words, and what `identify` does about them ----------------------------------------
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault of a record: what was seen, what to do about it, and the figures behind it."""
+
+    kind: str
+    text: str
+    remedy: str
+    evidence: dict[str, float | str]
+
+    @property
+    def warning(self) -> str:
+        """For the notes of a model."""
+        left_out = self.kind == "dead_sensor"
+        return f"warning: {self.text}" + ("; left out" if left_out else f": {self.remedy}")
+
+
+def faults(data: Dataset) -> tuple[Fault, ...]:
+    """Dead stretches of the output's sensor, or columns that are no input and output of a plant."""
+    order = _order_fault(data)
+    return (*map(partial(_dead_fault, data), dead_stretches(data)), *order)
+
+
+def _dead_fault(data: Dataset, dead: Dead) -> Fault:
+    e = data.experiments[dead.experiment]
+    of = "" if len(data.experiments) == 1 else f" of {e.name}"
+    span = f"{dead.start}:{dead.stop}"
+    return Fault(
+        "dead_sensor",
+        f"{data.output_name} keeps the value {dead.value:.6g} to the last bit in samples {span}"
+        f"{of}, {(dead.stop - dead.start) / len(e):.0%} of the record, while the input moves as it "
+        "does elsewhere: the sensor was dead or frozen",
+        f'leave these samples out, data.mask("{span}") (--mask {span})'
+        + ("" if len(data.experiments) == 1 else ", in their file alone")
+        + ", and check cable and sensor",
+        {"first": float(dead.start), "last": float(dead.stop), "value": dead.value},
+    )
+
+
+def _order_fault(data: Dataset) -> Iterator[Fault]:
+    y = labelled(data.output_name, data.output_unit)
+    if (copy := copied(data)) is not None:
+        name = data.input_names[copy.input]
+        after = "" if copy.delay == 0 else f" of {copy.delay} samples before"
+        yield Fault(
+            "no_dynamics",
+            f"{y} is {name}{after} times {copy.gain:.6g}, exactly: there are no dynamics between "
+            "the two, as one column was read twice or computed from the other",
+            "name the column of a sensor as output",
+            {"input": name, "gain": copy.gain, "offset": copy.offset, "delay": float(copy.delay)},
+        )
+        return
+    if (order := order_in_time(data)) is None:
+        return
+    name = data.input_names[order.input]
+    u = labelled(name, data.input_units[order.input])
+    evidence: dict[str, float | str] = {
+        "input": name, "shift": float(order.shift), "log_likelihood": order.evidence,
+    }  # fmt: skip
+    shift = f"data.shift_inputs({order.shift}) (--shift-input {order.shift})"
+    if order.kind == "exchanged":
+        yield Fault(
+            "exchanged",
+            f"{u} answers {y}, and {data.output_name} does not answer {name}: input and output "
+            "are exchanged",
+            f"take {data.output_name} as input and {name} as output",
+            evidence,
+        )
+    elif order.kind == "late":
+        yield Fault(
+            "late_input",
+            f"{y} moves {order.shift - 1} sample{'s' if order.shift > 2 else ''} before {u} does: "
+            f"{name} was logged {order.shift} samples late, counted to one sample from the command "
+            "to the output; every delay and time constant would be wrong",
+            f"read it earlier, {shift}",
+            evidence,
+        )
+    else:
+        yield Fault(
+            "at_once",
+            f"{y} moves in the same sample as {u} (nk = 0), and a controller that has to measure "
+            "first cannot be closed around such a model: it would need the output before the "
+            "command",
+            f"if {name} was logged a sample late, {shift}; if the plant does answer at once, "
+            "identify it with nk=0 (--nk 0), to simulate",
+            evidence,
+        )
+
+
+def sound(data: Dataset) -> tuple[Dataset, tuple[Fault, ...]]:
+    """The data without dead stretches, and what was found, for `identify`.
+
+    Raises
+    ------
+    DataError
+        If the columns are no input and output of a plant: one is computed from the other, or they
+        are exchanged.
+    """
+    found = faults(data)
+    wrong = next((f for f in found if f.kind in ("no_dynamics", "exchanged")), None)
+    if wrong is not None:
+        raise DataError(
+            name=data.source, expected="an output that answers the input", received=wrong.text,
+            remedy=wrong.remedy,
+        )  # fmt: skip
+    dead = dead_stretches(data) if found else ()
+    if dead:
+        masks = [np.zeros(len(e), dtype=np.bool_) for e in data.experiments]
+        for d in dead:
+            start = data.experiments[d.experiment].start
+            masks[d.experiment][d.start - start : d.stop - start] = True
+        data = data.mask(masks, why="of a dead sensor left out")
+    return data, found
