@@ -2,7 +2,7 @@
 
 Read in this order: `recording` (`read`, `read_table`, formats that other packages add), `roles`
 (which column is the input, which the output), `timebase` (the sample time of a column, moments), `delimited`,
-`containers`, `logs` (formats of other tools), `blackbox`, `frames` (tables in memory).
+`jsonlog`, `containers`, `logs` (formats of other tools), `blackbox`, `frames` (tables in memory).
 """
 
 from .containers import Table

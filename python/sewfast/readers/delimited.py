@@ -161,7 +161,7 @@ def _layout(path: Path, text: str) -> _Layout:
                 raise DataError(
                     name=f"{path}: line {skipped + 1}",
                     expected=f"a header with names for the {found[1]} columns below it",
-                    received=_short(line), remedy="add one, such as t,u,y",
+                    received=short(line), remedy="add one, such as t,u,y",
                 )  # fmt: skip
             delimiter, header = " ", spaced
         if _is_numeric(header):
@@ -169,7 +169,7 @@ def _layout(path: Path, text: str) -> _Layout:
             if len(named) != len(header) or _is_numeric(named):
                 raise DataError(
                     f"{path}: expected a header with column names (such as t,u,y) in the first "
-                    f"line, received numbers: {_short(line)}; add one"
+                    f"line, received numbers: {short(line)}; add one"
                 )
             header, body, above = named, text[offset - len(line) - 1 :], skipped
         return _checked(_Layout(path, header, body, above, delimiter, _decimal(delimiter, body)))
@@ -236,7 +236,7 @@ def _above_numbers(
         header = [f"{n} [{u}]" if u and "[" not in n else n for n, u in pairs]
     notes = []
     if skipped:
-        shown = _short(lines[skipped[0]][1].strip())
+        shown = short(lines[skipped[0]][1].strip())
         many = _count(len(skipped), "above the header")
         notes.append(f"{path.name}: {many} skipped: {shown}")
     start = lines[at][0] - len(lines[at][1]) - 1
@@ -377,7 +377,7 @@ def _slow_pass(layout: _Layout) -> Table:
         columns.append(column)
     table = from_headers(layout.path, header, columns, bad, lines)
     names = split_units(header)[0]
-    notes = (*layout.notes, *below, *_skipped(layout, corrupt, len(rows)))
+    notes = (*layout.notes, *below, *skipped_lines(layout.path, corrupt, len(rows)))
     return replace(table, notes=notes, moments=tuple(names[i] for i in moments))
 
 
@@ -407,15 +407,16 @@ def _wrong(layout: _Layout, cells: Sequence[str]) -> int:
     return sum(not _is_read(layout, c) for c in cells)
 
 
-def _skipped(layout: _Layout, corrupt: list[tuple[int, str]], left: int) -> tuple[str, ...]:
+def skipped_lines(path: Path, corrupt: list[tuple[int, str]], left: int) -> tuple[str, ...]:
+    """A note on corrupt lines, each with its number and text, beside `left` good ones."""
     if not corrupt:
         return ()
     corrupt = sorted(corrupt)
-    shown = ", ".join(f"{number} ({_short(text)})" for number, text in corrupt[:3])
+    shown = ", ".join(f"{number} ({short(text)})" for number, text in corrupt[:3])
     more = f" and {len(corrupt) - 3} more" if len(corrupt) > 3 else ""
     one = len(corrupt) == 1
     return (
-        f"{layout.path.name}: {len(corrupt)} of {left + len(corrupt)} lines skipped, as "
+        f"{path.name}: {len(corrupt)} of {left + len(corrupt)} lines skipped, as "
         f"{'it has' if one else 'they have'} cells that are missing or no numbers: "
         f"line{'' if one else 's'} {shown}{more}",
     )
@@ -453,7 +454,7 @@ def _rows(
         raise _of_other_width(layout, *corrupt[0], len(corrupt), len(rows) + len(corrupt))
     notes: tuple[str, ...] = ()
     if below:
-        shown = _short(layout.delimiter.join(below[0][1]))
+        shown = short(layout.delimiter.join(below[0][1]))
         many = _count(len(below), "below the table")
         notes = (f"{layout.path.name}: {many} left out: {shown}",)
     return lines, rows, notes, [(n, layout.delimiter.join(cells)) for n, cells in corrupt]
@@ -486,7 +487,7 @@ def _of_other_width(
         hint += "; numbers with decimal commas need semicolons between the columns"
     return DataError(
         f"{layout.path}: line {number}: expected {len(layout.header)} cells, as in the header, "
-        f"received {len(cells)}: {_short(layout.delimiter.join(cells))}; {hint}"
+        f"received {len(cells)}: {short(layout.delimiter.join(cells))}; {hint}"
     )
 
 
@@ -546,9 +547,10 @@ def _complaint(layout: _Layout, line: int, column: int, cell: str, count: int) -
         hint = "; the file also holds decimal points: write all numbers one way"
     return (
         f"line {line}, column {layout.header[column]!r}: expected a number, received "
-        f"{_short(cell)}{hint}"
+        f"{short(cell)}{hint}"
     )
 
 
-def _short(text: str) -> str:
+def short(text: str) -> str:
+    """A text in quotes, at most 60 characters of it."""
     return repr(text if len(text) <= 60 else text[:57] + "...")

@@ -29,6 +29,7 @@ from ..speed import speed_between_gaps
 from .containers import Table, freeze, read_mat, read_npz
 from .delimited import read_delimited
 from .frames import collected, of_arrow, table_of
+from .jsonlog import is_json, read_json
 from .logs import is_log, read_log
 from .roles import recognised
 from .timebase import TOLERANCE, Grid, time_base
@@ -173,8 +174,8 @@ def _package(point: EntryPoint) -> str:
 
 
 def read_table(path: Any) -> Table:
-    """Read all columns of a CSV, `.mat`, `.npz`, Parquet or MCAP file, of a log of another tool, or
-    of a table in memory.
+    """Read all columns of a CSV, `.mat`, `.npz`, Parquet, MCAP or JSON file, of a log of another
+    tool, or of a table in memory.
 
     Parameters
     ----------
@@ -183,7 +184,8 @@ def read_table(path: Any) -> Table:
         from pandas, polars, pyarrow (or anything with `__arrow_c_stream__`), xarray (a Dataset) or
         is a mapping of name to array; null, NA and NaT are NaN, moments become seconds from the
         first one. Logs are MDF, TDMS, PX4 ULog, WPILib's data log and ROS bags (`.bag`, `.mcap`);
-        the signal with most samples gives the rows, others are held. If an installed package
+        the signal with most samples gives the rows, others are held. JSON is an object of numbers
+        on each line (JSON lines), a list of such objects, or an object of columns. If an installed package
         handles the file's ending (entry point `sewfast.readers`), that package reads it.
 
     Returns
@@ -229,6 +231,8 @@ def _table(path: Path, raw: bytes) -> Table:
             "damaged; supported are CSV, .mat, .npz, Parquet, recordings (.mcap) and logs of "
             "other tools"
         )
+    if is_json(raw):
+        return read_json(path, raw)
     return read_delimited(path, raw)
 
 

@@ -32,7 +32,10 @@ if TYPE_CHECKING:
     from .tuning import Tuning
 
 
-RECORDINGS = (".csv", ".npz", ".mat", ".parquet", ".mcap")
+RECORDINGS = (
+    ".csv", ".tsv", ".txt", ".log", ".jsonl", ".ndjson", ".json", ".npz", ".mat", ".parquet",
+    ".mcap",
+)  # fmt: skip
 LARGEST = 512 * 2**20
 """Most bytes of a recording."""
 
@@ -117,6 +120,8 @@ class Project:
             entry.name
             for entry in _files(self.folder)
             if entry.suffix.lower() in RECORDINGS and ":" not in entry.name
+            # models, controllers and results state their format, logs do not
+            and not (entry.suffix.lower() == ".json" and self._format_of(entry))
         )
 
     def documents(self, format: str) -> list[str]:
