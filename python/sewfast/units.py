@@ -97,6 +97,33 @@ def counts_per_unit(counts_per_rev: float, unit: str = "rpm") -> float:
     return counts_per_rev * factor
 
 
+# --- Times as text ---------------------------------------------------------------------------------
+
+
+def time_unit(seconds: float) -> tuple[float, str]:
+    """The unit that suits a time, as a factor from seconds and its name.
+
+    ms below a second, s below ten minutes, min below three hours, h above.
+    """
+    if not 1.0 <= abs(seconds) < math.inf:
+        return 1e3, "ms"
+    if abs(seconds) < 600.0:
+        return 1.0, "s"
+    return (1.0 / 60.0, "min") if abs(seconds) < 10800.0 else (1.0 / 3600.0, "h")
+
+
+def duration(seconds: float, digits: int = 4) -> str:
+    """A time in the unit that suits it.
+
+    Examples
+    --------
+    >>> duration(0.0494), duration(8139.4571), duration(97200.0)
+    ('49.4 ms', '135.7 min', '27 h')
+    """
+    factor, unit = time_unit(seconds)
+    return f"{factor * seconds:.{digits}g} {unit}"
+
+
 # --- Units in the names of columns ----------------------------------------------------------------
 
 

@@ -523,3 +523,14 @@ def test_a_model_keeps_its_own_columns(tmp_path: Path) -> None:
     toml(tmp_path, '[columns]\ninput = "y"\noutput = "u"\n')
     found = json.loads(sewfast(tmp_path, "validate", "drive.json", "bench.csv", "--json").out)
     assert found["grade"] == "good"
+
+
+def test_suggested_commands_quote_names_with_spaces(tmp_path: Path) -> None:
+    stranger(tmp_path / "my bench.csv", "time_ms;u;y", above="")
+    said = sewfast(tmp_path, "identify", "my bench.csv", "--model", "arx").out
+    assert "sewfast validate 'my bench-model.json' DATA" in said
+
+
+def test_look_counts_the_rows_of_the_longest_variable(tmp_path: Path) -> None:
+    np.savez(tmp_path / "x.npz", info=np.arange(6.0), a=np.arange(7200.0), b=np.arange(7200.0) ** 2)
+    assert "x.npz: 7200 rows" in sewfast(tmp_path, "look", "x.npz").out

@@ -378,7 +378,8 @@ def _show_columns(tables: list[Table], args: argparse.Namespace) -> None:
     from .output import print_rows
 
     for table, (path, found) in zip(tables, columns.items(), strict=True):
-        print(f"{path}: {found[0].n if found else 0} rows")
+        # variables of a file can differ in length
+        print(f"{path}: {max((c.n for c in found), default=0)} rows")
         header = ("column", "from", "to", "standard deviation", "missing")
         print_rows([header, *map(_row, found)])
         for name, reason in table.unusable.items():

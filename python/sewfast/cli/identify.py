@@ -37,7 +37,7 @@ from .data import (
     read_training,
     split,
 )
-from .output import DONE, INTERRUPTED, print_json, print_result, write_columns
+from .output import DONE, INTERRUPTED, print_json, print_result, suggested, write_columns
 
 if TYPE_CHECKING:
     from ..dataset import Dataset, FloatArray
@@ -332,7 +332,8 @@ def _show(
         print(f"alternative: {other!r} in {path}")
     if args.plot is not None:
         print(f"written to {args.plot}")
-    print(f"written to {args.out}; score it on another recording: sewfast validate {args.out} DATA")
+    command = suggested("validate", args.out, "DATA")
+    print(f"written to {args.out}; score it on another recording: {command}")
 
 
 # --- `sewfast validate`, `sewfast simulate`: a model on a recording -------------------------------
