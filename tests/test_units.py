@@ -115,7 +115,7 @@ def test_what_is_no_angular_speed_has_no_counts() -> None:
 @pytest.mark.parametrize(
     ("seconds", "text"),
     [
-        (0.0, "0 ms"), (0.0494, "49.4 ms"), (1.0, "1 s"), (599.0, "599 s"), (1697.1, "28.29 min"),
+        (0.0, "0 ms"), (0.0494, "49.4 ms"), (1.0, "1 s"), (599.0, "599 s"), (1697.4, "28.29 min"),
         (8139.4571, "135.7 min"), (97200.0, "27 h"), (math.inf, "inf ms"),
     ],
 )  # fmt: skip
