@@ -285,23 +285,31 @@ def _squares(
     j: int = 0,
     *,
     far: bool = False,
-) -> tuple[float, int]:
-    """Mean square error of column `of` by the past of some columns and column j at `leads`.
+) -> tuple[list[float], int]:
+    """Mean square errors of column `of` by the past of some columns, and the number of rows.
 
-    With `far` also by the distant past of column j.
+    Without and with column j at the first, the first two .. all of `leads`; with `far` also by the
+    distant past of column j.
     """
     rows, targets = [], []
     for p in pieces:
         k = np.arange(PAST, len(p) - PAST)
         columns = [p[k - i, c] for c in past for i in range(1, PAST + 1)]
         columns += _distant(p[:, j], k) if far else []
-        rows.append(np.stack([*columns, *(p[k + i, j] for i in leads), np.ones(len(k))], axis=1))
+        rows.append(np.stack([*columns, np.ones(len(k)), *(p[k + i, j] for i in leads)], axis=1))
         targets.append(p[k, of])
     X, y = np.concatenate(rows), np.concatenate(targets)
-    theta = np.linalg.lstsq(X, y, rcond=1e-10)[0]
-    error = y - X @ theta
+    # the triangle has the same residuals, and few rows
+    R = np.asarray(np.linalg.qr(np.column_stack([X, y]), mode="r"), dtype=np.float64)
+    return [_left(R, len(leads) - k) / len(y) for k in range(len(leads) + 1)], len(y)
+
+
+def _left(R: FloatArray, without: int) -> float:
+    """Sum of squares that the columns leave of the last one, without the last `without` of them."""
+    X, y = R[:, : R.shape[1] - 1 - without], R[:, -1]
+    error = y - X @ np.linalg.lstsq(X, y, rcond=1e-10)[0]
     # below this only the rounding of the columns is left
-    return max(float(error @ error) / len(y), 1e-12), len(y)
+    return max(float(error @ error), 1e-12 * float(y @ y))
 
 
 def _distant(column: FloatArray, k: np.ndarray) -> list[FloatArray]:
@@ -317,27 +325,27 @@ def _late(pieces: list[FloatArray], j: int) -> Order | None:
     everything = tuple(range(pieces[0].shape[1]))
     of = len(everything) - 1
     ahead = tuple(range(PAST + 1))
-    full, n = _squares(pieces, of, everything, ahead, j)
+    squares, n = _squares(pieces, of, everything, ahead, j)
     # the last lead without which something is lost
     for lead in range(PAST, -1, -1):
-        less, _ = _squares(pieces, of, everything, tuple(range(lead)), j)
-        if n * math.log(less / full) > SURE:
+        evidence = n * math.log(squares[lead] / squares[-1])
+        if evidence > SURE:
             # the farthest lead matters: the record differs from this model in another way
             if lead == PAST:
                 return None
             kind = "late" if lead > 0 else "at_once"
-            return Order(kind, j, lead + 1, n * math.log(less / full))
+            return Order(kind, j, lead + 1, evidence)
     return None
 
 
 def _exchanged(pieces: list[FloatArray], j: int) -> Order | None:
     of = pieces[0].shape[1] - 1
-    own, n = _squares(pieces, of, (of,))
-    driven, _ = _squares(pieces, of, (of, j), j=j, far=True)
+    (own,), n = _squares(pieces, of, (of,))
+    (driven,), _ = _squares(pieces, of, (of, j), j=j, far=True)
     if n * math.log(own / driven) > SURE:
         return None
-    alone, _ = _squares(pieces, j, (j,))
-    answering, _ = _squares(pieces, j, (j, of))
+    (alone,), _ = _squares(pieces, j, (j,))
+    (answering,), _ = _squares(pieces, j, (j, of))
     evidence = n * math.log(alone / answering)
     if evidence > SURE:
         return Order("exchanged", j, 0, evidence)
