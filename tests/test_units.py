@@ -17,8 +17,7 @@ from sewfast.link.plan import require_units
 from sewfast.link.wire import Channel
 from sewfast.motorfit import rad_per_second
 from sewfast.plotting import quantity
-from sewfast.readers import read_table
-from sewfast.readers import Roles, roles
+from sewfast.readers import Roles, read_table, roles
 from sewfast.units import ANGULAR_SPEEDS, SPEEDS, counts_per_unit, duration, is_unit, spelled
 
 WRITTEN = [

@@ -97,7 +97,7 @@ def counts_per_unit(counts_per_rev: float, unit: str = "rpm") -> float:
     return counts_per_rev * factor
 
 
-# --- Times as text ---------------------------------------------------------------------------------
+# --- Times as text --------------------------------------------------------------------------------
 
 
 def time_unit(seconds: float) -> tuple[float, str]:

@@ -534,7 +534,7 @@ def test_one_column_is_not_input_and_output(tmp_path: Path) -> None:
         read(path, inputs=["y", "y"])
 
 
-# --- serial logs: corrupt lines, `.log`, JSON ------------------------------------------------------
+# --- serial logs: corrupt lines, `.log`, JSON -----------------------------------------------------
 
 
 def serial(count: int = 1000) -> list[str]:
@@ -609,11 +609,15 @@ def test_corrupt_lines_of_json_are_skipped_or_refused(tmp_path: Path) -> None:
     assert "cut off" in table.notes[1]
     rows[50:60] = ["?"] * 10
     path.write_text("\n".join(rows))
-    with refuses(DataError, expected="JSON object", received="11 of 399", remedy="repair or delete"):
+    with refuses(
+        DataError, expected="JSON object", received="11 of 399", remedy="repair or delete"
+    ):
         read_table(path)
 
 
-@pytest.mark.parametrize("text", ["{}", "[{}]", '{"a": 1, "b": [1], "c": [1, 2]}', "{", '{"a": "x"}'])
+@pytest.mark.parametrize(
+    "text", ["{}", "[{}]", '{"a": 1, "b": [1], "c": [1, 2]}', "{", '{"a": "x"}']
+)
 def test_json_that_is_no_log_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "x.json"
     path.write_text(text)

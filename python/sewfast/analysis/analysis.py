@@ -27,9 +27,9 @@ from ..control.loop import (
 from ..control.systems import LinearLoop
 from ..errors import FitError, SettingError
 from ..tables import Table
-from ..units import duration, time_unit
 from ..trust import Judgement, Limits, judge
 from ..tuning.objective import Cost
+from ..units import duration, time_unit
 from .changes import Change
 from .points import LoopBode, PlantPoint, loop_bodes, plant_points
 from .responses import (

@@ -41,7 +41,7 @@ OCTAVES = 6
 """Means of an input over 10, 20, 40 .. samples before these: plants with long dead times."""
 
 
-# --- A sensor that died -----------------------------------------------------------------------------
+# --- A sensor that died ---------------------------------------------------------------------------
 
 ORDER = 4
 """Past outputs and inputs of the model of the rest."""
@@ -173,7 +173,7 @@ def _regressors(u: FloatArray, y: FloatArray) -> FloatArray:
     return np.stack([*past, *inputs, np.ones(len(k))], axis=1)
 
 
-# --- Columns of which one is computed from the other, exchanged, or late ----------------------------
+# --- Columns of which one is computed from the other, exchanged, or late --------------------------
 
 
 @dataclass(frozen=True)
@@ -352,7 +352,7 @@ def _exchanged(pieces: list[FloatArray], j: int) -> Order | None:
     return None
 
 
-# --- The three in words, and what `identify` does about them ----------------------------------------
+# --- The three in words, and what `identify` does about them --------------------------------------
 
 
 @dataclass(frozen=True)

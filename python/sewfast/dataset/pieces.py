@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import is_whole, FloatArray, frozen, range_of, require_same_units, runs
+from ..arrays import FloatArray, frozen, is_whole, range_of, require_same_units, runs
 from ..errors import DataError, SettingError
 
 if TYPE_CHECKING:

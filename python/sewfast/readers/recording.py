@@ -6,7 +6,7 @@ import io
 import logging
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -185,8 +185,8 @@ def read_table(path: Any) -> Table:
         is a mapping of name to array; null, NA and NaT are NaN, moments become seconds from the
         first one. Logs are MDF, TDMS, PX4 ULog, WPILib's data log and ROS bags (`.bag`, `.mcap`);
         the signal with most samples gives the rows, others are held. JSON is an object of numbers
-        on each line (JSON lines), a list of such objects, or an object of columns. If an installed package
-        handles the file's ending (entry point `sewfast.readers`), that package reads it.
+        on each line (JSON lines), a list of such objects, or an object of columns. If an installed
+        package handles the file's ending (entry point `sewfast.readers`), that package reads it.
 
     Returns
     -------
@@ -392,9 +392,7 @@ def read_columns(
     return data.resample(wanted) if slower else data
 
 
-def _names(
-    table: Table, inputs: Any, output: str | None, counts: str | None
-) -> tuple[str, ...]:
+def _names(table: Table, inputs: Any, output: str | None, counts: str | None) -> tuple[str, ...]:
     """The names of the inputs, none if none is given; refuses what is no name."""
     single = isinstance(inputs, str) or not isinstance(inputs, Iterable)
     names: tuple[Any, ...] = () if inputs is None else (inputs,) if single else tuple(inputs)

@@ -32,7 +32,8 @@ _SECONDS = {
 }  # fmt: skip
 _UNIT = r"s|sec|seconds|ms|msec|millis(?:econds)?|us|µs|usec|micros(?:econds)?|ns|nanos(?:econds)?"
 _TIME = re.compile(
-    r"(?:t|(?:(?:elapsed|relative|rel|unix|epoch|system|sys|log|run)[_ ]?)?time|time[_ ]?stamp|stamp|"
+    r"(?:t|(?:(?:elapsed|relative|rel|unix|epoch|system|sys|log|run)[_ ]?)?time|time[_ ]?stamp|"
+    r"stamp|"
     r"(?:elapsed|relative|rel|unix|epoch)|time[_ ]since[_ ](?:start|boot|power[_ ]?on)|seconds?|"
     rf"zeit|laufzeit|zeitstempel|temps|tiempo|tempo|x-axis|x_value)(?:[_ ]({_UNIT}))?"
     r"|(ms|us|millis(?:econds)?|micros(?:econds)?|nanos(?:econds)?)"

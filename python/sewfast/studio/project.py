@@ -119,7 +119,8 @@ class Project:
         return sorted(
             entry.name
             for entry in _files(self.folder)
-            if entry.suffix.lower() in RECORDINGS and ":" not in entry.name
+            if entry.suffix.lower() in RECORDINGS
+            and ":" not in entry.name
             # models, controllers and results state their format, logs do not
             and not (entry.suffix.lower() == ".json" and self._format_of(entry))
         )
