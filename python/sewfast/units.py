@@ -137,8 +137,6 @@ _UNITS = SPEEDS | frozenset(
 """Units that are written behind or below a name, in lower case."""
 _STATISTIC = re.compile(r"(?:^|\s+)(?:rms|avg|mean|max|min|peak|pk|pp)$", re.IGNORECASE)
 """What a number between brackets is of several samples; `[V rms]` is in V."""
-_STATISTIC = re.compile(r"(?:^|\s+)(?:rms|avg|mean|max|min|peak|pk|pp)$", re.IGNORECASE)
-"""What a number between brackets is of several samples; `[V rms]` is in V."""
 _BEFORE_UNIT = re.compile(r"\s+in\s+|\s*/\s*|\s*,\s+")
 
 

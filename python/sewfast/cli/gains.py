@@ -111,7 +111,7 @@ def _plant(args: argparse.Namespace) -> tuple[Fopdt, float]:
         # a speed from counts is in RPM; of the others the numbers say nothing
         unit = "RPM" if args.counts_per_rev else ""
         Ts = 0.001 if args.ts is None else args.ts
-        return Fopdt(*given, u_unit="", y_unit=unit), Ts
+        return Fopdt(args.K, args.T, args.L, u_unit="", y_unit=unit), Ts
     data = read_training(argparse.Namespace(**{**vars(args), "data": [args.data]}))
     step = data.experiments[0]
     if len(data.experiments) != 1 or step.u.shape[1] != 1:

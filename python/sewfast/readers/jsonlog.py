@@ -37,9 +37,10 @@ def read_json(path: Path, raw: bytes) -> Table:
     """
     found: Any = None
     text = raw.decode("utf-8-sig", errors="replace").rstrip("\0\x1a")
+    notes: tuple[str, ...] = ()
     try:
         found = json.loads(text)
-        rows, lines, notes = _rows(found), None, ()
+        rows, lines = _rows(found), None
     except (ValueError, RecursionError):
         rows, lines, notes = _of_lines(path, text)
     table = _by_row(path, rows, lines) if any(rows) else _by_column(path, found)
