@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 import sewfast as api
 from cli import call_refused as refused
@@ -13,7 +16,8 @@ from cli import called as sewfast
 from effort import FULL
 from refusals import refuses
 from sewfast import diagnose
-from sewfast.dataset import Dataset
+from sewfast.dataset import Dataset, Experiment
+from sewfast.dataset.faults import faults
 from sewfast.errors import DataError, SettingError
 
 SEEDS = range(40 if FULL else 4)
@@ -171,7 +175,7 @@ def test_identify_leaves_a_dead_stretch_out(tmp_path: Path) -> None:
     assert any("left out" in note for note in model.training["notes"])
     assert model.core.theta[1] == pytest.approx(3.0, rel=0.05)
     api.write_table(tmp_path / "x.csv", {"t": 0.01 * np.arange(4000), "u": u, "y": y})
-    said = sewfast(tmp_path, "identify", "x.csv", "--model", "arx", "-o", "m.json").err
+    said = sewfast(tmp_path, "identify", "x.csv", "--model", "arx", "-o", "m.json").out
     assert "in samples 2000:4000, 50% of the record" in said
 
 
@@ -231,6 +235,32 @@ def test_an_answer_in_the_same_sample_says_why_it_closes_no_loop() -> None:
     assert finding is not None
     assert "nk = 0" in finding.text
     assert "--nk 0" in finding.remedy
+
+
+values = st.floats(width=64) | st.sampled_from(
+    [0.0, 1.0, np.nan, np.inf, 1e308, -1e308, 1e150, 1e59, -1e59, 1e-60, 5e-324]
+)
+levels = st.lists(values, min_size=1, max_size=40)
+
+
+@settings(deadline=None, max_examples=100)
+@given(u=levels, y=levels, n=st.integers(1, 400), times=st.integers(1, 80))
+@example(u=[0.0, 1.0], y=[1e308, -1e308], n=2, times=1)
+@example(u=[0.0], y=[0.0], n=160, times=1)
+@example(u=[0.0, 1e59, 1.0], y=[1.0, 5e-324, 1e-60], n=400, times=3)
+def test_no_test_fails_on_any_numbers(u: list[float], y: list[float], n: int, times: int) -> None:
+    once = Experiment(np.resize(np.repeat(u, times), (n, 1)), np.resize(y, n))
+    still = Experiment(np.resize(u, (n, 1)), np.resize(np.repeat(y, times), n))
+    data = Dataset((once, still), 0.01, ("u",), "y", ("",))
+    for fault in faults(data):
+        json.dumps(fault.evidence, allow_nan=False)
+
+
+@pytest.mark.parametrize("spoilt", [np.nan, np.inf, 1e308, 1e-320])
+def test_a_column_that_identify_refuses_is_not_judged(spoilt: float) -> None:
+    u = steps(np.random.default_rng(0), 3000)
+    assert found(np.full(3000, spoilt), u) == found(u, np.full(3000, spoilt)) == []
+    assert found(np.where(u > 0.0, 0.0, spoilt), np.full(3000, 1.0)) == []
 
 
 def test_shifts_that_are_none() -> None:

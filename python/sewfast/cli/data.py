@@ -30,18 +30,6 @@ def shifted(data: Dataset, args: argparse.Namespace) -> Dataset:
     return data.shift_inputs(getattr(args, "shift_input", 0))
 
 
-def alive(data: Dataset) -> Dataset:
-    """The data without what a dead sensor said, with a warning; refused as by `identify`."""
-    from ..dataset.faults import sound
-
-    data, found = sound(data)
-    for fault in found:
-        # the model prints the others
-        if fault.kind == "dead_sensor":
-            note(fault.warning)
-    return data
-
-
 def warn_of_faults(data: Dataset) -> None:
     """Print what is wrong with the columns of a record to standard error."""
     from ..dataset.faults import faults

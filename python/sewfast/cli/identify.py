@@ -29,7 +29,6 @@ from .arguments import (
 from .data import (
     add_hold,
     add_preparation,
-    alive,
     held,
     masked,
     prepared,
@@ -224,12 +223,14 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
 
 
 def identify_command(args: argparse.Namespace) -> int | None:
+    from ..dataset.experiment import in_effect
+    from ..dataset.faults import sound
+
     require_place(args.out, (".json",))
     require_plot(args.plot)
     train, held = split(masked(read_training(args), args), args.train, args.validate)
     train = prepared(train, args, cut=True)
     held = None if held is None else prepared(held, args, like=train, cut=True)
-    train = alive(train)
     try:
         with Progress("identify", quiet=args.quiet) as progress:
             model = _identify(args, train, held, progress)
@@ -238,6 +239,8 @@ def identify_command(args: argparse.Namespace) -> int | None:
         print(f"interrupted; kept the best so far in {args.out}", file=sys.stderr)
         return 130
     model.save(args.out)
+    # scored as identify took them, without dead stretches
+    train, _ = sound(in_effect(train))
     try:
         others = _save_alternatives(args, model) if args.alternatives else []
         scores = _scores(model, train, held)

@@ -1,6 +1,8 @@
 """Faults of a record: a sensor that died, columns without dynamics, exchanged or late columns.
 
-All tests compare a record with itself, and take the side of the record in doubt.
+All tests compare a record with itself, and take the side of the record in doubt. Values that
+`identify` refuses count as not known, and no test judges columns that do not move, so that none
+fails on any numbers: columns are compared about their mean, in units of their deviation.
 
 - A dead sensor: the output keeps one value to the last bit while a linear model of the rest, whose
   output is limited to the recorded range, moves; the input has the levels there at which the output
@@ -13,18 +15,20 @@ All tests compare a record with itself, and take the side of the record in doubt
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import FloatArray, labelled, runs
 from ..errors import DataError
 from .outliers import quantum
-from .pieces import LARGEST
+from .pieces import LARGEST_FITTED, SMALLEST_FITTED
 
 if TYPE_CHECKING:
     from .dataset import Dataset
@@ -39,6 +43,25 @@ SURE = 60.0
 and 60 in one of 3e8 records."""
 OCTAVES = 6
 """Means of an input over 10, 20, 40 .. samples before these: plants with long dead times."""
+
+
+def _columns(e: Experiment) -> FloatArray:
+    """Inputs and output, NaN where they are not known or no measured quantity is as large."""
+    columns = np.column_stack([e.u, e.y])
+    return np.where(np.abs(columns) < LARGEST_FITTED, columns, np.nan)
+
+
+def _known(columns: FloatArray) -> NDArray[np.bool_]:
+    known: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(columns), axis=1)
+    return known
+
+
+def _scale(parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray] | None:
+    """Mean and deviation of each column over all parts; None if one of them does not move."""
+    whole = np.concatenate(parts) if parts else np.zeros((1, 1))
+    if (np.ptp(whole, axis=0) < SMALLEST_FITTED).any():
+        return None
+    return whole.mean(axis=0), whole.std(axis=0)
 
 
 # --- A sensor that died ---------------------------------------------------------------------------
@@ -76,18 +99,14 @@ def dead_stretches(data: Dataset) -> tuple[Dead, ...]:
 
 
 def _dead_in(e: Experiment) -> list[tuple[int, int]]:
-    n, y = len(e), e.y
-    with np.errstate(invalid="ignore"):
-        same = np.concatenate([[False], np.diff(y) == 0.0])
-    still = [(a - 1, count + 1) for a, count in runs(same)]
-    least = max(4 * ORDER, LEAST_PART * n)
-    still = sorted((s for s in still if s[1] >= least), key=lambda s: -s[1])[:20]
-    if not still or not (np.abs(e.u) < LARGEST).all():
-        return []
-    rest = np.abs(y) < LARGEST
+    columns, least = _columns(e), max(4 * ORDER, LEAST_PART * len(e))
+    known = _known(columns)
+    same = known[1:] & known[:-1] & (e.y[1:] == e.y[:-1])
+    still = [(a, count + 1) for a, count in runs(same) if count + 1 >= least]
+    still = sorted(still, key=lambda s: -s[1])[:20]
     for first, count in still:
-        rest[first : first + count] = False
-    model = _Rest.of(e, rest)
+        known[first : first + count] = False
+    model = _Rest.of(columns, known) if still else None
     return [] if model is None else sorted(s for s in still if model.contradicts(*s))
 
 
@@ -101,15 +120,19 @@ class _Rest:
     pieces: tuple[tuple[int, int], ...]
 
     @classmethod
-    def of(cls, e: Experiment, rest: np.ndarray) -> _Rest | None:
+    def of(cls, columns: FloatArray, rest: NDArray[np.bool_]) -> _Rest | None:
         pieces = tuple(p for p in runs(rest) if p[1] > 4 * ORDER)
-        rows = [_regressors(e.u[a : a + n], e.y[a : a + n]) for a, n in pieces]
-        if sum(map(len, rows)) < 10 * ORDER * (2 + e.u.shape[1]):
+        scale = _scale([columns[a : a + n] for a, n in pieces])
+        if scale is None:
             return None
-        X = np.concatenate(rows)
-        y = np.concatenate([e.y[a + ORDER : a + n] for a, n in pieces])
-        theta = np.asarray(np.linalg.lstsq(X, y, rcond=1e-10)[0])
-        return cls(e.u, e.y, theta, pieces)
+        u, y = np.split((columns - scale[0]) / scale[1], [-1], axis=1)
+        y = y[:, 0]
+        X = np.concatenate([_regressors(u[a : a + n], y[a : a + n]) for a, n in pieces])
+        if len(X) < 10 * ORDER * (2 + u.shape[1]):
+            return None
+        target = np.concatenate([y[a + ORDER : a + n] for a, n in pieces])
+        theta = np.asarray(np.linalg.lstsq(X, target, rcond=1e-10)[0])
+        return cls(u, y, theta, pieces)
 
     def contradicts(self, first: int, count: int) -> bool:
         """Whether the output moves in this stretch, by everything known from the rest."""
@@ -136,9 +159,8 @@ class _Rest:
         own = self.u[first : first + count]
         rest = np.concatenate([self.u[a : a + n] for a, n in self.pieces])
         low, high = np.quantile(rest, [0.25, 0.75], axis=0)
-        moves = np.ptp(rest, axis=0) > 0.0
         inside = (own.min(axis=0) <= low) & (own.max(axis=0) >= high)
-        return bool((moves & inside & (np.ptp(own, axis=0) > 0.0)).any())
+        return bool((inside & (np.ptp(own, axis=0) > 0.0)).any())
 
     def _jumps(self, first: int, count: int) -> bool:
         """Whether the output can be at no limit: it is inside the range, or reached it at a jump.
@@ -188,27 +210,28 @@ class Copy:
 
 def copied(data: Dataset) -> Copy | None:
     """An input that the output repeats to rounding, up to `PAST` samples later."""
-    for j in range(data.n_inputs):
-        for delay in range(PAST + 1):
-            parts = [(e.u[: len(e) - delay, j], e.y[delay:]) for e in data.experiments]
-            u, y = (np.concatenate(c) for c in zip(*parts, strict=True))
-            known = (np.abs(u) < LARGEST) & (np.abs(y) < LARGEST)
-            u, y = u[known], y[known]
-            if len(np.unique(u[:MOST])) < 3 or len(y) < 4 * PAST:
-                continue
-            spread = float(u.std() * y.std())
-            covariance = float(np.mean((u - u.mean()) * (y - y.mean())))
-            if not (spread > 0.0 and abs(covariance) > 0.999 * spread):
-                continue
-            gain = covariance / float(u.var())
-            offset = float(y.mean() - gain * u.mean())
-            # what the rounding of either column leaves; printed to six digits where no step is seen
-            rounding = 0.5 * (quantum(y) or 1e-5 * np.ptp(y)) + 0.5 * abs(gain) * (
-                quantum(u) or 1e-5 * np.ptp(u)
-            )
-            coarse = rounding > 0.02 * float(y.std())
-            if not coarse and float(np.abs(y - gain * u - offset).max()) <= 1.01 * rounding:
-                return Copy(j, gain, offset, delay)
+    experiments = [_columns(e) for e in data.experiments]
+    for j, delay in itertools.product(range(data.n_inputs), range(PAST + 1)):
+        u = np.concatenate([c[: max(0, len(c) - delay), j] for c in experiments])
+        y = np.concatenate([c[delay:, -1] for c in experiments])
+        known = np.isfinite(u) & np.isfinite(y)
+        u, y = u[known], y[known]
+        if len(y) < 4 * PAST or len(np.unique(u[:MOST])) < 3:
+            continue
+        if _scale([np.column_stack([u, y])]) is None:
+            continue
+        covariance = float(np.mean((u - u.mean()) * (y - y.mean())))
+        if abs(covariance) < 0.999 * float(u.std() * y.std()):
+            continue
+        gain = covariance / float(u.var())
+        offset = float(y.mean() - gain * u.mean())
+        # what the rounding of either column leaves; printed to six digits where no step is seen
+        rounding = 0.5 * (quantum(y) or 1e-5 * np.ptp(y)) + 0.5 * abs(gain) * (
+            quantum(u) or 1e-5 * np.ptp(u)
+        )
+        coarse = rounding > 0.02 * float(y.std())
+        if not coarse and float(np.abs(y - gain * u - offset).max()) <= 1.01 * rounding:
+            return Copy(j, gain, offset, delay)
     return None
 
 
@@ -255,19 +278,16 @@ def order_in_time(data: Dataset) -> Order | None:
 
 
 def _pieces(data: Dataset) -> list[FloatArray]:
+    """Known stretches of the longest experiments, at most `MOST` samples, each column scaled."""
     pieces, left = [], MOST
     for e in sorted(data.experiments, key=len, reverse=True):
-        columns = np.column_stack([e.u, e.y])
-        known = np.logical_and.reduce(np.abs(columns) < LARGEST, axis=1)
-        for first, count in runs(known):
+        columns = _columns(e)
+        for first, count in runs(_known(columns)):
             if min(count, left) > 4 * PAST:
                 pieces.append(columns[first : first + min(count, left)])
                 left -= len(pieces[-1])
-    if not pieces:
-        return []
-    everything = np.concatenate(pieces)
-    middle, size = everything.mean(axis=0), everything.std(axis=0)
-    return [(p - middle) / np.where(size > 0.0, size, 1.0) for p in pieces]
+    scale = _scale(pieces)
+    return [] if scale is None else [(p - scale[0]) / scale[1] for p in pieces]
 
 
 def _is_held(pieces: list[FloatArray], j: int) -> bool:
@@ -308,8 +328,8 @@ def _left(R: FloatArray, without: int) -> float:
     """Sum of squares that the columns leave of the last one, without the last `without` of them."""
     X, y = R[:, : R.shape[1] - 1 - without], R[:, -1]
     error = y - X @ np.linalg.lstsq(X, y, rcond=1e-10)[0]
-    # below this only the rounding of the columns is left
-    return max(float(error @ error), 1e-12 * float(y @ y))
+    # below this only the rounding of the columns is left, and of a column that stands still nothing
+    return max(float(error @ error), 1e-12 * float(y @ y), sys.float_info.min)
 
 
 def _distant(column: FloatArray, k: np.ndarray) -> list[FloatArray]:
@@ -363,18 +383,17 @@ class Fault:
     text: str
     remedy: str
     evidence: dict[str, float | str]
+    dead: Dead | None = None
 
     @property
     def warning(self) -> str:
         """For the notes of a model."""
-        left_out = self.kind == "dead_sensor"
-        return f"warning: {self.text}" + ("; left out" if left_out else f": {self.remedy}")
+        return f"warning: {self.text}" + ("; left out" if self.dead else f": {self.remedy}")
 
 
 def faults(data: Dataset) -> tuple[Fault, ...]:
     """Dead stretches of the output's sensor, or columns that are no input and output of a plant."""
-    order = _order_fault(data)
-    return (*map(partial(_dead_fault, data), dead_stretches(data)), *order)
+    return (*(_dead_fault(data, dead) for dead in dead_stretches(data)), *_order_fault(data))
 
 
 def _dead_fault(data: Dataset, dead: Dead) -> Fault:
@@ -390,6 +409,7 @@ def _dead_fault(data: Dataset, dead: Dead) -> Fault:
         + ("" if len(data.experiments) == 1 else ", in their file alone")
         + ", and check cable and sensor",
         {"first": float(dead.start), "last": float(dead.stop), "value": dead.value},
+        dead,
     )
 
 
@@ -459,7 +479,7 @@ def sound(data: Dataset) -> tuple[Dataset, tuple[Fault, ...]]:
             name=data.source, expected="an output that answers the input", received=wrong.text,
             remedy=wrong.remedy,
         )  # fmt: skip
-    dead = dead_stretches(data) if found else ()
+    dead = [f.dead for f in found if f.dead]
     if dead:
         masks = [np.zeros(len(e), dtype=np.bool_) for e in data.experiments]
         for d in dead:

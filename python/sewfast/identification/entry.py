@@ -189,9 +189,8 @@ def identify(
     if not isinstance(select, bool):
         raise SettingError(f"select: expected True or False, received {select!r}")
     clock = Clock(time_budget)
-    used, faults = sound(_in_effect(data, "data"))
     task = Task(
-        data=used,
+        data=_in_effect(data, "data"),
         validation=None if validation is None else _in_effect(validation, "validation"),
         na=_LAGS if na is None else na,
         nb=_LAGS if nb is None else nb,
@@ -210,6 +209,10 @@ def identify(
         is_order_given=na is not None,
     )
     _require_data(task, kind)
+    used, faults = sound(task.data)
+    if used is not task.data:
+        task = replace(task, data=used)
+        _require_data(task, kind)
     if isinstance(model, Model):
         found = _within_budget(partial(further.trained, model), task)
         if found.core is model.core:
