@@ -470,8 +470,11 @@ class Upload:
         Raises
         ------
         SettingError
-            For fewer bytes than announced, or a name taken meanwhile; then the file is deleted.
+            For fewer bytes than announced, a name taken meanwhile, or a model, a controller or
+            another file that states its format; then the file is deleted.
         """
+        from .. import storage
+
         try:
             if self.received != self.size:
                 raise SettingError(
@@ -479,6 +482,11 @@ class Upload:
                     "again"
                 )
             self._out.close()
+            if found := storage.format_of(self._part):
+                raise SettingError(
+                    f"{self.file}: expected a recording, received a file of the format {found}; "
+                    "copy it into the project folder"
+                )
             try:
                 os.link(self._part, self._place)  # unlike a rename, it replaces nothing
             except FileExistsError:
