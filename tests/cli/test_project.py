@@ -366,7 +366,11 @@ def test_columns_and_units_come_from_the_file_above_and_options_win(tmp_path: Pa
     assert (tuple(model.input_units), model.output_unit) == (("V",), "RPM")
     sewfast(folder, "validate", "bench-model.json", "bench.csv")
     other = ("--input", "b", "--output", "a", "-o", "swapped.json")
-    done = sewfast(folder, "identify", "bench.csv", "--model", "arx", *other)
+    said = refused(folder, "identify", "bench.csv", "--model", "arx", *other)
+    assert "from" not in said.splitlines()[0]
+    assert "are exchanged; take a as input and b as output" in said
+    stranger(folder / "other.csv", "time_ms;b;a")
+    done = sewfast(folder, "identify", "other.csv", "--model", "arx", *other)
     assert "from" not in done.err.splitlines()[0]
     assert api.load_model(folder / "swapped.json").output_name == "a"
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import LinkError, SettingError
 from .arguments import Commands, add_command, add_view
-from .output import print_json, print_rows, suggested
+from .output import print_json, print_rows
 
 if TYPE_CHECKING:
     from ..control.machine import Machine
@@ -278,7 +278,7 @@ def _require_untripped(port: str, drive: Drive) -> None:
     if status.state == "tripped":
         raise LinkError(
             f"{port}: expected a drive that is ready, it has tripped: {status.reason}; find out "
-            f"why, then `{suggested('clear', port)}`"
+            f"why, then `sewfast clear {port}`"
         )
 
 
