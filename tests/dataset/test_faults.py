@@ -147,6 +147,11 @@ def test_nothing_is_accused_falsely(record: object) -> None:
         assert found(*record(np.random.default_rng(seed))) == [], seed
 
 
+@pytest.mark.parametrize("seed", [24, 45, 99])
+def test_one_bump_into_an_end_stop_is_no_late_command(seed: int) -> None:
+    assert found(*end_stop(np.random.default_rng(seed))) == []
+
+
 # --- a sensor that died ---------------------------------------------------------------------------
 
 
