@@ -16,6 +16,26 @@ pub(super) fn moves(step: &Step<'_>, found: &Candidate) -> bool {
     variances(step, found).is_some_and(|v| found.free.powi(2) > SIGMAS.powi(2) * v[4])
 }
 
+/// Whether the outputs before the step drift by more than their noise explains.
+pub(super) fn drifts(step: &Step<'_>) -> bool {
+    let before: Vec<(f64, f64)> = step
+        .samples()
+        .take_while(|&(k, _)| k < step.at)
+        .map(|(k, y)| (k as f64, y))
+        .collect();
+    let n = before.len() as f64;
+    let mean = |of: fn(&(f64, f64)) -> f64| before.iter().map(of).sum::<f64>() / n;
+    let (k_mean, y_mean) = (mean(|s| s.0), mean(|s| s.1));
+    let about = || before.iter().map(|(k, y)| (k - k_mean, y - y_mean));
+    let squares: f64 = about().map(|(k, _)| k * k).sum();
+    let slope = about().map(|(k, y)| k * y).sum::<f64>() / squares;
+    let left: Vec<f64> = about().map(|(k, y)| y - slope * k).collect();
+    // coloured noise drifts by itself: as many independent samples as its colour leaves
+    let free = Colour::of(&left).independent(left.len()) - 2.0;
+    let variance = left.iter().map(|e| e * e).sum::<f64>() / (free * squares);
+    free > 0.0 && slope * slope > SIGMAS * SIGMAS * variance
+}
+
 /// Standard errors of rise, `t` and `l` \[samples\].
 pub(super) fn errors(step: &Step<'_>, found: &Candidate) -> [f64; 3] {
     variances(step, found).map_or([f64::INFINITY; 3], |v| {
