@@ -23,6 +23,7 @@ from .dataset import (
     require_same_units,
 )
 from .dataset.experiment import without_weightless
+from .dataset.standing import soon_moved
 from .errors import DataError, SettingError, SewfastError
 from .tables import html_of
 
@@ -306,18 +307,43 @@ class DynamicModel(ABC):
         """The initial state of a run over an experiment, from its first `init` measured outputs.
 
         Past outputs y(-1), y(-2), .. of a lagged model, or the states of a state-space model. If
-        some of the first outputs are missing, more samples are used.
+        some of the first outputs are missing, more samples are used. An experiment that stands
+        still at first and moves within these samples begins at the model's equilibrium: its
+        response must not be taken for a state.
         """
         require_init(init)
         if init == 0:
-            rest: FloatArray = self.core.rest_state()
-            return rest
+            return self.rest_state()
+        standing = self._standing_state(experiment, init)
+        if standing is not None:
+            return standing
         experiment = without_weightless(experiment)
         first = experiment.initial_samples(init)
         state: FloatArray = self.core.estimate_initial_state(
             experiment.u[:first], experiment.y[:first]
         )
         return state
+
+    def _standing_state(self, experiment: Experiment, init: int) -> FloatArray | None:
+        """The equilibrium under the first inputs, if the record stands there and moves too soon."""
+        from .evidence.operating import linearise
+
+        found = soon_moved(experiment, init)
+        if found is None:
+            return None
+        u, states = np.array(found.u), []
+        for model in self.members or (self,):
+            small = linearise(model.core, u, level=found.y)
+            # an integrator stands at any level, so at the recorded one
+            if not (small.settled or small.y == found.y):
+                return None
+            states.append(small.state)
+        return np.concatenate(states)
+
+    def rest_state(self) -> FloatArray:
+        """The state of the plant at rest, as listed in `state_names`."""
+        rest: FloatArray = self.core.rest_state()
+        return rest
 
     def _inputs(self, values: ArrayLike) -> FloatArray:
         """Inputs as (N, n_inputs)."""
@@ -348,7 +374,7 @@ class DynamicModel(ABC):
 
     def _state(self, values: ArrayLike | None) -> FloatArray:
         """An initial state for the core; None is rest."""
-        rest: FloatArray = self.core.rest_state()
+        rest = self.rest_state()
         if values is None:
             return rest
         state = real_numbers(values, "initial_state", f"numbers of shape {rest.shape}")

@@ -1,0 +1,90 @@
+"""The level at which a record stands still before its inputs first move."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .experiment import without_weightless
+from .trends import LEAST_REST, SETTLED
+
+if TYPE_CHECKING:
+    from .experiment import Experiment
+
+LEAST = 3
+"""Fewest measured outputs by which a drift can be told from noise."""
+SIGMAS = 3.0
+"""Standard errors beyond which a drift, or a level, is not noise."""
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Standing:
+    """The samples of an experiment before its inputs first move, if its output stood still.
+
+    Attributes
+    ----------
+    samples : int
+        Their number.
+    u : tuple of float
+        The inputs.
+    y : float
+        Mean output; zero if the inputs are zero and noise explains the difference.
+    """
+
+    samples: int
+    u: tuple[float, ...]
+    y: float
+
+
+def standing(experiment: Experiment) -> Standing | None:
+    """The standing samples at the beginning of an experiment; None if there are none.
+
+    The inputs keep their first values, and the output has at least three measured samples whose
+    drift is explained by noise, or is at most a twentieth of the output's range.
+    """
+    e = without_weightless(experiment)
+    moved = (e.u != e.u[0]).any(axis=1)
+    if not moved.any():
+        return None
+    n = int(np.argmax(moved))
+    k = np.flatnonzero(np.isfinite(e.y[:n]))
+    if len(k) < LEAST:
+        return None
+    y, spread = e.y[k], float(np.nanmax(e.y) - np.nanmin(e.y))
+    about = k - k.mean()
+    slope = float(about @ (y - y.mean()) / (about @ about))
+    left = y - y.mean() - slope * about
+    freedom = len(k) - 2
+    error = math.sqrt(float(left @ left) / freedom / float(about @ about))
+    drift = abs(slope) * float(k[-1] - k[0])
+    still = abs(slope) <= _student(freedom) * error + _ROUNDING * spread / n
+    if not (still or drift <= SETTLED * spread):
+        return None
+    if not still and len(y) >= LEAST_REST:
+        y = y[len(y) // 2 :]
+    level = float(y.mean())
+    u = tuple(float(v) for v in e.u[0])
+    noise = float(y.std(ddof=1)) / math.sqrt(len(y))
+    if not any(u) and abs(level) <= _student(len(y) - 1) * noise + _ROUNDING * spread:
+        level = 0.0
+    return Standing(n, u, level)
+
+
+def soon_moved(experiment: Experiment, init: int) -> Standing | None:
+    """The standing samples of an experiment that moves within its first `init` samples, or None.
+
+    A state estimated from these samples would take over a part of the response.
+    """
+    if not (experiment.u[:init] != experiment.u[0]).any():
+        return None
+    return standing(experiment)
+
+
+def _student(freedom: int) -> float:
+    """`SIGMAS` of a normal distribution as a value of Student's (Wallace, 1959)."""
+    z = SIGMAS * (8 * freedom + 3) / (8 * freedom + 1)
+    return math.sqrt(freedom * math.expm1(z * z / freedom))
