@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .dataset import Dataset, Experiment, FloatArray, labelled, require_dataset
 from .dataset.experiment import in_effect, mean_square, weights_of, without_weightless
 from .dataset.outliers import white_noise
+from .dataset.standing import soon_moved
 from .dynamic_model import INIT, DynamicModel, require_init
 from .errors import DataError, FitError, SettingError
 from .plotting import Drawing, Plotted, fit_panels, stacked
@@ -358,13 +359,23 @@ def judged(fit: float, error: float, noise: float, share: float) -> tuple[str, s
 
 
 def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
-    """`free_run_error` with the inputs held at their means after the initial samples."""
+    """`free_run_error` with the inputs held at their means after the initial samples.
+
+    They are held at rest in an experiment that stands still and moves within these samples: the
+    mean of a single step is nearly the step itself.
+    """
     means = np.mean(np.concatenate([e.u for e in data.experiments]), axis=0)
     resting = []
     for e in data.experiments:
         u = e.u.copy()
-        u[e.initial_samples(init) :] = means
-        resting.append(replace(e, u=u))
+        standing = soon_moved(e, init)
+        if standing is None:
+            u[e.initial_samples(init) :] = means
+            resting.append(replace(e, u=u))
+        else:
+            # the outputs say where the run begins
+            u[:] = standing.u
+            resting.append(replace(e, u=u, y=np.full(len(e), standing.y)))
     return free_run_error(model, data, replace(data, experiments=tuple(resting)), init)
 
 

@@ -18,6 +18,7 @@ from ..errors import DataError, FitError, Interrupted
 from ..models import ARX, IV, LinearOE, Model
 from .delays import delay, reach
 from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs, with_run_up
+from .rest import begins_at_rest
 from .task import (
     Look,
     Pool,
@@ -56,8 +57,25 @@ def iv(task: Task) -> Model:
 
 def oe(task: Task) -> Model:
     """Linear output error."""
-    fit = _core.fit_oe(arrays(task.data), **task.fit_options())
+    fit = output_error(task.data, **task.fit_options())
     return completed(task.model(LinearOE, fit.model, linear_provenance(fit)))
+
+
+def output_error(data: Dataset, **options: Any) -> _core.LinearFit:
+    """Output error with free initial states, but at rest where a record stands still at first.
+
+    A free state can take over the response to a step soon after the start. An integrator rests at
+    any level, which its inputs do not tell: its states stay free.
+    """
+    rests = begins_at_rest(data)
+    if not any(rests):
+        return _core.fit_oe(arrays(data), **options)
+    fit = _core.fit_oe(arrays(data), rests=rests, **options)
+    longest = max(len(e) for e in data.experiments)
+    if fit.termination != "interrupted" and time_constant(fit.model) > UNSEEN * longest:
+        free = _core.fit_oe(arrays(data), **options)
+        return free if free.cost < fit.cost else fit
+    return fit
 
 
 def linear_provenance(fit: _core.LinearFit) -> Provenance:
@@ -113,7 +131,7 @@ def short(task: Task, reason: str) -> Model:
 
 def _tried(data: Dataset, options: Mapping[str, Any]) -> _core.LinearFit | None:
     try:
-        fit = _core.fit_oe(arrays(data), **options)
+        fit = output_error(data, **options)
     except (DataError, FitError):
         return None
     if fit.termination == "interrupted":
@@ -368,8 +386,8 @@ def simplest(
 def fitted(data: Dataset, order: int, nk: int, look: Look) -> _core.LinearModel | None:
     """Output error of that order; None if there is no model."""
     try:
-        return _core.fit_oe(
-            arrays(data),
+        return output_error(
+            data,
             na=order,
             nb=order + 1,
             nk=nk,

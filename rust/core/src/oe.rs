@@ -22,6 +22,9 @@ const HEAT: usize = 30;
 
 /// Fits `LinearModel` in free run over all experiments, with an initial state per experiment.
 ///
+/// A record that begins at rest ([`Record::rests`]) begins at the model's own equilibrium under its first inputs: a free state
+/// could take over the response to a step soon after the start, and nothing would tell the gain.
+///
 /// Least squares is biased by measurement noise, so its model is one candidate among others: instrumental-variable
 /// iterations (SRIV, Young 1976; Steiglitz and McBride 1965) and fixed sets of real and complex poles over the whole
 /// range of time constants, each with its best numerator. The best free runs are refined; steps that would move a pole
