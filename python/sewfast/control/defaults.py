@@ -67,14 +67,16 @@ _MOST_TUNED = 60_000
 def recorded_limits(models: Sequence[Any]) -> tuple[float, float] | None:
     """Least and largest command that the models were identified on, and at rest; None if unknown.
 
-    A controller must be able to give the command of a plant at rest, 0 for most.
+    A controller must be able to give the command of a plant at rest: 0, unless the record shows
+    another by standing still.
     """
     known = [r[0] for m in models if isinstance(m, Model) for r in _stored(m, "input_range")]
     ends = [float(end) for pair in known for end in pair]
     if not ends or not np.isfinite(ends).all() or not any(ends):
         return None
-    rests = [m.rest.u[0] for m in models if isinstance(m, Model)]
-    return min(*rests, *ends), max(*rests, *ends)
+    rests = [m.rest for m in models if isinstance(m, Model)]
+    ends += [r.u[0] if r.source == "standing samples" else 0.0 for r in rests]
+    return min(ends), max(ends)
 
 
 def _stored(model: Model, name: str) -> list[Any]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .experiment import without_weightless
+from .outliers import white_noise
 from .trends import LEAST_REST, SETTLED
 
 if TYPE_CHECKING:
@@ -57,11 +58,10 @@ def standing(experiment: Experiment) -> Standing | None:
     y, spread = e.y[k], float(np.nanmax(e.y) - np.nanmin(e.y))
     about = k - k.mean()
     slope = float(about @ (y - y.mean()) / (about @ about))
-    left = y - y.mean() - slope * about
-    freedom = len(k) - 2
-    error = math.sqrt(float(left @ left) / freedom / float(about @ about))
+    # the noise of the whole record: that of a few samples is known too badly to see a drift
+    error = white_noise(e.y) / math.sqrt(float(about @ about))
     drift = abs(slope) * float(k[-1] - k[0])
-    still = abs(slope) <= _student(freedom) * error + _ROUNDING * spread / n
+    still = abs(slope) <= SIGMAS * error + _ROUNDING * spread / n
     if not (still or drift <= SETTLED * spread):
         return None
     if not still and len(y) >= LEAST_REST:

@@ -65,7 +65,7 @@ def output_error(data: Dataset, **options: Any) -> _core.LinearFit:
     """Output error with free initial states, but at rest where a record stands still at first.
 
     A free state can take over the response to a step soon after the start. An integrator rests at
-    any level, which its inputs do not tell: its states stay free.
+    any level, which its inputs do not tell: with a pole slower than the record states are free.
     """
     rests = begins_at_rest(data)
     if not any(rests):
@@ -73,8 +73,7 @@ def output_error(data: Dataset, **options: Any) -> _core.LinearFit:
     fit = _core.fit_oe(arrays(data), rests=rests, **options)
     longest = max(len(e) for e in data.experiments)
     if fit.termination != "interrupted" and time_constant(fit.model) > UNSEEN * longest:
-        free = _core.fit_oe(arrays(data), **options)
-        return free if free.cost < fit.cost else fit
+        return _core.fit_oe(arrays(data), **options)
     return fit
 
 
@@ -131,7 +130,8 @@ def short(task: Task, reason: str) -> Model:
 
 def _tried(data: Dataset, options: Mapping[str, Any]) -> _core.LinearFit | None:
     try:
-        fit = output_error(data, **options)
+        # only asked for where a pole is slower than the record: there no rest is known
+        fit = _core.fit_oe(arrays(data), **options)
     except (DataError, FitError):
         return None
     if fit.termination == "interrupted":
