@@ -326,7 +326,7 @@ class DynamicModel(ABC):
 
     def _standing_state(self, experiment: Experiment, init: int) -> FloatArray | None:
         """The equilibrium under the first inputs, if the record stands there and moves too soon."""
-        from .evidence.operating import linearise
+        from .equilibrium import linearise
 
         found = soon_moved(experiment, init)
         if found is None:

@@ -12,7 +12,7 @@ import numpy as np
 from ..dataset import Dataset, FloatArray
 from ..dataset.standing import Standing, standing
 from ..errors import SettingError
-from ..evidence.operating import linearise
+from ..equilibrium import linearise
 from ..evidence.region import stored_region
 from ..evidence.residuals import representative
 from ..models import Model
