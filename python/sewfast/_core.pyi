@@ -460,12 +460,9 @@ def fit_hammerstein_wiener(
 ) -> HammersteinWienerFit: ...
 def fit_oe(
     experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool = True,
-    max_iterations: int = 100, initial: LinearModel | None = None, rests: list[bool] | None = None,
-    progress: _Progress = None,
+    max_iterations: int = 100, initial: LinearModel | None = None, progress: _Progress = None,
 ) -> LinearFit:
     """Output error. ``initial``, of these orders, replaces the search over many starts.
-
-    ``rests`` says of each experiment whether it begins at rest: then at the model's own equilibrium.
 
     Ctrl-C gives the best model so far as "interrupted"; its initial states and cost can then be those of an excerpt.
     """

@@ -23,7 +23,8 @@ from .dataset import (
     require_same_units,
 )
 from .dataset.experiment import without_weightless
-from .dataset.standing import soon_moved
+from .dataset.standing import SIGMAS, soon_moved
+from .equilibrium import linearise
 from .errors import DataError, SettingError, SewfastError
 from .tables import html_of
 
@@ -32,6 +33,13 @@ VERSION = 1
 INIT = 20
 """Default number of samples that determine the initial state."""
 _STEPS_SHOWN = 4
+
+
+class AtRest(NamedTuple):
+    """The equilibrium at which an experiment begins: its output, and the state of the model."""
+
+    y: float
+    state: FloatArray
 
 
 class FreeRunJacobian(NamedTuple):
@@ -308,15 +316,15 @@ class DynamicModel(ABC):
 
         Past outputs y(-1), y(-2), .. of a lagged model, or the states of a state-space model. If
         some of the first outputs are missing, more samples are used. An experiment that stands
-        still at first and moves within these samples begins at the model's equilibrium: its
-        response must not be taken for a state.
+        still at the model's equilibrium and moves within these samples begins there: its response
+        must not be taken for a state.
         """
         require_init(init)
         if init == 0:
             return self.rest_state()
-        standing = self._standing_state(experiment, init)
-        if standing is not None:
-            return standing
+        rest = self.standing(experiment, init)
+        if rest is not None:
+            return rest.state
         experiment = without_weightless(experiment)
         first = experiment.initial_samples(init)
         state: FloatArray = self.core.estimate_initial_state(
@@ -324,10 +332,8 @@ class DynamicModel(ABC):
         )
         return state
 
-    def _standing_state(self, experiment: Experiment, init: int) -> FloatArray | None:
-        """The equilibrium under the first inputs, if the record stands there and moves too soon."""
-        from .equilibrium import linearise
-
+    def standing(self, experiment: Experiment, init: int) -> AtRest | None:
+        """The equilibrium at which an experiment begins, if it moves within `init` samples."""
         found = soon_moved(experiment, init)
         if found is None:
             return None
@@ -335,10 +341,11 @@ class DynamicModel(ABC):
         for model in self.members or (self,):
             small = linearise(model.core, u, level=found.y)
             # an integrator stands at any level, so at the recorded one
-            if not (small.settled or small.y == found.y):
+            off = abs(small.y - found.y) + abs(small.drift) * len(experiment)
+            if not off <= SIGMAS * found.scatter:
                 return None
             states.append(small.state)
-        return np.concatenate(states)
+        return AtRest(found.y, np.concatenate(states))
 
     def rest_state(self) -> FloatArray:
         """The state of the plant at rest, as listed in `state_names`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from .dataset import Dataset, Experiment, FloatArray, labelled, require_dataset
 from .dataset.experiment import in_effect, mean_square, weights_of, without_weightless
 from .dataset.outliers import white_noise
-from .dataset.standing import soon_moved
 from .dynamic_model import INIT, DynamicModel, require_init
 from .errors import DataError, FitError, SettingError
 from .plotting import Drawing, Plotted, fit_panels, stacked
@@ -361,32 +360,36 @@ def judged(fit: float, error: float, noise: float, share: float) -> tuple[str, s
 def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
     """`free_run_error` with the inputs held at their means after the initial samples.
 
-    They are held at rest in an experiment that stands still and moves within these samples: the
+    An experiment that begins at rest, and moves within these samples, would have stayed there: the
     mean of a single step is nearly the step itself.
     """
     means = np.mean(np.concatenate([e.u for e in data.experiments]), axis=0)
-    resting = []
+    held = []
     for e in data.experiments:
         u = e.u.copy()
-        standing = soon_moved(e, init)
-        if standing is None:
-            u[e.initial_samples(init) :] = means
-            resting.append(replace(e, u=u))
-        else:
-            # the outputs say where the run begins
-            u[:] = standing.u
-            resting.append(replace(e, u=u, y=np.full(len(e), standing.y)))
-    return free_run_error(model, data, replace(data, experiments=tuple(resting)), init)
+        u[e.initial_samples(init) :] = means
+        held.append(replace(e, u=u))
+
+    def run() -> list[FloatArray]:
+        runs = model.simulate(replace(data, experiments=tuple(held)), init=init)
+        rests = [model.standing(e, init) for e in data.experiments]
+        return [y if s is None else np.full(len(y), s.y) for y, s in zip(runs, rests, strict=True)]
+
+    return _error(run, data, init)
 
 
-def free_run_error(model: DynamicModel, data: Dataset, inputs: Dataset, init: int) -> float:
-    """Root mean square error of the free run on `inputs` against the outputs of `data`.
+def free_run_error(model: DynamicModel, data: Dataset, init: int) -> float:
+    """Root mean square error of the free run.
 
     Weighted, over the known outputs after the initial samples [output unit]; infinite if the free
     run diverges.
     """
+    return _error(lambda: model.simulate(data, init=init), data, init)
+
+
+def _error(simulated: Callable[[], list[FloatArray]], data: Dataset, init: int) -> float:
     try:
-        runs = model.simulate(inputs, init=init)
+        runs = simulated()
     except (DataError, FitError):
         return math.inf
     squares, weights = [], []

@@ -151,6 +151,7 @@ def with_gain(model: Model, factor: float) -> Model:
     if not isinstance(model, SingleModel):
         raise SettingError("gain: expected a single model, received an ensemble; take its members")
     scaled = _changed(model, **model.with_output_scaled(factor))
+    assert isinstance(scaled, SingleModel)
     # the level at rest stays
     moved = (factor - 1.0) * model.rest.y
     parameters = scaled.with_zero_at(np.zeros(len(model.input_names)), moved) if moved else {}

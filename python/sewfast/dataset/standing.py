@@ -10,7 +10,6 @@ import numpy as np
 
 from .experiment import without_weightless
 from .outliers import white_noise
-from .trends import LEAST_REST, SETTLED
 
 if TYPE_CHECKING:
     from .experiment import Experiment
@@ -34,18 +33,21 @@ class Standing:
         The inputs.
     y : float
         Mean output; zero if the inputs are zero and noise explains the difference.
+    scatter : float
+        Standard deviation of the outputs, of the whole record's white noise at least.
     """
 
     samples: int
     u: tuple[float, ...]
     y: float
+    scatter: float
 
 
 def standing(experiment: Experiment) -> Standing | None:
     """The standing samples at the beginning of an experiment; None if there are none.
 
     The inputs keep their first values, and the output has at least three measured samples whose
-    drift is explained by noise, or is at most a twentieth of the output's range.
+    drift is explained by noise.
     """
     e = without_weightless(experiment)
     moved = (e.u != e.u[0]).any(axis=1)
@@ -59,19 +61,17 @@ def standing(experiment: Experiment) -> Standing | None:
     about = k - k.mean()
     slope = float(about @ (y - y.mean()) / (about @ about))
     # the noise of the whole record: that of a few samples is known too badly to see a drift
-    error = white_noise(e.y) / math.sqrt(float(about @ about))
-    drift = abs(slope) * float(k[-1] - k[0])
-    still = abs(slope) <= SIGMAS * error + _ROUNDING * spread / n
-    if not (still or drift <= SETTLED * spread):
+    white = white_noise(e.y)
+    error = white / math.sqrt(float(about @ about))
+    if abs(slope) > SIGMAS * error + _ROUNDING * spread / n:
         return None
-    if not still and len(y) >= LEAST_REST:
-        y = y[len(y) // 2 :]
     level = float(y.mean())
     u = tuple(float(v) for v in e.u[0])
-    noise = float(y.std(ddof=1)) / math.sqrt(len(y))
+    deviation = float(y.std(ddof=1))
+    noise = deviation / math.sqrt(len(y))
     if not any(u) and abs(level) <= _student(len(y) - 1) * noise + _ROUNDING * spread:
         level = 0.0
-    return Standing(n, u, level)
+    return Standing(n, u, level, max(deviation, white))
 
 
 def soon_moved(experiment: Experiment, init: int) -> Standing | None:

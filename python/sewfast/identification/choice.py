@@ -36,15 +36,7 @@ from .folds import (
     verdict,
     what_to_record,
 )
-from .linear import (
-    HELD_OUT,
-    LEAST_GAIN,
-    LinearCandidate,
-    LinearTable,
-    linear_provenance,
-    output_error,
-    short,
-)
+from .linear import HELD_OUT, LEAST_GAIN, LinearCandidate, LinearTable, linear_provenance, short
 from .search import CLIMB_ITERATIONS, Search
 from .task import Pool, Provenance, Stopped, Task, arrays, finite, with_provenance, wrap
 from .training import Network, Request, Structure
@@ -356,8 +348,8 @@ class Choice(Finals):
         until = self.clock.until(SHARE_OF_REFIT)
         options = task.fit_options(na=chosen.order, nb=chosen.order + 1, nk=chosen.nk)
         (fit,) = self.search.pool.map(
-            lambda data, look: output_error(data, **{**options, "progress": look}),
-            [task.data], until=until, share=1.0, what=_REFIT,
+            lambda data, look: _core.fit_oe(data, **{**options, "progress": look}),
+            [arrays(task.data)], until=until, share=1.0, what=_REFIT,
         )  # fmt: skip
         if fit is None:
             # no time to fit all samples: keep the model of the excerpt

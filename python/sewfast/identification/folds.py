@@ -300,7 +300,7 @@ def verdict(
         things to do, the most important one first.
     """
     # `error` can come from other samples; the share explained by the input needs the same ones
-    own = free_run_error(model, part.held, part.held, INIT)
+    own = free_run_error(model, part.held, INIT)
     error = own if error is None else error
     spread = part.spread
     fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")

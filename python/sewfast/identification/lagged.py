@@ -16,7 +16,7 @@ from ..errors import FitError, Interrupted
 from ..models import LinearOE, Model, NeuralOE
 from ..models.base import Fitted, StructuredModel
 from .folds import Errors, compared, errors_of, folds, free_runs
-from .linear import is_misled, oe, output_error, raised
+from .linear import is_misled, oe, raised
 from .task import (
     Progress,
     Provenance,
@@ -263,11 +263,11 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
     parts = folds(task.data, task.validation)
     if na < 1 or nb < 1 or not parts or task.clock.over(LINEAR_SHARE, _LINEAR_FITS):
         return linear
-    learned = parts[0].fitted
+    learned = arrays(parts[0].fitted)
     models = []
     for a, b in ((na, nb), (orders["na"], orders["nb"])):
         try:
-            fit = output_error(learned, **task.fit_options(na=a, nb=b))
+            fit = _core.fit_oe(learned, **task.fit_options(na=a, nb=b))
             if fit.termination == "interrupted":
                 raise KeyboardInterrupt
         except FitError:

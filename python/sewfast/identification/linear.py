@@ -18,7 +18,6 @@ from ..errors import DataError, FitError, Interrupted
 from ..models import ARX, IV, LinearOE, Model
 from .delays import delay, reach
 from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs, with_run_up
-from .rest import begins_at_rest
 from .task import (
     Look,
     Pool,
@@ -57,24 +56,8 @@ def iv(task: Task) -> Model:
 
 def oe(task: Task) -> Model:
     """Linear output error."""
-    fit = output_error(task.data, **task.fit_options())
+    fit = _core.fit_oe(arrays(task.data), **task.fit_options())
     return completed(task.model(LinearOE, fit.model, linear_provenance(fit)))
-
-
-def output_error(data: Dataset, **options: Any) -> _core.LinearFit:
-    """Output error with free initial states, but at rest where a record stands still at first.
-
-    A free state can take over the response to a step soon after the start. An integrator rests at
-    any level, which its inputs do not tell: with a pole slower than the record states are free.
-    """
-    rests = begins_at_rest(data)
-    if not any(rests):
-        return _core.fit_oe(arrays(data), **options)
-    fit = _core.fit_oe(arrays(data), rests=rests, **options)
-    longest = max(len(e) for e in data.experiments)
-    if fit.termination != "interrupted" and time_constant(fit.model) > UNSEEN * longest:
-        return _core.fit_oe(arrays(data), **options)
-    return fit
 
 
 def linear_provenance(fit: _core.LinearFit) -> Provenance:
@@ -130,7 +113,6 @@ def short(task: Task, reason: str) -> Model:
 
 def _tried(data: Dataset, options: Mapping[str, Any]) -> _core.LinearFit | None:
     try:
-        # only asked for where a pole is slower than the record: there no rest is known
         fit = _core.fit_oe(arrays(data), **options)
     except (DataError, FitError):
         return None
@@ -386,8 +368,8 @@ def simplest(
 def fitted(data: Dataset, order: int, nk: int, look: Look) -> _core.LinearModel | None:
     """Output error of that order; None if there is no model."""
     try:
-        return output_error(
-            data,
+        return _core.fit_oe(
+            arrays(data),
             na=order,
             nb=order + 1,
             nk=nk,

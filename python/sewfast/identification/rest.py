@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 
 from ..dataset import Dataset, FloatArray
 from ..dataset.standing import Standing, standing
-from ..errors import SettingError
 from ..equilibrium import linearise
+from ..errors import SettingError
 from ..evidence.region import stored_region
 from ..evidence.residuals import representative
 from ..models import Model
@@ -20,11 +20,6 @@ from ..models.rest import Rest
 from .task import free_run_rmse, with_provenance
 
 M = TypeVar("M", bound=Model)
-
-
-def begins_at_rest(data: Dataset) -> list[bool]:
-    """Whether each experiment stands still before its inputs first move."""
-    return [standing(e) is not None for e in data.experiments]
 
 
 def with_rest(model: M, data: Dataset) -> M:
@@ -42,7 +37,7 @@ def _rested(model: M, data: Dataset, found: Rest | None) -> M:
         model.about(rest)
     except SettingError:
         return model  # its own zero is its rest
-    return with_provenance(model, {"rest": rest.to_json()})
+    return cast("M", with_provenance(model, {"rest": rest.to_json()}))
 
 
 def _standing(data: Dataset) -> Rest | None:

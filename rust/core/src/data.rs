@@ -218,6 +218,15 @@ impl<'a> Record<'a> {
         Self { rests, ..self }
     }
 
+    /// Whether the inputs keep their first values for so many measured outputs, and move later.
+    pub fn begins_held(&self, outputs: usize) -> bool {
+        let rows = self.u.chunks_exact(self.channels);
+        let held = rows
+            .take_while(|row| *row == &self.u[..self.channels])
+            .count();
+        held < self.len() && self.y[..held].iter().filter(|y| !y.is_nan()).count() >= outputs
+    }
+
     /// The weight of sample `k`.
     pub fn weight(&self, k: usize) -> f64 {
         self.weights.map_or(1.0, |weights| weights[k])

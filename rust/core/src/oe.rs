@@ -20,10 +20,15 @@ const ABOUT_AS_WELL: f64 = 1.05;
 /// Iterations after which the refined candidates are compared and the best one goes on alone.
 const HEAT: usize = 30;
 
+/// Measured outputs under the first inputs from which a plant can be seen to stand: two always lie on a line.
+const HELD: usize = 3;
+
 /// Fits `LinearModel` in free run over all experiments, with an initial state per experiment.
 ///
-/// A record that begins at rest ([`Record::rests`]) begins at the model's own equilibrium under its first inputs: a free state
-/// could take over the response to a step soon after the start, and nothing would tell the gain.
+/// Records whose inputs are held at first are fitted a second time, from the model's own equilibrium under these inputs: a
+/// free state could take over the response to a step soon after the start, and nothing would tell the gain. The free states
+/// are kept if they lower the Bayesian information criterion (Schwarz, *Ann. Stat.* 6, 1978) of as many independent samples
+/// as the colour of the residuals leaves: then the plant was moving before the record began.
 ///
 /// Least squares is biased by measurement noise, so its model is one candidate among others: instrumental-variable
 /// iterations (SRIV, Young 1976; Steiglitz and McBride 1965) and fixed sets of real and complex poles over the whole
@@ -58,15 +63,19 @@ pub fn fit(
     monitor: &Monitor,
 ) -> Result<LinearFit> {
     let lags = arx::check(records, na, nb, nk)?;
-    let mut problem = OutputError::new(records, lags, offset, monitor)?;
-    monitor.set_total((max_iterations + (REFINED - 1) * HEAT) as u64);
-    let from_pieces = excerpt(records)
-        .and_then(|pieces| searched_in(&pieces, &mut problem, max_iterations, monitor));
-    let (best, spent) = match from_pieces {
-        Some(found) => found,
-        None => searched(&mut problem, records, max_iterations, monitor).ok_or_else(no_model)?,
-    };
-    finished(problem, best, spent, max_iterations, monitor)
+    let iterations = max_iterations + (REFINED - 1) * HEAT;
+    from_rest_or_motion(records, iterations, monitor, |records| {
+        let mut problem = OutputError::new(records, lags, offset, monitor)?;
+        let from_pieces = excerpt(records)
+            .and_then(|pieces| searched_in(&pieces, &mut problem, max_iterations, monitor));
+        let (best, spent) = match from_pieces {
+            Some(found) => found,
+            None => {
+                searched(&mut problem, records, max_iterations, monitor).ok_or_else(no_model)?
+            }
+        };
+        finished(problem, best, spent, max_iterations, monitor)
+    })
 }
 
 /// [`fit`] from one model instead of a search over many: for data that a model is known to describe nearly.
@@ -96,14 +105,60 @@ pub fn fit_from(
             lags.channels
         )));
     }
-    let mut problem = OutputError::new(records, lags, offset, monitor)?;
-    monitor.set_total(max_iterations as u64);
-    let (cost, theta) = problem
-        .with_states(initial)
-        .or_else(|| problem.with_poles(&stabilised(initial.a())))
-        .ok_or_else(no_model)?;
-    let start = unfinished(cost, theta, Termination::MaxIterations);
-    finished(problem, start, 0, max_iterations, monitor)
+    from_rest_or_motion(records, max_iterations, monitor, |records| {
+        let mut problem = OutputError::new(records, lags, offset, monitor)?;
+        let (cost, theta) = problem
+            .with_states(initial)
+            .or_else(|| problem.with_poles(&stabilised(initial.a())))
+            .ok_or_else(no_model)?;
+        let start = unfinished(cost, theta, Termination::MaxIterations);
+        finished(problem, start, 0, max_iterations, monitor)
+    })
+}
+
+/// The fit with free initial states, or that from rest if the free states do not pay.
+fn from_rest_or_motion(
+    records: &[Record],
+    iterations: usize,
+    monitor: &Monitor,
+    fit: impl Fn(&[Record]) -> Result<Fitted>,
+) -> Result<LinearFit> {
+    let resting: Vec<_> = records
+        .iter()
+        .map(|r| r.at_rest(r.begins_held(HELD)))
+        .collect();
+    let tied = resting.iter().filter(|r| r.rests).count();
+    monitor.set_total(iterations as u64 * if tied > 0 { 2 } else { 1 });
+    let free = fit(records);
+    if tied == 0 || monitor.stopped() {
+        return free.map(|free| free.fit);
+    }
+    match (free, fit(&resting)) {
+        (Err(_), Ok(rest)) => Ok(rest.fit),
+        (Ok(free), Ok(rest)) if !free.pays(&rest, tied) => Ok(LinearFit {
+            iterations: free.fit.iterations + rest.fit.iterations,
+            ..rest.fit
+        }),
+        (free, rest) => free.map(|free| LinearFit {
+            iterations: free.fit.iterations + rest.map_or(0, |rest| rest.fit.iterations),
+            ..free.fit
+        }),
+    }
+}
+
+/// A fit, and how many independent samples its residuals are worth.
+struct Fitted {
+    fit: LinearFit,
+    independent: f64,
+}
+
+impl Fitted {
+    /// Whether the free states of `tied` records lower the information criterion of a fit from rest.
+    fn pays(&self, rest: &Self, tied: usize) -> bool {
+        let states = (tied * self.fit.model.lags().na) as f64;
+        let n = self.independent;
+        n * (rest.fit.cost / self.fit.cost).ln() > states * n.ln()
+    }
 }
 
 /// The fit that goes on from `best` for the iterations that are left, after `spent` ones in all.
@@ -113,7 +168,7 @@ fn finished(
     spent: usize,
     max_iterations: usize,
     monitor: &Monitor,
-) -> Result<LinearFit> {
+) -> Result<Fitted> {
     let left = max_iterations.saturating_sub(best.iterations);
     let goes_on = best.termination == Termination::MaxIterations && left > 0;
     let (best, spent) = if goes_on {
@@ -129,7 +184,8 @@ fn finished(
     } else {
         (best, spent)
     };
-    Ok(LinearFit {
+    let independent = problem.independent(&best.theta);
+    let fit = LinearFit {
         model: problem.model(&best.theta)?,
         cost: best.cost,
         iterations: spent,
@@ -140,7 +196,8 @@ fn finished(
         trace: best.trace,
         initial_states: problem.initial_states(&best.theta),
         covariance: problem.covariance(&best.theta, best.cost),
-    })
+    };
+    Ok(Fitted { fit, independent })
 }
 
 /// The best of the refined candidates, and the iterations of all.

@@ -2,6 +2,7 @@
 
 use nalgebra::DMatrix;
 
+use crate::colour::Colour;
 use crate::data::weighted_squares;
 use crate::gram::Gram;
 use crate::lagged::{Lagged, Lags, push_past};
@@ -166,6 +167,21 @@ impl<'a> OutputError<'a> {
         let step = theta[first..].iter_mut().zip(&jte[first..]);
         step.for_each(|(value, step)| *value += step);
         Some((self.cost(&theta)?, theta))
+    }
+
+    /// How many independent samples the residuals at `theta` are worth.
+    pub fn independent(&mut self, theta: &[f64]) -> f64 {
+        if self.cost(theta).is_none() {
+            return 0.0;
+        }
+        let measured = self.records.iter().zip(&self.firsts).zip(&self.runs);
+        let residuals: Vec<f64> = measured
+            .flat_map(|((record, &first), run)| {
+                let outputs = record.y[first..].iter().zip(run);
+                outputs.filter(|(y, _)| !y.is_nan()).map(|(y, run)| y - run)
+            })
+            .collect();
+        Colour::of(&residuals).independent(residuals.len())
     }
 
     /// Covariance of the shared parameters for white noise, row by row, with a row for the offset in any case.

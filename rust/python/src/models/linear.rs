@@ -148,7 +148,7 @@ fn fit_arx(
 
 #[pyfunction]
 #[pyo3(signature = (
-    experiments, *, na, nb, nk, offset = true, max_iterations = 100, initial = None, rests = None, progress = None
+    experiments, *, na, nb, nk, offset = true, max_iterations = 100, initial = None, progress = None
 ))]
 #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
 fn fit_oe(
@@ -160,15 +160,9 @@ fn fit_oe(
     offset: bool,
     max_iterations: usize,
     initial: Option<PyRef<'_, LinearModel>>,
-    rests: Option<Vec<bool>>,
     progress: Option<Bound<'_, PyAny>>,
 ) -> PyResult<LinearFit> {
-    let rests = rests.unwrap_or_default().into_iter();
-    let records: Vec<_> = records(py, &experiments)?
-        .into_iter()
-        .zip(rests.chain(std::iter::repeat(false)))
-        .map(|(record, rests)| record.at_rest(rests))
-        .collect();
+    let records = records(py, &experiments)?;
     let initial = initial.map(|m| m.inner.clone());
     if let Some(lags) = initial.as_ref().map(|m| m.lags())
         && (lags.na, lags.nb, lags.nk) != (na, nb, nk)
