@@ -133,17 +133,18 @@ fn from_rest_or_motion(
     if tied == 0 || monitor.stopped() {
         return free.map(|free| free.fit);
     }
-    match (free, fit(&resting)) {
-        (Err(_), Ok(rest)) => Ok(rest.fit),
-        (Ok(free), Ok(rest)) if !free.pays(&rest, tied) => Ok(LinearFit {
-            iterations: free.fit.iterations + rest.fit.iterations,
-            ..rest.fit
-        }),
-        (free, rest) => free.map(|free| LinearFit {
-            iterations: free.fit.iterations + rest.map_or(0, |rest| rest.fit.iterations),
-            ..free.fit
-        }),
+    let rest = fit(&resting);
+    let iterations = [&free, &rest].map(|f| f.as_ref().map_or(0, |f| f.fit.iterations));
+    let mut chosen = match (free, rest) {
+        (Err(_), Ok(rest)) => rest.fit,
+        (Ok(free), Ok(rest)) if !free.pays(&rest, tied) => rest.fit,
+        (free, _) => free?.fit,
+    };
+    chosen.iterations = iterations.iter().sum();
+    if monitor.stopped() {
+        chosen.termination = Termination::Interrupted;
     }
+    Ok(chosen)
 }
 
 /// A fit, and how many independent samples its residuals are worth.
@@ -537,6 +538,27 @@ mod tests {
 
     /// Slow iterations that end a fit.
     const PATIENCE: usize = 6;
+
+    #[test]
+    fn begins_at_rest_or_in_motion_as_the_record_does() {
+        let truth = LinearModel::new(vec![-1.9, 0.9025], vec![0.03, 0.02], 1, 1, 0.2).unwrap();
+        let rest = (0.2 + 0.05 * 2.0) / 0.0025;
+        for (held, states) in [(3, [rest; 2]), (20, [rest; 2]), (7, [rest + 40.0, rest - 30.0])] {
+            let u: Vec<f64> = (0..700).map(|k| if k < held { 2.0 } else { 8.0 }).collect();
+            let y = noisy(&truth.simulate(&u, 1, &states).unwrap(), 1.0, held as u64);
+            let records = [Record::new(&u, 1, &y).unwrap()];
+            let fit = fit(&records, 2, 2, 1, true, 100, &Monitor::default()).unwrap();
+            let [first, second] = fit.initial_states[0][..] else {
+                panic!("two past outputs")
+            };
+            let at_rest = states[0] == states[1];
+            assert_eq!(first == second, at_rest, "{held}: {first} {second}");
+            if at_rest {
+                let gain = fit.model.dc_gain()[0];
+                assert!((gain - 20.0).abs() < 0.2, "{held}: {gain}");
+            }
+        }
+    }
 
     #[test]
     fn gives_the_best_so_far_wherever_it_is_stopped() {
