@@ -23,7 +23,7 @@ from .dataset import (
     require_same_units,
 )
 from .dataset.experiment import without_weightless
-from .dataset.standing import SIGMAS, soon_moved
+from .dataset.standing import SIGMAS, standing
 from .equilibrium import linearise
 from .errors import DataError, SettingError, SewfastError
 from .tables import html_of
@@ -322,9 +322,10 @@ class DynamicModel(ABC):
         require_init(init)
         if init == 0:
             return self.rest_state()
-        rest = self.standing(experiment, init)
-        if rest is not None:
-            return rest.state
+        if (experiment.u[:init] != experiment.u[0]).any():
+            rest = self.standing(experiment)
+            if rest is not None:
+                return rest.state
         experiment = without_weightless(experiment)
         first = experiment.initial_samples(init)
         state: FloatArray = self.core.estimate_initial_state(
@@ -332,9 +333,9 @@ class DynamicModel(ABC):
         )
         return state
 
-    def standing(self, experiment: Experiment, init: int) -> AtRest | None:
-        """The equilibrium at which an experiment begins, if it moves within `init` samples."""
-        found = soon_moved(experiment, init)
+    def standing(self, experiment: Experiment) -> AtRest | None:
+        """The equilibrium at which an experiment stands before its inputs move, if it does."""
+        found = standing(experiment)
         if found is None:
             return None
         u, states = np.array(found.u), []

@@ -360,8 +360,8 @@ def judged(fit: float, error: float, noise: float, share: float) -> tuple[str, s
 def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
     """`free_run_error` with the inputs held at their means after the initial samples.
 
-    An experiment that begins at rest, and moves within these samples, would have stayed there: the
-    mean of a single step is nearly the step itself.
+    An experiment that begins at rest would have stayed there: the mean of a single step is nearly
+    the step itself.
     """
     means = np.mean(np.concatenate([e.u for e in data.experiments]), axis=0)
     held = []
@@ -372,7 +372,7 @@ def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
 
     def run() -> list[FloatArray]:
         runs = model.simulate(replace(data, experiments=tuple(held)), init=init)
-        rests = [model.standing(e, init) for e in data.experiments]
+        rests = [model.standing(e) for e in data.experiments]
         return [y if s is None else np.full(len(y), s.y) for y, s in zip(runs, rests, strict=True)]
 
     return _error(run, data, init)

@@ -74,16 +74,6 @@ def standing(experiment: Experiment) -> Standing | None:
     return Standing(n, u, level, max(deviation, white))
 
 
-def soon_moved(experiment: Experiment, init: int) -> Standing | None:
-    """The standing samples of an experiment that moves within its first `init` samples, or None.
-
-    A state estimated from these samples would take over a part of the response.
-    """
-    if not (experiment.u[:init] != experiment.u[0]).any():
-        return None
-    return standing(experiment)
-
-
 def _student(freedom: int) -> float:
     """`SIGMAS` of a normal distribution as a value of Student's (Wallace, 1959)."""
     z = SIGMAS * (8 * freedom + 3) / (8 * freedom + 1)
