@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from effort import FULL
-from sewfast import Dataset, _core, identify
+from sewfast import Dataset, LinearOE, _core, identify
 from sewfast.arrays import FloatArray
 from sewfast.control import fit_fopdt
 from sewfast.dataset.standing import standing
@@ -31,10 +31,12 @@ def single_step(seed: int) -> tuple[Dataset, float]:
     return Dataset.from_arrays(u, y + rng.choice([0.0, 24.5, 293.15]) + noise, Ts=0.001), gain
 
 
+@pytest.mark.parametrize("kind", ["oe", "auto"])
 @pytest.mark.parametrize("seed", range(30 if FULL else 6))
-def test_a_step_soon_after_the_start_tells_its_gain(seed: int) -> None:
+def test_a_step_soon_after_the_start_tells_its_gain(seed: int, kind: str) -> None:
     data, gain = single_step(seed)
-    model = identify(data, model="oe", threads=1)
+    model = identify(data, model=kind, threads=1)
+    assert isinstance(model, LinearOE)
     assert model.dc_gain[0] == pytest.approx(gain, rel=0.05)
     assert model.training["verdict"]["grade"] == "good"
 
