@@ -17,9 +17,8 @@ from sewfast.link.plan import require_units
 from sewfast.link.wire import Channel
 from sewfast.motorfit import rad_per_second
 from sewfast.plotting import quantity
-from sewfast.readers import read_table
-from sewfast.readers.recording import Roles, roles
-from sewfast.units import ANGULAR_SPEEDS, SPEEDS, counts_per_unit, is_unit, spelled
+from sewfast.readers import Roles, read_table, roles
+from sewfast.units import ANGULAR_SPEEDS, SPEEDS, counts_per_unit, duration, is_unit, spelled
 
 WRITTEN = [
     ("RPM", 60.0), ("rpm", 60.0), ("1/min", 60.0), ("U/min", 60.0), ("min⁻¹", 60.0),
@@ -110,3 +109,14 @@ def test_what_is_no_angular_speed_has_no_counts() -> None:
     assert "m/s" not in ANGULAR_SPEEDS
     with pytest.raises(SettingError, match="expected a speed unit out of rpm"):
         counts_per_unit(1000.0, "m/s")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.0, "0 ms"), (0.0494, "49.4 ms"), (1.0, "1 s"), (599.0, "599 s"), (1697.4, "28.29 min"),
+        (8139.4571, "135.7 min"), (97200.0, "27 h"), (math.inf, "inf ms"),
+    ],
+)  # fmt: skip
+def test_times_are_written_in_the_unit_that_suits_them(seconds: float, text: str) -> None:
+    assert duration(seconds) == text

@@ -76,8 +76,12 @@ class Fopdt:
         if not (math.isfinite(self.K) and 0.0 < self.T < math.inf and 0.0 <= self.L < math.inf):
             raise SettingError(
                 "expected a finite gain K, T above 0 s and L of 0 s or more, got "
-                f"K = {self.K:g} {self.y_unit}/{self.u_unit}, T = {self.T:g} s, L = {self.L:g} s"
+                f"K = {self.K:g} {self._unit}, T = {self.T:g} s, L = {self.L:g} s"
             )
+
+    @property
+    def _unit(self) -> str:
+        return f"{self.y_unit or 'y'}/{self.u_unit or 'u'}"
 
     @property
     def warning(self) -> str:
@@ -101,7 +105,7 @@ class Fopdt:
             return f"{value:.6g}" + ("" if math.isnan(error) else f" +- {error:.2g}")
 
         parts = [
-            f"K {with_error(self.K, self.K_se)} {self.y_unit}/{self.u_unit}",
+            f"K {with_error(self.K, self.K_se)} {self._unit}",
             f"T {with_error(self.T, self.T_se)} s",
             f"L {with_error(self.L, self.L_se)} s (L/T {self.L / self.T:.3g})",
         ]

@@ -97,6 +97,33 @@ def counts_per_unit(counts_per_rev: float, unit: str = "rpm") -> float:
     return counts_per_rev * factor
 
 
+# --- Times as text --------------------------------------------------------------------------------
+
+
+def time_unit(seconds: float) -> tuple[float, str]:
+    """The unit that suits a time, as a factor from seconds and its name.
+
+    ms below a second, s below ten minutes, min below three hours, h above.
+    """
+    if not 1.0 <= abs(seconds) < math.inf:
+        return 1e3, "ms"
+    if abs(seconds) < 600.0:
+        return 1.0, "s"
+    return (1.0 / 60.0, "min") if abs(seconds) < 10800.0 else (1.0 / 3600.0, "h")
+
+
+def duration(seconds: float, digits: int = 4) -> str:
+    """A time in the unit that suits it.
+
+    Examples
+    --------
+    >>> duration(0.0494), duration(8139.4571), duration(97200.0)
+    ('49.4 ms', '135.7 min', '27 h')
+    """
+    factor, unit = time_unit(seconds)
+    return f"{factor * seconds:.{digits}g} {unit}"
+
+
 # --- Units in the names of columns ----------------------------------------------------------------
 
 
@@ -104,10 +131,12 @@ _UNITS = SPEEDS | frozenset(
     re.split(
         " ",
         "s sec second seconds ms us µs ns min v volt volts mv a amp ampere amperes ma rev "
-        "rad deg ° nm n m cm mm w hz khz % °c degc counts counts/s",
+        "rad deg ° nm n m cm mm w hz khz % °c degc counts counts/s kgf bar kpa",
     )
 )
 """Units that are written behind or below a name, in lower case."""
+_STATISTIC = re.compile(r"(?:^|\s+)(?:rms|avg|mean|max|min|peak|pk|pp)$", re.IGNORECASE)
+"""What a number between brackets is of several samples; `[V rms]` is in V."""
 _BEFORE_UNIT = re.compile(r"\s+in\s+|\s*/\s*|\s*,\s+")
 
 
@@ -115,12 +144,15 @@ def split_unit(header: str) -> tuple[str, str]:
     """`u [V]`, `u (V)`, `u, V`, `u in V` or `u / V` -> `("u", "V")`; no unit gives an empty one."""
     match = re.fullmatch(r"\s*(\S.*?)[\s/]*(?:\[([^\]]*)\]|\(([^)]*)\))\s*", header)
     if match is not None:
-        return match[1], (match[2] or match[3] or "").strip()
+        return match[1], _STATISTIC.sub("", match[2] or match[3] or "").strip()
     text = header.strip()
+    if is_unit(text):
+        return text, ""
+    ends, known = unit_in_name(text)
     for between in _BEFORE_UNIT.finditer(text):
         name, unit = text[: between.start()], text[between.end() :]
-        # `speed m/s` does not mean `speed m` in seconds
-        if name and is_unit(unit) and not is_unit(text[len(name.rpartition(" ")[0]) :]):
+        # `speed m/s` and `speed_rad/s` end with a unit of speed; they are no `speed m` in seconds
+        if name and is_unit(unit) and not (known and len(name) > len(ends)):
             return name, unit
     return text, ""
 
@@ -135,19 +167,33 @@ _SUFFIX = {
     "rad_s": "rad/s", "degps": "deg/s", "deg_s": "deg/s", "deg": "deg", "rad": "rad", "Nm": "Nm",
     "mm": "mm", "Hz": "Hz", "rad_per_s": "rad/s", "deg_per_s": "deg/s", "m_s": "m/s",
     "mm_s": "mm/s", "m_per_s": "m/s", "mm_per_s": "mm/s", "mps": "m/s", "percent": "%", "pct": "%",
-    "volt": "V", "volts": "V",
+    "volt": "V", "volts": "V", "degC": "degC", "degc": "degC", "celsius": "degC", "kelvin": "K",
 }  # fmt: skip
-_CURRENT = re.compile(r"i|curr(ent)?|strom|amps?|i_?motor|motor_?current")
 _SUFFIXED = re.compile(rf"(.+)[_ ]({'|'.join(sorted(_SUFFIX, key=len, reverse=True))})")
+_SPEED_SUFFIX = re.compile(rf"(.+?)[_ ]({'|'.join(map(re.escape, sorted(SPEEDS, key=len)))})")
+_LETTERS = {"A": "A", "C": "degC", "K": "K"}
+_LETTERED = re.compile(
+    r"((?i:(?:motor_?)?(?:i|curr(?:ent)?|strom|amps?)|i_?motor))[_ ](A)"
+    r"|((?:.*[_ ])?(?i:t|temp|temperature|temperatur))(?:[_ ]?\d+)?[_ ]([CK])"
+)
+"""Units of one letter, each behind a word for what it measures."""
 
 
 def unit_in_name(name: str) -> tuple[str, str]:
     """`speed_rpm` -> `("speed", "RPM")`; a name without a unit at its end gives an empty one.
 
-    Only unambiguous endings count. A lone `A` can also be a phase or a channel, so it is a unit
-    only behind a word for a current.
+    Only unambiguous endings count. A lone `A`, `C` or `K` can also be a phase or a channel, so it
+    is a unit only behind a word for a current or a temperature.
+
+    Examples
+    --------
+    >>> unit_in_name("speed_rad/s"), unit_in_name("temp_C"), unit_in_name("phase_C")
+    (('speed', 'rad/s'), ('temp', 'degC'), ('phase_C', ''))
     """
-    match = _SUFFIXED.fullmatch(name)
-    if match is None or (match[2] == "A" and not _CURRENT.fullmatch(match[1].lower())):
-        return name, ""
-    return match[1], _SUFFIX[match[2]]
+    if (match := _LETTERED.fullmatch(name)) is not None:
+        return match[1] or match[3], _LETTERS[match[2] or match[4]]
+    if (match := _SUFFIXED.fullmatch(name)) is not None and match[2] != "A":
+        return match[1], _SUFFIX[match[2]]
+    if (match := _SPEED_SUFFIX.fullmatch(name.lower())) is not None:
+        return name[: match.end(1)], name[match.start(2) :]
+    return name, ""

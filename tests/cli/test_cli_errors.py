@@ -118,12 +118,12 @@ def test_wrong_column_names_what_there_is(folder: Path) -> None:
     assert "u, y, extra" in message
 
 
-@pytest.mark.parametrize("given", [("--input", "u"), ("--output", "y")])
-def test_unnamed_column_names_the_option(folder: Path, given: tuple[str, str]) -> None:
-    message = refused(folder, "identify", "run.csv", *given, "-o", "m.json")
-    missing = "--output" if given[0] == "--input" else "--input"
-    assert missing in message
-    assert "available: t, u, y, extra" in message
+def test_columns_in_doubt_are_named_with_the_options(folder: Path) -> None:
+    names = {"t": "t", "u": "a", "y": "b", "extra": "c"}
+    api.write_table(folder / "run.csv", {names[k]: v for k, v in recording().items()})
+    for given in ((), ("--input", "a"), ("--output", "b")):
+        message = refused(folder, "identify", "run.csv", *given, "-o", "m.json")
+        assert "received t, a, b, c; name them: --input COL, --output COL" in message
 
 
 def test_sample_time_that_disagrees(folder: Path) -> None:

@@ -52,3 +52,19 @@ def test_what_does_not_belong_together_is_refused(tmp_path: Path) -> None:
     assert "nearest" in refused(
         tmp_path, "gains", "--K", 1, "--T", 1, "--L", 0.01, "--rule", "table-1"
     )
+
+
+def test_a_unit_is_known_or_empty_and_never_invented(tmp_path: Path) -> None:
+    t = np.arange(1500) * 0.001
+    y = Fopdt(0.6, 0.15, 0.012, u_high=2.0).response(t - 0.2)
+    write_table(tmp_path / "step.csv", {"t": t, "u": np.where(t < 0.2, 0.0, 2.0), "y": y})
+    for given in (("step.csv",), ("--K", 0.6, "--T", 0.15, "--L", 0.012)):
+        found = sewfast(tmp_path, "gains", *given, "-o", "c.json").out
+        assert "V/RPM" not in found
+        assert " y/u" in found
+        assert " u/y" in found
+        gains = load_controller(tmp_path / "c.json").gains
+        assert (gains.u_unit, gains.y_unit) == ("", "")
+    write_table(tmp_path / "oven.csv", {"t": t, "heater_pct": np.where(t < 0.2, 0.0, 2.0),
+                                        "temp_C": y})  # fmt: skip
+    assert "%/degC" in sewfast(tmp_path, "gains", "oven.csv").out

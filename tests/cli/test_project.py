@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from effort import FULL
 from sewfast.cli.project import NAME, find, load
 from sewfast.errors import SettingError
 from sewfast.readers import read_table, roles
+from sewfast.studio.project import Project, Step
 from sewfast.units import split_unit, unit_in_name
 
 LIMITS = "volt = 8\nspeed = 3500\nacceleration = 40000\ncurrent = 15\n"
@@ -120,6 +122,10 @@ def table(tmp_path: Path, *names: str) -> api.readers.Table:
         (("stellgroesse", "istwert", "regelabweichung"), ("stellgroesse", "istwert")),
         (("voltaje_V", "velocidad_rpm"), ("voltaje_V", "velocidad_rpm")),
         (("voltage/V", "speed/(rad/s)"), ("voltage", "speed")),
+        (("heater_pct", "temp_C"), ("heater_pct", "temp_C")),
+        (("heater_pct", "temp_C", "ambient_C"), ("heater_pct", "temp_C")),
+        (("valve [%]", "level [m]", "noise"), ("valve", "level")),
+        (("Voltage", "speed_rad/s", "other"), ("Voltage", "speed_rad/s")),
     ],
 )
 def test_columns_are_recognised_or_left_open(
@@ -127,6 +133,49 @@ def test_columns_are_recognised_or_left_open(
 ) -> None:
     found = roles(table(tmp_path, *names))
     assert (None if found is None else (found.input, found.output)) == expected
+
+
+@pytest.mark.parametrize(
+    ("names", "named", "expected"),
+    [
+        (("voltage", "speed", "a"), {"inputs": ("a",)}, ("a", "speed")),
+        (("voltage", "a", "b"), {"output": "a"}, ("voltage", "a")),
+        (("a", "b"), {"output": "b"}, ("a", "b")),
+        (("a", "b"), {"inputs": ("b",)}, ("b", "a")),
+        (("a", "b", "c"), {"inputs": ("b",)}, None),
+        (("a", "speed", "angle_rad"), {"output": "speed"}, None),
+    ],
+)
+def test_a_named_role_leaves_the_other_recognised(
+    tmp_path: Path, names: tuple[str, ...], named: Any, expected: tuple[str, str] | None
+) -> None:
+    found = roles(table(tmp_path, *names), **named)
+    assert (None if found is None else (found.input, found.output)) == expected
+
+
+def test_the_command_line_python_and_the_studio_take_the_same_columns(tmp_path: Path) -> None:
+    rows = [
+        f"2026-03-14 10:{k // 60:02}:{k % 60:02},{(k // 9) % 5},{20 + (k // 7) % 3}"
+        for k in range(300)
+    ]
+    (tmp_path / "oven.csv").write_text("\n".join(["Logged at,heater_pct,temp_C", *rows]))
+    data = api.read(tmp_path / "oven.csv")
+    assert (data.input_names, data.output_name, data.Ts) == (("heater_pct",), "temp_C", 1.0)
+    assert (data.input_units, data.output_unit) == (("%",), "degC")
+    for option in ((), ("--input", "heater_pct"), ("--output", "temp_C")):
+        assert "heater_pct [%]" in sewfast(tmp_path, "look", "oven.csv", *option).out
+    asked = Project(tmp_path).columns(Step("oven.csv"))
+    assert (asked["inputs"], asked["output"]) == (["heater_pct"], "temp_C")
+
+
+def test_the_studio_takes_no_time_for_a_voltage(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{k % 3},{k % 5}\n" for k in range(50))
+    (tmp_path / "x.csv").write_text("Time,Voltage,Speed\n" + rows)
+    asked = Project(tmp_path).columns(Step("x.csv"))
+    assert (asked["inputs"], asked["output"]) == (["Voltage"], "Speed")
+    (tmp_path / "y.csv").write_text("Time,a,b\n" + rows)
+    asked = Project(tmp_path).columns(Step("y.csv"))
+    assert (asked["inputs"], asked["output"]) == ([], None)
 
 
 @pytest.mark.parametrize(
@@ -177,6 +226,7 @@ def test_a_column_that_never_changes_is_neither(tmp_path: Path) -> None:
     [
         ("speed_rpm", "RPM"), ("u_V", "V"), ("current_A", "A"), ("w_rad_s", "rad/s"),
         ("phase_A", ""), ("rpm", ""), ("i_a", ""), ("pos_m", ""), ("speed", ""), ("", ""),
+        ("temp_C", "degC"), ("T_K", "K"), ("speed_rad/s", "rad/s"), ("phase_C", ""),
         ("vel_m_s", "m/s"), ("omega_rad_per_s", "rad/s"), ("pwm_percent", "%"), ("ao_volts", "V"),
     ],
 )  # fmt: skip
@@ -190,6 +240,7 @@ def test_units_in_names(name: str, unit: str) -> None:
         ("n/rpm", ("n", "rpm")), ("Drehzahl / 1/min", ("Drehzahl", "1/min")),
         ("Voltage, V", ("Voltage", "V")), ("u in mV", ("u", "mV")),
         ("speed m/s", ("speed m/s", "")),
+        ("u [V rms]", ("u", "V")), ("u [ rms]", ("u", "")), ("speed_rad/s", ("speed_rad/s", "")),
         ("rad/s", ("rad/s", "")), ("in", ("in", "")), ("in / out", ("in / out", "")),
         ("power on/off", ("power on/off", "")), ("km/h", ("km/h", "")), ("/s", ("/s", "")),
     ],
@@ -208,7 +259,7 @@ def test_names_may_hold_a_delimiter_that_the_numbers_do_not(tmp_path: Path) -> N
 def test_in_doubt_it_asks(tmp_path: Path) -> None:
     stranger(tmp_path / "bench.csv", "time_ms;a;b")
     said = refused(tmp_path, "identify", "bench.csv")
-    assert "expected the column of the input" in said
+    assert "expected columns that show which is the input" in said
     assert "--input COL" in said
 
 
@@ -315,7 +366,11 @@ def test_columns_and_units_come_from_the_file_above_and_options_win(tmp_path: Pa
     assert (tuple(model.input_units), model.output_unit) == (("V",), "RPM")
     sewfast(folder, "validate", "bench-model.json", "bench.csv")
     other = ("--input", "b", "--output", "a", "-o", "swapped.json")
-    done = sewfast(folder, "identify", "bench.csv", "--model", "arx", *other)
+    said = refused(folder, "identify", "bench.csv", "--model", "arx", *other)
+    assert "from" not in said.splitlines()[0]
+    assert "are exchanged; take a as input and b as output" in said
+    stranger(folder / "other.csv", "time_ms;b;a")
+    done = sewfast(folder, "identify", "other.csv", "--model", "arx", *other)
     assert "from" not in done.err.splitlines()[0]
     assert api.load_model(folder / "swapped.json").output_name == "a"
 
@@ -472,3 +527,14 @@ def test_a_model_keeps_its_own_columns(tmp_path: Path) -> None:
     toml(tmp_path, '[columns]\ninput = "y"\noutput = "u"\n')
     found = json.loads(sewfast(tmp_path, "validate", "drive.json", "bench.csv", "--json").out)
     assert found["grade"] == "good"
+
+
+def test_suggested_commands_quote_names_with_spaces(tmp_path: Path) -> None:
+    stranger(tmp_path / "my bench.csv", "time_ms;u;y", above="")
+    said = sewfast(tmp_path, "identify", "my bench.csv", "--model", "arx").out
+    assert "sewfast validate 'my bench-model.json' DATA" in said
+
+
+def test_look_counts_the_rows_of_the_longest_variable(tmp_path: Path) -> None:
+    np.savez(tmp_path / "x.npz", info=np.arange(6.0), a=np.arange(7200.0), b=np.arange(7200.0) ** 2)
+    assert "x.npz: 7200 rows" in sewfast(tmp_path, "look", "x.npz").out

@@ -680,6 +680,14 @@ def test_an_input_that_is_wild_where_the_output_is_missing_overflows_nowhere() -
     assert found.find("integrator") is None
 
 
+def test_an_input_that_is_unknown_in_one_experiment_says_nothing_there() -> None:
+    u = held(np.random.default_rng(0), 2000, -3.0, 3.0, 100)[:, 0]
+    (known,) = answer(u).experiments
+    unknown = Experiment(np.full((2000, 1), np.nan), known.y)
+    both = Dataset((known, unknown), 0.01, *_names(1))
+    assert sewfast.diagnose(both).findings == sewfast.diagnose(answer(u)).findings
+
+
 def _names(inputs: int) -> tuple[Any, ...]:
     return tuple(f"u{i}" for i in range(inputs)), "y", ("",) * inputs
 

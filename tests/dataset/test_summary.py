@@ -114,9 +114,14 @@ def test_a_position_is_not_to_be_resampled_for_its_slow_spectrum() -> None:
     json.dumps(found.to_json(), allow_nan=False)
 
 
+def answer(u: np.ndarray) -> np.ndarray:
+    """A lag of 20 samples, from the sample after the input on."""
+    return np.convolve(u, np.r_[0.0, np.exp(-np.arange(100) / 20)], "full")[: len(u)]
+
+
 def test_good_data_need_no_advice() -> None:
     u = excited()
-    y = np.convolve(u, np.exp(-np.arange(100) / 20), "full")[:N]
+    y = answer(u)
     y += 0.02 * np.random.default_rng(3).standard_normal(N)
     assert advice(u, y) == ""
     assert "nothing stands in the way" in str(Dataset.from_arrays(u, y, TS).summary())
@@ -146,7 +151,7 @@ def test_a_summary_of_anything(draw: st.DataObject, n: int, inputs: int) -> None
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     u = excited()[:2000]
-    y = np.convolve(u, np.exp(-np.arange(100) / 20), "full")[:2000]
+    y = answer(u)
     y[300:350] = np.nan
     y[700] += 500.0
     u[900:905] = np.nan
@@ -155,11 +160,10 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_look_lists_columns_then_says_what_is_in_them(folder: Path) -> None:
-    listed = sewfast(folder, "look", "run.csv").out
-    assert "speed [RPM]" in listed
-    assert "--input COL --output COL" in listed
+def test_look_says_what_is_in_recognised_columns_and_lists_those_in_doubt(folder: Path) -> None:
     text = sewfast(folder, "look", "run.csv:u:speed").out
+    assert sewfast(folder, "look", "run.csv").out == text
+    assert "output speed [RPM]" in text
     assert "50 in 1 gaps" in text
     assert "1 value of speed stands out from its neighbours, at sample 700" in text
     assert "--mask outliers" in text
@@ -174,10 +178,14 @@ def test_look_lists_columns_then_says_what_is_in_them(folder: Path) -> None:
     assert found["outliers"] == 1
     assert found["outliers_at"] == [{"experiment": "run.csv", "sample": 700}]
     assert found["findings"] == []
-    assert (
-        json.loads(sewfast(folder, "look", "run.csv", "--json").out)["run.csv"][2]["name"]
-        == "speed"
-    )
+    assert json.loads(sewfast(folder, "look", "run.csv", "--json").out) == found
+    columns = {"t": T[:2000], "a": excited()[:2000], "b": T[:2000] ** 2}
+    api.write_table(folder / "doubt.csv", columns, units={"a": "1", "b": "2"})
+    listed = sewfast(folder, "look", "doubt.csv").out
+    assert "--input COL --output COL" in listed
+    assert "b [2]" in listed
+    columns = json.loads(sewfast(folder, "look", "doubt.csv", "--json").out)["doubt.csv"]
+    assert [c["name"] for c in columns] == ["t", "a", "b"]
 
 
 def test_look_draws(folder: Path) -> None:

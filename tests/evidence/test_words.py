@@ -34,7 +34,7 @@ def oe(poles: list[complex], Ts: float) -> LinearOE:
         (0.9999, 4.0, "0.9999 (11.11 h)"),
         (-0.9, 0.001, "-0.9 (alternates from sample to sample, dies away in 9.491 ms)"),
         (1.0, 0.001, "1 (integrates)"),
-        (1.0 - 2e-7, 0.001, "1 - 2e-07 (5000 s)"),
+        (1.0 - 2e-7, 0.001, "1 - 2e-07 (83.33 min)"),
         (1.2, 0.001, "1.2"),
     ],
 )

@@ -252,4 +252,7 @@ def test_command(tmp_path: Path) -> None:
     found = sewfast(tmp_path, *command, "--nk", "3", "--json").json()
     assert found["choice"] == {"na": 2, "nb": 2, "nk": 3}
     assert found["delay"] is None
-    assert "--output" in refused(tmp_path, "orders", "run.csv", "--input", "u")
+    alone = sewfast(tmp_path, "orders", "run.csv", "--input", "u", "--json", *command[-4:]).json()
+    assert alone["choice"] == {"na": 2, "nb": 2, "nk": 3}
+    api.write_table(tmp_path / "doubt.csv", {"t": columns["t"], "a": e.y, "b": e.y, "u": e.u[:, 0]})
+    assert "--output" in refused(tmp_path, "orders", "doubt.csv", "--input", "u")

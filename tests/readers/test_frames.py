@@ -334,5 +334,6 @@ def test_columns_that_show_what_they_are_need_no_names() -> None:
     np.testing.assert_array_equal(data.experiments[0].y, k % 7)
     with refuses(DataError, expected="which is the input", received="a, b", remedy="name both"):
         sewfast.read(pandas.DataFrame({"a": k % 3, "b": k % 5}), Ts=0.1)
-    with refuses(SettingError):  # one of two is no doubt to settle
-        sewfast.read(table, output="speed")
+    # naming one role leaves the other recognised
+    assert sewfast.read(table, output="speed").input_names == ("voltage",)
+    assert sewfast.read(table, inputs="voltage").output_name == "speed"

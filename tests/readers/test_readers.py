@@ -1,5 +1,6 @@
 """Files in: every format read, and every damaged file refused with its name and place."""
 
+import json
 import os
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import sewfast
 from refusals import refuses
 from sewfast.errors import DataError, SettingError, SewfastError
 from sewfast.readers import parse_source, read, read_table
@@ -530,3 +532,105 @@ def test_one_column_is_not_input_and_output(tmp_path: Path) -> None:
         read(path, inputs="u", output="u")
     with pytest.raises(SettingError, match="'y' twice"):
         read(path, inputs=["y", "y"])
+
+
+# --- serial logs: corrupt lines, `.log`, JSON -----------------------------------------------------
+
+
+def serial(count: int = 1000) -> list[str]:
+    return [f"{0.01 * k:.2f},{(k // 10) % 7},{k % 5}" for k in range(count)]
+
+
+@pytest.mark.parametrize("ending", ["csv", "log", "txt"])
+def test_corrupt_lines_are_skipped_counted_and_named(tmp_path: Path, ending: str) -> None:
+    rows = serial()
+    rows[100], rows[300], rows[500] = "1.0,3", "3.00,x3,1", "5.00,3,1,8"
+    path = tmp_path / f"x.{ending}"
+    path.write_text("t,u,y\n" + "\n".join(rows) + "\n")
+    data = sewfast.read(path)
+    assert len(data) == 1000
+    assert list(np.flatnonzero(np.isnan(data.experiments[0].y))) == [100, 300, 500]
+    assert data.experiments[0].u[100, 0] == data.experiments[0].u[99, 0]
+    assert "3 of 1000 lines skipped" in data.notes[0]
+    assert "lines 102 ('1.0,3'), 302 ('3.00,x3,1'), 502" in data.notes[0]
+
+
+def test_more_than_a_hundredth_is_refused_with_line_and_remedy(tmp_path: Path) -> None:
+    rows = serial()
+    for k in range(100, 130):
+        rows[k] = rows[k].rpartition(",")[0]
+    path = tmp_path / "x.csv"
+    path.write_text("t,u,y\n" + "\n".join(rows) + "\n")
+    with pytest.raises(DataError, match=r"line 102: .*30 of 1000 lines .*repair or delete"):
+        sewfast.read(path)
+    rows = [row.replace(",", ",#", 1) if 100 <= k < 130 else row for k, row in enumerate(serial())]
+    path.write_text("t,u,y\n" + "\n".join(rows) + "\n")
+    with pytest.raises(DataError, match=r"line 102, column 'u'.*30 cells"):
+        sewfast.read(path, inputs="u", output="y")
+
+
+def as_json(kind: str) -> str:
+    rows = [
+        {"time": 0.01 * k, "motor": {"volt": k // 10 % 7, "rpm": 5.5 * (k % 5)}, "on": k > 3}
+        for k in range(400)
+    ]
+    if kind == "lines":
+        return "\n".join(map(json.dumps, rows))
+    if kind == "list":
+        return json.dumps(rows, indent=1)
+    if kind == "inside":
+        return json.dumps({"device": "x", "samples": rows})
+    columns = {name: [row[name] for row in rows] for name in ("time", "on")}
+    motor = {name: [row["motor"][name] for row in rows] for name in ("volt", "rpm")}
+    return json.dumps({**columns, "motor": motor})
+
+
+@pytest.mark.parametrize("ending", ["json", "jsonl", "log"])
+@pytest.mark.parametrize("kind", ["lines", "list", "inside", "columns"])
+def test_logs_in_json_are_read(tmp_path: Path, ending: str, kind: str) -> None:
+    path = tmp_path / f"x.{ending}"
+    path.write_text(as_json(kind))
+    table = read_table(path)
+    assert set(table.names) == {"time", "motor.volt", "motor.rpm", "on"}
+    data = sewfast.read(path, inputs="motor.volt", output="motor.rpm")
+    assert (len(data), data.Ts) == (400, pytest.approx(0.01))
+    assert data.experiments[0].y[3] == 16.5
+
+
+def test_corrupt_lines_of_json_are_skipped_or_refused(tmp_path: Path) -> None:
+    rows = as_json("lines").splitlines()
+    rows[7], rows[-1] = rows[7][:-4], rows[-1][:9]
+    path = tmp_path / "x.log"
+    path.write_text("\n".join(rows))
+    table = read_table(path)
+    assert len(table["time"]) == 398
+    assert "1 of 399 lines skipped" in table.notes[0]
+    assert "line 8" in table.notes[0]
+    assert "cut off" in table.notes[1]
+    rows[50:60] = ["?"] * 10
+    path.write_text("\n".join(rows))
+    with refuses(
+        DataError, expected="JSON object", received="11 of 399", remedy="repair or delete"
+    ):
+        read_table(path)
+
+
+@pytest.mark.parametrize(
+    "text", ["{}", "[{}]", '{"a": 1, "b": [1], "c": [1, 2]}', "{", '{"a": "x"}']
+)
+def test_json_that_is_no_log_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "x.json"
+    path.write_text(text)
+    with pytest.raises(DataError):
+        read_table(path)
+
+
+def test_the_studio_offers_logs_and_no_models(tmp_path: Path) -> None:
+    from sewfast.studio.project import Project
+
+    for name in ("a.log", "b.jsonl", "c.json"):
+        (tmp_path / name).write_text(as_json("lines"))
+    u = np.repeat([1.0, 2.0, 0.0, 3.0], 100)
+    data = sewfast.Dataset.from_arrays(u[1:], 0.5 * u[:-1] + 0.01 * np.sin(np.arange(399)), 0.01)
+    sewfast.identify(data, model="arx").save(tmp_path / "model.json")
+    assert Project(tmp_path).recordings() == ["a.log", "b.jsonl", "c.json"]

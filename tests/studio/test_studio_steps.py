@@ -281,13 +281,24 @@ def test_a_recording_is_uploaded(folder: Path) -> None:
 @pytest.mark.parametrize(
     "file",
     ["../a.csv", "/tmp/a.csv", "a/b.csv", ".a.csv", "a.exe", "a.csv\0", "a\n.csv", "a:b.csv", "",
-     "x" * 200 + ".csv", "..\\a.csv", "a.json"],
+     "x" * 200 + ".csv", "..\\a.csv", "a.toml"],
 )  # fmt: skip
 def test_a_file_comes_in_nowhere_else(folder: Path, file: str) -> None:
     before = sorted(folder.parent.rglob("*"))
     with Studio(Project(folder)) as studio, Page(studio) as page:
         assert "error" in _upload(page, file, b"t,u,y\n0,1,2\n")
     assert sorted(folder.parent.rglob("*")) == before
+
+
+def test_json_comes_in_as_a_log_and_not_as_a_model(folder: Path) -> None:
+    before = sorted(folder.parent.rglob("*"))
+    with Studio(Project(folder)) as studio, Page(studio) as page:
+        refused = _upload(page, "a.json", b'{"format": "sewfast.model", "version": 4}')
+        assert "received a file of the format sewfast.model" in refused["error"]
+        assert sorted(folder.parent.rglob("*")) == before
+        log = b'[{"t": 0, "u": 1, "y": 2}, {"t": 1, "u": 2, "y": 3}]'
+        assert _upload(page, "a.json", log)["found"] == {"file": "a.json"}
+        assert page.ask("columns", file="a.json")["found"]["names"] == ["t", "u", "y"]
 
 
 def test_no_file_is_replaced(folder: Path) -> None:

@@ -29,6 +29,7 @@ from ..errors import FitError, SettingError
 from ..tables import Table
 from ..trust import Judgement, Limits, judge
 from ..tuning.objective import Cost
+from ..units import duration, time_unit
 from .changes import Change
 from .points import LoopBode, PlantPoint, loop_bodes, plant_points
 from .responses import (
@@ -354,7 +355,8 @@ def _judgement(
 
 def text(a: Analysis) -> str:
     """Margins, steps, cost, sensitivities, what-if, guards."""
-    y, u = a.controller.gains.y_unit, a.controller.gains.u_unit
+    # y and u stand for unknown units, as in the units of gains
+    y, u = a.controller.gains.y_unit or "y", a.controller.gains.u_unit or "u"
     lines = [f"Analysis on {_plants(a.plants)}", "", "margins (worst plant)"]
     lines += rows([["about", "Ms", "Mt", "gain", "phase", "delay", "noise gain"]]
                   + [_margin_row(loop, u, y) for loop in a.loops])  # fmt: skip
@@ -384,7 +386,7 @@ def _margin_row(loop: LoopBode, u: str, y: str) -> list[str]:
         return [about, "unstable", "", "", "", "", ""]
     return [
         about, f"{m.Ms:.3f}", f"{m.Mt:.3f}", f"{m.gain_margin:.3g}",
-        f"{m.phase_margin_deg:.1f} deg", f"{1e3 * m.delay_margin_s:.3g} ms",
+        f"{m.phase_margin_deg:.1f} deg", duration(m.delay_margin_s, 3),
         f"{m.noise_gain:.3g} {u}/{y}",
     ]  # fmt: skip
 
@@ -394,15 +396,21 @@ def _response_line(r: Responses) -> str:
     if r.kind == "reference":
         return (
             f"reference step of {in_unit(f'{r.size:.4g}', r.y_unit)} at "
-            f"{in_unit(f'{r.level:.4g}', r.y_unit)}: rise {span([m['rise_ms'] for m in found])} "
-            f"ms, overshoot {span([m['overshoot_percent'] for m in found])} %, settled within "
-            f"{span([m['settling_ms'] for m in found])} ms"
+            f"{in_unit(f'{r.level:.4g}', r.y_unit)}: rise {times([m['rise_ms'] for m in found])}, "
+            f"overshoot {span([m['overshoot_percent'] for m in found])} %, settled within "
+            f"{times([m['settling_ms'] for m in found])}"
         )
     return (
         f"disturbance worth {in_unit(f'{r.disturbance:.3g}', r.u_unit)} at the plant's input: "
         f"{span([m['peak'] for m in found])} {r.y_unit} off, back within "
-        f"{span([m['recovery_ms'] for m in found])} ms"
+        f"{times([m['recovery_ms'] for m in found])}"
     )
+
+
+def times(values: Sequence[float | None]) -> str:
+    """The range of times [ms] as text, in the unit that suits the longest."""
+    factor, unit = time_unit(max((1e-3 * v for v in values if v is not None), default=0.0))
+    return f"{span([None if v is None else factor * 1e-3 * v for v in values])} {unit}"
 
 
 def span(values: Sequence[float | None]) -> str:

@@ -65,6 +65,10 @@ def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
         "--time", metavar="COL", help="column of time, if its name does not show it"
     )
     parser.add_argument(
+        "--shift-input", type=int, default=0, metavar="N",
+        help="read the inputs N samples earlier, if the command was logged late (0)",
+    )  # fmt: skip
+    parser.add_argument(
         "--counts", metavar="COL",
         help="column of encoder counts; the output is then the speed [RPM] computed from it",
     )  # fmt: skip

@@ -213,7 +213,7 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
     SettingError, DataError
         For any other text, and a file without r or with another sample time or unit.
     """
-    from ..readers import read
+    from ..readers import read_columns
     from ..signals import REFERENCES
     from ..units import ANGULAR_SPEEDS, spelled
 
@@ -224,7 +224,7 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
             f"--reference {text}: expected a CSV file with columns t, r, or one of "
             f"{', '.join(REFERENCES)}; received neither"
         )
-    data = read(text, inputs="r")
+    data = read_columns(text, inputs="r")
     data.require_inputs()
     if abs(data.Ts - Ts) > 0.01 * Ts:
         raise DataError(

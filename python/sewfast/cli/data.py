@@ -14,34 +14,45 @@ from .project import with_units
 if TYPE_CHECKING:
     from ..dataset import ColumnSummary, Dataset
     from ..models import Model
-    from ..readers import Table
+    from ..readers import Roles, Table
 
 
 def read_training(args: argparse.Namespace, channels: Sequence[str] = ()) -> Dataset:
     """Every DATA argument as an experiment; columns from `FILE:IN:OUT` or the options."""
     from ..dataset import Dataset
 
-    return Dataset.concat([_read_named(source, args, channels) for source in args.data])
+    read = (_read_named(source, args, channels) for source in args.data)
+    return Dataset.concat([shifted(data, args) for data in read])
+
+
+def shifted(data: Dataset, args: argparse.Namespace) -> Dataset:
+    """The data with the inputs read `--shift-input` samples earlier."""
+    return data.shift_inputs(getattr(args, "shift_input", 0))
 
 
 def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) -> Dataset:
-    from ..readers import parse_source, read, read_table, roles
+    from ..readers import left_out, parse_source, read_columns, read_table
 
     path, inputs, output = parse_source(source)
     table = with_units(read_table(path), args)
     inputs, output = inputs or tuple(args.input or ()), output or args.output
     counts = args.counts
-    if table.counts_per_rev is not None:
-        inputs, counts = _of_recording(table, inputs, output, counts)
-    if not inputs and not output and not counts and (found := roles(table)) is not None:
-        inputs, output = (found.input,), found.output
-        note(f"{path}: input {found.input}, output {found.output}")
-    if not inputs:
-        raise _unnamed(table, "input", "--input COL")
-    if not output and not counts:
-        raise _unnamed(table, "output", "--output COL, or --counts COL --counts-per-rev N")
+    if not inputs or not (output or counts):
+        found = _recognised(table, args, inputs, output)
+        if found is None:
+            raise SettingError(
+                name=str(table.path), expected="columns that show which is the input and which "
+                "the output", received=", ".join(table.names),
+                remedy="name them: --input COL, --output COL, or --counts COL --counts-per-rev N"
+                + left_out(table),
+            )  # fmt: skip
+        inputs = inputs or (found.input,)
+        if not output and not counts:
+            output, counts = found.output, found.counts
+        if table.counts_per_rev is None:
+            note(f"{path}: input {', '.join(inputs)}, output {output or counts}")
     return _with_notes(
-        read(
+        read_columns(
             table,
             inputs=inputs,
             output=output,
@@ -53,6 +64,15 @@ def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) 
             weights=getattr(args, "weights", None),
         )
     )
+
+
+def _recognised(
+    table: Table, args: argparse.Namespace, inputs: Sequence[str] = (), output: str | None = None
+) -> Roles | None:
+    """Input and output of a table, of which some are named; None where that leaves any doubt."""
+    from ..readers import roles
+
+    return roles(table, inputs=inputs, output=output, counts=args.counts, time=args.time)
 
 
 def _with_notes(data: Dataset) -> Dataset:
@@ -72,31 +92,11 @@ def _references(table: Table, taken: tuple[str | None, ...]) -> list[str]:
     return [n for n in names if {len(table[n])} == lengths]
 
 
-def _of_recording(
-    table: Table, inputs: tuple[str, ...] | None, output: str | None, counts: str | None
-) -> tuple[tuple[str, ...] | None, str | None]:
-    """Inputs and counts of a recording, by default its columns `u` and `counts`."""
-    if not inputs and "u" in table:
-        inputs = ("u",)
-    if counts is None and output is None and "counts" in table:
-        counts = "counts"
-    return inputs, counts
-
-
-def _unnamed(table: Table, what: str, remedy: str) -> SettingError:
-    from ..readers import left_out
-
-    return SettingError(
-        name=str(table.path), expected=f"the column of the {what} by its name", received="none",
-        remedy=f"available: {', '.join(table.names)}; name it: {remedy}{left_out(table)}",
-    )  # fmt: skip
-
-
 def read_for_model(
     source: str, model: Model, args: argparse.Namespace, *, needs_output: bool = True
 ) -> tuple[Dataset, Table]:
     """The data of one DATA argument, with the model's columns unless others are named."""
-    from ..readers import parse_source, read, read_table
+    from ..readers import parse_source, read_columns, read_table
 
     path, inputs, output = parse_source(source)
     table = with_units(read_table(path), args)
@@ -108,7 +108,8 @@ def read_for_model(
         columns |= {"output": None, "counts": None, "counts_per_rev": None}
     columns["weights"] = getattr(args, "weights", None)
     columns["time"] = args.time
-    return _with_notes(read(table, Ts=_sample_time(args.ts, table, model), **columns)), table
+    data = read_columns(table, Ts=_sample_time(args.ts, table, model), **columns)
+    return shifted(_with_notes(data), args), table
 
 
 def _output_columns(
@@ -296,12 +297,13 @@ LOOK_TEXT = """\
 Show the properties of recordings that matter for identification: samples, gaps, range, trend,
 quantisation, time at limits, noise, the excited band, with advice on each.
 
-Without --input and --output it lists every column of a file, so that you can choose the two.
+Where the names and units of the columns leave in doubt which is the input and which the output, it
+lists every column of the file, so that you can choose the two: --input COL --output COL.
 """
 
 LOOK_EXAMPLES = """\
 examples:
-  sewfast look run.csv                                    its columns
+  sewfast look run.csv
   sewfast look run.csv --input u --output speed
   sewfast look run.csv --input u --output speed --plot look.png
   sewfast look run.csv:u:speed other.csv:volt:rpm --json
@@ -321,12 +323,8 @@ def add_look(commands: Commands) -> None:
 
 
 def look_command(args: argparse.Namespace) -> None:
-    from ..readers import roles
-
     require_plot(args.plot)
-    tables = [] if args.input or args.output or args.counts else _unnamed_columns(args)
-    # a plot needs input and output: named, or recognised by their names and units
-    if tables and not (args.plot is not None and all(roles(t) is not None for t in tables)):
+    if (tables := _in_doubt(args)) is not None:
         _show_columns(tables, args)
         return
     found = prepared(read_training(args), args).summary()
@@ -335,15 +333,16 @@ def look_command(args: argparse.Namespace) -> None:
     print_result(found, args, plot=args.plot)
 
 
-def _unnamed_columns(args: argparse.Namespace) -> list[Table]:
-    """The tables, if neither an argument nor a file names input and output."""
+def _in_doubt(args: argparse.Namespace) -> list[Table] | None:
+    """All tables, if nothing names a column and input or output of one of them are in doubt."""
     from ..readers import parse_source, read_table
 
     sources = [parse_source(source) for source in args.data]
-    if any(inputs or output for _, inputs, output in sources):
-        return []
+    named = args.input or args.output or args.counts
+    if named or any(inputs or output for _, inputs, output in sources):
+        return None
     tables = [with_units(read_table(path), args) for path, _, _ in sources]
-    return [] if all(t.counts_per_rev is not None for t in tables) else tables
+    return tables if any(_recognised(table, args) is None for table in tables) else None
 
 
 def _show_columns(tables: list[Table], args: argparse.Namespace) -> None:
@@ -359,7 +358,8 @@ def _show_columns(tables: list[Table], args: argparse.Namespace) -> None:
     from .output import print_rows
 
     for table, (path, found) in zip(tables, columns.items(), strict=True):
-        print(f"{path}: {found[0].n if found else 0} rows")
+        # variables of a file can differ in length
+        print(f"{path}: {max((c.n for c in found), default=0)} rows")
         header = ("column", "from", "to", "standard deviation", "missing")
         print_rows([header, *map(_row, found)])
         for name, reason in table.unusable.items():

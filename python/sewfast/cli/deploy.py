@@ -13,7 +13,7 @@ from typing import Any
 
 from ..errors import SettingError
 from .arguments import Commands, add_command, add_overwrite
-from .output import note, print_json
+from .output import note, print_json, suggested
 
 DEPLOY = """\
 Write a model or a controller as code: C99 without heap, C library or global state; IEC 61131-3
@@ -239,7 +239,7 @@ def _carried_out(args: argparse.Namespace, words: list[str]) -> tuple[int, Any]:
     """Run one stage; return its exit code, and with --json its output."""
     from . import main
 
-    note(f"$ sewfast {' '.join(words)}")
+    note(f"$ {suggested(*words)}")
     if args.quiet:
         words = [*words, "--quiet"]
     if not args.json:

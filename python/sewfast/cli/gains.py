@@ -67,10 +67,10 @@ def add(commands: Commands) -> None:
         help="the derivative is filtered with Td/N (10); inf: not",
     )  # fmt: skip
     parser.add_argument(
-        "--u-min", type=float, default=-20.0, metavar="V", help="least command (-20)"
+        "--u-min", type=float, default=-20.0, metavar="U", help="least command (-20)"
     )
     parser.add_argument(
-        "--u-max", type=float, default=20.0, metavar="V", help="largest command (20)"
+        "--u-max", type=float, default=20.0, metavar="U", help="largest command (20)"
     )
     parser.add_argument(
         "--form", choices=[f.replace("_", "-") for f in FORMS], default="standard",
@@ -108,12 +108,15 @@ def _plant(args: argparse.Namespace) -> tuple[Fopdt, float]:
     if (args.data is None) == (None in given):
         raise SettingError("expected either a recording of a step, or --K, --T and --L")
     if args.data is None:
-        return Fopdt(*given), 0.001 if args.ts is None else args.ts
+        # a speed from counts is in RPM; of the others the numbers say nothing
+        unit = "RPM" if args.counts_per_rev else ""
+        Ts = 0.001 if args.ts is None else args.ts
+        return Fopdt(args.K, args.T, args.L, u_unit="", y_unit=unit), Ts
     data = read_training(argparse.Namespace(**{**vars(args), "data": [args.data]}))
     step = data.experiments[0]
     if len(data.experiments) != 1 or step.u.shape[1] != 1:
         raise SettingError("expected one experiment with one input, a step")
-    units = {"u_unit": data.input_units[0] or "V", "y_unit": data.output_unit or "RPM"}
+    units = {"u_unit": data.input_units[0], "y_unit": data.output_unit}
     return fit_fopdt(step.u[:, 0], step.y, Ts=data.Ts, **units), data.Ts
 
 

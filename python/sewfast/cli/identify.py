@@ -36,7 +36,7 @@ from .data import (
     read_training,
     split,
 )
-from .output import DONE, INTERRUPTED, print_json, print_result, write_columns
+from .output import DONE, INTERRUPTED, print_json, print_result, suggested, write_columns
 
 if TYPE_CHECKING:
     from ..dataset import Dataset, FloatArray
@@ -223,6 +223,9 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
 
 
 def identify_command(args: argparse.Namespace) -> int | None:
+    from ..dataset.experiment import in_effect
+    from ..dataset.faults import sound
+
     require_place(args.out, (".json",))
     require_plot(args.plot)
     train, held = split(masked(read_training(args), args), args.train, args.validate)
@@ -236,6 +239,8 @@ def identify_command(args: argparse.Namespace) -> int | None:
         print(f"interrupted; kept the best so far in {args.out}", file=sys.stderr)
         return 130
     model.save(args.out)
+    # scored as identify took them, without dead stretches
+    train, _ = sound(in_effect(train))
     try:
         others = _save_alternatives(args, model) if args.alternatives else []
         scores = _scores(model, train, held)
@@ -330,7 +335,8 @@ def _show(
         print(f"alternative: {other!r} in {path}")
     if args.plot is not None:
         print(f"written to {args.plot}")
-    print(f"written to {args.out}; score it on another recording: sewfast validate {args.out} DATA")
+    command = suggested("validate", args.out, "DATA")
+    print(f"written to {args.out}; score it on another recording: {command}")
 
 
 # --- `sewfast validate`, `sewfast simulate`: a model on a recording -------------------------------

@@ -19,7 +19,7 @@ from .arguments import (
     require_plot,
 )
 from .drive import add_drive, is_port, machine_of, opened, require_no_drive_options
-from .output import REFUSED, print_json
+from .output import REFUSED, note, print_json
 
 if TYPE_CHECKING:
     from ..control.controller import Controller
@@ -413,6 +413,7 @@ def add_physics(commands: Commands) -> None:
 
 
 def physics_command(args: argparse.Namespace) -> None:
+    from ..dataset.faults import sound
     from ..greybox import physics
     from ..greybox.exports import BOARDS, Target
 
@@ -428,10 +429,12 @@ def physics_command(args: argparse.Namespace) -> None:
             name="--winding", expected=f"line or q with --export {target}", received="nothing",
             remedy="line: volts and amperes between two terminals; q: amplitudes along the q axis",
         )  # fmt: skip
-    structure = args.structure
+    data, found = sound(_motor_data(args))
+    for fault in found:
+        note(fault.warning)
     motor = physics(
-        _motor_data(args),
-        structure=structure.split(","),
+        data,
+        structure=args.structure.split(","),
         current=args.current,
         volts=args.volts,
         speed_unit=args.speed_unit,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,6 +29,11 @@ LOG = logging.getLogger(__package__)
 def note(text: str) -> None:
     """Print a note to standard error, except with `--quiet`."""
     LOG.info("%s", text)
+
+
+def suggested(*words: object) -> str:
+    """A command to type, with names that hold spaces in quotes."""
+    return shlex.join(["sewfast", *map(str, words)])
 
 
 class _ToStderr(logging.Handler):

@@ -413,8 +413,10 @@ def _described(recording: str) -> tuple[str, str]:
             f"{recording}: expected columns that show which is the input and which the output, "
             f"received {', '.join(table.names)}; leave --recording out and name them in {NAME}"
         )
-    units = {n: table.unit(n) for n in (found.input, found.output) if table.unit(n)}
-    columns = f"input = {_quoted(found.input)}\noutput = {_quoted(found.output)}\n"
+    role = "output" if found.counts is None else "counts"
+    names = {"input": found.input, role: found.output or found.counts or ""}
+    units = {n: table.unit(n) for n in names.values() if table.unit(n)}
+    columns = "".join(f"{role} = {_quoted(n)}\n" for role, n in names.items())
     return columns, "".join(f"{_quoted(n)} = {_quoted(u)}\n" for n, u in units.items()) or _UNITS
 
 

@@ -133,7 +133,7 @@ def _excitation(args: argparse.Namespace) -> tuple[FloatArray, float]:
     SettingError, DataError
         For a text that is neither a name nor a file, a file without u, or an invalid factor.
     """
-    from ..readers import read
+    from ..readers import read_columns
     from ..signals import EXCITATIONS, TS, excitation
 
     if not math.isfinite(args.scale):
@@ -141,7 +141,7 @@ def _excitation(args: argparse.Namespace) -> tuple[FloatArray, float]:
     named = args.signal.replace("-", "_").lower() in EXCITATIONS
     if named or not Path(args.signal).exists():
         return args.scale * excitation(args.signal, args.seed), TS
-    data = read(args.signal, inputs="u")
+    data = read_columns(args.signal, inputs="u")
     data.require_inputs()
     return args.scale * data.experiments[0].u[:, 0], data.Ts
 

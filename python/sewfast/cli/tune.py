@@ -20,7 +20,7 @@ from .arguments import (
     require_plot,
 )
 from .control import reference_of
-from .output import print_json, print_rows
+from .output import print_json, print_rows, suggested
 
 if TYPE_CHECKING:
     from ..control.biquad import Biquad
@@ -480,7 +480,7 @@ def _show_gains(args: argparse.Namespace, controller: SampledController) -> None
         )
     if args.plot is not None:
         print(f"written to {args.plot}")
-    print(f"written to {args.out}; try it: sewfast run {args.out} {args.model[0]}")
+    print(f"written to {args.out}; try it: {suggested('run', args.out, args.model[0])}")
 
 
 def forms_of(controller: Controller) -> list[Gains]:

@@ -21,7 +21,7 @@ from ..machine import VirtualMachine
 from ..models import Ensemble, Model
 from ..models.rest import Rest
 from ..tables import Table, percent, significant
-from ..units import spelled
+from ..units import duration, spelled
 from .controller import Controller, SampledController, pid_of
 from .defaults import default_references, drive_references
 
@@ -151,8 +151,8 @@ class ClosedLoopRun:
         )
         if metrics["rise_time_ms"] is not None:
             lines.append(
-                f"  first edge {metrics['rise_time_ms']:.1f} ms from 10 to 90 % (reference "
-                f"{metrics['reference_rise_time_ms']:.1f} ms), "
+                f"  first edge {_rise(metrics['rise_time_ms'])} from 10 to 90 % (reference "
+                f"{_rise(metrics['reference_rise_time_ms'])}), "
                 f"overshoot {metrics['overshoot_percent']:.2f} %"
             )
         saturated = 100.0 * (metrics["saturated"] or 0.0)
@@ -161,6 +161,12 @@ class ClosedLoopRun:
             f"sample to sample, at a limit {saturated:.1f} % of the time"
         )
         return "\n".join(lines)
+
+
+def _rise(ms: float | None) -> str:
+    if ms is None:
+        return "unknown"
+    return f"{ms:.1f} ms" if ms < 1e3 else duration(1e-3 * ms)
 
 
 class HasMetrics(Protocol):
@@ -181,7 +187,7 @@ def run_html(found: HasMetrics, caption: str) -> str:
 
     rows = [("tracking error", f"{size('rmse', y)} rms, {size('max_abs', y)} at most")]
     if m["rise_time_ms"] is not None:
-        rise = f"{size('rise_time_ms', 'ms')} (reference {size('reference_rise_time_ms', 'ms')})"
+        rise = f"{_rise(m['rise_time_ms'])} (reference {_rise(m['reference_rise_time_ms'])})"
         rows.append(("10 to 90 % of the first edge", rise))
         rows.append(("overshoot", percent(m["overshoot_percent"])))
     rows.append(("command", f"{size('u_rms', u)} rms"))

@@ -20,6 +20,7 @@ from ..models.conversion import from_state_space, polynomials_of, transfer_funct
 from ..plotting import SHADE, Drawing, Plotted, legend, stacked
 from ..rules import Fopdt
 from ..tables import html_of
+from ..units import duration
 from .controller import Controller
 from .loop import plant_units, require_controller, require_units
 
@@ -323,7 +324,7 @@ class Margins(Plotted):
             [
                 f"Ms {self.Ms:.3f}{_at(self.Ms_omega)}, Mt {self.Mt:.3f}{_at(self.Mt_omega)}",
                 f"gain margin {self.gain_margin:.3g}{less}, phase margin "
-                f"{self.phase_margin_deg:.1f} deg, delay margin {1e3 * self.delay_margin_s:.3g} ms",
+                f"{self.phase_margin_deg:.1f} deg, delay margin {duration(self.delay_margin_s, 3)}",
                 f"crossover {crossing}, noise gain {self.noise_gain:.4g} "
                 f"{self.u_unit}/{self.y_unit}",
             ]

@@ -196,6 +196,7 @@ class Dataset:
 
     mask = pieces.mask
     fill_inputs = pieces.fill_inputs
+    shift_inputs = pieces.shift_inputs
     detrend = trends.detrend
     restore = trends.restore
     resample = rates.resample

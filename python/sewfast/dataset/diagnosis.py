@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray, labelled, runs
 from ..tables import Table
+from .faults import faults
 from .feedback import Integration, feedback, integration
 from .outliers import MAD, quantum
 from .pieces import LARGEST, require_dataset
@@ -57,8 +58,9 @@ class Finding:
     Attributes
     ----------
     kind : str
-        `integrator`, `wraps`, `closed_loop`, `repeats`, `two_level_input`, `rests`,
-        `short_record`, `limited_input` or `coarse_output`.
+        `dead_sensor`, `no_dynamics`, `exchanged`, `late_input`, `at_once`, `integrator`, `wraps`,
+        `closed_loop`, `repeats`, `two_level_input`, `rests`, `short_record`, `limited_input` or
+        `coarse_output`.
     text : str
         The finding and its meaning, one sentence without a full stop.
     remedy : str
@@ -125,6 +127,11 @@ def diagnose(data: Dataset) -> Diagnosis:
     """Report the properties of a record that decide what can be identified from it.
 
     ==================  ======================================================================
+    `dead_sensor`       the output keeps one value while the rest says that it cannot
+    `no_dynamics`       the output is the input times a number: a column was read twice
+    `exchanged`         the input answers the output
+    `late_input`        the output moves before the input, which was logged late
+    `at_once`           the output moves in the sample in which the input does
     `integrator`        the output is a position: it integrates what an input drives
     `wraps`             the output is an angle that jumps back by a turn
     `closed_loop`       an input was computed from the output, or a reference was recorded
@@ -168,10 +175,12 @@ def diagnose(data: Dataset) -> Diagnosis:
     Diagnosis(integrator, two_level_input)
     """
     require_dataset(data, "data")
+    wrong = [Finding(f.kind, f.text, f.remedy, f.evidence) for f in faults(data)]
     wrapped = list(_wraps(data))
     found = None if wrapped else integration(data)
     return Diagnosis(
         (
+            *wrong,
             *wrapped,
             *_integrator(data, found),
             *_closed_loop(data),

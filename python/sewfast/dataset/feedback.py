@@ -225,9 +225,9 @@ def _rows(scaled: FloatArray, past: int, record: float, spread: float) -> FloatA
     moving = change / np.sqrt(change**2 + 0.01 * spread**2 + TINY)
     columns += [np.ones(len(k)), k / record - 0.5, moving[k - 1]]
     for column in u.T:
-        size = np.abs(column)
+        size = np.abs(column[np.isfinite(column)])
         # the square of a two-level input is a constant
-        if np.nanmax(size) - np.nanmin(size) > 0.05:
+        if len(size) and np.ptp(size) > 0.05:
             columns += [column[k] ** 2, column[k - 1] ** 2]
         else:
             columns += [np.zeros(len(k)), np.zeros(len(k))]

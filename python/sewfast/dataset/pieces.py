@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray, frozen, range_of, require_same_units, runs
+from ..arrays import FloatArray, frozen, is_whole, range_of, require_same_units, runs
 from ..errors import DataError, SettingError
 
 if TYPE_CHECKING:
@@ -376,6 +376,36 @@ def mask(data: Dataset, where: Where, *, why: str = "masked") -> Dataset:
         if taken.any():
             notes.append(f"{e.name} [{e.range_text}]: {int(taken.sum())} outputs {why}")
     return replace(data, experiments=tuple(experiments), notes=(*data.notes, *notes))
+
+
+def shift_inputs(data: Dataset, samples: int) -> Dataset:
+    """The data with inputs read `samples` earlier, for a command that was logged late.
+
+    `u(k + samples)` takes the place of `u(k)`; outputs and channels stay. The last samples of every
+    experiment, for which no input is left, are cut off. Negative numbers read the inputs later, and
+    cut off the first samples.
+
+    Raises
+    ------
+    SettingError
+        If it is not a whole number, or an experiment has no more samples than that.
+    """
+    shortest = min(map(len, data.experiments))
+    if not (is_whole(samples) and abs(samples) < shortest):
+        raise SettingError(
+            f"shift_inputs: expected a whole number of samples below {shortest}, the length of the "
+            f"record, received {samples!r}"
+        )
+    if samples == 0:
+        return data
+    first, last = max(0, -samples), max(0, samples)
+    experiments = []
+    for e in data.experiments:
+        kept = e.cut(first, len(e) - last)
+        u = e.u[first + samples : len(e) - last + samples]
+        experiments.append(replace(kept, u=u))
+    note = f"inputs read {abs(samples)} sample(s) {'earlier' if samples > 0 else 'later'}"
+    return replace(data, experiments=tuple(experiments), notes=(*data.notes, note))
 
 
 def _masks(data: Dataset, where: Where) -> list[BoolArray]:

@@ -346,7 +346,8 @@ def advice(found: Summary) -> Iterator[str]:
     output = found.columns[-1]
     for c in found.columns:
         yield from _values(c)
-    if found.outliers:
+    # an output that jumps with its input has outliers nowhere
+    if found.outliers and found.diagnosis.find("at_once") is None:
         yield _outliers(found, output.name)
     yield from _limits(output)
     yield from _noise_advice(output)

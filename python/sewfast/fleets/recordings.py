@@ -25,7 +25,7 @@ from ..validation import validate
 from .table import Row
 
 READABLE = (
-    ".csv", ".mat", ".npz", ".parquet", ".mcap",
+    ".csv", ".mat", ".npz", ".parquet", ".mcap", ".log", ".jsonl", ".ndjson",
     ".mf4", ".mdf", ".tdms", ".ulg", ".wpilog", ".bag", ".bbl", ".bfl",
 )  # fmt: skip
 """Endings of recordings and logs in a folder; a manifest can list any file."""

@@ -140,7 +140,9 @@ def propose(
         own = of.provenance.get("counts_per_rev")
         if counts_per_rev is None and own is not None:
             counts_per_rev = real("counts_per_rev", own)
-        units = {"u_unit": of.u_unit or "V", "y_unit": of.y_unit or "RPM"}
+        # the encoder is stated, so an output without a unit is the speed from its counts
+        known = of.y_unit or ("RPM" if counts_per_rev is not None else "")
+        units = {"u_unit": of.u_unit, "y_unit": known}
         like = Controller(
             Gains.standard(1.0, 1.0, 0.0, **units), Ts=of.Ts, filter_samples=4, u_min=-u_max,
             u_max=u_max, counts_per_rev=counts_per_rev,

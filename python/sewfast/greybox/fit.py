@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias, get_args, overload
 from numpy.typing import ArrayLike
 
 from ..dataset import Dataset
+from ..dataset.faults import sound
 from ..errors import SettingError
 from ..motorfit import OPTIONAL, TERMS, WAVES, estimated, records_of
 from ..recording import Recording
@@ -112,7 +113,8 @@ def physics(
     ------
     DataError
         If speed or command do not change, the speed falls as the command rises (a sign is
-        wrong), or too few samples are left.
+        wrong), the two are exchanged or one is computed from the other, or too few samples are
+        left. What a dead sensor said is left out.
     SettingError
         For an unknown term or unit, equations that return another shape, or parameters without
         a start.
@@ -144,6 +146,8 @@ def physics(
         isinstance(volts, (int, float)) and math.isfinite(volts) and volts > 0
     ):
         raise SettingError(f"expected volts per unit of command above 0, received {volts!r}")
+    if isinstance(data, Dataset):
+        data, _ = sound(data)
     records = records_of(data, current, speed_unit)
     found = estimated(records, terms, if_clear=OPTIONAL if "dcmotor" in structure else ())
     return motor_of(found, volts, profile=intervals == "profile")

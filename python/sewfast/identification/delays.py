@@ -19,6 +19,7 @@ from ..dataset.pieces import require_fittable
 from ..errors import DataError, FitError, SettingError
 from ..plotting import SHADE, lettered, stacked
 from ..tables import html_of
+from ..units import duration
 
 CHUNK = 4096
 DEPENDENT = 1e-10
@@ -222,7 +223,7 @@ class DelayEstimate:
         return html_of(str(self))
 
     def __str__(self) -> str:
-        head = f"delay: {self.nk} sample(s), {1e3 * self.nk * self.Ts:g} ms"
+        head = f"delay: {self.nk} sample(s), {duration(self.nk * self.Ts, 6)}"
         return "\n".join([head, *(f"  {i}" for i in self.inputs)])
 
     __repr__ = __str__

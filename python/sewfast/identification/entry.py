@@ -12,6 +12,7 @@ from typing import Literal
 from ..arrays import require_whole
 from ..dataset import Dataset, diagnose, require_dataset
 from ..dataset.experiment import in_effect
+from ..dataset.faults import sound
 from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted, SettingError
@@ -147,7 +148,8 @@ def identify(
     Raises
     ------
     DataError
-        If an input is NaN, data never move, or are too short for the orders.
+        If an input is NaN, data never move, or are too short for the orders; if the output is the
+        input times a number, or input and output are exchanged.
     SettingError
         If a setting is out of its range or contradicts another.
     FitError
@@ -208,6 +210,10 @@ def identify(
         is_order_given=na is not None,
     )
     _require_data(task, kind)
+    used, faults = sound(task.data)
+    if used is not task.data:
+        task = replace(task, data=used)
+        _require_data(task, kind)
     if isinstance(model, Model):
         found = _within_budget(partial(further.trained, model), task)
         if found.core is model.core:
@@ -215,6 +221,9 @@ def identify(
             return _with_losses(found, clock)
     else:
         found = _within_budget(_KINDS[kind], task)
+    if faults:
+        said = [*found.training.get("notes", []), *(f.warning for f in faults)]
+        found = with_provenance(found, {"notes": said})
     try:
         if "verdict" not in found.training:
             own = _verdict(found, task.data, task.validation)

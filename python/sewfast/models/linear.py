@@ -14,6 +14,7 @@ from .. import _core
 from ..dataset import FloatArray, labelled
 from ..errors import SettingError
 from ..storage import Fields
+from ..units import duration
 from .base import SingleModel
 from .conversion import (
     ContinuousModel,
@@ -339,10 +340,3 @@ def _pole_text(pole: complex, Ts: float) -> str:
         # not a lag of the plant: due to delay, noise or too high an order
         return f"{number} (alternates from sample to sample, dies away in {tau})"
     return f"{number} ({tau})"
-
-
-def duration(seconds: float) -> str:
-    """A time constant in ms below a second, in s below three hours, in h above."""
-    if seconds < 1.0:
-        return f"{1e3 * seconds:.4g} ms"
-    return f"{seconds:.4g} s" if seconds < 10800.0 else f"{seconds / 3600.0:.4g} h"

@@ -47,6 +47,8 @@ class Table:
         Rows and columns left out when the file was read.
     counts_per_rev : float or None
         Encoder counts of one turn, of the column `counts`, where the file states it.
+    moments : sequence of str
+        Columns that were dates or times of day, now in seconds from the first one.
     """
 
     path: Path
@@ -58,6 +60,7 @@ class Table:
     counts_per_rev: float | None = None
     Ts_source: str = "the header"
     notes: tuple[str, ...] = ()
+    moments: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 from ..dataset import FloatArray
 from ..errors import DataError
 from ..units import is_unit, split_unit
-from .containers import MAX_COLUMNS, Table, from_headers
+from .containers import MAX_COLUMNS, Table, from_headers, split_units
 from .timebase import is_moment, seconds_of_texts
 
 MAX_LINE = 1_000_000
@@ -32,6 +32,8 @@ _APART = re.compile(r"[+-]?\d{1,3}(?:['’\u00a0\u2009\u202f ]\d{3})+(?=[.,]\d|$
 """Digits in groups of three, separated by marks with no other meaning."""
 _FOOTER = 20
 """Most lines below a table that are left out if they have fewer cells."""
+CORRUPT = 0.01
+"""Part of the lines that can be corrupt, as serial ports lose characters: they are skipped."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ def read_delimited(path: Path, raw: bytes) -> Table:
     Lines above the header, as oscilloscopes write them, are skipped, with a note in `Table.notes`;
     a row of units below it gives the units. The delimiter is comma, semicolon, tab, bar or space;
     decimal commas and thousands separators are recognised from the cells. Lines that begin with `#`
-    are comments, and a few shorter lines at the end are left out, with a note.
+    are comments, and a few shorter lines at the end are left out, with a note. Up to 1 % of the
+    lines can be corrupt, with cells that are missing or no numbers: they are skipped, with a note.
     Empty cells are NaN, dates and times of day become seconds from the first one. Columns with text
     are marked unusable, each with line and cell, so that they raise an error only if selected.
 
@@ -158,7 +161,7 @@ def _layout(path: Path, text: str) -> _Layout:
                 raise DataError(
                     name=f"{path}: line {skipped + 1}",
                     expected=f"a header with names for the {found[1]} columns below it",
-                    received=_short(line), remedy="add one, such as t,u,y",
+                    received=short(line), remedy="add one, such as t,u,y",
                 )  # fmt: skip
             delimiter, header = " ", spaced
         if _is_numeric(header):
@@ -166,7 +169,7 @@ def _layout(path: Path, text: str) -> _Layout:
             if len(named) != len(header) or _is_numeric(named):
                 raise DataError(
                     f"{path}: expected a header with column names (such as t,u,y) in the first "
-                    f"line, received numbers: {_short(line)}; add one"
+                    f"line, received numbers: {short(line)}; add one"
                 )
             header, body, above = named, text[offset - len(line) - 1 :], skipped
         return _checked(_Layout(path, header, body, above, delimiter, _decimal(delimiter, body)))
@@ -233,7 +236,7 @@ def _above_numbers(
         header = [f"{n} [{u}]" if u and "[" not in n else n for n, u in pairs]
     notes = []
     if skipped:
-        shown = _short(lines[skipped[0]][1].strip())
+        shown = short(lines[skipped[0]][1].strip())
         many = _count(len(skipped), "above the header")
         notes.append(f"{path.name}: {many} skipped: {shown}")
     start = lines[at][0] - len(lines[at][1]) - 1
@@ -349,51 +352,112 @@ def _fast_pass(layout: _Layout) -> list[FloatArray] | None:
 
 
 def _slow_pass(layout: _Layout) -> Table:
-    lines, rows, below = _rows(layout)
+    lines, rows, below, corrupt = _rows(layout)
     if not rows:
         raise DataError(f"{layout.path}: a header but no rows; expected rows of numbers below it")
     layout = _written(layout, rows)
     header, columns, bad = list(layout.header), [], {}
+    moments = []
+    spoiled = _spoiled_rows(layout, rows, len(corrupt))
+    corrupt += [(lines[k], layout.delimiter.join(rows[k])) for k in spoiled]
+    if spoiled:
+        gone = set(spoiled)
+        lines = [line for k, line in enumerate(lines) if k not in gone]
+        rows = [row for k, row in enumerate(rows) if k not in gone]
     for i, cells in enumerate(zip(*rows, strict=True)):
         column = _column(layout, cells)
         if column is None and is_moment(cells[0]):
             column = seconds_of_texts(cells)
-            header[i] = f"{split_unit(header[i])[0]} [s]" if column is not None else header[i]
+            if column is not None:
+                header[i] = f"{split_unit(header[i])[0]} [s]"
+                moments.append(i)
         if column is None:
             k, column = _spoiled(layout, cells)
-            bad[i] = _complaint(layout, lines[k], i, cells[k])
+            bad[i] = _complaint(layout, lines[k], i, cells[k], _wrong(layout, cells))
         columns.append(column)
     table = from_headers(layout.path, header, columns, bad, lines)
-    return replace(table, notes=(*layout.notes, *below))
+    names = split_units(header)[0]
+    notes = (*layout.notes, *below, *skipped_lines(layout.path, corrupt, len(rows)))
+    return replace(table, notes=notes, moments=tuple(names[i] for i in moments))
 
 
-def _rows(layout: _Layout) -> tuple[list[int], list[list[str]], tuple[str, ...]]:
-    """Line numbers and cells of the rows, checked against the header, and a note on lines below.
+def _spoiled_rows(layout: _Layout, rows: list[list[str]], corrupt: int) -> list[int]:
+    """Rows with a cell that is no number in a column of numbers, if they are few."""
+    few = CORRUPT * len(rows) - corrupt
+    found: set[int] = set()
+    for cells in zip(*rows, strict=True):
+        if _column(layout, cells) is not None:
+            continue
+        # a column of moments, or of text, in which a few cells were lost
+        dated = sum(map(is_moment, cells)) > len(cells) / 2
+        wrong = [
+            k for k, c in enumerate(cells)
+            if not (is_moment(c) if dated else _is_read(layout, c))
+        ]  # fmt: skip
+        if len(wrong) <= few:
+            found.update(wrong)
+    return sorted(found) if len(found) <= few else []
 
-    Blank lines and comments do not count as rows.
+
+def _is_read(layout: _Layout, cell: str) -> bool:
+    return _number(cell, layout.decimal, layout.thousands) is not None
+
+
+def _wrong(layout: _Layout, cells: Sequence[str]) -> int:
+    return sum(not _is_read(layout, c) for c in cells)
+
+
+def skipped_lines(path: Path, corrupt: list[tuple[int, str]], left: int) -> tuple[str, ...]:
+    """A note on corrupt lines, each with its number and text, beside `left` good ones."""
+    if not corrupt:
+        return ()
+    corrupt = sorted(corrupt)
+    shown = ", ".join(f"{number} ({short(text)})" for number, text in corrupt[:3])
+    more = f" and {len(corrupt) - 3} more" if len(corrupt) > 3 else ""
+    one = len(corrupt) == 1
+    return (
+        f"{path.name}: {len(corrupt)} of {left + len(corrupt)} lines skipped, as "
+        f"{'it has' if one else 'they have'} cells that are missing or no numbers: "
+        f"line{'' if one else 's'} {shown}{more}",
+    )
+
+
+def _rows(
+    layout: _Layout,
+) -> tuple[list[int], list[list[str]], tuple[str, ...], list[tuple[int, str]]]:
+    """Line numbers and cells of the rows, a note on lines below them, and corrupt lines.
+
+    Blank lines and comments do not count as rows. Lines of another width are corrupt; more of them
+    than `CORRUPT` are refused.
     """
     width = len(layout.header)
     lines: list[int] = []
     rows: list[list[str]] = []
-    short: list[tuple[int, list[str]]] = []
+    other: list[tuple[int, list[str]]] = []
     for number, cells in _split(layout):
         while len(cells) > width and not cells[-1].strip():
             cells.pop()
         blank = not any(c.strip() for c in cells) and len(cells) < max(width, 2)
         if blank or cells[0].lstrip().startswith("#"):
             continue
-        if len(cells) < width and rows and len(short) < _FOOTER:
-            short.append((number, cells))
+        if len(cells) != width:
+            other.append((number, cells))
             continue
-        if len(cells) != width or short:
-            raise _of_other_width(layout, *(short[0] if short else (number, cells)))
         lines.append(number)
         rows.append(cells)
-    if not short:
-        return lines, rows, ()
-    shown = _short(layout.delimiter.join(short[0][1]))
-    many = _count(len(short), "below the table")
-    return lines, rows, (f"{layout.path.name}: {many} left out: {shown}",)
+    below = [o for o in other if lines and o[0] > lines[-1]]
+    # a footer is a few shorter lines
+    if len(below) > _FOOTER or any(len(cells) > width for _, cells in below):
+        below = []
+    corrupt = other[: len(other) - len(below)]
+    if corrupt and len(corrupt) > CORRUPT * len(rows):
+        raise _of_other_width(layout, *corrupt[0], len(corrupt), len(rows) + len(corrupt))
+    notes: tuple[str, ...] = ()
+    if below:
+        shown = short(layout.delimiter.join(below[0][1]))
+        many = _count(len(below), "below the table")
+        notes = (f"{layout.path.name}: {many} left out: {shown}",)
+    return lines, rows, notes, [(n, layout.delimiter.join(cells)) for n, cells in corrupt]
 
 
 def _split(layout: _Layout) -> Iterator[tuple[int, list[str]]]:
@@ -410,13 +474,20 @@ def _split(layout: _Layout) -> Iterator[tuple[int, list[str]]]:
         raise DataError(f"{layout.path}: line {layout.skipped + reader.line_num}: {e}") from e
 
 
-def _of_other_width(layout: _Layout, number: int, cells: list[str]) -> DataError:
-    hint = ""
+def _of_other_width(
+    layout: _Layout, number: int, cells: list[str], count: int, total: int
+) -> DataError:
+    hint = "repair or delete the line"
+    if count > 1:
+        hint = (
+            f"{count} of {total} lines are like that, and up to {CORRUPT:.0%} would be skipped: "
+            "repair or delete them, or record again at a lower baud rate"
+        )
     if layout.delimiter == "," and len(cells) > len(layout.header):
-        hint = "; numbers with decimal commas need semicolons between the columns"
+        hint += "; numbers with decimal commas need semicolons between the columns"
     return DataError(
         f"{layout.path}: line {number}: expected {len(layout.header)} cells, as in the header, "
-        f"received {len(cells)}: {_short(layout.delimiter.join(cells))}{hint}"
+        f"received {len(cells)}: {short(layout.delimiter.join(cells))}; {hint}"
     )
 
 
@@ -465,15 +536,21 @@ def _number(cell: str, decimal: str, thousands: str = "") -> float | None:
         return None
 
 
-def _complaint(layout: _Layout, line: int, column: int, cell: str) -> str:
-    hint = ""
+def _complaint(layout: _Layout, line: int, column: int, cell: str, count: int) -> str:
+    hint = "; repair or delete the line"
+    if count > 1:
+        hint = (
+            f"; {count} cells of this column are no numbers, and lines with such cells are skipped "
+            f"up to {CORRUPT:.0%}: repair or delete them, or choose another column"
+        )
     if "," in cell and layout.decimal == ".":
         hint = "; the file also holds decimal points: write all numbers one way"
     return (
         f"line {line}, column {layout.header[column]!r}: expected a number, received "
-        f"{_short(cell)}{hint}"
+        f"{short(cell)}{hint}"
     )
 
 
-def _short(text: str) -> str:
+def short(text: str) -> str:
+    """A text in quotes, at most 60 characters of it."""
     return repr(text if len(text) <= 60 else text[:57] + "...")

@@ -5,15 +5,14 @@ from __future__ import annotations
 import io
 import logging
 import os
-import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..dataset import Dataset, Experiment, FloatArray, is_reference
+from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.experiment import as_weights, require_some_weight
 from ..errors import (
     DataError,
@@ -27,12 +26,13 @@ from ..errors import (
 from ..recordfile.format import MAGIC
 from ..recordfile.reader import decode_recording
 from ..speed import speed_between_gaps
-from ..units import SPEEDS, unit_in_name
 from .containers import Table, freeze, read_mat, read_npz
 from .delimited import read_delimited
 from .frames import collected, of_arrow, table_of
+from .jsonlog import is_json, read_json
 from .logs import is_log, read_log
-from .timebase import TOLERANCE, Grid, time_base, time_column
+from .roles import recognised
+from .timebase import TOLERANCE, Grid, time_base
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -174,8 +174,8 @@ def _package(point: EntryPoint) -> str:
 
 
 def read_table(path: Any) -> Table:
-    """Read all columns of a CSV, `.mat`, `.npz`, Parquet or MCAP file, of a log of another tool, or
-    of a table in memory.
+    """Read all columns of a CSV, `.mat`, `.npz`, Parquet, MCAP or JSON file, of a log of another
+    tool, or of a table in memory.
 
     Parameters
     ----------
@@ -184,8 +184,9 @@ def read_table(path: Any) -> Table:
         from pandas, polars, pyarrow (or anything with `__arrow_c_stream__`), xarray (a Dataset) or
         is a mapping of name to array; null, NA and NaT are NaN, moments become seconds from the
         first one. Logs are MDF, TDMS, PX4 ULog, WPILib's data log and ROS bags (`.bag`, `.mcap`);
-        the signal with most samples gives the rows, others are held. If an installed package
-        handles the file's ending (entry point `sewfast.readers`), that package reads it.
+        the signal with most samples gives the rows, others are held. JSON is an object of numbers
+        on each line (JSON lines), a list of such objects, or an object of columns. If an installed
+        package handles the file's ending (entry point `sewfast.readers`), that package reads it.
 
     Returns
     -------
@@ -230,6 +231,8 @@ def _table(path: Path, raw: bytes) -> Table:
             "damaged; supported are CSV, .mat, .npz, Parquet, recordings (.mcap) and logs of "
             "other tools"
         )
+    if is_json(raw):
+        return read_json(path, raw)
     return read_delimited(path, raw)
 
 
@@ -280,11 +283,11 @@ def read(
         CSV, `.mat`, `.npz`, Parquet or MCAP; a table of pandas, polars, pyarrow or xarray, a
         mapping of name to array, or a `Table`; see `read_table`.
     inputs : str or sequence of str, or None
-        Column names of the inputs. None, without `output` and `counts`: input and output are
-        recognised by their names and units, as on the command line.
+        Column names of the inputs. None: recognised by names and units, as on the command line.
     output : str or None
-        Column name of the output. None, without `counts`, leaves the output NaN: enough to
-        simulate from rest.
+        Column name of the output. None, without `counts`: recognised likewise. Where inputs are
+        named and no column shows that it is the output, the output stays NaN: enough to simulate
+        from rest.
     Ts : float or None
         Sample time [s]. Where the file has a time column with even steps, the two must agree
         within 1 % and this one is used. Where its steps are uneven, the rows are resampled to it
@@ -314,23 +317,41 @@ def read(
     Raises
     ------
     DataError
-        If the file or a column cannot be used.
+        If the file or a column cannot be used, or the input is neither named nor recognised.
     SettingError
         If the sample time is missing or settings contradict each other.
     """
     table = path if isinstance(path, Table) else read_table(path)
-    if inputs is None and output is None and counts is None:
-        found = recognised(table)
-        inputs, output = found.input, found.output
-    names: tuple[Any, ...] = (
-        (inputs,) if isinstance(inputs, str) or not isinstance(inputs, Iterable) else tuple(inputs)
-    )
-    for role, one in [*(("inputs", n) for n in names), ("output", output), ("counts", counts)]:
-        if not isinstance(one, str | None) or (role == "inputs" and one is None):
-            raise SettingError(
-                f"{role}: expected the name of a column, received {one!r}; names are text, as in "
-                f"'{table.names[0] if len(table) else 'u'}'"
-            )
+    named = _names(table, inputs, output, counts)
+    if not named and inputs is not None:
+        raise SettingError("inputs: expected at least one column name, received none")
+    if not named or (output is None and counts is None):
+        found = recognised(table, inputs=named, output=output, counts=counts, time=time)
+        named = named or (found.input,)
+        if output is None and counts is None:
+            output, counts = found.output, found.counts
+    return read_columns(
+        table, inputs=named, output=output, Ts=Ts, counts=counts, counts_per_rev=counts_per_rev,
+        time=time, channels=channels, name=name, weights=weights,
+    )  # fmt: skip
+
+
+def read_columns(
+    path: Any,
+    *,
+    inputs: str | Sequence[str],
+    output: str | None = None,
+    Ts: float | None = None,
+    counts: str | None = None,
+    counts_per_rev: float | None = None,
+    time: str | None = None,
+    channels: Sequence[str] = (),
+    name: str | None = None,
+    weights: str | None = None,
+) -> Dataset:
+    """As `read`, with no column recognised: without output and counts the output is NaN."""
+    table = path if isinstance(path, Table) else read_table(path)
+    names = _names(table, inputs, output, counts)
     if not names:
         raise SettingError("inputs: expected at least one column name, received none")
     if counts is not None and counts_per_rev is None:
@@ -369,6 +390,19 @@ def read(
         looks_ahead=source is not None or (base.grid is not None and not base.grid.exact),
     )  # fmt: skip
     return data.resample(wanted) if slower else data
+
+
+def _names(table: Table, inputs: Any, output: str | None, counts: str | None) -> tuple[str, ...]:
+    """The names of the inputs, none if none is given; refuses what is no name."""
+    single = isinstance(inputs, str) or not isinstance(inputs, Iterable)
+    names: tuple[Any, ...] = () if inputs is None else (inputs,) if single else tuple(inputs)
+    for role, one in [*(("inputs", n) for n in names), ("output", output), ("counts", counts)]:
+        if not isinstance(one, str | None) or (role == "inputs" and one is None):
+            raise SettingError(
+                f"{role}: expected the name of a column, received {one!r}; names are text, as in "
+                f"'{table.names[0] if len(table) else 'u'}'"
+            )
+    return names
 
 
 def _on_grid(table: Table, grid: Grid, inputs: Sequence[str], measured: Sequence[str]) -> Table:
@@ -473,152 +507,3 @@ def parse_source(text: str) -> tuple[str, tuple[str, ...] | None, str | None]:
             f"expected FILE:INPUT:OUTPUT, such as run.csv:u:speed; received {text!r}"
         )
     return path, names, output.strip()
-
-
-# --- Roles: the input and the output of a table, by the names and units of its columns ------------
-
-
-@dataclass(frozen=True)
-class _Sort:
-    """Columns of one sort, recognised by the words in their names or by their units."""
-
-    words: frozenset[str]
-    units: frozenset[str]
-
-
-def _sort(words: str, units: Iterable[str]) -> _Sort:
-    return _Sort(frozenset(words.split()), frozenset(units))
-
-
-_INPUTS = (
-    _sort(
-        "u in input command cmd pwm duty volt volts voltage spannung tension control throttle "
-        "stellgröße stellgroesse commande voltaje tensione",
-        ("v", "mv", "volt", "volts"),
-    ),
-    _sort("i curr current strom amp amps courant", ("a", "ma", "amp", "ampere", "amps")),
-)
-_OUTPUTS = (
-    _sort(
-        "y out output speed rpm velocity vel omega drehzahl geschwindigkeit vitesse tacho tach "
-        "position pos angle theta winkel weg istwert velocidad velocità",
-        (*SPEEDS, "rad", "deg", "°", "rev", "m", "mm"),
-    ),
-    _sort("temperature temp temperatur", ("°c", "degc", "k")),
-)
-"""The first sort with a column counts; columns of later sorts were logged beside it."""
-_SUPPLY = re.compile(r"(battery|batt|bat|vbat|supply|bus|akku|batterie|versorgung)(?![a-z])")
-"""Names of a drive's supply, which is not a command."""
-_NUMBER = re.compile(
-    r"#|(sample|row|line|record|packet|frame)s?([_ ]?(no|nr|number|index))?|index|idx|no|nr|seq"
-)
-"""Names of a column that numbers the rows."""
-_QUALIFIERS = frozenset(
-    re.split(
-        " ",
-        "motor shaft actual act ist meas measured measurement gemessen signal value wert cycle "
-        "percent pct raw filt filtered",
-    )
-)
-"""Words without meaning for the role of a column."""
-_WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+(?![^\W\d_A-Z])")
-
-
-@dataclass(frozen=True)
-class Roles:
-    """Input and output of a table, recognised by names and units."""
-
-    input: str
-    output: str
-
-
-def roles(table: Table) -> Roles | None:
-    """Input and output of a table; None if its names and units leave any doubt.
-
-    Time, references, row numbers, supplies and columns that never change are neither. The plain
-    names `u` and `y` come first, then a voltage or a command (a current only where there is no
-    voltage) as input and a speed or a position (a temperature only where there is neither) as
-    output. A column with both a matching name and a matching unit comes before one with a single
-    match. Where one role is decided and one column is left, that column takes the other role.
-    """
-    time = time_column(table)
-    length = max((len(table[name]) for name in table.names), default=0)
-    left = [
-        name for name in table.names
-        if name != time and len(table[name]) == length and _moves(table, name)
-        and not is_reference(name) and _stem(name) != "speed_true"
-        and not _SUPPLY.match(_stem(name)) and not _counts_rows(table, name)
-    ]  # fmt: skip
-    given = _only(left, "u") or _first(table, left, _INPUTS)
-    found = _only(left, "y") or _first(table, left, _OUTPUTS)
-    if len(left) == 2 and (given is None) != (found is None):
-        (other,) = (name for name in left if name not in (given, found))
-        given, found = given or other, found or other
-    if given is None or found is None or given == found:
-        return None
-    return Roles(given, found)
-
-
-def recognised(table: Table) -> Roles:
-    """Input and output of a table, as `roles`.
-
-    Raises
-    ------
-    DataError
-        If its names and units leave any doubt.
-    """
-    found = roles(table)
-    if found is None:
-        raise DataError(
-            name=str(table.path), expected="columns that show which is the input and which the "
-            "output", received=", ".join(table.names), remedy=f"name both{left_out(table)}",
-        )  # fmt: skip
-    return found
-
-
-def _moves(table: Table, name: str) -> bool:
-    known = table[name][np.isfinite(table[name])]
-    return len(known) > 0 and bool(known.min() < known.max())
-
-
-def _counts_rows(table: Table, name: str) -> bool:
-    if _NUMBER.fullmatch(name.lower()) is None:
-        return False
-    with np.errstate(invalid="ignore"):  # between two infinities
-        steps = np.diff(table[name])
-    return bool((steps == steps[0]).all())
-
-
-def _stem(name: str) -> str:
-    """A name in lower case, without the unit that it ends with."""
-    return unit_in_name(name)[0].lower()
-
-
-def left_out(table: Table) -> str:
-    """The end of a message: columns of the right kind that were ruled out, and why."""
-    why = list(table.unusable.values())[:3]
-    still = [name for name in table.names if not _moves(table, name)]
-    if still:
-        why.append(f"no two different numbers in {', '.join(still[:10])}")
-    return "".join(f"; {reason}" for reason in why)
-
-
-def _only(names: list[str], plain: str) -> str | None:
-    return plain if plain in names else None
-
-
-def _first(table: Table, names: list[str], sorts: Sequence[_Sort]) -> str | None:
-    """The best column of the first sort that has any; None if several match equally well."""
-    for sort in sorts:
-        scores = {name: _score(table, name, sort) for name in names}
-        best = max(scores.values(), default=0)
-        if best:
-            fitting = [name for name in names if scores[name] == best]
-            return fitting[0] if len(fitting) == 1 else None
-    return None
-
-
-def _score(table: Table, name: str, sort: _Sort) -> int:
-    """2 for a column whose name and unit both match the sort, 1 for one match, else 0."""
-    words = {word.lower() for word in _WORD.findall(unit_in_name(name)[0])} - _QUALIFIERS
-    return (bool(words) and words <= sort.words) + (table.unit(name).lower() in sort.units)

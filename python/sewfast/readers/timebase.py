@@ -33,6 +33,7 @@ _SECONDS = {
 _UNIT = r"s|sec|seconds|ms|msec|millis(?:econds)?|us|µs|usec|micros(?:econds)?|ns|nanos(?:econds)?"
 _TIME = re.compile(
     r"(?:t|(?:(?:elapsed|relative|rel|unix|epoch|system|sys|log|run)[_ ]?)?time|time[_ ]?stamp|"
+    r"stamp|"
     r"(?:elapsed|relative|rel|unix|epoch)|time[_ ]since[_ ](?:start|boot|power[_ ]?on)|seconds?|"
     rf"zeit|laufzeit|zeitstempel|temps|tiempo|tempo|x-axis|x_value)(?:[_ ]({_UNIT}))?"
     r"|(ms|us|millis(?:econds)?|micros(?:econds)?|nanos(?:econds)?)"
@@ -136,7 +137,12 @@ class Grid:
         lies in a gap or belongs to a row without a value.
         """
         if self.exact:
-            return self.output(column)
+            found = self.output(column)
+            place = np.rint(self.t / self.Ts).astype(np.intp)
+            for before, steps in zip(place, np.diff(place), strict=False):
+                if 1 < steps <= GAP:
+                    found[before + 1 : before + steps] = found[before]
+            return found
         cut = self.t[:-1][np.diff(self.t) > GAP * self.period] + self.period
         starts = np.concatenate([self.t, cut])
         order = np.argsort(starts, kind="stable")
@@ -167,7 +173,10 @@ class Grid:
         if len(gaps):
             text += f"; {len(gaps)} gaps, the longest {gaps.max():.4g} s, are not known (NaN)"
         elif self.exact:
-            text += ": these samples are not known (NaN)"
+            text += (
+                ": their outputs are not known (NaN), inputs are held for up to "
+                f"{math.floor(GAP) - 1} samples"
+            )
         return text
 
 
@@ -179,10 +188,14 @@ def _means(values: FloatArray, edges: FloatArray, ends: FloatArray) -> FloatArra
 
 
 def time_column(table: Table) -> str | None:
-    """The column with a name for time: t, time, timestamp, seconds, also time_ms and the like."""
+    """The column with a name for time: t, time, timestamp, seconds, also time_ms and the like.
+
+    Where there is none, dates with times of day are the time, whatever the name.
+    """
     names = [n for n in table.names if _is_time(n)] or [
-        n for n in table.names if _DATE.fullmatch(n.lower()) and table.unit(n) == "s"
-    ]
+        n for n in table.names
+        if n in table.moments or (_DATE.fullmatch(n.lower()) and table.unit(n) == "s")
+    ]  # fmt: skip
     return next((n for n in names if n.lower() in ("t", "time")), next(iter(names), None))
 
 

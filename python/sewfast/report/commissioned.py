@@ -338,7 +338,7 @@ def _margin_cells(m: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _scores(found: Mapping[str, Any]) -> Table:
-    unit, volt = found["units"]["y"], found["units"]["u"]
+    unit, volt = found["units"]["y"] or "y", found["units"]["u"] or "u"
     rows = [("as it is", *_score_cells(found["score"]))]
     rows += [(w["change"], *_score_cells(w)) for w in found["what_if"]]
     header = (

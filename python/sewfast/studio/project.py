@@ -32,7 +32,10 @@ if TYPE_CHECKING:
     from .tuning import Tuning
 
 
-RECORDINGS = (".csv", ".npz", ".mat", ".parquet", ".mcap")
+RECORDINGS = (
+    ".csv", ".tsv", ".txt", ".log", ".jsonl", ".ndjson", ".json", ".npz", ".mat", ".parquet",
+    ".mcap",
+)  # fmt: skip
 LARGEST = 512 * 2**20
 """Most bytes of a recording."""
 
@@ -116,7 +119,10 @@ class Project:
         return sorted(
             entry.name
             for entry in _files(self.folder)
-            if entry.suffix.lower() in RECORDINGS and ":" not in entry.name
+            if entry.suffix.lower() in RECORDINGS
+            and ":" not in entry.name
+            # models, controllers and results state their format, logs do not
+            and not (entry.suffix.lower() == ".json" and self._format_of(entry))
         )
 
     def documents(self, format: str) -> list[str]:
@@ -245,20 +251,16 @@ class Project:
     # --- Steps ------------------------------------------------------------------------------------
 
     def columns(self, step: Step) -> dict[str, Any]:
-        """Columns of a recording, and the probable input and output among them."""
-        from ..readers import read_table
+        """Columns of a recording, and its input and output where names and units show them."""
+        from ..readers import read_table, roles
 
         table = read_table(self.path_of(step.file))
-        rest = [n for n in table.names if n != "t"]
-        inputs = [n for n in ("u", "input", "voltage") if n in table][:1] or rest[:1]
-        outputs = [n for n in ("y", "speed", "output") if n in table and n not in inputs]
-        outputs = outputs or [n for n in rest if n not in inputs]
-        encoder = table.counts_per_rev is not None and "counts" in table
+        found = roles(table)
         return {
             "names": list(table.names),
-            "inputs": inputs,
-            "output": outputs[0] if outputs and not encoder else None,
-            "encoder": encoder,
+            "inputs": [] if found is None else [found.input],
+            "output": None if found is None else found.output,
+            "encoder": table.counts_per_rev is not None and "counts" in table,
         }
 
     def look(self, step: Step) -> dict[str, Any]:
@@ -468,8 +470,11 @@ class Upload:
         Raises
         ------
         SettingError
-            For fewer bytes than announced, or a name taken meanwhile; then the file is deleted.
+            For fewer bytes than announced, a name taken meanwhile, or a model, a controller or
+            another file that states its format; then the file is deleted.
         """
+        from .. import storage
+
         try:
             if self.received != self.size:
                 raise SettingError(
@@ -477,6 +482,11 @@ class Upload:
                     "again"
                 )
             self._out.close()
+            if found := storage.format_of(self._part):
+                raise SettingError(
+                    f"{self.file}: expected a recording, received a file of the format {found}; "
+                    "copy it into the project folder"
+                )
             try:
                 os.link(self._part, self._place)  # unlike a rename, it replaces nothing
             except FileExistsError:

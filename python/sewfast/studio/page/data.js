@@ -45,7 +45,7 @@ on("state", s => {
     fill($("file"), s.recordings.map(n => [n, n]), [s.recordings.includes(before) ? before : s.first]);
     // a recording may be large, so it is opened only where its columns are asked for
     if ($("file").value !== before) { stale = true; if (!$("data").hidden) open(); }
-    if (!s.recordings.length && !s.gone) tell(new Error("there is no recording in this folder: drop a CSV, .mat, .npz, Parquet or MCAP file here"));
+    if (!s.recordings.length && !s.gone) tell(new Error("there is no recording in this folder: drop a CSV, log, JSON, .mat, .npz, Parquet or MCAP file here"));
   }
   enable();
 });

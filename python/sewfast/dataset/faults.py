@@ -1,0 +1,491 @@
+"""Faults of a record: a sensor that died, columns without dynamics, exchanged or late columns.
+
+All tests compare a record with itself, and take the side of the record in doubt. Values that
+`identify` refuses count as not known, and no test judges columns that do not move, so that none
+fails on any numbers: columns are compared about their mean, in units of their deviation.
+
+- A dead sensor: the output keeps one value to the last bit while a linear model of the rest, whose
+  output is limited to the recorded range, moves; the input has the levels there at which the output
+  moves elsewhere, so that friction or a dead zone is no explanation; and a limit of the output was
+  not reached by motion, so that a saturation or an end stop is none either.
+- No dynamics: in one sample and for the whole record, the output is the input times a number.
+- The order in time: the past of a cause helps to predict its effect beyond the effect's own past,
+  and not the other way (Granger 1969).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import FloatArray, labelled, runs
+from ..errors import DataError
+from .outliers import quantum
+from .pieces import LARGEST_FITTED, SMALLEST_FITTED
+
+if TYPE_CHECKING:
+    from .dataset import Dataset
+    from .experiment import Experiment
+
+PAST = 10
+"""Past outputs and inputs in the regressions, and largest lead in samples."""
+MOST = 20_000
+"""Most samples that a regression uses."""
+SURE = 60.0
+"""Twice the log-likelihood that a cause must add. By chance the 10 coefficients of a lead add 10,
+and 60 in one of 3e8 records."""
+OCTAVES = 6
+"""Means of an input over 10, 20, 40 .. samples before these: plants with long dead times."""
+
+
+def _columns(e: Experiment) -> FloatArray:
+    """Inputs and output, NaN where they are not known or no measured quantity is as large."""
+    columns = np.column_stack([e.u, e.y])
+    return np.where(np.abs(columns) < LARGEST_FITTED, columns, np.nan)
+
+
+def _known(columns: FloatArray) -> NDArray[np.bool_]:
+    known: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(columns), axis=1)
+    return known
+
+
+def _scale(parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray] | None:
+    """Mean and deviation of each column over all parts; None if one of them does not move."""
+    whole = np.concatenate(parts) if parts else np.zeros((1, 1))
+    if (np.ptp(whole, axis=0) < SMALLEST_FITTED).any():
+        return None
+    return whole.mean(axis=0), whole.std(axis=0)
+
+
+# --- A sensor that died ---------------------------------------------------------------------------
+
+ORDER = 4
+"""Past outputs and inputs of the model of the rest."""
+LEAST_PART = 0.01
+"""Least part of its experiment for a dead stretch."""
+WINDOWS = 8
+"""Least number of windows of the rest with which a stretch is compared."""
+APART = 10.0
+"""Ratio of squared errors, in the stretch to the worst window of the rest. Of 2,400 sound records
+of `tests/dataset/test_faults.py` the worst has 4.5 (a saturation), of 766 dead sensors the least
+20."""
+
+
+@dataclass(frozen=True)
+class Dead:
+    """A stretch in which the output's sensor says nothing: samples `start` to `stop`, excluded.
+
+    Samples are those of the file, 0-based; `experiment` is the index in the data set.
+    """
+
+    experiment: int
+    start: int
+    stop: int
+    value: float
+
+
+def dead_stretches(data: Dataset) -> tuple[Dead, ...]:
+    """Stretches in which the output stands still while the rest says that it cannot."""
+    return tuple(
+        Dead(i, e.start + first, e.start + first + count, float(e.y[first]))
+        for i, e in enumerate(data.experiments)
+        for first, count in _dead_in(e)
+    )
+
+
+def _dead_in(e: Experiment) -> list[tuple[int, int]]:
+    columns, least = _columns(e), max(4 * ORDER, LEAST_PART * len(e))
+    known = _known(columns)
+    same = known[1:] & known[:-1] & (e.y[1:] == e.y[:-1])
+    still = [(a, count + 1) for a, count in runs(same) if count + 1 >= least]
+    still = sorted(still, key=lambda s: -s[1])[:20]
+    for first, count in still:
+        known[first : first + count] = False
+    model = _Rest.of(columns, known) if still else None
+    return [] if model is None else sorted(s for s in still if model.contradicts(*s))
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """A linear model of the part of an experiment in which the output moves."""
+
+    u: FloatArray
+    y: FloatArray
+    theta: FloatArray
+    pieces: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, columns: FloatArray, rest: NDArray[np.bool_]) -> _Rest | None:
+        pieces = tuple(p for p in runs(rest) if p[1] > 4 * ORDER)
+        scale = _scale([columns[a : a + n] for a, n in pieces])
+        if scale is None:
+            return None
+        u, y = np.split((columns - scale[0]) / scale[1], [-1], axis=1)
+        y = y[:, 0]
+        X = np.concatenate([_regressors(u[a : a + n], y[a : a + n]) for a, n in pieces])
+        if len(X) < 10 * ORDER * (2 + u.shape[1]):
+            return None
+        target = np.concatenate([y[a + ORDER : a + n] for a, n in pieces])
+        theta = np.asarray(np.linalg.lstsq(X, target, rcond=1e-10)[0])
+        return cls(u, y, theta, pieces)
+
+    def contradicts(self, first: int, count: int) -> bool:
+        """Whether the output moves in this stretch, by everything known from the rest."""
+        length = min(count, sum(n for _, n in self.pieces) // WINDOWS)
+        if length <= 2 * ORDER:
+            return False
+        others = np.array([
+            k for a, n in self.pieces for k in range(a, a + n - length + 1, max(1, length // 2))
+        ])  # fmt: skip
+        if len(others) < WINDOWS // 2:
+            return False
+        if not (self._covers(first, count) and self._jumps(first, count)):
+            return False
+        own = np.arange(first, first + count - length + 1, length)
+        errors = self._errors(others, length)
+        return bool(np.median(self._errors(own, length)) > APART * errors.max())
+
+    def _covers(self, first: int, count: int) -> bool:
+        """Whether an input reaches the levels here that it has while the output moves.
+
+        Friction, a dead zone or a closed valve keep an output still at some levels, but not at the
+        middle half of those at which it moves.
+        """
+        own = self.u[first : first + count]
+        rest = np.concatenate([self.u[a : a + n] for a, n in self.pieces])
+        low, high = np.quantile(rest, [0.25, 0.75], axis=0)
+        inside = (own.min(axis=0) <= low) & (own.max(axis=0) >= high)
+        return bool((inside & (np.ptp(own, axis=0) > 0.0)).any())
+
+    def _jumps(self, first: int, count: int) -> bool:
+        """Whether the output can be at no limit: it is inside the range, or reached it at a jump.
+
+        A saturated output and an end stop are reached by motion.
+        """
+        y, value = self.y, self.y[first]
+        if np.nanmin(y) < value < np.nanmax(y):
+            return True
+        ends = [abs(y[k] - y[k - 1]) for k in (first, first + count) if 0 < k < len(y)]
+        usual = max(float(np.abs(np.diff(y[a : a + n])).max()) for a, n in self.pieces)
+        return max(ends, default=0.0) > usual
+
+    def _errors(self, starts: np.ndarray, length: int) -> FloatArray:
+        """Mean square errors of free runs from the measured start of each window."""
+        low, high = np.nanmin(self.y), np.nanmax(self.y)
+        past = [self.y[starts + i] for i in range(ORDER)][::-1]
+        total = np.zeros(len(starts))
+        for k in range(ORDER, length):
+            columns = [*past, *(self.u[starts + k - i, j] for j in range(self.u.shape[1])
+                                for i in range(1, ORDER + 1)), np.ones(len(starts))]  # fmt: skip
+            y = np.clip(np.stack(columns, axis=1) @ self.theta, low, high)
+            total += (self.y[starts + k] - y) ** 2
+            past = [y, *past[:-1]]
+        return total / (length - ORDER)
+
+
+def _regressors(u: FloatArray, y: FloatArray) -> FloatArray:
+    k = np.arange(ORDER, len(y))
+    past = [y[k - i] for i in range(1, ORDER + 1)]
+    inputs = [u[k - i, j] for j in range(u.shape[1]) for i in range(1, ORDER + 1)]
+    return np.stack([*past, *inputs, np.ones(len(k))], axis=1)
+
+
+# --- Columns of which one is computed from the other, exchanged, or late --------------------------
+
+
+@dataclass(frozen=True)
+class Copy:
+    """The output is `gain` times the input `delay` samples before, plus `offset`."""
+
+    input: int
+    gain: float
+    offset: float
+    delay: int
+
+
+def copied(data: Dataset) -> Copy | None:
+    """An input that the output repeats to rounding, up to `PAST` samples later."""
+    experiments = [_columns(e) for e in data.experiments]
+    for j, delay in itertools.product(range(data.n_inputs), range(PAST + 1)):
+        u = np.concatenate([c[: max(0, len(c) - delay), j] for c in experiments])
+        y = np.concatenate([c[delay:, -1] for c in experiments])
+        known = np.isfinite(u) & np.isfinite(y)
+        u, y = u[known], y[known]
+        if len(y) < 4 * PAST or len(np.unique(u[:MOST])) < 3:
+            continue
+        if _scale([np.column_stack([u, y])]) is None:
+            continue
+        covariance = float(np.mean((u - u.mean()) * (y - y.mean())))
+        if abs(covariance) < 0.999 * float(u.std() * y.std()):
+            continue
+        gain = covariance / float(u.var())
+        offset = float(y.mean() - gain * u.mean())
+        # what the rounding of either column leaves; printed to six digits where no step is seen
+        rounding = 0.5 * (quantum(y) or 1e-5 * np.ptp(y)) + 0.5 * abs(gain) * (
+            quantum(u) or 1e-5 * np.ptp(u)
+        )
+        coarse = rounding > 0.02 * float(y.std())
+        if not coarse and float(np.abs(y - gain * u - offset).max()) <= 1.01 * rounding:
+            return Copy(j, gain, offset, delay)
+    return None
+
+
+@dataclass(frozen=True)
+class Order:
+    """Which of two signals moves first.
+
+    Attributes
+    ----------
+    kind : "exchanged", "late" or "at_once"
+        The input answers the output; the input was logged `shift` samples late; or the output moves
+        in the sample in which the input does.
+    input : int
+    shift : int
+        Samples by which the input is to be read earlier, so that the output moves one sample after.
+    evidence : float
+        Twice the log-likelihood that shows it.
+    """
+
+    kind: str
+    input: int
+    shift: int
+    evidence: float
+
+
+def order_in_time(data: Dataset) -> Order | None:
+    """Whether an input moves after the output that it should drive; None if no input does.
+
+    An input that keeps its value to the last bit for most samples is no answer to a noisy output:
+    if the output moves before it, it was logged late. Of other inputs, late ones cannot be told
+    from those that a controller computed, so only exchanged columns are found: the past of the
+    output predicts the input, and the past of the input says nothing about the output.
+    """
+    if data.looks_ahead:
+        return None
+    pieces = _pieces(data)
+    if sum(map(len, pieces)) < 10 * PAST * (2 + data.n_inputs):
+        return None
+    for j in range(data.n_inputs):
+        found = _late(pieces, j) if _is_held(pieces, j) else _exchanged(pieces, j)
+        if found is not None:
+            return found
+    return None
+
+
+def _pieces(data: Dataset) -> list[FloatArray]:
+    """Known stretches of the longest experiments, at most `MOST` samples, each column scaled."""
+    pieces, left = [], MOST
+    for e in sorted(data.experiments, key=len, reverse=True):
+        columns = _columns(e)
+        for first, count in runs(_known(columns)):
+            if min(count, left) > 4 * PAST:
+                pieces.append(columns[first : first + min(count, left)])
+                left -= len(pieces[-1])
+    scale = _scale(pieces)
+    return [] if scale is None else [(p - scale[0]) / scale[1] for p in pieces]
+
+
+def _is_held(pieces: list[FloatArray], j: int) -> bool:
+    still = sum(int((np.diff(p[:, j]) == 0.0).sum()) for p in pieces)
+    moving = sum(int((np.diff(p[:, -1]) != 0.0).sum()) for p in pieces)
+    count = sum(len(p) - 1 for p in pieces)
+    return 2 * still > count and 2 * moving > count
+
+
+def _squares(
+    pieces: list[FloatArray],
+    of: int,
+    past: tuple[int, ...],
+    leads: tuple[int, ...] = (),
+    j: int = 0,
+    *,
+    far: bool = False,
+) -> tuple[list[float], int]:
+    """Mean square errors of column `of` by the past of some columns, and the number of rows.
+
+    Without and with column j at the first, the first two .. all of `leads`; with `far` also by the
+    distant past of column j.
+    """
+    rows, targets = [], []
+    for p in pieces:
+        k = np.arange(PAST, len(p) - PAST)
+        columns = [p[k - i, c] for c in past for i in range(1, PAST + 1)]
+        columns += _distant(p[:, j], k) if far else []
+        rows.append(np.stack([*columns, np.ones(len(k)), *(p[k + i, j] for i in leads)], axis=1))
+        targets.append(p[k, of])
+    X, y = np.concatenate(rows), np.concatenate(targets)
+    # the triangle has the same residuals, and few rows
+    R = np.asarray(np.linalg.qr(np.column_stack([X, y]), mode="r"), dtype=np.float64)
+    return [_left(R, len(leads) - k) / len(y) for k in range(len(leads) + 1)], len(y)
+
+
+def _left(R: FloatArray, without: int) -> float:
+    """Sum of squares that the columns leave of the last one, without the last `without` of them."""
+    X, y = R[:, : R.shape[1] - 1 - without], R[:, -1]
+    error = y - X @ np.linalg.lstsq(X, y, rcond=1e-10)[0]
+    # below this only the rounding of the columns is left, and of a column that stands still nothing
+    return max(float(error @ error), 1e-12 * float(y @ y), sys.float_info.min)
+
+
+def _distant(column: FloatArray, k: np.ndarray) -> list[FloatArray]:
+    """Means over octaves of lags from `PAST` on, 0 before the first sample."""
+    total = np.concatenate([[0.0], np.cumsum(column)])
+    edges = [PAST * 2**i for i in range(OCTAVES + 1)]
+    at = [total[np.maximum(k - edge, 0)] for edge in edges]
+    return [(a - b) / (d - c) for a, b, c, d in zip(at, at[1:], edges, edges[1:], strict=False)]
+
+
+def _late(pieces: list[FloatArray], j: int) -> Order | None:
+    """How many samples the output leads an input that no controller computed."""
+    everything = tuple(range(pieces[0].shape[1]))
+    of = len(everything) - 1
+    ahead = tuple(range(PAST + 1))
+    squares, n = _squares(pieces, of, everything, ahead, j)
+    # the last lead without which something is lost
+    for lead in range(PAST, -1, -1):
+        evidence = n * math.log(squares[lead] / squares[-1])
+        if evidence > SURE:
+            # the farthest lead matters: the record differs from this model in another way
+            if lead == PAST:
+                return None
+            kind = "late" if lead > 0 else "at_once"
+            return Order(kind, j, lead + 1, evidence)
+    return None
+
+
+def _exchanged(pieces: list[FloatArray], j: int) -> Order | None:
+    of = pieces[0].shape[1] - 1
+    (own,), n = _squares(pieces, of, (of,))
+    (driven,), _ = _squares(pieces, of, (of, j), j=j, far=True)
+    if n * math.log(own / driven) > SURE:
+        return None
+    (alone,), _ = _squares(pieces, j, (j,))
+    (answering,), _ = _squares(pieces, j, (j, of))
+    evidence = n * math.log(alone / answering)
+    if evidence > SURE:
+        return Order("exchanged", j, 0, evidence)
+    return None
+
+
+# --- The three in words, and what `identify` does about them --------------------------------------
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault of a record: what was seen, what to do about it, and the figures behind it."""
+
+    kind: str
+    text: str
+    remedy: str
+    evidence: dict[str, float | str]
+    dead: Dead | None = None
+
+    @property
+    def warning(self) -> str:
+        """For the notes of a model."""
+        return f"warning: {self.text}" + ("; left out" if self.dead else f": {self.remedy}")
+
+
+def faults(data: Dataset) -> tuple[Fault, ...]:
+    """Dead stretches of the output's sensor, or columns that are no input and output of a plant."""
+    return (*(_dead_fault(data, dead) for dead in dead_stretches(data)), *_order_fault(data))
+
+
+def _dead_fault(data: Dataset, dead: Dead) -> Fault:
+    e = data.experiments[dead.experiment]
+    of = "" if len(data.experiments) == 1 else f" of {e.name}"
+    span = f"{dead.start}:{dead.stop}"
+    return Fault(
+        "dead_sensor",
+        f"{data.output_name} keeps the value {dead.value:.6g} to the last bit in samples {span}"
+        f"{of}, {(dead.stop - dead.start) / len(e):.0%} of the record, while the input moves as it "
+        "does elsewhere: the sensor was dead or frozen",
+        f'leave these samples out, data.mask("{span}") (--mask {span})'
+        + ("" if len(data.experiments) == 1 else ", in their file alone")
+        + ", and check cable and sensor",
+        {"first": float(dead.start), "last": float(dead.stop), "value": dead.value},
+        dead,
+    )
+
+
+def _order_fault(data: Dataset) -> Iterator[Fault]:
+    y = labelled(data.output_name, data.output_unit)
+    if (copy := copied(data)) is not None:
+        name = data.input_names[copy.input]
+        after = "" if copy.delay == 0 else f" of {copy.delay} samples before"
+        yield Fault(
+            "no_dynamics",
+            f"{y} is {name}{after} times {copy.gain:.6g}, exactly: there are no dynamics between "
+            "the two, as one column was read twice or computed from the other",
+            "name the column of a sensor as output",
+            {"input": name, "gain": copy.gain, "offset": copy.offset, "delay": float(copy.delay)},
+        )
+        return
+    if (order := order_in_time(data)) is None:
+        return
+    name = data.input_names[order.input]
+    u = labelled(name, data.input_units[order.input])
+    evidence: dict[str, float | str] = {
+        "input": name, "shift": float(order.shift), "log_likelihood": order.evidence,
+    }  # fmt: skip
+    shift = f"data.shift_inputs({order.shift}) (--shift-input {order.shift})"
+    if order.kind == "exchanged":
+        yield Fault(
+            "exchanged",
+            f"{u} answers {y}, and {data.output_name} does not answer {name}: input and output "
+            "are exchanged",
+            f"take {data.output_name} as input and {name} as output",
+            evidence,
+        )
+    elif order.kind == "late":
+        yield Fault(
+            "late_input",
+            f"{y} moves {order.shift - 1} sample{'s' if order.shift > 2 else ''} before {u} does: "
+            f"{name} was logged {order.shift} samples late, counted to one sample from the command "
+            "to the output; every delay and time constant would be wrong",
+            f"read it earlier, {shift}",
+            evidence,
+        )
+    else:
+        yield Fault(
+            "at_once",
+            f"{y} moves in the same sample as {u} (nk = 0), and a controller that has to measure "
+            "first cannot be closed around such a model: it would need the output before the "
+            "command",
+            f"if {name} was logged a sample late, {shift}; if the plant does answer at once, "
+            "identify it with nk=0 (--nk 0), to simulate",
+            evidence,
+        )
+
+
+def sound(data: Dataset) -> tuple[Dataset, tuple[Fault, ...]]:
+    """The data without dead stretches, and what was found, for `identify`.
+
+    Raises
+    ------
+    DataError
+        If the columns are no input and output of a plant: one is computed from the other, or they
+        are exchanged.
+    """
+    found = faults(data)
+    wrong = next((f for f in found if f.kind in ("no_dynamics", "exchanged")), None)
+    if wrong is not None:
+        raise DataError(
+            name=data.source, expected="an output that answers the input", received=wrong.text,
+            remedy=wrong.remedy,
+        )  # fmt: skip
+    dead = [f.dead for f in found if f.dead]
+    if dead:
+        masks = [np.zeros(len(e), dtype=np.bool_) for e in data.experiments]
+        for d in dead:
+            start = data.experiments[d.experiment].start
+            masks[d.experiment][d.start - start : d.stop - start] = True
+        data = data.mask(masks, why="of a dead sensor left out")
+    return data, found

@@ -1,0 +1,204 @@
+"""Which column of a table is the input and which the output, by names and units.
+
+The command line, Python, the studio and the fleet all ask here, so that they give one answer.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..dataset import is_reference
+from ..errors import DataError
+from ..units import SPEEDS, unit_in_name
+from .containers import Table
+from .timebase import time_column
+
+
+@dataclass(frozen=True)
+class _Sort:
+    """Columns of one sort, recognised by the words in their names or by their units."""
+
+    words: frozenset[str]
+    units: frozenset[str]
+
+
+def _sort(words: str, units: Iterable[str]) -> _Sort:
+    return _Sort(frozenset(words.split()), frozenset(units))
+
+
+_INPUTS = (
+    _sort(
+        "u in input command cmd pwm duty volt volts voltage spannung tension control throttle "
+        "stellgröße stellgroesse commande voltaje tensione heater heating valve heizung ventil",
+        ("v", "mv", "volt", "volts"),
+    ),
+    _sort("i curr current strom amp amps courant", ("a", "ma", "amp", "ampere", "amps")),
+)
+_OUTPUTS = (
+    _sort(
+        "y out output speed rpm velocity vel omega drehzahl geschwindigkeit vitesse tacho tach "
+        "position pos angle theta winkel weg istwert velocidad velocità",
+        (*SPEEDS, "rad", "deg", "°", "rev", "m", "mm"),
+    ),
+    _sort(
+        "temperature temp temperatur level füllstand fuellstand pressure druck flow durchfluss "
+        "thrust schub",
+        ("°c", "degc", "k", "bar", "kpa", "kgf"),
+    ),
+)
+"""The first sort with a column counts; columns of later sorts were logged beside it."""
+_SUPPLY = re.compile(r"(battery|batt|bat|vbat|supply|bus|akku|batterie|versorgung)(?![a-z])")
+"""Names of a drive's supply, which is not a command."""
+_NUMBER = re.compile(
+    r"#|(sample|row|line|record|packet|frame)s?([_ ]?(no|nr|number|index))?|index|idx|no|nr|seq"
+)
+"""Names of a column that numbers the rows."""
+_QUALIFIERS = frozenset(
+    re.split(
+        " ",
+        "motor shaft actual act ist meas measured measurement gemessen signal value wert cycle "
+        "percent pct raw filt filtered",
+    )
+)
+"""Words without meaning for the role of a column."""
+_WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+(?![^\W\d_A-Z])")
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Input and output of a table, recognised by names and units.
+
+    Attributes
+    ----------
+    input : str
+        The first input where several were named.
+    output : str or None
+        None where the output is a speed from `counts`.
+    counts : str or None
+        Column of encoder counts.
+    """
+
+    input: str
+    output: str | None
+    counts: str | None = None
+
+
+def roles(
+    table: Table,
+    *,
+    inputs: Sequence[str] = (),
+    output: str | None = None,
+    counts: str | None = None,
+    time: str | None = None,
+) -> Roles | None:
+    """Input and output of a table; None if its names and units leave any doubt.
+
+    Columns that are named here keep their role, the others are recognised. Time, references, row
+    numbers, supplies and columns that never change are neither input nor output. The plain names
+    `u` and `y` come first, then a voltage or a command (a current only where there is no voltage)
+    as input and a speed or a position (a temperature, a level, a pressure or a flow only where
+    there is neither) as output. A column with both a matching name and a matching unit comes before
+    one with a single match. Where one role is decided and one column is left, that column takes the
+    other role. A recording that states the counts of one turn has its output from the column
+    `counts`.
+    """
+    time = time_column(table) if time is None else table.resolve(time)
+    named = [table.resolve(name) for name in (*inputs, output, counts) if name is not None]
+    if output is None and counts is None and table.counts_per_rev and "counts" in table:
+        counts = "counts"
+    length = max((len(table[name]) for name in table.names), default=0)
+    left = [
+        name for name in table.names
+        if name not in (time, counts, *named) and len(table[name]) == length
+        and _moves(table, name) and not is_reference(name) and _stem(name) != "speed_true"
+        and not _SUPPLY.match(_stem(name)) and not _counts_rows(table, name)
+    ]  # fmt: skip
+    given = table.resolve(inputs[0]) if inputs else _only(left, "u") or _first(table, left, _INPUTS)
+    if counts is not None:
+        given = given or (left[0] if len(left) == 1 else None)
+        return None if given is None else Roles(given, output, table.resolve(counts))
+    known = None if output is None else table.resolve(output)
+    found = known or _only(left, "y") or _first(table, left, _OUTPUTS)
+    rest = [name for name in left if name not in (given, found)]
+    if len(rest) == 1 and (given is None) != (found is None):
+        given, found = given or rest[0], found or rest[0]
+    return None if given is None or found is None or given == found else Roles(given, found)
+
+
+def recognised(
+    table: Table,
+    *,
+    inputs: Sequence[str] = (),
+    output: str | None = None,
+    counts: str | None = None,
+    time: str | None = None,
+) -> Roles:
+    """Input and output of a table, as `roles`; without an output if inputs are named and none is
+    recognised.
+
+    Raises
+    ------
+    DataError
+        If its names and units leave any doubt.
+    """
+    found = roles(table, inputs=inputs, output=output, counts=counts, time=time)
+    if found is None and inputs:
+        return Roles(inputs[0], None)
+    if found is None:
+        raise DataError(
+            name=str(table.path), expected="columns that show which is the input and which the "
+            "output", received=", ".join(table.names), remedy=f"name both{left_out(table)}",
+        )  # fmt: skip
+    return found
+
+
+def _moves(table: Table, name: str) -> bool:
+    known = table[name][np.isfinite(table[name])]
+    return len(known) > 0 and bool(known.min() < known.max())
+
+
+def _counts_rows(table: Table, name: str) -> bool:
+    if _NUMBER.fullmatch(name.lower()) is None:
+        return False
+    with np.errstate(invalid="ignore"):  # between two infinities
+        steps = np.diff(table[name])
+    return bool((steps == steps[0]).all())
+
+
+def _stem(name: str) -> str:
+    """A name in lower case, without the unit that it ends with."""
+    return unit_in_name(name)[0].lower()
+
+
+def left_out(table: Table) -> str:
+    """The end of a message: columns of the right kind that were ruled out, and why."""
+    why = list(table.unusable.values())[:3]
+    still = [name for name in table.names if not _moves(table, name)]
+    if still:
+        why.append(f"no two different numbers in {', '.join(still[:10])}")
+    return "".join(f"; {reason}" for reason in why)
+
+
+def _only(names: list[str], plain: str) -> str | None:
+    return plain if plain in names else None
+
+
+def _first(table: Table, names: list[str], sorts: Sequence[_Sort]) -> str | None:
+    """The best column of the first sort that has any; None if several match equally well."""
+    for sort in sorts:
+        scores = {name: _score(table, name, sort) for name in names}
+        best = max(scores.values(), default=0)
+        if best:
+            fitting = [name for name in names if scores[name] == best]
+            return fitting[0] if len(fitting) == 1 else None
+    return None
+
+
+def _score(table: Table, name: str, sort: _Sort) -> int:
+    """2 for a column whose name and unit both match the sort, 1 for one match, else 0."""
+    words = {word.lower() for word in _WORD.findall(unit_in_name(name)[0])} - _QUALIFIERS
+    return (bool(words) and words <= sort.words) + (table.unit(name).lower() in sort.units)
