@@ -23,6 +23,8 @@ from .dataset import (
     require_same_units,
 )
 from .dataset.experiment import without_weightless
+from .dataset.standing import SIGMAS, standing
+from .equilibrium import linearise
 from .errors import DataError, SettingError, SewfastError
 from .tables import html_of
 
@@ -31,6 +33,13 @@ VERSION = 1
 INIT = 20
 """Default number of samples that determine the initial state."""
 _STEPS_SHOWN = 4
+
+
+class AtRest(NamedTuple):
+    """The equilibrium at which an experiment begins: its output, and the state of the model."""
+
+    y: float
+    state: FloatArray
 
 
 class FreeRunJacobian(NamedTuple):
@@ -306,18 +315,43 @@ class DynamicModel(ABC):
         """The initial state of a run over an experiment, from its first `init` measured outputs.
 
         Past outputs y(-1), y(-2), .. of a lagged model, or the states of a state-space model. If
-        some of the first outputs are missing, more samples are used.
+        some of the first outputs are missing, more samples are used. An experiment that stands
+        still at the model's equilibrium and moves within these samples begins there: its response
+        must not be taken for a state.
         """
         require_init(init)
         if init == 0:
-            rest: FloatArray = self.core.rest_state()
-            return rest
+            return self.rest_state()
+        if (experiment.u[:init] != experiment.u[0]).any():
+            rest = self.standing(experiment)
+            if rest is not None:
+                return rest.state
         experiment = without_weightless(experiment)
         first = experiment.initial_samples(init)
         state: FloatArray = self.core.estimate_initial_state(
             experiment.u[:first], experiment.y[:first]
         )
         return state
+
+    def standing(self, experiment: Experiment) -> AtRest | None:
+        """The equilibrium at which an experiment stands before its inputs move, if it does."""
+        found = standing(experiment)
+        if found is None:
+            return None
+        u, states = np.array(found.u), []
+        for model in self.members or (self,):
+            small = linearise(model.core, u, level=found.y)
+            # an integrator stands at any level, so at the recorded one
+            off = abs(small.y - found.y) + abs(small.drift) * len(experiment)
+            if not off <= SIGMAS * found.scatter:
+                return None
+            states.append(small.state)
+        return AtRest(found.y, np.concatenate(states))
+
+    def rest_state(self) -> FloatArray:
+        """The state of the plant at rest, as listed in `state_names`."""
+        rest: FloatArray = self.core.rest_state()
+        return rest
 
     def _inputs(self, values: ArrayLike) -> FloatArray:
         """Inputs as (N, n_inputs)."""
@@ -348,7 +382,7 @@ class DynamicModel(ABC):
 
     def _state(self, values: ArrayLike | None) -> FloatArray:
         """An initial state for the core; None is rest."""
-        rest: FloatArray = self.core.rest_state()
+        rest = self.rest_state()
         if values is None:
             return rest
         state = real_numbers(values, "initial_state", f"numbers of shape {rest.shape}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -358,24 +358,38 @@ def judged(fit: float, error: float, noise: float, share: float) -> tuple[str, s
 
 
 def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
-    """`free_run_error` with the inputs held at their means after the initial samples."""
+    """`free_run_error` with the inputs held at their means after the initial samples.
+
+    An experiment that begins at rest would have stayed there: the mean of a single step is nearly
+    the step itself.
+    """
     means = np.mean(np.concatenate([e.u for e in data.experiments]), axis=0)
-    resting = []
+    held = []
     for e in data.experiments:
         u = e.u.copy()
         u[e.initial_samples(init) :] = means
-        resting.append(replace(e, u=u))
-    return free_run_error(model, data, replace(data, experiments=tuple(resting)), init)
+        held.append(replace(e, u=u))
+
+    def run() -> list[FloatArray]:
+        runs = model.simulate(replace(data, experiments=tuple(held)), init=init)
+        rests = [model.standing(e) for e in data.experiments]
+        return [y if s is None else np.full(len(y), s.y) for y, s in zip(runs, rests, strict=True)]
+
+    return _error(run, data, init)
 
 
-def free_run_error(model: DynamicModel, data: Dataset, inputs: Dataset, init: int) -> float:
-    """Root mean square error of the free run on `inputs` against the outputs of `data`.
+def free_run_error(model: DynamicModel, data: Dataset, init: int) -> float:
+    """Root mean square error of the free run.
 
     Weighted, over the known outputs after the initial samples [output unit]; infinite if the free
     run diverges.
     """
+    return _error(lambda: model.simulate(data, init=init), data, init)
+
+
+def _error(simulated: Callable[[], list[FloatArray]], data: Dataset, init: int) -> float:
     try:
-        runs = model.simulate(inputs, init=init)
+        runs = simulated()
     except (DataError, FitError):
         return math.inf
     squares, weights = [], []

@@ -19,9 +19,9 @@ import sewfast
 from cli import called as command
 from kinds import CASES, TS, levels, model_of, recording
 from sewfast import Controller, Dataset, Ensemble, Gains, Model
+from sewfast.equilibrium import linearise
 from sewfast.errors import DataError, ModelFileError, SettingError, SewfastError
 from sewfast.evidence import bands
-from sewfast.evidence.operating import linearise
 from sewfast.models.files import from_dict
 from sewfast.trust import judge
 

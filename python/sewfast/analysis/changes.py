@@ -150,7 +150,12 @@ def with_gain(model: Model, factor: float) -> Model:
     """The model with its output multiplied by a factor."""
     if not isinstance(model, SingleModel):
         raise SettingError("gain: expected a single model, received an ensemble; take its members")
-    return _changed(model, **model.with_output_scaled(factor))
+    scaled = _changed(model, **model.with_output_scaled(factor))
+    assert isinstance(scaled, SingleModel)
+    # the level at rest stays
+    moved = (factor - 1.0) * model.rest.y
+    parameters = scaled.with_zero_at(np.zeros(len(model.input_names)), moved) if moved else {}
+    return _changed(scaled, **(parameters or {}))
 
 
 def with_delay(model: Model, samples: int) -> Model:

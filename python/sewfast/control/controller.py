@@ -16,6 +16,9 @@ from ..tables import html_of
 from ..units import counts_per_unit
 from .biquad import MOST, NUMBERS, Biquad
 
+if TYPE_CHECKING:
+    from ..models.rest import Rest
+
 GAIN_NAMES = ("Kp", "Ti", "Td")
 NOTCH_NAMES = ("notch_frequency", "notch_depth", "notch_width")
 SETTINGS = (
@@ -88,6 +91,25 @@ class SampledController:
     def core(self) -> _core._Controller:
         """The compiled controller, at rest."""
         raise NotImplementedError
+
+    def about(self: _Kind, rest: Rest) -> _Kind:
+        """The same controller for deviations from a level of command and output.
+
+        Raises
+        ------
+        SettingError
+            For a gain schedule, which depends on the output itself, about another level than zero.
+        """
+        if rest.is_zero:
+            return self
+        if getattr(self, "schedule", ()) and rest.y != 0.0:
+            raise SettingError(
+                name="schedule", expected="constant gains for a plant that does not rest at 0",
+                received=f"a schedule over the output, with a rest at {rest.y:g}",
+                remedy="leave the schedule out, or identify the model from data that begin at 0",
+            )  # fmt: skip
+        low, high = self.u_min - rest.u[0], self.u_max - rest.u[0]
+        return replace(self, u_min=low, u_max=high)  # type: ignore[type-var]
 
     def sent(self) -> tuple[int, list[float]]:
         """Number of the kind and its parameters, as sent to a device (docs/PROTOCOL.md)."""

@@ -65,15 +65,18 @@ _MOST_TUNED = 60_000
 
 
 def recorded_limits(models: Sequence[Any]) -> tuple[float, float] | None:
-    """Least and largest command that the models were identified on, 0 included; None if unknown.
+    """Least and largest command that the models were identified on, and at rest; None if unknown.
 
-    0 is the command of a drive at rest, which a controller must be able to give.
+    A controller must be able to give the command of a plant at rest: 0, unless the record shows
+    another by standing still.
     """
     known = [r[0] for m in models if isinstance(m, Model) for r in _stored(m, "input_range")]
     ends = [float(end) for pair in known for end in pair]
     if not ends or not np.isfinite(ends).all() or not any(ends):
         return None
-    return min(0.0, *ends), max(0.0, *ends)
+    rests = [m.rest for m in models if isinstance(m, Model)]
+    ends += [r.u[0] if r.source == "standing samples" else 0.0 for r in rests]
+    return min(ends), max(ends)
 
 
 def _stored(model: Model, name: str) -> list[Any]:
@@ -144,7 +147,7 @@ class DriveStep:
     fopdt : Fopdt
         First order with dead time.
     rest : float
-        Output at a command of 0 [y].
+        Output at the command of rest [y].
     slowest : float
         The dominant time constant [s]: for a response with overshoot, a third of the time until it
         stays within 5 %.
@@ -177,25 +180,25 @@ def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
         If no step settles.
     """
     require_one_input(model)
-    size = u_max if u_max >= -u_min else u_min
+    size, about = _largest_step(model, u_min, u_max), model.rest
     if not np.isfinite(size) or size == 0.0:
         raise SettingError(
             name="u_min, u_max",
-            expected="finite limits of the command, not both 0, to size a step by",
+            expected=f"finite limits of the command, not both {about.u[0]:g}, to size a step by",
             received=f"{u_min} and {u_max}", remedy="give the amplifier's limits",
         )  # fmt: skip
     reason: Exception | None = None
     for u, at in _steps(size):
         try:
-            y = model.core.simulate(u[:, None], model.core.rest_state())
-            fopdt = fit_fopdt(u, y, Ts=model.Ts)
+            y = _from_rest(model, u)
+            fopdt = fit_fopdt(u + about.u[0], y, Ts=model.Ts)
         except (DataError, FitError) as error:
             reason = error
             continue
         return DriveStep(fopdt, float(y[at - 1]), _slowest(fopdt, y[at:], model.Ts))
     raise FitError(
         name="model", expected="one whose step response settles",
-        received=f"none up to u = {0.5 * size:g} ({reason})",
+        received=f"none up to u = {about.u[0] + 0.5 * size:g} ({reason})",
         remedy="give a controller to start from",
     ) from reason  # fmt: skip
 
@@ -210,17 +213,17 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
     FitError
         If the rate settles after no step.
     """
-    size = u_max if u_max >= -u_min else u_min
+    size = _largest_step(model, u_min, u_max)
     pole = integrating_pole(model)
     if pole is None or not _moves_on(model, _STEP_SHARES[0] * size):
         return None
     reason: Exception | None = None
     for u, _ in _steps(size):
-        y = model.core.simulate(u[:, None], model.core.rest_state())
+        y = _from_rest(model, u)
         try:
             # exclude the decay of a pole slightly below 1 from the rate
             rate = (y[1:] - y[0] - pole * (y[:-1] - y[0])) / model.Ts
-            fopdt = fit_fopdt(u[1:], rate, Ts=model.Ts)
+            fopdt = fit_fopdt(u[1:] + model.rest.u[0], rate, Ts=model.Ts)
         except (DataError, FitError) as error:
             reason = error
             continue
@@ -231,8 +234,21 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
     ) from reason  # fmt: skip
 
 
+def _largest_step(model: Model, u_min: float, u_max: float) -> float:
+    """The larger of the two changes of the command from rest to its limits [u]."""
+    up, down = u_max - model.rest.u[0], u_min - model.rest.u[0]
+    return up if up >= -down else down
+
+
+def _from_rest(model: Model, u: FloatArray) -> FloatArray:
+    """The free run from rest under changes of the command [u], shape (N,)."""
+    core = model.about_rest
+    y: FloatArray = core.simulate(u[:, None], core.rest_state()) + model.rest.y
+    return y
+
+
 def _steps(size: float) -> Iterator[tuple[FloatArray, int]]:
-    """Commands with a step, and its sample: from small to large, from short to long."""
+    """Changes of the command with a step, and its sample: small to large, short to long."""
     for share in _STEP_SHARES:
         for samples in _STEP_SAMPLES:
             u = np.zeros(samples)
@@ -249,7 +265,7 @@ def _slowest(fopdt: Fopdt, y: FloatArray, Ts: float) -> float:
 
 def moves_on(model: Model, u_min: float, u_max: float) -> bool:
     """Whether the output keeps moving as long as a command acts, so that no step settles."""
-    size = u_max if u_max >= -u_min else u_min
+    size = _largest_step(model, u_min, u_max)
     return (
         bool(np.isfinite(size))
         and integrating_pole(model) is not None
@@ -263,10 +279,10 @@ def _moves_on(model: Model, size: float) -> bool:
     A pole at 1 that a zero nearly cancels does not integrate.
     """
     samples = _STEP_SAMPLES[-1]
-    u = np.zeros((samples, 1))
+    u = np.zeros(samples)
     # after some samples, as the model's rest state assumes the first command before the start
     u[samples // 20 :] = size
-    y = model.core.simulate(u, model.core.rest_state())
+    y = _from_rest(model, u)
     return bool(abs(y[-1] - y[samples // 2]) > _MOVES_ON * abs(y[-1] - y[0]))
 
 
@@ -291,6 +307,8 @@ def catalogue_fits(model: Any, u_min: float, u_max: float, unit: str) -> bool:
     known = _output_range(model) if isinstance(model, Model) else None
     if known is None:
         return True
+    if not model.rest.is_zero:
+        return False  # the catalogue begins at a standstill
     try:
         fopdt = drive_step(model, u_min, u_max).fopdt
     except (FitError, SettingError):
@@ -349,8 +367,9 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
         if pace is None or not math.isfinite(high - low):
             raise
         # the command that holds a level is unknown: use the recorded range alone
-        top = _RECORDED * (high if abs(high) >= abs(low) else low)
-        return _Span(0.0, 0.0, top, 0.0, 4.0 * pace)
+        rest = model.rest.y
+        way = high - rest if abs(high - rest) >= abs(low - rest) else low - rest
+        return _Span(rest, rest, rest + _RECORDED * way, rest, 4.0 * pace)
     fopdt, rest = step.fopdt, step.rest
     reach = [fopdt.K * u + fopdt.offset - rest for u in (u_min, u_max)]
     up = max(0.0, min(_RECORDED * (high - rest), _REACHED * max(reach)))

@@ -19,6 +19,7 @@ from ..errors import DataError, FitError, SettingError
 from ..gains import Gains, vector
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
+from ..models.rest import Rest
 from ..tables import Table, percent, significant
 from ..units import duration, spelled
 from .controller import Controller, SampledController, pid_of
@@ -274,10 +275,11 @@ def run(
             controller, on, r, title, cancel, file=file, live=live, overwrite=overwrite
         )
     check_fits(controller, on)
+    rest = common_rest([on])
     record = _core.closed_loop(
-        single_core(on),
-        controller.core(),
-        r,
+        single_core(on, rest),
+        controller.about(rest).core(),
+        r - rest.y,
         counts_per_unit=controller.counts_per_unit,
         feedforward=extra.get("feedforward"),
         disturbance=extra.get("disturbance"),
@@ -285,7 +287,7 @@ def run(
     return ClosedLoopRun(
         t=np.arange(len(r), dtype=np.float64) * controller.Ts,
         r=r,
-        **record,
+        **_from(rest, record),
         controller=controller,
         plant=plant_name(on),
         reference=title,
@@ -425,9 +427,30 @@ def plant_units(plant: Plant) -> tuple[str, str]:
     return plant.input_units[0], plant.output_unit
 
 
-def single_core(plant: Plant) -> Any:
-    """The compiled plant of one run: for an ensemble its first member, the best one."""
-    return plant.members[0].core if isinstance(plant, Ensemble) else plant.core
+def single_core(plant: Plant, rest: Rest) -> Any:
+    """The compiled plant of one run about a rest: of an ensemble its first member, the best one."""
+    if not isinstance(plant, Model):
+        return plant.core
+    return (plant.members[0] if isinstance(plant, Ensemble) else plant).about(rest)
+
+
+def common_rest(plants: Sequence[Any]) -> Rest:
+    """The rest about which loops run on these plants: that of the first one, zero for machines.
+
+    A loop is computed in deviations from rest: there a controller that is switched on without a
+    bump begins at zero, and a constant added to input or output changes no gain.
+    """
+    if all(isinstance(plant, Model) for plant in plants):
+        return plants[0].rest  # type: ignore[no-any-return]
+    return Rest((0.0,), 0.0)
+
+
+def _from(rest: Rest, record: dict[str, FloatArray]) -> dict[str, FloatArray]:
+    """The signals of a run in deviations from rest, with the level added again."""
+    if rest.is_zero:
+        return record
+    levels = {"u": rest.u[0], "y": rest.y, "feedback": rest.y}
+    return {name: values + levels[name] for name, values in record.items()}
 
 
 def plant_name(plant: Plant) -> str:

@@ -74,7 +74,7 @@ def searched(task: Task, *, wants_network: bool = False) -> Model:
     if not parts:
         reason = (
             f"the record is too short to hold out {100 * SHARE:.0f} % of every experiment, at "
-            f"least {LEAST_HELD_OUT} samples, to compare on; or nothing moves before"
+            f"least {LEAST_HELD_OUT} samples, to compare on; or nothing moves before, or only once"
         )
         if wants_network:
             raise FitError(f"{task.data.source}: {reason}; record longer, or give validation data")

@@ -25,6 +25,7 @@ from ..threads import Workers, available, require_workers
 from . import choice, further, grey_box, lagged, linear
 from .folds import TEXTS, UNSEEN_DATA, Split, thinned, verdict
 from .outputs import OUTPUTS
+from .rest import with_rest
 from .task import Clock, Progress, Provenance, Task, with_provenance
 from .training import Structure
 
@@ -227,10 +228,11 @@ def identify(
         if "verdict" not in found.training:
             own = _verdict(found, task.data, task.validation)
             found = with_provenance(found, {"verdict": own})
+        excerpt = _excerpt(found, task.data, clock)
         if not clock.can_close:
             clock.lose("evidence")
-            return _with_losses(found, clock)
-        return with_training_evidence(_with_losses(found, clock), _excerpt(found, task.data, clock))
+            return with_rest(_with_losses(found, clock), excerpt)
+        return with_rest(with_training_evidence(_with_losses(found, clock), excerpt), excerpt)
     except KeyboardInterrupt:
         raise Interrupted(found) from None
 

@@ -123,11 +123,14 @@ def _whole(data: Dataset, skipped: float) -> tuple[list[Experiment], list[Experi
 def folds(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]:
     """Forward chaining: the last fifth after all data before it, then the fifth before, and so on.
 
-    The newest fold comes first; there is none if experiments are too short. Validation data, if
-    given, are the only fold.
+    The newest fold comes first; there is none if experiments are too short, or if the inputs move
+    only once: what follows a single step is its response, in the fitted part as in the held one.
+    Validation data, if given, are the only fold.
     """
     if validation is not None:
         return (Split(data, validation, is_given=True, sources=tuple(sources(validation))),)
+    if sum(int((np.diff(e.u, axis=0) != 0.0).any(axis=1).sum()) for e in data.experiments) < 2:
+        return ()
     found = (split(data, skipped=i * SHARE) for i in range(FOLDS))
     return tuple(f for f in found if f is not None and f.scored and _moves(f.fitted))
 
@@ -300,7 +303,7 @@ def verdict(
         things to do, the most important one first.
     """
     # `error` can come from other samples; the share explained by the input needs the same ones
-    own = free_run_error(model, part.held, part.held, INIT)
+    own = free_run_error(model, part.held, INIT)
     error = own if error is None else error
     spread = part.spread
     fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")

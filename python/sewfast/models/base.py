@@ -17,6 +17,7 @@ from ..errors import FitError, SettingError
 from ..evidence import Bands, OperatingPoint, ReportCard, bands, check, operating_range
 from ..storage import Fields
 from ..validation import Validation, validate
+from .rest import Rest
 
 _OF_LINEAR_MODELS = (
     "dc_gain", "frequency_response", "poles", "steady_output", "to_continuous", "to_control",
@@ -57,6 +58,37 @@ class Model(DynamicModel):
     def members(self) -> tuple[Model, ...]:
         """The members of an ensemble; empty for a single model."""
         return ()
+
+    @cached_property
+    def rest(self) -> Rest:
+        """The level at which the plant stands still, as `identify` found it; else zero.
+
+        Free runs from rest, closed loops and default references begin there.
+        """
+        known = self.training.get("rest")
+        if known is None:
+            return Rest((0.0,) * len(self.input_names), 0.0)
+        return Rest(tuple(map(float, known["u"])), float(known["y"]), str(known.get("source", "")))
+
+    def rest_state(self) -> FloatArray:
+        # deviations from rest are zero there, so that past outputs are the level at rest
+        state: FloatArray = self.about_rest.rest_state()
+        return state + self.rest.y if "na" in self.orders else state
+
+    @cached_property
+    def about_rest(self) -> Any:
+        """The compiled model of the deviations from rest; at a rest of zero the model itself."""
+        return self.about(self.rest)
+
+    @abstractmethod
+    def about(self, rest: Rest) -> Any:
+        """The compiled model of the deviations of inputs and output from a level.
+
+        Raises
+        ------
+        SettingError
+            For a kind that has a zero of its own: the equations of a motor, an output without sign.
+        """
 
     def linearise(self, u: ArrayLike | None = None) -> OperatingPoint:
         """The linear model about the equilibrium at constant inputs.
@@ -142,6 +174,27 @@ class SingleModel(Model):
         """The parameters that change if the input acts some samples later."""
         return {"nk": self.parameters()["nk"] + samples}
 
+    def with_zero_at(self, u: FloatArray, y: float) -> dict[str, Any] | None:
+        """The parameters that change if inputs and output are counted from `u` (nu,) and `y`.
+
+        None for a kind that has a zero of its own.
+        """
+        return None
+
+    def about(self, rest: Rest) -> Any:
+        if rest.is_zero:
+            return self.core
+        moved = self.with_zero_at(np.array(rest.u), rest.y)
+        if moved is None:
+            raise SettingError(
+                name="rest", expected=f"zero for {self.title}, which has a zero of its own",
+                received=f"input {', '.join(f'{v:g}' for v in rest.u)}, output {rest.y:g}",
+                remedy="identify another kind of model",
+            )  # fmt: skip
+        from .files import from_dict
+
+        return from_dict({**self.to_dict(), "parameters": {**self.parameters(), **moved}}).core
+
 
 class Fitted(Protocol):
     """A compiled fit: the model, its cost and its termination."""
@@ -180,7 +233,7 @@ COMBINATIONS: tuple[Combine, ...] = ("median", "mean")
 MOST_MEMBERS = 1000
 LEAST_SHARE = 0.5
 """Part of the members that must not diverge for the ensemble to have a run."""
-_OF_ALL_MEMBERS = ("input_range", "output_range", "region")
+_OF_ALL_MEMBERS = ("input_range", "output_range", "region", "rest")
 """Entries that a file stores once for all members."""
 
 
@@ -348,6 +401,14 @@ class Ensemble(Model):
             states.append(rows[:, at + p : at + p + s])
             at += p + s
         return FreeRunJacobian(y, np.hstack(theta), np.hstack(states))
+
+    def about(self, rest: Rest) -> Any:
+        if rest.is_zero:
+            return self.core
+        return EnsembleCore(tuple(m.about(rest) for m in self.members), self.combine)
+
+    def rest_state(self) -> FloatArray:
+        return np.concatenate([m.rest_state() for m in self.members])
 
     def parameters(self) -> dict[str, Any]:
         members = [

@@ -121,6 +121,11 @@ def _training(training: Fields, inputs: int) -> Mapping[str, Any]:
         if ranges.shape != (inputs, 2) or (ranges[:, 0] > ranges[:, 1]).any():
             expected = f"{inputs} pairs of numbers, the lower one first"
             raise training.refuse("input_range", expected, known["input_range"])
+    if "rest" in known:
+        rest = training.object("rest")
+        rest.number("y")
+        if len(rest.vector("u")) != inputs:
+            raise rest.refuse("u", f"{inputs} inputs at rest", known["rest"].get("u"))
     if "data" in known:
         for source in training.objects("data"):
             source.text("name")

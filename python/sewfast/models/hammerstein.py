@@ -103,6 +103,14 @@ class HammersteinWiener(StructuredModel):
         ends = {k: factor * s[k] for k in ("x_low", "x_high")}
         return {**ends, "theta": theta.tolist()}
 
+    def with_zero_at(self, u: FloatArray, y: float) -> dict[str, Any]:
+        s, theta = self.settings, self.core.theta
+        na, end = s["na"], s["na"] + s["nb"] * len(self.input_names)
+        push = theta[na:end].reshape(len(self.input_names), -1).sum(axis=1) @ u
+        theta[end] += push - (1.0 + theta[:na].sum()) * y
+        ends = {k: (s[k] - u).tolist() for k in ("input_low", "input_high")}
+        return {**ends, "x_low": s["x_low"] - y, "x_high": s["x_high"] - y, "theta": theta.tolist()}
+
     @staticmethod
     def core_from(fields: Fields) -> _core.HammersteinWiener:
         """The compiled model from the parameters of a file."""

@@ -74,6 +74,9 @@ class LinearDifference(SingleModel):
     def with_output_scaled(self, factor: float) -> dict[str, Any]:
         return {"b": (factor * self.core.b).tolist(), "offset": factor * self.core.offset}
 
+    def with_zero_at(self, u: FloatArray, y: float) -> dict[str, Any]:
+        return {"offset": self.core.offset - offset_at(self.core, u, y)}
+
     @staticmethod
     def core_from(fields: Fields) -> _core.LinearModel:
         """The compiled model from the parameters of a file."""

@@ -31,6 +31,14 @@ class _Network(SingleModel):
         scales = self.settings
         return {k: (factor * np.asarray(scales[k])).tolist() for k in ("y_mean", "y_scale")}
 
+    def with_zero_at(self, u: FloatArray, y: float) -> dict[str, Any] | None:
+        s = self.settings
+        # an output without sign has its own zero
+        if y != 0.0 and s.get("output") == "abs":
+            return None
+        moved = {"u_mean": np.asarray(s["u_mean"]) - u, "y_mean": np.asarray(s["y_mean"]) - y}
+        return {name: values.tolist() for name, values in moved.items()}
+
 
 # --- The network output-error model ---------------------------------------------------------------
 

@@ -258,7 +258,7 @@ def pareto(
     try:
         found = _core.pareto(
             task.core(variables, ms="Ms" in names),
-            others=[tuned.pid.core()],
+            others=[tuned.pid.about(task.rest).core()],
             objectives=names,
             size=whole("size", size),
             evaluations=rest,

@@ -289,8 +289,8 @@ class LoadStep:
             if getattr(self, name) == 0.0:
                 raise SettingError(f"expected a {name} of a load step other than 0, got 0")
 
-    def samples(self, Ts: float) -> tuple[FloatArray, FloatArray, float, int]:
-        """Reference [y], disturbance [u], band [y] and samples of the mean.
+    def samples(self, Ts: float, rest: float = 0.0) -> tuple[FloatArray, FloatArray, float, int]:
+        """Reference as a deviation from rest [y], disturbance [u], band [y], samples of the mean.
 
         Raises
         ------
@@ -308,7 +308,7 @@ class LoadStep:
         share = np.minimum(1.0, k * Ts / self.ramp) if self.ramp > 0.0 else np.ones(len(k))
         assert self.band is not None
         return (
-            self.level * share,
+            (self.level - rest) * share,
             np.where(k < on, 0.0, self.disturbance),
             self.band,
             max(1, round(self.mean / Ts)),

@@ -506,7 +506,7 @@ def costs(
             check_fits(controller, plant)
     judged = _core.tuning_costs(
         task.core(),
-        [c.core() for c in given],
+        [c.about(task.rest).core() for c in given],
         threads=threads_or_all(threads),
         progress=progress,
     )

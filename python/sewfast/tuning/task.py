@@ -30,6 +30,7 @@ from ..control.loop import (
     Plants,
     References,
     check_fits,
+    common_rest,
     each_plant,
     each_reference,
     plant_units,
@@ -39,6 +40,7 @@ from ..control.margins import margins, sampled
 from ..errors import FitError, SettingError
 from ..gains import Gains, real, vector, whole
 from ..models import Model
+from ..models.rest import Rest
 from ..progress import TimeUp, latest
 from ..rules import Fopdt, Rule, table_1
 from ..threads import available
@@ -114,6 +116,11 @@ class TuningTask:
             assumed=_assumed(start, given, derived=derived),
         )
 
+    @property
+    def rest(self) -> Rest:
+        """The level at which the loops begin."""
+        return common_rest(self.plants)
+
     def core(self, names: Sequence[Wanted] | None = None, *, ms: bool = False) -> _core._Task:
         """The task for the core, with variables by name; `ms` if Ms is an objective."""
         asked = ms or self.constraints.Ms is not None
@@ -124,12 +131,13 @@ class TuningTask:
                 "those that the controller has to serve",
             )  # fmt: skip
         loops, measured = self._loops() if asked else ([], [])
+        rest = self.rest
         return {
-            "plants": [plant.core for plant in self.plants],
-            "references": self.references,
+            "plants": [p.about(rest) if isinstance(p, Model) else p.core for p in self.plants],
+            "references": [r - rest.y for r in self.references],
             "disturbances": self.disturbances,
-            "load_steps": [step.samples(self.start.Ts) for step in self.loads],
-            "start": self.start.core(),
+            "load_steps": [step.samples(self.start.Ts, rest.y) for step in self.loads],
+            "start": self.start.about(rest).core(),
             "counts_per_unit": self.start.counts_per_unit,
             "variations": self.variations,
             "variables": wanted(
@@ -182,9 +190,11 @@ def out_of_reach(task: TuningTask) -> str | None:
         fopdt = drive_step(plant, start.u_min, start.u_max).fopdt
     except (FitError, SettingError):
         return None  # its reach is unknown
-    low, high = sorted(gain * (fopdt.K * u + fopdt.offset) for u in (start.u_min, start.u_max))
+    rest = plant.rest.y
+    reach = (fopdt.K * u + fopdt.offset for u in (start.u_min, start.u_max))
+    low, high = sorted(rest + gain * (y - rest) for y in reach)
     top, bottom = max(r.max() for r in task.references), min(r.min() for r in task.references)
-    if bottom >= min(low, 0.0) and top <= max(high, 0.0):
+    if bottom >= min(low, rest) and top <= max(high, rest):
         return None
     unit = f" {start.y_unit}" if start.y_unit else ""
     return (
@@ -211,8 +221,10 @@ def close_to_instability(
         return None
     low = min(float(r.min()) for r in task.references)
     high = max(float(r.max()) for r in task.references)
-    # at 0, in the middle of references of both signs, a motor stands in its dry friction
-    levels = [0.5 * (low + high), *(0.5 * end for end in (high, low) if end != 0.0)]
+    # at rest, in the middle of references of both signs, a motor stands in its dry friction
+    rest = task.rest.y
+    halves = (rest + 0.5 * (end - rest) for end in (high, low) if end != rest)
+    levels = [0.5 * (low + high), *halves]
     levels += [speed for speed, _ in controller.schedule]
     found, about, linear = 0.0, 0.0, True
     for plant in task.plants:

@@ -74,6 +74,7 @@ impl<'a> Samples<'a> {
             y: self.y,
             unmeasured: 0,
             weights: self.weights,
+            rests: false,
         }
     }
 }
@@ -170,6 +171,8 @@ pub struct Record<'a> {
     pub unmeasured: usize,
     /// How much the squared error of each sample counts, finite and 0 or more; all alike where there are none.
     pub weights: Option<&'a [f64]>,
+    /// Whether the plant stood still before the first sample: at the equilibrium of the inputs there.
+    pub rests: bool,
 }
 
 impl<'a> Record<'a> {
@@ -208,6 +211,20 @@ impl<'a> Record<'a> {
             weights: unless_one(weights),
             ..self
         })
+    }
+
+    /// The same record of a plant that stood still before its first sample, or not.
+    pub fn at_rest(self, rests: bool) -> Self {
+        Self { rests, ..self }
+    }
+
+    /// Whether the inputs keep their first values for so many measured outputs, and move later.
+    pub fn begins_held(&self, outputs: usize) -> bool {
+        let rows = self.u.chunks_exact(self.channels);
+        let held = rows
+            .take_while(|row| *row == &self.u[..self.channels])
+            .count();
+        held < self.len() && self.y[..held].iter().filter(|y| !y.is_nan()).count() >= outputs
     }
 
     /// The weight of sample `k`.

@@ -86,7 +86,7 @@ pub fn fit_fopdt(record: Record<'_>, ts: f64, monitor: &Monitor) -> Result<Fopdt
     Ok(Fopdt {
         k: gain,
         t: best.t * ts,
-        l: best.l * ts,
+        l: (best.l + step.early) * ts,
         offset: best.level - gain * step.u_low,
         u_low: step.u_low,
         u_high: step.u_high,
@@ -103,6 +103,9 @@ struct Step<'a> {
     y: &'a [f64],
     /// The sample from which on the input is at its new level.
     at: usize,
+    /// How long before that sample the step came, less than one sample: resampled inputs are averaged, so that the sample of the
+    /// step lies between the levels.
+    early: f64,
     u_low: f64,
     u_high: f64,
     /// Which samples have weight.
@@ -147,13 +150,22 @@ impl<'a> Step<'a> {
         let next_after = |from: usize| {
             (from + 1..u.len()).find(|&k| threshold > 0.0 && (u[k] - u[k - 1]).abs() > threshold)
         };
-        let at = next_after(0).ok_or_else(|| {
+        let mut at = next_after(0).ok_or_else(|| {
             Error::data(
                 "expected a step in the input, got one that stays where it is or only drifts; record some samples \
                  before the step too",
             )
         })?;
-        let end = next_after(at).unwrap_or(u.len());
+        let mut end = next_after(at).unwrap_or(u.len());
+        let before = at;
+        let mut early = 0.0;
+        // one sample between two levels: the step came within the time that it stands for
+        let between = at + 1 < u.len() && (u[at + 1] - u[at]) * (u[at] - u[at - 1]) > 0.0;
+        if end == at + 1 && between {
+            early = (u[at] - u[at - 1]) / (u[at + 1] - u[at - 1]);
+            at += 1;
+            end = next_after(at).unwrap_or(u.len());
+        }
         if end - at < FEWEST {
             return Err(Error::data(format!(
                 "expected at least {FEWEST} samples at the input's new level, got {} from sample {at} on; record a \
@@ -165,7 +177,8 @@ impl<'a> Step<'a> {
         Ok(Self {
             y: &record.y[..end],
             at,
-            u_low: mean(&u[..at]),
+            early,
+            u_low: mean(&u[..before]),
             u_high: mean(&u[at..end]),
             used: vec![true; end],
             moving: false,
@@ -206,8 +219,9 @@ impl<'a> Step<'a> {
                 moving: true,
                 ..*self
             };
-            // what helps at the best point of the other search is worth one of its own
-            if clearly(&in_motion.candidate(from_rest.t, from_rest.l)) {
+            // What helps at the best point of the other search is worth one of its own. A plant whose samples before the step
+            // stand still did not move: what helps then is a second lag, which this response is not.
+            if confidence::drifts(self) && clearly(&in_motion.candidate(from_rest.t, from_rest.l)) {
                 let found = in_motion.search();
                 if clearly(&found) && confidence::moves(&in_motion, &found) {
                     self.moving = true;
@@ -258,7 +272,7 @@ impl<'a> Step<'a> {
     fn search(&self) -> Candidate {
         let (mut ln_t, mut l) = (
             (0.05_f64.ln(), (4.0 * self.length()).ln()),
-            (0.0, self.length() / 2.0),
+            (-self.early, self.length() / 2.0),
         );
         let mut best = self.candidate(self.length() / 5.0, 0.0);
         for _ in 0..ROUNDS {
@@ -274,7 +288,7 @@ impl<'a> Step<'a> {
                 }
             }
             ln_t = narrowed(ln_t, best.t.ln(), f64::NEG_INFINITY);
-            l = narrowed(l, best.l, 0.0);
+            l = narrowed(l, best.l, -self.early);
         }
         // The sum of T and L is what a response tells best; how it is shared between them the grid can miss by a whole basin where
         // T is a small part of it.
@@ -300,7 +314,7 @@ impl<'a> Step<'a> {
             let Some((t, l)) = confidence::step(self, &best, false) else {
                 return best;
             };
-            let held = best.l + l < 0.0 || best.l + l > self.length() / 2.0;
+            let held = best.l + l < -self.early || best.l + l > self.length() / 2.0;
             // at the edge of dead times T goes alone
             let (t, l) = if held {
                 confidence::step(self, &best, true).unwrap_or((t, l))
@@ -308,7 +322,7 @@ impl<'a> Step<'a> {
                 (t, l)
             };
             let at = |share: f64| {
-                let l = (best.l + share * l).clamp(0.0, self.length() / 2.0);
+                let l = (best.l + share * l).clamp(-self.early, self.length() / 2.0);
                 let t = best.t + share * t;
                 (t > 0.0).then(|| self.candidate(t, l))
             };
@@ -324,7 +338,7 @@ impl<'a> Step<'a> {
 
     /// Level, rise and free response by least squares for one `T` and `L`.
     fn candidate(&self, t: f64, l: f64) -> Candidate {
-        let first = self.at + l.floor() as usize + 1;
+        let first = (self.at as f64 + l.floor() + 1.0) as usize;
         let decay = (-1.0 / t).exp();
         let mut left = (-(first as f64 - self.at as f64 - l) / t).exp();
         let mut free = if self.moving { 1.0 } else { 0.0 };

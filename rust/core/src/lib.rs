@@ -6,6 +6,7 @@
 
 pub mod arx;
 pub mod closed_loop;
+mod colour;
 pub mod data;
 mod descent;
 pub mod embedded;

@@ -298,6 +298,9 @@ pub(crate) fn spread(information: &DMatrix<f64>, variance: f64) -> Option<DMatri
 /// What is left of the first `kept` rows and columns of an information matrix when the others are free, too.
 pub(crate) fn without_nuisance(information: &DMatrix<f64>, kept: usize) -> Option<DMatrix<f64>> {
     let others = information.nrows() - kept;
+    if others == 0 {
+        return Some(information.clone());
+    }
     let mut nuisance = information
         .view((kept, kept), (others, others))
         .into_owned();

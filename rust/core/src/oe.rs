@@ -20,7 +20,15 @@ const ABOUT_AS_WELL: f64 = 1.05;
 /// Iterations after which the refined candidates are compared and the best one goes on alone.
 const HEAT: usize = 30;
 
+/// Measured outputs under the first inputs from which a plant can be seen to stand: two always lie on a line.
+const HELD: usize = 3;
+
 /// Fits `LinearModel` in free run over all experiments, with an initial state per experiment.
+///
+/// Records whose inputs are held at first are fitted a second time, from the model's own equilibrium under these inputs: a
+/// free state could take over the response to a step soon after the start, and nothing would tell the gain. The free states
+/// are kept if they lower the Bayesian information criterion (Schwarz, *Ann. Stat.* 6, 1978) of as many independent samples
+/// as the colour of the residuals leaves: then the plant was moving before the record began.
 ///
 /// Least squares is biased by measurement noise, so its model is one candidate among others: instrumental-variable
 /// iterations (SRIV, Young 1976; Steiglitz and McBride 1965) and fixed sets of real and complex poles over the whole
@@ -55,15 +63,19 @@ pub fn fit(
     monitor: &Monitor,
 ) -> Result<LinearFit> {
     let lags = arx::check(records, na, nb, nk)?;
-    let mut problem = OutputError::new(records, lags, offset, monitor)?;
-    monitor.set_total((max_iterations + (REFINED - 1) * HEAT) as u64);
-    let from_pieces = excerpt(records)
-        .and_then(|pieces| searched_in(&pieces, &mut problem, max_iterations, monitor));
-    let (best, spent) = match from_pieces {
-        Some(found) => found,
-        None => searched(&mut problem, records, max_iterations, monitor).ok_or_else(no_model)?,
-    };
-    finished(problem, best, spent, max_iterations, monitor)
+    let iterations = max_iterations + (REFINED - 1) * HEAT;
+    from_rest_or_motion(records, iterations, monitor, |records| {
+        let mut problem = OutputError::new(records, lags, offset, monitor)?;
+        let from_pieces = excerpt(records)
+            .and_then(|pieces| searched_in(&pieces, &mut problem, max_iterations, monitor));
+        let (best, spent) = match from_pieces {
+            Some(found) => found,
+            None => {
+                searched(&mut problem, records, max_iterations, monitor).ok_or_else(no_model)?
+            }
+        };
+        finished(problem, best, spent, max_iterations, monitor)
+    })
 }
 
 /// [`fit`] from one model instead of a search over many: for data that a model is known to describe nearly.
@@ -93,14 +105,61 @@ pub fn fit_from(
             lags.channels
         )));
     }
-    let mut problem = OutputError::new(records, lags, offset, monitor)?;
-    monitor.set_total(max_iterations as u64);
-    let (cost, theta) = problem
-        .with_states(initial)
-        .or_else(|| problem.with_poles(&stabilised(initial.a())))
-        .ok_or_else(no_model)?;
-    let start = unfinished(cost, theta, Termination::MaxIterations);
-    finished(problem, start, 0, max_iterations, monitor)
+    from_rest_or_motion(records, max_iterations, monitor, |records| {
+        let mut problem = OutputError::new(records, lags, offset, monitor)?;
+        let (cost, theta) = problem
+            .with_states(initial)
+            .or_else(|| problem.with_poles(&stabilised(initial.a())))
+            .ok_or_else(no_model)?;
+        let start = unfinished(cost, theta, Termination::MaxIterations);
+        finished(problem, start, 0, max_iterations, monitor)
+    })
+}
+
+/// The fit with free initial states, or that from rest if the free states do not pay.
+fn from_rest_or_motion(
+    records: &[Record],
+    iterations: usize,
+    monitor: &Monitor,
+    fit: impl Fn(&[Record]) -> Result<Fitted>,
+) -> Result<LinearFit> {
+    let resting: Vec<_> = records
+        .iter()
+        .map(|r| r.at_rest(r.begins_held(HELD)))
+        .collect();
+    let tied = resting.iter().filter(|r| r.rests).count();
+    monitor.set_total(iterations as u64 * if tied > 0 { 2 } else { 1 });
+    let free = fit(records);
+    if tied == 0 || monitor.stopped() {
+        return free.map(|free| free.fit);
+    }
+    let rest = fit(&resting);
+    let iterations = [&free, &rest].map(|f| f.as_ref().map_or(0, |f| f.fit.iterations));
+    let mut chosen = match (free, rest) {
+        (Err(_), Ok(rest)) => rest.fit,
+        (Ok(free), Ok(rest)) if !free.pays(&rest, tied) => rest.fit,
+        (free, _) => free?.fit,
+    };
+    chosen.iterations = iterations.iter().sum();
+    if monitor.stopped() {
+        chosen.termination = Termination::Interrupted;
+    }
+    Ok(chosen)
+}
+
+/// A fit, and how many independent samples its residuals are worth.
+struct Fitted {
+    fit: LinearFit,
+    independent: f64,
+}
+
+impl Fitted {
+    /// Whether the free states of `tied` records lower the information criterion of a fit from rest.
+    fn pays(&self, rest: &Self, tied: usize) -> bool {
+        let states = (tied * self.fit.model.lags().na) as f64;
+        let n = self.independent;
+        n * (rest.fit.cost / self.fit.cost).ln() > states * n.ln()
+    }
 }
 
 /// The fit that goes on from `best` for the iterations that are left, after `spent` ones in all.
@@ -110,7 +169,7 @@ fn finished(
     spent: usize,
     max_iterations: usize,
     monitor: &Monitor,
-) -> Result<LinearFit> {
+) -> Result<Fitted> {
     let left = max_iterations.saturating_sub(best.iterations);
     let goes_on = best.termination == Termination::MaxIterations && left > 0;
     let (best, spent) = if goes_on {
@@ -126,7 +185,8 @@ fn finished(
     } else {
         (best, spent)
     };
-    Ok(LinearFit {
+    let independent = problem.independent(&best.theta);
+    let fit = LinearFit {
         model: problem.model(&best.theta)?,
         cost: best.cost,
         iterations: spent,
@@ -137,7 +197,8 @@ fn finished(
         trace: best.trace,
         initial_states: problem.initial_states(&best.theta),
         covariance: problem.covariance(&best.theta, best.cost),
-    })
+    };
+    Ok(Fitted { fit, independent })
 }
 
 /// The best of the refined candidates, and the iterations of all.
@@ -477,6 +538,27 @@ mod tests {
 
     /// Slow iterations that end a fit.
     const PATIENCE: usize = 6;
+
+    #[test]
+    fn begins_at_rest_or_in_motion_as_the_record_does() {
+        let truth = LinearModel::new(vec![-1.9, 0.9025], vec![0.03, 0.02], 1, 1, 0.2).unwrap();
+        let rest = (0.2 + 0.05 * 2.0) / 0.0025;
+        for (held, states) in [(3, [rest; 2]), (20, [rest; 2]), (7, [rest + 40.0, rest - 30.0])] {
+            let u: Vec<f64> = (0..700).map(|k| if k < held { 2.0 } else { 8.0 }).collect();
+            let y = noisy(&truth.simulate(&u, 1, &states).unwrap(), 1.0, held as u64);
+            let records = [Record::new(&u, 1, &y).unwrap()];
+            let fit = fit(&records, 2, 2, 1, true, 100, &Monitor::default()).unwrap();
+            let [first, second] = fit.initial_states[0][..] else {
+                panic!("two past outputs")
+            };
+            let at_rest = states[0] == states[1];
+            assert_eq!(first == second, at_rest, "{held}: {first} {second}");
+            if at_rest {
+                let gain = fit.model.dc_gain()[0];
+                assert!((gain - 20.0).abs() < 0.2, "{held}: {gain}");
+            }
+        }
+    }
 
     #[test]
     fn gives_the_best_so_far_wherever_it_is_stopped() {

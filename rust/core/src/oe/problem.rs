@@ -2,6 +2,7 @@
 
 use nalgebra::DMatrix;
 
+use crate::colour::Colour;
 use crate::data::weighted_squares;
 use crate::gram::Gram;
 use crate::lagged::{Lagged, Lags, push_past};
@@ -15,7 +16,8 @@ const MARGIN: f64 = 1e-9;
 /// Samples between two looks at the monitor.
 const LOOK: usize = 4096;
 
-/// Parameters: a (na), b (inputs x nb), the offset where there is one, then the past outputs of each experiment.
+/// Parameters: a (na), b (inputs x nb), the offset where there is one, then the past outputs of each experiment that does
+/// not begin at rest.
 pub(super) struct OutputError<'a> {
     pub lags: Lags,
     records: &'a [Record<'a>],
@@ -24,6 +26,9 @@ pub(super) struct OutputError<'a> {
     /// Samples that count, and the sum of their weights: as many where they count alike.
     samples: f64,
     weight: f64,
+    /// Where the past outputs of each experiment are among the parameters; `None` for one that begins at rest.
+    places: Vec<Option<usize>>,
+    parameters: usize,
     /// Where each free run begins: at the first measured sample, for a state before a gap would leave no trace.
     firsts: Vec<usize>,
     /// Free runs from there on.
@@ -41,7 +46,14 @@ impl<'a> OutputError<'a> {
     ) -> Result<Self> {
         let samples: usize = records.iter().map(Record::counting).sum();
         let shared = lags.regressors() + usize::from(offset);
-        let parameters = shared + lags.na * records.len();
+        let mut parameters = shared;
+        let mut place = |record: &Record| {
+            (!record.rests).then(|| {
+                parameters += lags.na;
+                parameters - lags.na
+            })
+        };
+        let places = records.iter().map(&mut place).collect();
         if samples <= parameters {
             return Err(Error::data(format!(
                 "expected more than {parameters} samples for as many parameters and initial states, got {samples} measured; record longer or lower na and nb"
@@ -54,6 +66,8 @@ impl<'a> OutputError<'a> {
             offset,
             samples: samples as f64,
             weight: records.iter().map(Record::total_weight).sum(),
+            places,
+            parameters,
             firsts: records.iter().map(Record::first_measured).collect(),
             runs: records
                 .iter()
@@ -82,10 +96,37 @@ impl<'a> OutputError<'a> {
     }
 
     pub fn initial_states(&self, theta: &[f64]) -> Vec<Vec<f64>> {
-        theta[self.shared()..]
-            .chunks_exact(self.lags.na)
-            .map(<[f64]>::to_vec)
-            .collect()
+        let of = |experiment| self.state(theta, experiment);
+        (0..self.records.len()).map(of).collect()
+    }
+
+    /// The past outputs of an experiment, newest first.
+    fn state(&self, theta: &[f64], experiment: usize) -> Vec<f64> {
+        let na = self.lags.na;
+        match self.places[experiment] {
+            Some(place) => theta[place..][..na].to_vec(),
+            None => vec![self.equilibrium(theta, experiment).0; na],
+        }
+    }
+
+    /// The output that the model holds under the first inputs of an experiment, and its derivatives by the shared parameters:
+    ///
+    /// ```text
+    /// y = (sum b u + offset) / (1 + sum a),   dy/da = -y / (1 + sum a),   dy/db = u / (1 + sum a)
+    /// ```
+    fn equilibrium(&self, theta: &[f64], experiment: usize) -> (f64, Vec<f64>) {
+        let (na, n_phi) = (self.lags.na, self.lags.regressors());
+        let left = 1.0 + theta[..na].iter().sum::<f64>();
+        let mut by = vec![1.0; self.shared()];
+        // before the first sample the inputs are held, so that these are the inputs at rest
+        self.lags
+            .write_inputs(self.records[experiment].u, 0, &mut by[na..n_phi]);
+        let shared = theta[na..self.shared()].iter();
+        let push = shared.zip(&by[na..]).map(|(b, u)| b * u).sum::<f64>();
+        let y = push / left;
+        by[..na].fill(-y);
+        by.iter_mut().for_each(|slope| *slope /= left);
+        (y, by)
     }
 
     /// The best parameters with these poles.
@@ -128,6 +169,21 @@ impl<'a> OutputError<'a> {
         Some((self.cost(&theta)?, theta))
     }
 
+    /// How many independent samples the residuals at `theta` are worth.
+    pub fn independent(&mut self, theta: &[f64]) -> f64 {
+        if self.cost(theta).is_none() {
+            return 0.0;
+        }
+        let measured = self.records.iter().zip(&self.firsts).zip(&self.runs);
+        let residuals: Vec<f64> = measured
+            .flat_map(|((record, &first), run)| {
+                let outputs = record.y[first..].iter().zip(run);
+                outputs.filter(|(y, _)| !y.is_nan()).map(|(y, run)| y - run)
+            })
+            .collect();
+        Colour::of(&residuals).independent(residuals.len())
+    }
+
     /// Covariance of the shared parameters for white noise, row by row, with a row for the offset in any case.
     pub fn covariance(&mut self, theta: &[f64], cost: f64) -> Vec<f64> {
         let n = self.parameters();
@@ -146,8 +202,8 @@ impl<'a> OutputError<'a> {
 
     fn simulate(&mut self, theta: &[f64], model: &LinearModel, experiment: usize) -> Option<f64> {
         let (lags, record) = (self.lags, &self.records[experiment]);
-        let state = &theta[self.shared() + experiment * lags.na..][..lags.na];
-        self.phi[..lags.na].copy_from_slice(state);
+        let state = self.state(theta, experiment);
+        self.phi[..lags.na].copy_from_slice(&state);
         let mut sum = 0.0;
         let samples = self.firsts[experiment]..record.len();
         for (k, out) in samples.zip(&mut self.runs[experiment]) {
@@ -183,10 +239,18 @@ impl<'a> OutputError<'a> {
             lags.regressors() + usize::from(self.offset),
         );
         let gains: Vec<f64> = theta[..na].iter().map(|a| -a).collect();
-        self.phi[..na].copy_from_slice(&theta[shared + experiment * na..][..na]);
+        let state = self.state(theta, experiment);
+        self.phi[..na].copy_from_slice(&state);
+        let rest = self.places[experiment]
+            .is_none()
+            .then(|| self.equilibrium(theta, experiment).1);
         self.gram.clear();
         for i in 0..na {
-            self.gram.past_mut(i + 1)[shared + i] = 1.0;
+            let past = self.gram.past_mut(i + 1);
+            match &rest {
+                Some(slopes) => past[..shared].copy_from_slice(slopes),
+                None => past[shared + i] = 1.0,
+            }
         }
         let look = look((shared + na).pow(2));
         let weights = record.weights;
@@ -213,7 +277,7 @@ impl<'a> OutputError<'a> {
 
 impl Problem for OutputError<'_> {
     fn parameters(&self) -> usize {
-        self.shared() + self.lags.na * self.records.len()
+        self.parameters
     }
 
     fn cost(&mut self, theta: &[f64]) -> Option<f64> {
@@ -234,9 +298,16 @@ impl Problem for OutputError<'_> {
         jte.fill(0.0);
         for experiment in 0..self.records.len() {
             self.sensitivities(theta, experiment);
-            let place = |i: usize| if i < shared { i } else { i + experiment * na };
+            // of a record that begins at rest the columns of past outputs are 0
+            let state = self.places[experiment];
+            let place = |i: usize| {
+                state
+                    .filter(|_| i >= shared)
+                    .map_or(i, |at| at + i - shared)
+            };
+            let own = if state.is_some() { shared + na } else { shared };
             let (sums, width) = self.gram.finish();
-            for i in 0..shared + na {
+            for i in 0..own {
                 jte[place(i)] += sums[(shared + na) * width + i] / self.weight;
                 for j in 0..=i {
                     jtj[place(i) * n + place(j)] += sums[i * width + j] / self.weight;
@@ -269,6 +340,8 @@ mod tests {
         let weighted = [records[0].with_weights(&w).unwrap(), records[1]];
         let problem = |records| OutputError::new(records, lags, true, &monitor).unwrap();
         check_gradient(&mut problem(&weighted), &theta);
+        let begun = [records[0].at_rest(true), records[1]];
+        check_gradient(&mut problem(&begun), &theta[..7]);
         // weights of 1 and, on a part, of 3
         let part = |k: usize| k % 7 < 3;
         let tripled: Vec<f64> = (0..400).map(|k| if part(k) { 3.0 } else { 1.0 }).collect();

@@ -130,6 +130,7 @@ fn pieces_of<'a>(record: &Record<'a>, share: usize) -> Vec<Record<'a>> {
         let (from, to) = (start * record.channels, (start + length) * record.channels);
         let y = &record.y[start..start + length];
         let piece = Record::with_gaps(&record.u[from..to], record.channels, y).ok()?;
+        let piece = piece.at_rest(record.rests && start == 0);
         match record.weights {
             None => Some(piece),
             Some(weights) => piece.with_weights(&weights[start..start + length]).ok(),

@@ -1,0 +1,80 @@
+"""The level at which a record stands still before its inputs first move."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .experiment import without_weightless
+from .outliers import white_noise
+
+if TYPE_CHECKING:
+    from .experiment import Experiment
+
+LEAST = 3
+"""Fewest measured outputs by which a drift can be told from noise."""
+SIGMAS = 3.0
+"""Standard errors beyond which a drift, or a level, is not noise."""
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Standing:
+    """The samples of an experiment before its inputs first move, if its output stood still.
+
+    Attributes
+    ----------
+    samples : int
+        Their number.
+    u : tuple of float
+        The inputs.
+    y : float
+        Mean output; zero if the inputs are zero and noise explains the difference.
+    scatter : float
+        Standard deviation of the outputs, of the whole record's white noise at least.
+    """
+
+    samples: int
+    u: tuple[float, ...]
+    y: float
+    scatter: float
+
+
+def standing(experiment: Experiment) -> Standing | None:
+    """The standing samples at the beginning of an experiment; None if there are none.
+
+    The inputs keep their first values, and the output has at least three measured samples whose
+    drift is explained by noise.
+    """
+    e = without_weightless(experiment)
+    moved = (e.u != e.u[0]).any(axis=1)
+    if not moved.any():
+        return None
+    n = int(np.argmax(moved))
+    k = np.flatnonzero(np.isfinite(e.y[:n]))
+    if len(k) < LEAST:
+        return None
+    y, spread = e.y[k], float(np.nanmax(e.y) - np.nanmin(e.y))
+    about = k - k.mean()
+    slope = float(about @ (y - y.mean()) / (about @ about))
+    # the noise of the whole record: that of a few samples is known too badly to see a drift
+    white = white_noise(e.y)
+    error = white / math.sqrt(float(about @ about))
+    if abs(slope) > SIGMAS * error + _ROUNDING * spread / n:
+        return None
+    level = float(y.mean())
+    u = tuple(float(v) for v in e.u[0])
+    deviation = float(y.std(ddof=1))
+    noise = deviation / math.sqrt(len(y))
+    if not any(u) and abs(level) <= _student(len(y) - 1) * noise + _ROUNDING * spread:
+        level = 0.0
+    return Standing(n, u, level, max(deviation, white))
+
+
+def _student(freedom: int) -> float:
+    """`SIGMAS` of a normal distribution as a value of Student's (Wallace, 1959)."""
+    z = SIGMAS * (8 * freedom + 3) / (8 * freedom + 1)
+    return math.sqrt(freedom * math.expm1(z * z / freedom))

@@ -1,0 +1,79 @@
+"""The rest of a plant: from standing samples of its records, else an equilibrium of the model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar, cast
+
+import numpy as np
+
+from ..dataset import Dataset, FloatArray
+from ..dataset.standing import Standing, standing
+from ..equilibrium import linearise
+from ..errors import SettingError
+from ..evidence.region import stored_region
+from ..evidence.residuals import representative
+from ..models import Model
+from ..models.rest import Rest
+from .task import free_run_rmse, with_provenance
+
+M = TypeVar("M", bound=Model)
+
+
+def with_rest(model: M, data: Dataset) -> M:
+    """The model with its rest in `training`, and so its alternatives; unchanged if that is zero."""
+    found = _standing(data)
+    others = tuple(_rested(m, data, found) for m in model.alternatives)
+    return replace(_rested(model, data, found), alternatives=others)
+
+
+def _rested(model: M, data: Dataset, found: Rest | None) -> M:
+    rest = found or _equilibrium(model, data)
+    if rest is None or rest.is_zero:
+        return model
+    try:
+        model.about(rest)
+    except SettingError:
+        return model  # its own zero is its rest
+    return cast("M", with_provenance(model, {"rest": rest.to_json()}))
+
+
+def _standing(data: Dataset) -> Rest | None:
+    """The level of the experiment that stands with the least command, and of those the longest."""
+    levels: Sequence[Standing] = [s for s in map(standing, data.experiments) if s is not None]
+    if not levels:
+        return None
+    best = min(levels, key=lambda s: (math.hypot(*s.u), -s.samples))
+    return Rest(best.u, best.y, "standing samples")
+
+
+def _equilibrium(model: Model, data: Dataset) -> Rest | None:
+    """The model's equilibrium without a command, or with the least recorded one.
+
+    The record has been at rest or not, so the level is kept within the recorded outputs. It is zero
+    if the model's own error does not tell it from zero.
+    """
+    low, high = np.array(data.input_range, dtype=np.float64).T
+    zero = np.zeros(len(low))
+    off = _level(model, zero)
+    if off is None:
+        u, off = np.clip(zero, low, high), _level(model, np.clip(zero, low, high))
+    else:
+        u = zero
+    if off is None:
+        return None
+    y = float(np.clip(off, *data.output_range))
+    if not u.any() and abs(y) <= free_run_rmse(model, data):
+        return None
+    return Rest(tuple(float(v) for v in u), y, "equilibrium")
+
+
+def _level(model: Model, u: FloatArray) -> float | None:
+    """The steady output at constant inputs, if there is one where the model is known."""
+    found = linearise(representative(model).core, u)
+    region = stored_region(model)
+    if not (found.settled and math.isfinite(found.y)):
+        return None
+    return found.y if region is None or region.holds(u, found.y) else None

@@ -1,0 +1,102 @@
+"""Records that stand still at first: their rest, and gains that no initial state takes over."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from effort import FULL
+from sewfast import Dataset, LinearOE, _core, identify
+from sewfast.arrays import FloatArray
+from sewfast.control import fit_fopdt
+from sewfast.dataset.standing import standing
+
+
+def two_lags(k: FloatArray, slow: float, fast: float) -> FloatArray:
+    """The response to a step of size 1 at k = 0 [samples]."""
+    since = np.maximum(k, 0.0)
+    share = slow * np.exp(-since / slow) - fast * np.exp(-since / fast)
+    return 1.0 - share / (slow - fast)
+
+
+def single_step(seed: int) -> tuple[Dataset, float]:
+    """A step after 3 to 20 standing samples, at some level and with some noise, and its gain."""
+    rng = np.random.default_rng(seed)
+    at, slow = int(rng.integers(3, 21)), rng.uniform(60.0, 200.0)
+    gain = float(rng.uniform(5.0, 40.0) * rng.choice([1.0, -1.0]))
+    n = at + int(rng.uniform(4.0, 8.0) * slow)
+    u = rng.choice([0.0, 3.0]) + 6.0 * (np.arange(n) >= at)
+    y = 6.0 * gain * two_lags(np.arange(n) - at, slow, rng.uniform(0.05, 0.5) * slow)
+    noise = 6.0 * abs(gain) * rng.uniform(0.001, 0.02) * rng.standard_normal(n)
+    return Dataset.from_arrays(u, y + rng.choice([0.0, 24.5, 293.15]) + noise, Ts=0.001), gain
+
+
+@pytest.mark.parametrize("kind", ["oe", "auto"])
+@pytest.mark.parametrize("seed", range(30 if FULL else 6))
+def test_a_step_soon_after_the_start_tells_its_gain(seed: int, kind: str) -> None:
+    data, gain = single_step(seed)
+    model = identify(data, model=kind, threads=1)
+    assert isinstance(model, LinearOE)
+    assert model.dc_gain[0] == pytest.approx(gain, rel=0.05)
+    assert model.training["verdict"]["grade"] == "good"
+
+
+def test_the_rest_of_a_record_is_kept_in_its_model() -> None:
+    rng, n = np.random.default_rng(0), 600
+    u = np.concatenate([np.full(40, 2.0), np.repeat(rng.uniform(2.0, 9.0, 28), 20)])
+    plant = _core.LinearModel(np.array([-0.9]), np.array([[0.2]]), 1, 0.0)
+    y = plant.simulate(u[:, None], np.array([4.0])) + 0.01 * rng.standard_normal(n)
+    for level in (0.0, 24.5, 293.15):
+        model = identify(Dataset.from_arrays(u, y + level, Ts=0.1), model="oe", threads=1)
+        assert model.rest.u == (2.0,)
+        assert model.rest.source == "standing samples"
+        assert model.rest.y == pytest.approx(4.0 + level, abs=0.01)
+        assert model.training["rest"] == model.rest.to_json()
+    # without standing samples: the equilibrium under the least command
+    model = identify(Dataset.from_arrays(u[60:], y[60:] + 24.5, Ts=0.1), model="oe", threads=1)
+    assert model.rest.source == "equilibrium"
+    assert model.rest.y == pytest.approx(24.5 + 2.0 * model.rest.u[0], abs=0.5)
+
+
+def test_only_outputs_that_stand_still_are_a_rest() -> None:
+    u = np.repeat([0.0, 1.0], [50, 150])
+    noise = 0.01 * np.random.default_rng(1).standard_normal(200)
+
+    def found(y: FloatArray) -> float | None:
+        at_rest = standing(Dataset.from_arrays(u, y, Ts=1.0).experiments[0])
+        return None if at_rest is None else at_rest.y
+
+    response = two_lags(np.arange(200.0) - 50.0, 20.0, 5.0)
+    assert found(response + noise) == 0.0
+    assert found(response + noise + 22.0) == pytest.approx(22.0, abs=0.01)
+    # an output that still cools down is at no rest
+    assert found(response + noise + np.exp(-np.arange(200.0) / 40.0)) is None
+    # and neither is a record that never moves, or moves at once
+    assert standing(Dataset.from_arrays(u * 0.0, noise, Ts=1.0).experiments[0]) is None
+    assert standing(Dataset.from_arrays(u[49:], noise[49:], Ts=1.0).experiments[0]) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_second_lag_after_standing_samples_is_no_motion_from_before(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    k, u = np.arange(1000.0) - 60.0, np.repeat([10.0, 30.0], [60, 940])
+    y = 22.5 + 0.85 * 20.0 * two_lags(k, 140.0, 35.0) + 0.05 * rng.standard_normal(1000)
+    found = fit_fopdt(u, y, Ts=1.0)
+    assert not found.moving
+    assert found.K == pytest.approx(0.85, rel=0.02)  # noqa: SIM300
+    # a plant that does move before the step is still seen
+    cooling = y + 8.0 * np.exp(-(k + 60.0) / 150.0)
+    assert fit_fopdt(u, cooling, Ts=1.0).moving
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_an_input_averaged_over_its_step_is_one_step(share: float) -> None:
+    # the step comes this share of a sample after sample 100
+    u = np.repeat([100.0, 1100.0], [100, 150])
+    u[100] += share * (100.0 - 1100.0)
+    since = np.maximum(np.arange(250.0) - 100.0 - share, 0.0)
+    y = -0.42 * np.expm1(-since / 2.0) + 1e-3 * np.random.default_rng(0).standard_normal(250)
+    found = fit_fopdt(u, y, Ts=0.02)
+    assert found.K == pytest.approx(0.42 / 1000.0, rel=0.01)  # noqa: SIM300
+    assert found.T == pytest.approx(0.04, rel=0.02)  # noqa: SIM300
+    assert found.L < 0.002
