@@ -240,7 +240,7 @@ def identify_command(args: argparse.Namespace) -> int | None:
         return 130
     model.save(args.out)
     # scored as identify took them, without dead stretches
-    train, _ = sound(in_effect(train))
+    train, _ = sound(in_effect(train), runs_freely=False)
     try:
         others = _save_alternatives(args, model) if args.alternatives else []
         scores = _scores(model, train, held)
@@ -329,7 +329,8 @@ def _show(
         label = "training data" if name == "train" else "held out to choose"
         s = score.simulation
         unit = f" {score.unit}" if score.unit else ""
-        print(f"{label}: free-run fit {s.fit_percent:.2f} %, rmse {s.rmse:.5g}{unit}")
+        fit = f"fit {s.fit_percent:.2f} %, " if s.fit_percent > -100.0 else ""
+        print(f"{label}: free-run {fit}rmse {s.rmse:.5g}{unit}")
     # without --alternatives nothing was written
     for path, other in zip(others, model.alternatives, strict=False):
         print(f"alternative: {other!r} in {path}")

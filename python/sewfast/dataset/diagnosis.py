@@ -58,9 +58,9 @@ class Finding:
     Attributes
     ----------
     kind : str
-        `dead_sensor`, `no_dynamics`, `exchanged`, `late_input`, `at_once`, `integrator`, `wraps`,
-        `closed_loop`, `repeats`, `two_level_input`, `rests`, `short_record`, `limited_input` or
-        `coarse_output`.
+        `dead_sensor`, `no_dynamics`, `exchanged`, `late_input`, `at_once`, `unstable`,
+        `integrator`, `wraps`, `closed_loop`, `repeats`, `two_level_input`, `rests`, `short_record`,
+        `limited_input` or `coarse_output`.
     text : str
         The finding and its meaning, one sentence without a full stop.
     remedy : str
@@ -132,6 +132,7 @@ def diagnose(data: Dataset) -> Diagnosis:
     `exchanged`         the input answers the output
     `late_input`        the output moves before the input, which was logged late
     `at_once`           the output moves in the sample in which the input does
+    `unstable`          an unstable plant, which only a closed loop holds
     `integrator`        the output is a position: it integrates what an input drives
     `wraps`             the output is an angle that jumps back by a turn
     `closed_loop`       an input was computed from the output, or a reference was recorded

@@ -1,4 +1,5 @@
-"""Faults of a record: a sensor that died, columns without dynamics, exchanged or late columns.
+"""Faults of a record: a sensor that died, columns without dynamics, exchanged or late columns, and
+unstable plants.
 
 All tests compare a record with itself, and take the side of the record in doubt. Values that
 `identify` refuses count as not known, and no test judges columns that do not move, so that none
@@ -16,6 +17,7 @@ fails on any numbers: columns are compared about their mean, in units of their d
 from __future__ import annotations
 
 import itertools
+import math
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -26,8 +28,10 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray, labelled, runs
 from ..errors import DataError
+from ..units import duration
 from .outliers import quantum
 from .pieces import LARGEST_FITTED, SMALLEST_FITTED
+from .stability import unstable_pole
 
 if TYPE_CHECKING:
     from .dataset import Dataset
@@ -383,7 +387,7 @@ def _exchanged(pieces: list[FloatArray], j: int) -> Order | None:
     return Order("exchanged", j, 0, float(answers[0])) if answers[0] > SURE else None
 
 
-# --- The three in words, and what `identify` does about them --------------------------------------
+# --- The faults in words, and what `identify` does about them -------------------------------------
 
 
 @dataclass(frozen=True)
@@ -403,8 +407,10 @@ class Fault:
 
 
 def faults(data: Dataset) -> tuple[Fault, ...]:
-    """Dead stretches of the output's sensor, or columns that are no input and output of a plant."""
-    return (*(_dead_fault(data, dead) for dead in dead_stretches(data)), *_order_fault(data))
+    """Dead stretches of the output's sensor, columns that are no input and output of a plant, or a
+    plant that only a closed loop holds."""
+    found = (*(_dead_fault(data, dead) for dead in dead_stretches(data)), *_order_fault(data))
+    return found or tuple(_unstable_fault(data))
 
 
 def _dead_fault(data: Dataset, dead: Dead) -> Fault:
@@ -474,22 +480,46 @@ def _order_fault(data: Dataset) -> Iterator[Fault]:
         )
 
 
-def sound(data: Dataset) -> tuple[Dataset, tuple[Fault, ...]]:
+def _unstable_fault(data: Dataset) -> Iterator[Fault]:
+    if (pole := unstable_pole(data)) is None:
+        return
+    y = labelled(data.output_name, data.output_unit)
+    doubles = math.log(2.0) / math.log(pole) * data.Ts
+    yield Fault(
+        "unstable",
+        f"{y} is that of an unstable plant in a closed loop: a pole at {pole:.5g}, so that it "
+        f"doubles every {duration(doubles)} without its controller",
+        'no free run can describe it: identify it one step ahead, with model="arx" and 8 or more '
+        "orders (--model arx --na 8 --nb 8), and tune from the controller that holds it (--start); "
+        "or name the loop's reference as input",
+        {"pole": pole, "doubles": doubles},
+    )
+
+
+_EXPECTED = {
+    "no_dynamics": "an output that answers the input",
+    "exchanged": "an output that answers the input",
+    "unstable": "a plant that can run freely",
+}
+"""Faults for which there is no model, and what was expected instead."""
+
+
+def sound(data: Dataset, *, runs_freely: bool = True) -> tuple[Dataset, tuple[Fault, ...]]:
     """The data without dead stretches, and what was found, for `identify`.
 
     Raises
     ------
     DataError
         If the columns are no input and output of a plant: one is computed from the other, or they
-        are exchanged.
+        are exchanged; or if the plant is unstable and the model has to run freely.
     """
     found = faults(data)
-    wrong = next((f for f in found if f.kind in ("no_dynamics", "exchanged")), None)
-    if wrong is not None:
-        raise DataError(
-            name=data.source, expected="an output that answers the input", received=wrong.text,
-            remedy=wrong.remedy,
-        )  # fmt: skip
+    for wrong in found:
+        if wrong.kind in _EXPECTED and (runs_freely or wrong.kind != "unstable"):
+            raise DataError(
+                name=data.source, expected=_EXPECTED[wrong.kind], received=wrong.text,
+                remedy=wrong.remedy,
+            )  # fmt: skip
     dead = [f.dead for f in found if f.dead]
     if dead:
         masks = [np.zeros(len(e), dtype=np.bool_) for e in data.experiments]

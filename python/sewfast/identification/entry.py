@@ -9,6 +9,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Literal
 
+import numpy as np
+
 from ..arrays import require_whole
 from ..dataset import Dataset, diagnose, require_dataset
 from ..dataset.experiment import in_effect
@@ -20,10 +22,11 @@ from ..evidence import with_training_evidence
 from ..kinds import KINDS, Kind, spelled
 from ..models import Model
 from ..models.files import STRUCTURED
+from ..models.linear import LinearDifference
 from ..progress import shown_in_notebooks
 from ..threads import Workers, available, require_workers
 from . import choice, further, grey_box, lagged, linear
-from .folds import TEXTS, UNSEEN_DATA, Split, thinned, verdict
+from .folds import TEXTS, UNSEEN_DATA, Split, thinned, unstable_verdict, verdict
 from .outputs import OUTPUTS
 from .rest import with_rest
 from .task import Clock, Progress, Provenance, Task, with_provenance
@@ -47,6 +50,8 @@ NETWORKS = ("neural_oe", "neural_ss")
 EVIDENCE_RATE, LEAST_EVIDENCE = 2.5e5, 2_000
 """Samples times parameters whose evidence takes a second of a slow processor."""
 _SEARCHED = ("auto", "neural_ss")
+_ONE_STEP = ("arx", "iv")
+"""Kinds fitted to predictions one step ahead, which describe an unstable plant, too."""
 """Kinds without given lags: their structure is searched."""
 _LAGS = 2
 _PAPER = {"na": 2, "nb": 2, "nk": 1, "hidden": 8}
@@ -210,7 +215,7 @@ def identify(
         is_order_given=na is not None,
     )
     _require_data(task, kind)
-    used, faults = sound(task.data)
+    used, faults = sound(task.data, runs_freely=kind not in _ONE_STEP)
     if used is not task.data:
         task = replace(task, data=used)
         _require_data(task, kind)
@@ -334,6 +339,10 @@ def _verdict(model: Model, data: Dataset, validation: Dataset | None) -> Provena
     """
     part = Split(data, validation or data, is_given=validation is not None)
     where = UNSEEN_DATA if part.is_given else "its own training data"
+    if isinstance(model, LinearDifference):
+        pole = float(np.abs(model.poles).max(initial=0.0))
+        if pole > 1.0:
+            return unstable_verdict(model, part, pole, where)
     found = verdict(model, data, part, where=where)
     if model.kind in ("arx", "iv", "oe") and found["grade"] in ("good", "fair"):
         slowest, longest = linear.time_constant(model.core), max(len(e) for e in data.experiments)

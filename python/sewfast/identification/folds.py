@@ -13,7 +13,15 @@ from ..dataset.experiment import mean_square, weights_of
 from ..dynamic_model import INIT, Core
 from ..errors import DataError, FitError
 from ..models import Model
-from ..validation import GOOD, by_input, free_run_error, judged, noise_of, without_input
+from ..validation import (
+    GOOD,
+    by_input,
+    free_run_error,
+    grade_of,
+    judged,
+    noise_of,
+    without_input,
+)
 from .task import Provenance, sources
 
 SHARE = 0.2
@@ -338,6 +346,35 @@ def verdict(
         "text": text,
         "next": todo,
     }
+
+
+def unstable_verdict(model: Model, part: Split, pole: float, where: str) -> Provenance:
+    """`verdict` on an unstable model, which leaves all bounds in free run.
+
+    It is judged by its predictions as far ahead as it doubles, and is at most "fair": nobody has
+    seen its plant run freely.
+    """
+    ahead = max(1, round(math.log(2.0) / math.log(pole)))
+    try:
+        runs = model.predict(part.held, ahead)
+    except FitError:
+        runs = [np.full(len(e), np.inf) for e in part.held.experiments]
+    error, spread = errors_of(runs, part).rmse, part.spread
+    fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else math.nan
+    grade = grade_of(fit, error, noise_of([e.y for e in part.held.experiments])) or "useless"
+    grade = "fair" if grade == "good" else grade
+    unit = f" {part.fitted.output_unit}" if part.fitted.output_unit else ""
+    return {
+        "grade": grade,
+        "fit_percent": fit if math.isfinite(fit) else None,
+        "text": f"{TEXTS[grade]}: unstable, as its plant has to be, with a pole at {pole:.5g}; "
+        f"predictions as far ahead as it doubles, {ahead} samples, explain {fit:.1f} % of {where} "
+        f"(rmse {error:.3g}{unit})",
+        "next": [
+            "tune from the controller that holds the plant (--start)" if grade == "fair"
+            else "raise na and nb, up to 20, as measurement noise asks for many"
+        ],
+    }  # fmt: skip
 
 
 def what_to_record(data: Dataset) -> list[str]:
