@@ -275,17 +275,23 @@ def test_several_inputs_keep_their_names(tmp_path: Path) -> None:
 # --- tune, run ----------------------------------------------------------------------------------
 
 
-def test_tune_warns_of_a_model_that_identify_called_useless(tmp_path: Path, walk: Path) -> None:
+def test_tune_refuses_a_model_that_identify_called_useless(tmp_path: Path, walk: Path) -> None:
     stored = json.loads((walk / "drive.json").read_text())
     verdict = {"grade": "useless", "text": "useless: it explains 3 %", "fit_percent": 3.0}
     stored["training"]["verdict"] = {**verdict, "next": []}
     (tmp_path / "poor.json").write_text(json.dumps(stored))
     few = ("--evaluations", 5, "-o", "c.json")
     assert "useless" not in sewfast(tmp_path, "tune", walk / "drive.json", *few).err
+    (tmp_path / "c.json").unlink()
+    refused = sewfast(tmp_path, "tune", "poor.json", *few, done=2).err
+    assert "received useless: it explains 3 %" in refused
+    assert "--force" in refused
+    assert not (tmp_path / "c.json").exists()
     assert (
         "warning: poor.json: useless: it explains 3 %"
-        in sewfast(tmp_path, "tune", "poor.json", *few).err
+        in sewfast(tmp_path, "tune", "poor.json", *few, "--force").err
     )
+    assert (tmp_path / "c.json").exists()
 
 
 def test_tune_prints_gains_in_every_form(tmp_path: Path, walk: Path) -> None:

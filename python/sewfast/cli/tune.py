@@ -129,6 +129,10 @@ def add(commands: Commands) -> None:
         help="another kind of model of the same drive, for a second opinion on the gains: a linear "
         "one for a network",
     )  # fmt: skip
+    parser.add_argument(
+        "--force", action="store_true",
+        help="tune on a model that identify called useless, too",
+    )  # fmt: skip
     _add_search(parser)
     add_plot(parser, "draw the loops of the result and the start; with --pareto the front")
     add_named_output(parser, "controller", "model", "controller file to write")
@@ -204,6 +208,12 @@ def tune_command(args: argparse.Namespace) -> int | None:
     models = [load_model(path) for path in args.model]
     for path, model in zip(args.model, models, strict=True):
         verdict = model.training.get("verdict") or {}
+        if verdict.get("grade") == "useless" and not args.force:
+            raise SettingError(
+                name=str(path), expected="a model that a controller can be tuned on",
+                received=verdict["text"],
+                remedy="record as identify said, or tune on it all the same with --force",
+            )  # fmt: skip
         if verdict.get("grade") in ("poor", "useless"):
             print(f"warning: {path}: {verdict['text']}", file=sys.stderr)
     first = models[0]
