@@ -240,7 +240,7 @@ def identify_command(args: argparse.Namespace) -> int | None:
         return 130
     model.save(args.out)
     # scored as identify took them, without dead stretches
-    train, _ = sound(in_effect(train), runs_freely=False)
+    train, _ = sound(in_effect(train))
     try:
         others = _save_alternatives(args, model) if args.alternatives else []
         scores = _scores(model, train, held)

@@ -489,37 +489,29 @@ def _unstable_fault(data: Dataset) -> Iterator[Fault]:
         "unstable",
         f"{y} is that of an unstable plant in a closed loop: a pole at {pole:.5g}, so that it "
         f"doubles every {duration(doubles)} without its controller",
-        'no free run can describe it: identify it one step ahead, with model="arx" and 8 or more '
-        "orders (--model arx --na 8 --nb 8), and tune from the controller that holds it (--start); "
-        "or name the loop's reference as input",
+        'identify it one step ahead, with model="arx" and 8 or more orders (--model arx --na 8 '
+        "--nb 8), and tune from the controller that holds it (--start); or name the loop's "
+        "reference as input",
         {"pole": pole, "doubles": doubles},
     )
 
 
-_EXPECTED = {
-    "no_dynamics": "an output that answers the input",
-    "exchanged": "an output that answers the input",
-    "unstable": "a plant that can run freely",
-}
-"""Faults for which there is no model, and what was expected instead."""
-
-
-def sound(data: Dataset, *, runs_freely: bool = True) -> tuple[Dataset, tuple[Fault, ...]]:
+def sound(data: Dataset) -> tuple[Dataset, tuple[Fault, ...]]:
     """The data without dead stretches, and what was found, for `identify`.
 
     Raises
     ------
     DataError
         If the columns are no input and output of a plant: one is computed from the other, or they
-        are exchanged; or if the plant is unstable and the model has to run freely.
+        are exchanged.
     """
     found = faults(data)
-    for wrong in found:
-        if wrong.kind in _EXPECTED and (runs_freely or wrong.kind != "unstable"):
-            raise DataError(
-                name=data.source, expected=_EXPECTED[wrong.kind], received=wrong.text,
-                remedy=wrong.remedy,
-            )  # fmt: skip
+    wrong = next((f for f in found if f.kind in ("no_dynamics", "exchanged")), None)
+    if wrong is not None:
+        raise DataError(
+            name=data.source, expected="an output that answers the input", received=wrong.text,
+            remedy=wrong.remedy,
+        )  # fmt: skip
     dead = [f.dead for f in found if f.dead]
     if dead:
         masks = [np.zeros(len(e), dtype=np.bool_) for e in data.experiments]

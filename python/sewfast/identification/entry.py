@@ -50,8 +50,6 @@ NETWORKS = ("neural_oe", "neural_ss")
 EVIDENCE_RATE, LEAST_EVIDENCE = 2.5e5, 2_000
 """Samples times parameters whose evidence takes a second of a slow processor."""
 _SEARCHED = ("auto", "neural_ss")
-_ONE_STEP = ("arx", "iv")
-"""Kinds fitted to predictions one step ahead, which describe an unstable plant, too."""
 """Kinds without given lags: their structure is searched."""
 _LAGS = 2
 _PAPER = {"na": 2, "nb": 2, "nk": 1, "hidden": 8}
@@ -215,7 +213,7 @@ def identify(
         is_order_given=na is not None,
     )
     _require_data(task, kind)
-    used, faults = sound(task.data, runs_freely=kind not in _ONE_STEP)
+    used, faults = sound(task.data)
     if used is not task.data:
         task = replace(task, data=used)
         _require_data(task, kind)
@@ -226,12 +224,23 @@ def identify(
             return _with_losses(found, clock)
     else:
         found = _within_budget(_KINDS[kind], task)
-    if faults:
-        said = [*found.training.get("notes", []), *(f.warning for f in faults)]
+    unstable = next((f for f in faults if f.kind == "unstable"), None)
+    said = [*found.training.get("notes", []), *(f.warning for f in faults if f is not unstable)]
+    if said:
         found = with_provenance(found, {"notes": said})
     try:
         if "verdict" not in found.training:
             own = _verdict(found, task.data, task.validation)
+            found = with_provenance(found, {"verdict": own})
+        own = found.training["verdict"]
+        if (
+            unstable is not None
+            and own["grade"] in ("poor", "useless")
+            and _largest_pole(found) <= 1.0
+        ):
+            # a free run that explains the record would show that the pole is none of the plant's
+            text = f"useless: {unstable.text}, and no free run describes it ({own['text']})"
+            own = {**own, "grade": "useless", "text": text, "next": [unstable.remedy]}
             found = with_provenance(found, {"verdict": own})
         excerpt = _excerpt(found, task.data, clock)
         if not clock.can_close:
@@ -339,10 +348,8 @@ def _verdict(model: Model, data: Dataset, validation: Dataset | None) -> Provena
     """
     part = Split(data, validation or data, is_given=validation is not None)
     where = UNSEEN_DATA if part.is_given else "its own training data"
-    if isinstance(model, LinearDifference):
-        pole = float(np.abs(model.poles).max(initial=0.0))
-        if pole > 1.0:
-            return unstable_verdict(model, part, pole, where)
+    if (pole := _largest_pole(model)) > 1.0:
+        return unstable_verdict(model, part, pole, where)
     found = verdict(model, data, part, where=where)
     if model.kind in ("arx", "iv", "oe") and found["grade"] in ("good", "fair"):
         slowest, longest = linear.time_constant(model.core), max(len(e) for e in data.experiments)
@@ -356,6 +363,12 @@ def _verdict(model: Model, data: Dataset, validation: Dataset | None) -> Provena
             )
             found["next"].insert(0, "lower na, or leave model out and let the search choose")
     return found
+
+
+def _largest_pole(model: Model) -> float:
+    """Modulus of a linear model's largest pole; 0 for other kinds."""
+    poles = model.poles if isinstance(model, LinearDifference) else ()
+    return float(np.abs(poles).max(initial=0.0))
 
 
 def _preset(preset: str, kind: str, orders: Mapping[str, int | None]) -> str:

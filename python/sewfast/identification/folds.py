@@ -359,7 +359,8 @@ def unstable_verdict(model: Model, part: Split, pole: float, where: str) -> Prov
         runs = model.predict(part.held, ahead)
     except FitError:
         runs = [np.full(len(e), np.inf) for e in part.held.experiments]
-    error, spread = errors_of(runs, part).rmse, part.spread
+    outputs = np.concatenate([e.y for e in part.held.experiments])
+    error, spread = errors_of(runs, part).rmse, float(np.nanstd(outputs))
     fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else math.nan
     grade = grade_of(fit, error, noise_of([e.y for e in part.held.experiments])) or "useless"
     grade = "fair" if grade == "good" else grade
