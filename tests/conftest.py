@@ -50,11 +50,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if not collection_path.name.startswith("test_") or collection_path.suffix != ".py":
         return None
     waits = ALONE.match(collection_path.name) is not None
-    if config.option.markexpr == "not alone":
+    chosen = config.option.markexpr
+    if chosen == "not alone and not budget":
         return waits or None
-    if config.option.markexpr == "alone":
-        some = waits or "mark.alone" in collection_path.read_text(encoding="utf-8")
-        return None if some else True
+    if chosen in ("alone", "budget"):
+        marked = f"mark.{chosen}" in collection_path.read_text(encoding="utf-8")
+        return None if marked or (waits and chosen == "alone") else True
     return None
 
 
