@@ -61,8 +61,9 @@ nightly: $(DEV) ## the long proofs: counts, every page, emulated boards, browser
 	$(BIN)/python tests/support/laws.py --state $(NIGHT)/laws --minutes 8
 	$(BIN)/python tests/support/deployed.py --state $(NIGHT)/bits --minutes 8
 	$(BIN)/python tests/support/fuzzed_logs.py --seconds 20
-	$(PYTEST) --nightly -m 'not alone'
-	$(BIN)/python -m pytest --hypothesis-seed=$(SEED) --nightly -m alone
+	$(PYTEST) --nightly -m '$(COMPUTES)'
+	$(PYTEST) --nightly -m alone
+	$(ONE_BY_ONE) --nightly -m budget
 
 lint: rust-lint python-lint types stubs ## formatting, clippy, ruff, mypy, stubs
 
@@ -179,16 +180,20 @@ firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian:
 	  arm-none-eabi-size target/bare/$$1.elf; \
 	done
 
-# first the tests that compute, then those that wait, one by one: beside compilers, or tests of time budgets, some come too late
-PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal --hypothesis-seed=$(SEED)
+# first the tests that compute, then those that wait (beside compilers, or tests of time budgets, some come too late), then those
+# that compute until their time is over: they take every processor, and one by one
+ONE_BY_ONE := $(BIN)/python -m pytest --hypothesis-seed=$(SEED)
+PYTEST := $(ONE_BY_ONE) -n 2 --dist worksteal
+COMPUTES := not alone and not budget
 python-test: $(DEV) ## pytest, with the snippets of the documentation and every example
-	$(PYTEST) -m 'not alone'
-	$(BIN)/python -m pytest --hypothesis-seed=$(SEED) -m alone
+	$(PYTEST) -m '$(COMPUTES)'
+	$(PYTEST) -m alone
+	$(ONE_BY_ONE) -m budget
 
 CORE_TESTS := $(addprefix tests/,analysis control dataset evidence files greybox identification models tuning) \
   $(wildcard tests/test_*.py)
 python-core: $(DEV)
-	$(PYTEST) -m 'not alone' $(filter-out tests/test_fleet.py,$(CORE_TESTS))
+	$(PYTEST) -m '$(COMPUTES)' $(filter-out tests/test_fleet.py,$(CORE_TESTS))
 
 docs: $(DEV) ## the site, in site/index.html; works offline
 	$(BIN)/python docs/build.py

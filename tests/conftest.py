@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,13 @@ if "SEWFAST_DATA" not in os.environ and _BESIDE.is_dir():
 # A product of small matrices on every processor waits in a loop for those that other tests
 # use: ten to sixty times as long. NumPy reads this at its import; workers and commands inherit it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Where Python may not keep what it compiled, every worker and every command that a test starts
+# compiles the package, the tests and their libraries anew: seconds each. Here it leaves no trace.
+if sys.dont_write_bytecode:
+    sys.dont_write_bytecode, sys.pycache_prefix = False, str(ROOT / "target" / "bytecode")
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # a shell starts background jobs with SIGINT ignored, nohup with SIGHUP, and so would the tests of
 # Ctrl-C and of a closed terminal
@@ -50,11 +58,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if not collection_path.name.startswith("test_") or collection_path.suffix != ".py":
         return None
     waits = ALONE.match(collection_path.name) is not None
-    if config.option.markexpr == "not alone":
+    chosen = config.option.markexpr
+    if chosen == "not alone and not budget":
         return waits or None
-    if config.option.markexpr == "alone":
-        some = waits or "mark.alone" in collection_path.read_text(encoding="utf-8")
-        return None if some else True
+    if chosen in ("alone", "budget"):
+        marked = f"mark.{chosen}" in collection_path.read_text(encoding="utf-8")
+        return None if marked or (waits and chosen == "alone") else True
     return None
 
 

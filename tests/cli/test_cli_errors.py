@@ -359,7 +359,7 @@ needs_sigint = pytest.mark.skipif(sys.platform == "win32", reason="needs SIGINT"
 
 
 @needs_sigint
-@pytest.mark.alone
+@pytest.mark.budget
 def test_ctrl_c_keeps_the_best_model(folder: Path) -> None:
     api.write_table(folder / "run.csv", recording(4000))
     settings = ("--model", "neural-oe", "--hidden", "40", "--starts", "100000")
@@ -369,7 +369,7 @@ def test_ctrl_c_keeps_the_best_model(folder: Path) -> None:
 
 
 @needs_sigint
-@pytest.mark.alone
+@pytest.mark.budget
 def test_ctrl_c_keeps_the_best_controller(folder: Path) -> None:
     t = 0.001 * np.arange(400_000)
     api.write_table(folder / "long.npz", {"t": t, "r": 1000.0 + 500.0 * np.sin(t)})

@@ -561,7 +561,7 @@ def test_an_ensemble_whose_further_training_is_stopped_keeps_its_members(
     assert ("2 of 3 members" if reached else "as given") in best.training["notes"][-1]
 
 
-@pytest.mark.alone
+@pytest.mark.budget
 @pytest.mark.parametrize("kind", ["oe", "neural_oe", "neural_ss"])
 def test_a_budget_too_short_for_a_step_further_gives_the_model_back(kind: Any) -> None:
     data = bent_data(600, noise=0.02)
@@ -581,7 +581,8 @@ def test_a_budget_too_short_for_a_step_further_gives_the_model_back(kind: Any) -
 # --- time budget ----------------------------------------------------------------------------------
 
 
-@pytest.mark.alone
+@pytest.mark.budget
+@pytest.mark.nightly("eight seconds of networks", by_day=["auto-1.5", "oe-1.5", "neural_oe-4.0"])
 @pytest.mark.parametrize(
     ("kind", "budget"), [("auto", 1.5), ("oe", 1.5), ("neural_oe", 4.0), ("neural_ss", 8.0)]
 )
@@ -603,7 +604,7 @@ def test_a_budget_leaves_a_model_of_the_kind_and_says_what_it_cut(kind: Any, bud
     assert validate(model, data).simulation.fit_percent > 50.0
 
 
-@pytest.mark.alone
+@pytest.mark.budget
 @pytest.mark.parametrize("kind", ["auto", "oe", "iv", "neural_oe", "neural_ss"])
 @pytest.mark.parametrize("budget", [1e-3, 0.03, 0.1, 0.3])
 def test_a_budget_too_short_gives_the_kind_or_says_so(kind: Any, budget: float) -> None:

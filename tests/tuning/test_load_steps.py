@@ -148,7 +148,7 @@ def test_bounds_the_wrong_way_round_are_refused() -> None:
         tune(drive(), [SHORT], start=QUIET, variables=[("Ti", 0.5, 0.02)], evaluations=5)
 
 
-@pytest.mark.alone
+@pytest.mark.budget
 def test_a_search_ends_in_time_with_its_best() -> None:
     found = tune(
         drive(), [SHORT], start=QUIET, evaluations=10**7, time_budget=0.5, threads=2
@@ -164,7 +164,7 @@ def test_a_search_ends_in_time_with_its_best() -> None:
     assert (whole.lost, whole.cut) == ((), None)
 
 
-@pytest.mark.alone
+@pytest.mark.budget
 def test_a_search_ends_in_time_where_every_loop_diverges() -> None:
     a = np.poly([1.2, 0.976 + 0.173j, 0.976 - 0.173j, 0.79]).real
     core = _core.LinearModel(a[1:].copy(), np.array([[1e-3, 0.0]]), 1, 0.0)
@@ -194,7 +194,7 @@ def test_a_deadline_asks_for_no_cost_but_for_the_start(monkeypatch: pytest.Monke
     assert time.lost == ["looks"]
 
 
-@pytest.mark.alone
+@pytest.mark.budget
 def test_what_was_lost_is_said_with_the_worst_grade_of_the_models() -> None:
     fair, good = (
         replace(drive(), training={"verdict": {"grade": grade}}) for grade in ("fair", "good")
@@ -207,7 +207,7 @@ def test_what_was_lost_is_said_with_the_worst_grade_of_the_models() -> None:
     assert found.cut.endswith("the model is graded fair")
 
 
-@pytest.mark.alone
+@pytest.mark.budget
 def test_a_front_ends_in_time() -> None:
     given: dict[str, Any] = {"start": QUIET, "threads": 2, "size": 4}
     front = pareto(drive(), [SHORT], evaluations=10**7, time_budget=1.0, **given)
@@ -225,7 +225,7 @@ def test_a_time_budget_that_makes_no_sense_is_refused(budget: Any) -> None:
         tune(drive(), [SHORT], start=QUIET, evaluations=5, time_budget=budget)
 
 
-@pytest.mark.alone
+@pytest.mark.budget
 def test_constraints_that_are_not_met_in_time_are_said() -> None:
     with pytest.raises(FitError, match="constraints"):
         tune(
@@ -247,7 +247,7 @@ def test_the_command_takes_a_load(tmp_path: Path) -> None:
         assert "LEVEL:COMMAND" in told.err
 
 
-@pytest.mark.alone
+@pytest.mark.budget
 def test_the_command_says_what_a_time_budget_cut_short(tmp_path: Path) -> None:
     drive().save(tmp_path / "drive.json")
     given = ("tune", "drive.json", "--evaluations", 10**7, "--time-budget", 1, "-o", "c.json")
