@@ -99,6 +99,7 @@ def test_every_machine_is_found(alone: Fleet) -> None:
         assert row.fit_percent > 90.0
 
 
+@pytest.mark.nightly("identifies sixteen times")
 def test_standard_errors_are_those_of_repetition(tmp_path: Path) -> None:
     runs = [fleet(made(tmp_path / str(s), 1, seed=100 * s), workers=0).rows[0] for s in range(16)]
     for quantity in ("gain", "residence_time"):
@@ -107,6 +108,7 @@ def test_standard_errors_are_those_of_repetition(tmp_path: Path) -> None:
         assert 0.5 < values.std(ddof=1) / said < 1.8
 
 
+@pytest.mark.slow("starts a cluster, of which this is the only one by day")
 @pytest.mark.usefixtures("quiet")
 def test_a_cluster_gives_the_same_bits_and_loses_no_row(folder: Path, alone: Fleet) -> None:
     pytest.importorskip("distributed", reason="needs dask")
@@ -582,6 +584,7 @@ def test_the_command(
     assert main(["fleet", str(tmp_path / "nix"), "-o", str(out), "--workers", "0"]) == 2
 
 
+@pytest.mark.nightly("every format", by_day=["csv"])
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such file names")
 @pytest.mark.parametrize("ending", ["csv", "json", "parquet"])
 def test_any_file_name_comes_back(tmp_path: Path, ending: str) -> None:

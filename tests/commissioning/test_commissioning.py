@@ -88,6 +88,7 @@ def out(saved: Path, tmp_path: Path) -> Path:
 # --- whole --------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly("another page")
 def test_the_page_has_margins_as_predicted_and_as_measured(
     whole: Commissioning, saved: Path, tmp_path: Path
 ) -> None:
@@ -239,12 +240,14 @@ def test_own_references_are_verified_on() -> None:
     np.testing.assert_array_equal(found.comparisons[0].predicted.r, r)
 
 
+@pytest.mark.nightly("a commissioning of its own")
 def test_a_constant_reference_is_judged_by_the_way_from_rest() -> None:
     found = commission(VirtualMachine(), references={"hold": np.full(1500, 900.0)}, **SMALL)
     assert found.is_verified
     assert found.comparisons[0].span == 900.0
 
 
+@pytest.mark.nightly("a commissioning of its own; by day the experiment's goes over the link")
 def test_a_drive_behind_a_port_is_commissioned_as_the_machine_is(whole: Commissioning) -> None:
     with VirtualDevice(fast=True) as device, connect(device.port) as drive:
         drive.set_limits()
@@ -359,7 +362,7 @@ def test_ctrl_c_does_not_wait_for_what_cannot_be_stopped(monkeypatch: pytest.Mon
     assert caught.value.best.stage == "training"
 
 
-@pytest.mark.nightly("a commissioning for each stage", by_day=["tuning"])
+@pytest.mark.nightly("a commissioning for each stage", by_day=["step response"])
 @pytest.mark.parametrize("stage", ["step response", "training", "tuning", "verification"])
 def test_cancelled_it_ends_as_after_ctrl_c(stage: str) -> None:
     cancel = threading.Event()
@@ -480,6 +483,7 @@ def test_nothing_of_an_earlier_commissioning_stays(whole: Commissioning, out: Pa
     assert not list((out / "recordings").iterdir())
 
 
+@pytest.mark.nightly("a commissioning and its page; the one that is refused runs by day")
 def test_the_command_fills_a_folder(tmp_path: Path) -> None:
     told = sewfast(
         tmp_path, "commission", "--on", "virtual:2", "--out", "two", "--members", "1",

@@ -139,6 +139,7 @@ def test_what_was_recorded_is_kept_and_a_machine_that_cannot_be_watched_runs_on(
     assert len(kept["hold"]) == len(R)
 
 
+@pytest.mark.nightly("a commissioning of its own; what it watches runs by day")
 def test_a_commissioning_names_the_reference_and_keeps_what_was_recorded(tmp_path: Path) -> None:
     class Changes(MachineBench):
         """Loses most of its current as the references begin."""

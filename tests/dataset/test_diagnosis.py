@@ -342,7 +342,7 @@ def found(kind: str, family: Family, seed: int, n: int) -> float:
     return sum(sewfast.diagnose(d).find(kind) is not None for d in records) / SEEDS
 
 
-@pytest.mark.nightly("both halves of the family", by_day=["rules-1500", "judged-6000"])
+@pytest.mark.nightly("both halves of the family", by_day=["rules-1500"])
 @pytest.mark.parametrize("n", [1500, 6000])
 @pytest.mark.parametrize("families", [RULES_INTEGRAL, JUDGED_INTEGRAL], ids=["rules", "judged"])
 def test_positions_are_integrators(families: list[Family], n: int) -> None:
@@ -351,7 +351,7 @@ def test_positions_are_integrators(families: list[Family], n: int) -> None:
     assert np.mean(list(parts.values())) >= 0.95, parts
 
 
-@pytest.mark.nightly("both halves of the family", by_day=["rules-6000", "judged-1500"])
+@pytest.mark.nightly("both halves of the family", by_day=["judged-1500"])
 @pytest.mark.parametrize("n", [1500, 6000])
 @pytest.mark.parametrize("families", [RULES_STABLE, JUDGED_STABLE], ids=["rules", "judged"])
 def test_what_comes_back_is_no_integrator(families: list[Family], n: int) -> None:

@@ -175,7 +175,7 @@ def test_what_stood_in_a_gap_changes_nothing(kind: Any) -> None:
     assert texts[0] == texts[1]
 
 
-@pytest.mark.nightly("a network for each kind of gap", by_day=["long gaps"])
+@pytest.mark.nightly("a network for each kind of gap; by day one of given size")
 @pytest.mark.parametrize("kind", ["random", "long gaps", "first samples"])
 def test_identify_takes_gaps(kind: str) -> None:
     u, y = recording(0)

@@ -93,6 +93,7 @@ def test_each_finding_has_its_advice(u: Any, y: Any, words: str) -> None:
     assert words in advice(u, y)
 
 
+@pytest.mark.nightly("a million samples")
 def test_chance_makes_no_outliers_of_a_long_record() -> None:
     """The threshold grows with the record, and a spike of 30 deviations still stands out."""
     n = 1_000_000

@@ -36,11 +36,8 @@ SAMPLES = 20_000
     "the same for every kind",
     by_day=[
         "oe-f64",
-        "oe-f32",
-        "oe, three inputs-f64",
         "neural_oe-f32",
         "neural_ss, saturation-f64",
-        "neural_ss, nk 2-f32",
         "ensemble of mixed kinds-f64",
     ],
 )
@@ -53,6 +50,7 @@ def test_the_code_has_the_bits_of_the_core(name: str, precision: str, tmp_path: 
         assert deployed.host(tmp_path, "code", compiler) == expected
 
 
+@pytest.mark.nightly("every level", by_day=["-Os"])
 @needs_compiler
 @pytest.mark.parametrize("optimise", ["-O0", "-Os", "-O3"])
 def test_no_optimisation_changes_a_bit(optimise: str, tmp_path: Path) -> None:
@@ -61,6 +59,7 @@ def test_no_optimisation_changes_a_bit(optimise: str, tmp_path: Path) -> None:
         assert deployed.host(tmp_path, "code", compiler, optimise) == expected
 
 
+@pytest.mark.nightly("the board for every kind", by_day=["neural_oe-f32", "everything-f64"])
 @pytest.mark.skipif(not deployed.emulator(), reason="needs arm-none-eabi-gcc and qemu-system-arm")
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", EMULATED)
@@ -97,7 +96,7 @@ def test_the_sketch_controls_a_motor_as_the_core_would(tmp_path: Path) -> None:
 
 @pytest.mark.nightly(
     "the same for every controller",
-    by_day=["pi-f32", "everything-f64", "everything-f32", "ramp-f64"],
+    by_day=["pi-f32", "everything-f64", "ramp-f64"],
 )
 @needs_compiler
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -136,9 +135,7 @@ def test_hostile_inputs_and_changes_of_mode_keep_the_bits(
 CHANGING = ("pi", "paper", "p alone", "lag", "tracking", "slew", "biquads")
 
 
-@pytest.mark.nightly(
-    "the same for every controller", by_day=["pi-f64", "paper-f32", "tracking-f64", "biquads-f32"]
-)
+@pytest.mark.nightly("the same for every controller", by_day=["tracking-f64", "biquads-f32"])
 @needs_compiler
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", CHANGING)

@@ -84,6 +84,9 @@ def slave(tmp_path: Path) -> Iterator[Any]:
         one.fmu.freeInstance()
 
 
+@pytest.mark.nightly(
+    "an FMU for each kind", by_day=["oe", "neural_ss, nk 0", "ensemble of mixed kinds"]
+)
 @pytest.mark.parametrize("name", KINDS)
 def test_the_free_run_is_that_of_the_package(name: str, slave: Any, tmp_path: Path) -> None:
     from fmpy.validation import validate_fmu
@@ -155,6 +158,7 @@ def _in_ecos(folder: Path, **given: Any) -> np.ndarray[Any, Any]:
     return np.array(json.loads(file.read_text()))
 
 
+@pytest.mark.nightly("an FMU for each kind", by_day=["neural_oe"])
 @pytest.mark.parametrize("name", ["oe", "neural_oe", "neural_ss, nk 0"])
 def test_a_second_importer_has_the_same_free_run(name: str, tmp_path: Path) -> None:
     model = kinds.model_of(name)
@@ -507,10 +511,10 @@ def test_the_commands_take_an_fmu(
     motor: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     on = f"{motor}?volt=10&speed=speed&speed_unit=RPM"
-    out = str(tmp_path / "chirp.csv")
-    record = ["record", "--signal", "chirp_lo_hi", "-o", out]
+    out = str(tmp_path / "step.csv")
+    record = ["record", "--signal", "step", "-o", out]
     assert main([*record, "--on", on]) == 0
-    assert "Motor, chirp_lo_hi: 20000 samples" in capsys.readouterr().out
+    assert "Motor, step: 3000 samples" in capsys.readouterr().out
     controller = sewfast.Controller(sewfast.Gains.standard(0.01, 0.1), u_min=-10.0, u_max=10.0)
     controller.save(tmp_path / "controller.json")
     run = ["run", str(tmp_path / "controller.json"), "--on", on, "--reference", "trapezoid"]

@@ -306,7 +306,7 @@ def test_standard_errors_are_the_spread_of_estimates() -> None:
         for k in range(1, len(e)):
             v[k] = 0.9 * v[k - 1] + 0.3 * w[k]
         noisy = Dataset.from_arrays(e.u, e.y + v, data.Ts)
-        model = sewfast.identify(noisy, model="oe")
+        model = sewfast.identify(noisy, model="oe", na=2, nb=2, nk=1)
         p = estimate(model, Residuals.of(model, noisy))
         assert p is not None
         found.append(p.values)

@@ -22,6 +22,7 @@ from sewfast.cli import main
 from sewfast.commissioning import SteppedBench
 from sewfast.errors import DataError, FitError, ModelFileError, SettingError
 from sewfast.frequency import FrequencyResponse, periodic, spectral
+from sewfast.frequency.shaft import ShaftFit
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benches"))
 
@@ -31,6 +32,11 @@ COMPLIANT = {"load_inertia": 1e-3, "stiffness": 150.0, "damping": 0.01}
 @pytest.fixture(scope="module")
 def compliant() -> FrequencyResponse:
     return bode(VirtualMachine(**COMPLIANT), speed=1500.0)
+
+
+@pytest.fixture(scope="module")
+def shaft(compliant: FrequencyResponse) -> ShaftFit:
+    return fit_shaft(compliant)
 
 
 def controller(**more: Any) -> sewfast.Controller:
@@ -89,8 +95,8 @@ def test_a_few_frequencies_of_an_ordinary_record_are_no_shaft(signal: str, seed:
     assert not fit.has_resonance
 
 
-def test_the_fit_is_a_model_like_any_other(compliant: FrequencyResponse) -> None:
-    fit = fit_shaft(compliant)
+def test_the_fit_is_a_model_like_any_other(compliant: FrequencyResponse, shaft: ShaftFit) -> None:
+    fit = shaft
     model = fit.to_model()
     step = np.exp(-2j * np.pi * compliant.hertz * 1e-3)
     num, den = model.to_tf()
@@ -105,9 +111,11 @@ def test_the_fit_is_a_model_like_any_other(compliant: FrequencyResponse) -> None
     assert sewfast.margins(controller(), model).stable
 
 
-def test_margins_agree_with_those_of_the_fit_and_of_the_loop(compliant: FrequencyResponse) -> None:
+def test_margins_agree_with_those_of_the_fit_and_of_the_loop(
+    compliant: FrequencyResponse, shaft: ShaftFit
+) -> None:
     measured = compliant.margins(controller())
-    predicted = sewfast.margins(controller(), fit_shaft(compliant).to_model())
+    predicted = sewfast.margins(controller(), shaft.to_model())
     assert measured.phase_margin_deg == pytest.approx(predicted.phase_margin_deg, abs=3.0)
     assert measured.Ms == pytest.approx(predicted.Ms, rel=0.05)
     low, high = measured.Ms_band

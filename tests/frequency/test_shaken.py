@@ -169,7 +169,7 @@ def tripping(after: float) -> Tripping:
     return Tripping(MachineBench(VirtualMachine(**COMPLIANT)), after)
 
 
-@pytest.mark.nightly("a measurement for each limit", by_day=["12.5-3.0"])
+@pytest.mark.nightly("a measurement and fits for each limit; by day a trip under feedback")
 @pytest.mark.parametrize(("after", "blocks"), [(25.0, 2.0), (12.5, 3.0)])
 def test_a_trip_in_mid_shake_keeps_the_whole_periods(after: float, blocks: float) -> None:
     """Two of four multisines, or three periods of the first."""

@@ -159,6 +159,7 @@ def test_a_delay_is_told_in_parts_of_a_sample() -> None:
     assert motor.value("delay") == pytest.approx(0.006, abs=0.0004)
 
 
+@pytest.mark.nightly("counts coverage over many records")
 def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
     inside = {"k_v": 0, "k_a": 0, "k_s": 0}
     for seed in range(40):

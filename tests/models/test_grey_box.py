@@ -46,6 +46,7 @@ def _model(fan: float = 0.0, seed: int = 1) -> Any:
     return sewfast.identify(_plant(5000, seed, fan), model="grey-box")
 
 
+@pytest.mark.nightly("a fit for each seed", by_day=["1"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_motor_is_found_without_a_network(seed: int) -> None:
     model = _model(0.0, seed)
@@ -59,7 +60,7 @@ def test_a_motor_is_found_without_a_network(seed: int) -> None:
     assert model.validate(fresh).simulation.rmse < 1.15 * 2.0
 
 
-@pytest.mark.nightly("a default search for each seed", by_day=["2"])
+@pytest.mark.nightly("a default search for each seed", by_day=["1"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_network_is_taken_where_something_is_left(seed: int) -> None:
     model = _model(6e-5, seed)

@@ -26,7 +26,10 @@ _ELSEWHERE = (
 """Tags that would load something from the network."""
 RUN = [p for p in PAGES if any(b.language in ("python", "console") for b in blocks(p))]
 MINUTES = pytest.mark.nightly("a walk that takes minutes of processor; `examples/` run by day")
-LONG = ("README", "bode", "cli", "commissioning", "physics", "real-data", "tutorial")
+LONG = (
+    "README", "bode", "choosing-a-model", "cli", "commissioning", "data-preparation", "physics",
+    "reading-margins", "real-data", "report-card", "tutorial",
+)  # fmt: skip
 RUN_WHEN = [pytest.param(p, id=p.stem, marks=MINUTES if p.stem in LONG else ()) for p in RUN]
 
 
@@ -87,6 +90,7 @@ def test_links_of_a_page_lead_somewhere(page: Path) -> None:
             assert (page.parent / target).exists(), f"{page}: {target}"
 
 
+@pytest.mark.slow("builds the whole site, whose links and anchors are checked so")
 def test_site_builds_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason="needs the docs extra")
     subprocess.run([sys.executable, ROOT / "docs" / "build.py"], check=True)

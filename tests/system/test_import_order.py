@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import sewfast
@@ -56,10 +57,11 @@ def _imported(module: str) -> Iterator[str]:
                 yield whole if whole in MODULES or not path else ".".join(path)
 
 
-def _arrows() -> set[tuple[str, str]]:
+@cache
+def _arrows() -> frozenset[tuple[str, str]]:
     """Every import from one unit into another: (module, unit)."""
     found = {(m, target.split(".")[0]) for m in MODULES for target in _imported(m)}
-    return {(m, unit) for m, unit in found if unit not in (m.split(".")[0], *BELOW_ALL)}
+    return frozenset((m, unit) for m, unit in found if unit not in (m.split(".")[0], *BELOW_ALL))
 
 
 def test_every_unit_has_its_place() -> None:

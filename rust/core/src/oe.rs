@@ -543,7 +543,11 @@ mod tests {
     fn begins_at_rest_or_in_motion_as_the_record_does() {
         let truth = LinearModel::new(vec![-1.9, 0.9025], vec![0.03, 0.02], 1, 1, 0.2).unwrap();
         let rest = (0.2 + 0.05 * 2.0) / 0.0025;
-        for (held, states) in [(3, [rest; 2]), (20, [rest; 2]), (7, [rest + 40.0, rest - 30.0])] {
+        for (held, states) in [
+            (3, [rest; 2]),
+            (20, [rest; 2]),
+            (7, [rest + 40.0, rest - 30.0]),
+        ] {
             let u: Vec<f64> = (0..700).map(|k| if k < held { 2.0 } else { 8.0 }).collect();
             let y = noisy(&truth.simulate(&u, 1, &states).unwrap(), 1.0, held as u64);
             let records = [Record::new(&u, 1, &y).unwrap()];
