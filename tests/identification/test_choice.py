@@ -152,11 +152,11 @@ def first_order(seed: int, delay: int, n: int = 1500, noise: float = 0.3) -> Dat
     return Dataset.from_arrays(u, y + noise * rng.normal(size=n), 0.01)
 
 
-@pytest.mark.nightly("a search for each delay and seed", by_day=["4-1"])
-@pytest.mark.parametrize(("delay", "seeds"), [(1, 5), (4, 5), (4, 1)])
-def test_a_small_order_and_the_delay_are_found(delay: int, seeds: int) -> None:
+@pytest.mark.nightly("a search for each delay", by_day=["4"])
+@pytest.mark.parametrize("delay", [1, 4])
+def test_a_small_order_and_the_delay_are_found(delay: int) -> None:
     orders = []
-    for seed in range(seeds):
+    for seed in range(5):
         data = first_order(seed, delay, noise=0.1)
         table = LinearTable(task(data).nk, folds(data)[:1], pool())
         table.search(None)
@@ -164,7 +164,7 @@ def test_a_small_order_and_the_delay_are_found(delay: int, seeds: int) -> None:
         assert table.choice.rmse < 1.01 * table.best.rmse
         if delay > 1:
             assert table.choice.rmse < 0.8 * table.error(1, 1)
-    assert sorted(orders)[seeds // 2] <= 2
+    assert sorted(orders)[2] <= 2
 
 
 @pytest.mark.nightly("default searches on long delays")
