@@ -217,6 +217,8 @@ def identify(
     if used is not task.data:
         task = replace(task, data=used)
         _require_data(task, kind)
+    # a budget buys models: whether the record is sound has to be known in any case
+    clock.begin()
     if isinstance(model, Model):
         found = _within_budget(partial(further.trained, model), task)
         if found.core is model.core:

@@ -36,7 +36,7 @@ CLOSING = 0.3
 
 
 class Clock:
-    """Time since it was created, and a budget; without one it never runs out.
+    """Time since it was created or began anew, and a budget; without one it never runs out.
 
     Attributes
     ----------
@@ -49,8 +49,12 @@ class Clock:
     def __init__(self, budget: float | None) -> None:
         self.budget = budget
         self.lost: list[str] = []
-        self._began = time.perf_counter()
         self._processor = self._waited = 0.0
+        self.begin()
+
+    def begin(self) -> None:
+        """Count from now on."""
+        self._began = time.perf_counter()
 
     def lose(self, what: str) -> None:
         """Note that the budget cut this work short."""
