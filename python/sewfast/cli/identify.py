@@ -224,7 +224,7 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
 
 def identify_command(args: argparse.Namespace) -> int | None:
     from ..dataset.experiment import in_effect
-    from ..dataset.faults import sound
+    from ..dataset.faults import alive, dead_stretches
 
     require_place(args.out, (".json",))
     require_plot(args.plot)
@@ -240,7 +240,8 @@ def identify_command(args: argparse.Namespace) -> int | None:
         return 130
     model.save(args.out)
     # scored as identify took them, without dead stretches
-    train, _ = sound(in_effect(train))
+    train = in_effect(train)
+    train = alive(train, dead_stretches(train))
     try:
         others = _save_alternatives(args, model) if args.alternatives else []
         scores = _scores(model, train, held)

@@ -512,11 +512,15 @@ def sound(data: Dataset) -> tuple[Dataset, tuple[Fault, ...]]:
             name=data.source, expected="an output that answers the input", received=wrong.text,
             remedy=wrong.remedy,
         )  # fmt: skip
-    dead = [f.dead for f in found if f.dead]
-    if dead:
-        masks = [np.zeros(len(e), dtype=np.bool_) for e in data.experiments]
-        for d in dead:
-            start = data.experiments[d.experiment].start
-            masks[d.experiment][d.start - start : d.stop - start] = True
-        data = data.mask(masks, why="of a dead sensor left out")
-    return data, found
+    return alive(data, [f.dead for f in found if f.dead]), found
+
+
+def alive(data: Dataset, dead: Sequence[Dead]) -> Dataset:
+    """The data without these dead stretches."""
+    if not dead:
+        return data
+    masks = [np.zeros(len(e), dtype=np.bool_) for e in data.experiments]
+    for d in dead:
+        start = data.experiments[d.experiment].start
+        masks[d.experiment][d.start - start : d.stop - start] = True
+    return data.mask(masks, why="of a dead sensor left out")

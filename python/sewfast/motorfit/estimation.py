@@ -218,65 +218,48 @@ def minimised(
         If one of the functions raises it at the start. Raised later, it ends the descent where it
         is.
     """
-    reached: list[Minimum] = []
-    with contextlib.suppress(TimeUp):
-        return _descended(normal, cost, start, bounds, count, enough, iterations, reached)
-    if not reached:
-        raise TimeUp
-    return reached[-1]
-
-
-def _descended(
-    normal: Callable[[FloatArray], Normal],
-    cost: Callable[[FloatArray], float],
-    start: FloatArray,
-    bounds: tuple[FloatArray, FloatArray],
-    count: int,
-    enough: float,
-    iterations: int,
-    reached: list[Minimum],
-) -> Minimum:
-    """As `minimised`; every point on the way is appended to `reached`."""
     low, high = bounds
     x, mu = start, DAMPING
     now, gradient, matrix = normal(x)
-    left = math.inf
-    for _ in range(iterations):
-        reached.append(Minimum(x, now, left))
-        variance = max(now / count, 1e-300)
-        held = ((x <= low) & (gradient > 0.0)) | ((x >= high) & (gradient < 0.0))
-        free = ~held & (np.diag(matrix) > 0.0)
-        if not free.any():
-            return Minimum(x, now, 0.0)
-        scale = np.sqrt(np.diag(matrix)[free])
-        size, along = np.linalg.eigh(matrix[np.ix_(free, free)] / np.outer(scale, scale))
-        slope = along.T @ (gradient[free] / scale)
-        known = size > FLAT * size[-1]
-        left = float(np.sum(slope[known] ** 2 / size[known])) / variance
-        if left < enough:
-            break
-        refused = math.inf
-        while mu <= MOST_DAMPING:
-            promised = float(np.sum((slope**2 * (size + 2.0 * mu) / (size + mu) ** 2)[known]))
-            if promised < enough * variance:
-                return Minimum(x, now, left)  # a kink: steps this short are not worth a trial
-            if promised > SAME * refused:
-                mu *= RAISE
-                continue  # nearly the step that was just rejected
-            step = np.zeros(len(x))
-            step[free] = -(along @ np.where(known, slope / (size + mu), 0.0)) / scale
-            trial = np.clip(x + step, low, high)
-            after = cost(trial)
-            if after < now:
+    left, reached = math.inf, Minimum(x, now, math.inf)
+    with contextlib.suppress(TimeUp):
+        for _ in range(iterations):
+            reached = Minimum(x, now, left)
+            variance = max(now / count, 1e-300)
+            held = ((x <= low) & (gradient > 0.0)) | ((x >= high) & (gradient < 0.0))
+            free = ~held & (np.diag(matrix) > 0.0)
+            if not free.any():
+                return Minimum(x, now, 0.0)
+            scale = np.sqrt(np.diag(matrix)[free])
+            size, along = np.linalg.eigh(matrix[np.ix_(free, free)] / np.outer(scale, scale))
+            slope = along.T @ (gradient[free] / scale)
+            known = size > FLAT * size[-1]
+            left = float(np.sum(slope[known] ** 2 / size[known])) / variance
+            if left < enough:
                 break
-            mu *= RAISE
-            refused = promised
-        else:
-            break  # a kink: the gain predicted by the linear model does not exist
-        gained = (now - after) / variance
-        x, mu = trial, max(mu / LOWER, LEAST_DAMPING)
-        now, gradient, matrix = normal(x)
-        if gained < enough:
-            left = min(left, gained)
-            break
-    return Minimum(x, now, left)
+            refused = math.inf
+            while mu <= MOST_DAMPING:
+                promised = float(np.sum((slope**2 * (size + 2.0 * mu) / (size + mu) ** 2)[known]))
+                if promised < enough * variance:
+                    return Minimum(x, now, left)  # a kink: steps this short are not worth a trial
+                if promised > SAME * refused:
+                    mu *= RAISE
+                    continue  # nearly the step that was just rejected
+                step = np.zeros(len(x))
+                step[free] = -(along @ np.where(known, slope / (size + mu), 0.0)) / scale
+                trial = np.clip(x + step, low, high)
+                after = cost(trial)
+                if after < now:
+                    break
+                mu *= RAISE
+                refused = promised
+            else:
+                break  # a kink: the gain predicted by the linear model does not exist
+            gained = (now - after) / variance
+            x, mu = trial, max(mu / LOWER, LEAST_DAMPING)
+            now, gradient, matrix = normal(x)
+            if gained < enough:
+                left = min(left, gained)
+                break
+        return Minimum(x, now, left)
+    return reached
