@@ -31,6 +31,19 @@ CONTROLLER = Controller(
 )  # fmt: skip
 REFERENCE = np.repeat([0.0, 2.0, 4.0, 1.0], 60)
 every_kind = pytest.mark.parametrize("name", CASES)
+one_of_each = pytest.mark.nightly(
+    "the same for every kind",
+    by_day=[
+        "oe",
+        "hammerstein_wiener",
+        "grey_box",
+        "neural_oe",
+        "neural_ss, integrator",
+        "neural_ss, two inputs",
+        "ensemble of mixed kinds",
+        "ensemble, no delay",
+    ],
+)
 
 
 def singles(model: Model) -> tuple[Model, ...]:
@@ -110,19 +123,7 @@ def test_validate_predict_simulate_and_bands(name: str) -> None:
     assert band.n == 380
 
 
-@pytest.mark.nightly(
-    "the same for every kind",
-    by_day=[
-        "oe",
-        "hammerstein_wiener",
-        "grey_box",
-        "neural_oe",
-        "neural_ss, integrator",
-        "neural_ss, two inputs",
-        "ensemble of mixed kinds",
-        "ensemble, no delay",
-    ],
-)
+@one_of_each
 @every_kind
 def test_run_analyse_tune_and_judge(name: str) -> None:
     model = model_of(name)
@@ -141,19 +142,7 @@ def test_run_analyse_tune_and_judge(name: str) -> None:
                 call()
 
 
-@pytest.mark.nightly(
-    "the same for every kind",
-    by_day=[
-        "oe",
-        "hammerstein_wiener",
-        "grey_box",
-        "neural_oe",
-        "neural_ss, integrator",
-        "neural_ss, two inputs",
-        "ensemble of mixed kinds",
-        "ensemble, no delay",
-    ],
-)
+@one_of_each
 @every_kind
 def test_tune_finds_its_own_start_or_says_why_not(name: str) -> None:
     model = model_of(name)

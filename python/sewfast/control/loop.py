@@ -441,7 +441,8 @@ def common_rest(plants: Sequence[Any]) -> Rest:
     bump begins at zero, and a constant added to input or output changes no gain.
     """
     if all(isinstance(plant, Model) for plant in plants):
-        return plants[0].rest  # type: ignore[no-any-return]
+        rest: Rest = plants[0].rest
+        return rest
     return Rest((0.0,), 0.0)
 
 
