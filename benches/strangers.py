@@ -12,7 +12,8 @@ the package does not know. Names, units and parameters are drawn by the seed. Fo
 
 without an option, and holds the controller on the drive itself, noise of its sensor included,
 against what the last command predicted. A row passes if no command refuses, the last one has no
-warning, and the drive follows the same reference with at most twice the predicted error.
+warning, and the drive follows the same reference with at most twice the predicted error and twice
+the predicted change of the command from sample to sample.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ FloatArray = NDArray[np.float64]
 Range = tuple[float, float]
 COUNTS = "counts"
 MOST = 2.0
-"""Times the predicted tracking error that the true drive may have."""
+"""Times the predicted tracking error, and change of the command, that the true drive may have."""
 
 
 # --- Drives ---------------------------------------------------------------------------------------
@@ -391,14 +392,20 @@ def command(folder: Path, *arguments: str) -> Step:
     return Step(done.returncode, time.perf_counter() - began, done.stdout, done.stderr)
 
 
-def on_drive(folder: Path, name: str, drive: Drive, r: FloatArray, seed: int) -> FloatArray:
-    """Output of the drive itself under the controller that was found."""
+def on_drive(
+    folder: Path, name: str, drive: Drive, r: FloatArray, seed: int
+) -> tuple[FloatArray, FloatArray]:
+    """Command and output of the drive itself under the controller that was found."""
     controller = load_controller(folder / f"{name}-controller.json")
     core = controller.core()
-    _, true = drive.responds(
-        controller.Ts, len(r), lambda k, y: float(core.step(float(r[k]), y)), seed + 1000
-    )
-    return true
+    u = np.zeros(len(r))
+
+    def decide(k: int, y: float) -> float:
+        u[k] = core.step(float(r[k]), y)
+        return float(u[k])
+
+    _, true = drive.responds(controller.Ts, len(r), decide, seed + 1000)
+    return u, true
 
 
 def tried(name: str, seed: int, folder: Path) -> bool:
@@ -423,14 +430,17 @@ def tried(name: str, seed: int, folder: Path) -> bool:
     warned = [x.strip() for x in steps[2].err.splitlines() if x.strip().startswith("warning")]
     lines = [x.split(",") for x in steps[2].out.splitlines() if re.match(r"[-\d]", x)]
     table = np.array([[float(cell or "nan") for cell in line] for line in lines])
-    r, predicted = table[:, 1], table[:, 3]
-    true = on_drive(folder, name, drive, r, seed)
+    r, u, predicted = table[:, 1], table[:, 2], table[:, 3]
+    sent, true = on_drive(folder, name, drive, r, seed)
     wide = float(np.ptp(r))
     thought, had = (100.0 * float(np.sqrt(np.mean((y - r) ** 2))) / wide for y in (predicted, true))
-    passed = not warned and had <= MOST * max(thought, 0.1)
+    changed, changes = (float(np.sqrt(np.mean(np.diff(x) ** 2))) for x in (u, sent))
+    passed = not warned and had <= MOST * max(thought, 0.1) and changes <= MOST * changed
     print(
         f"  model {verdict['grade']}; tracking rms {thought:.2f} % of the range on the model, "
-        f"{had:.2f} % on the drive; {sum(s.seconds for s in steps):.0f} s: "
+        f"{had:.2f} % on the drive ({had / thought:.2f} x); command changes by {changed:.3g} on "
+        f"the model, {changes:.3g} on the drive ({changes / changed:.2f} x); "
+        f"{sum(s.seconds for s in steps):.0f} s: "
         f"{'passed' if passed else 'FAILED'}",
         flush=True,
     )

@@ -633,10 +633,12 @@ _Plant: TypeAlias = Machine | LinearModel | NeuralOE | NeuralSS
 def closed_loop(
     plant: _Plant, controller: _Controller, reference: _F, *, counts_per_unit: float,
     encoder_phase: float = 0.5, feedforward: _F | None = None, disturbance: _F | None = None,
+    noise: float = 0.0, seed: int = 0,
 ) -> dict[str, _F]:
     """Keys u, y (true output), feedback (after encoder and filter); all (N,). From rest, controller reset.
 
-    ``feedforward`` is added to the command before its limits, ``disturbance`` behind them; both (N,) [u].
+    ``feedforward`` is added to the command before its limits, ``disturbance`` behind them; both (N,) [u]. ``noise`` is
+    the standard deviation of white noise that is measured with the output [y], drawn from ``seed``.
 
     ``counts_per_unit`` is counts per (output unit x second); 0 feeds the plant's output back unquantised.
     A virtual machine uses its own encoder. The controller passed in is not stepped. A loop that diverges
@@ -666,12 +668,13 @@ class _Task(TypedDict):
     samples of the mean). ``variables`` are (name, bounds or None); an empty list means the usual ones. Weights missing from ``cost``
     keep their defaults. ``linear_plants`` are (num, den) in powers of z^-1, ``measured`` ones
     (omega [rad/s], responses, radii of their circles, whether the output was counted). ``disturbances`` are commands behind the limits, one
-    for each reference or none at all.
+    for each reference or none at all; ``noise`` is the standard deviation of white noise on each plant's measurement along them [y].
     """
 
     plants: Sequence[_Plant]
     references: Sequence[_F]
     disturbances: Sequence[_F]
+    noise: Sequence[float]
     load_steps: Sequence[tuple[_F, _F, float, int]]
     start: _Controller
     counts_per_unit: float

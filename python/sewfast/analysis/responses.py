@@ -321,14 +321,14 @@ class Steps:
 def responses(
     controller: Controller, plants: Sequence[Plant], names: Sequence[str], steps: Steps
 ) -> tuple[Responses, Responses]:
-    """Reference step and disturbance step, with the encoder, the filters and the limits."""
+    """Reference step and disturbance step with encoder, filters and limits, without noise."""
     n = steps.samples
     lead = 3 * n
     ramp = np.interp(np.arange(lead), [0, n], [0.0, steps.level])
     r = np.concatenate([ramp, np.full(n, steps.level)])
     raised = np.concatenate([ramp, np.full(n, steps.level + steps.step)])
     d = np.where(np.arange(len(r)) < lead, 0.0, steps.disturbance)
-    tracked = [run(controller, p, raised, name="reference step") for p in plants]
+    tracked = [run(controller, p, raised, noise=0.0, name="reference step") for p in plants]
     upset = [_disturbed(controller, p, r, d) for p in plants]
     first = lead - n // 2
     made = [_cut(raised, tracked, lead, first, steps, names, "reference")]
@@ -341,7 +341,7 @@ def _disturbed(controller: Controller, plant: Plant, r: FloatArray, d: FloatArra
     if isinstance(plant, VirtualMachine):
         load = torque_of(plant, 1.0) * -d
         return run_under_load(controller, plant, r, load, name="disturbance step")
-    return run(controller, plant, r, disturbance=d, name="disturbance step")
+    return run(controller, plant, r, disturbance=d, noise=0.0, name="disturbance step")
 
 
 def _cut(

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from .. import _core, signals
 from ..arrays import FloatArray
 from ..errors import DataError, FitError, SettingError
-from ..gains import Gains, vector
+from ..gains import Gains, real, vector
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
 from ..models.rest import Rest
@@ -203,6 +203,7 @@ def run(
     *,
     feedforward: ArrayLike | None = None,
     disturbance: ArrayLike | None = None,
+    noise: float | None = None,
     seed: int = 0,
     name: str | None = None,
     file: str | os.PathLike[str] | None = None,
@@ -231,8 +232,12 @@ def run(
     disturbance : array, shape (N,), optional
         For a model: a command added after the limiter, unknown to the controller [u]. A virtual
         machine has `set_load`.
+    noise : float, optional
+        For a model without an encoder in the loop: standard deviation of white noise in what is
+        measured, which `y` does not contain [y]. By default that of the model's record
+        (`Model.noise`).
     seed : int
-        Chooses a named random reference.
+        Of the noise and of a named random reference.
     name : str, optional
         Name of the reference in messages and reports.
     file : path, optional
@@ -270,6 +275,8 @@ def run(
     r = reference_samples(reference, controller, seed, plant=on)
     title = name or (reference if isinstance(reference, str) else "reference")
     extra = _given(on, feedforward, disturbance)
+    if noise is not None:
+        noise = _noise(on, noise)
     if not isinstance(on, (Model, VirtualMachine)):
         return _on_machine(
             controller, on, r, title, cancel, file=file, live=live, overwrite=overwrite
@@ -283,6 +290,8 @@ def run(
         counts_per_unit=controller.counts_per_unit,
         feedforward=extra.get("feedforward"),
         disturbance=extra.get("disturbance"),
+        noise=noise_in_loop(controller, on) if noise is None else noise,
+        seed=seed,
     )
     return ClosedLoopRun(
         t=np.arange(len(r), dtype=np.float64) * controller.Ts,
@@ -322,6 +331,27 @@ def _given(
             received="one", remedy="run it on a model or a virtual machine",
         )  # fmt: skip
     return signals
+
+
+def noise_in_loop(controller: SampledController, plant: Plant) -> float:
+    """Standard deviation of the noise that a loop measures [y]: with an encoder there is none."""
+    is_counted = controller.counts_per_unit > 0.0 or not isinstance(plant, Model)
+    return 0.0 if is_counted else plant.noise
+
+
+def _noise(on: Any, noise: float) -> float:
+    deviation = real("noise", noise)
+    if not 0.0 <= deviation < math.inf:
+        raise SettingError(
+            name="noise", expected="a standard deviation of 0 or more", received=f"{noise!r}",
+            remedy="leave it out for that of the record",
+        )  # fmt: skip
+    if deviation > 0.0 and not isinstance(on, Model):
+        raise SettingError(
+            name="noise", expected="none on a machine, which has its own", received=f"{noise!r}",
+            remedy="leave it out",
+        )  # fmt: skip
+    return deviation
 
 
 def require_controller(

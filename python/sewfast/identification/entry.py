@@ -27,6 +27,7 @@ from ..progress import shown_in_notebooks
 from ..threads import Workers, available, require_workers
 from . import choice, further, grey_box, lagged, linear
 from .folds import TEXTS, UNSEEN_DATA, Split, thinned, unstable_verdict, verdict
+from .noise import with_noise
 from .outputs import OUTPUTS
 from .rest import with_rest
 from .task import Clock, Progress, Provenance, Task, with_provenance
@@ -247,8 +248,9 @@ def identify(
         excerpt = _excerpt(found, task.data, clock)
         if not clock.can_close:
             clock.lose("evidence")
-            return with_rest(_with_losses(found, clock), excerpt)
-        return with_rest(with_training_evidence(_with_losses(found, clock), excerpt), excerpt)
+        else:
+            found = with_training_evidence(found, excerpt)
+        return with_noise(with_rest(_with_losses(found, clock), excerpt), excerpt)
     except KeyboardInterrupt:
         raise Interrupted(found) from None
 

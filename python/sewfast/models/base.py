@@ -70,6 +70,14 @@ class Model(DynamicModel):
             return Rest((0.0,) * len(self.input_names), 0.0)
         return Rest(tuple(map(float, known["u"])), float(known["y"]), str(known.get("source", "")))
 
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the white noise in the recorded output [y]; 0 if unknown.
+
+        Closed loops on the model measure it, unless they have an encoder.
+        """
+        return float(self.training.get("noise", 0.0))
+
     def rest_state(self) -> FloatArray:
         # deviations from rest are zero there, so that past outputs are the level at rest
         state: FloatArray = self.about_rest.rest_state()
@@ -233,7 +241,7 @@ COMBINATIONS: tuple[Combine, ...] = ("median", "mean")
 MOST_MEMBERS = 1000
 LEAST_SHARE = 0.5
 """Part of the members that must not diverge for the ensemble to have a run."""
-_OF_ALL_MEMBERS = ("input_range", "output_range", "region", "rest")
+_OF_ALL_MEMBERS = ("input_range", "output_range", "region", "rest", "noise")
 """Entries that a file stores once for all members."""
 
 

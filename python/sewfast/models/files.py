@@ -126,6 +126,8 @@ def _training(training: Fields, inputs: int) -> Mapping[str, Any]:
         rest.number("y")
         if len(rest.vector("u")) != inputs:
             raise rest.refuse("u", f"{inputs} inputs at rest", known["rest"].get("u"))
+    if "noise" in known and training.number("noise") < 0.0:
+        raise training.refuse("noise", "a number of 0 or more", known["noise"])
     if "data" in known:
         for source in training.objects("data"):
             source.text("name")

@@ -33,6 +33,7 @@ from ..control.loop import (
     common_rest,
     each_plant,
     each_reference,
+    noise_in_loop,
     plant_units,
     reference_samples,
 )
@@ -136,6 +137,7 @@ class TuningTask:
             "plants": [p.about(rest) if isinstance(p, Model) else p.core for p in self.plants],
             "references": [r - rest.y for r in self.references],
             "disturbances": self.disturbances,
+            "noise": [noise_in_loop(self.start, p) for p in self.plants],
             "load_steps": [step.samples(self.start.Ts, rest.y) for step in self.loads],
             "start": self.start.about(rest).core(),
             "counts_per_unit": self.start.counts_per_unit,

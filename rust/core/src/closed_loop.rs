@@ -9,6 +9,7 @@ pub use plants::{LaggedPlant, StatePlant, Varied};
 
 use sewfast_control::{AnyController, Controller, PidController, Refused};
 
+use crate::random::Random;
 use crate::simd::{self, F64x8, Kernel};
 use crate::speed::Encoder;
 use crate::{Error, Monitor, Result};
@@ -63,7 +64,7 @@ fn counts(plant: &(impl Plant + ?Sized), encoder: Option<&Encoder>, since: f64) 
     Some(encoder.count(position))
 }
 
-/// Reference, feedforward and disturbance of a run, sample by sample.
+/// Reference, feedforward, disturbance and measurement noise of a run, sample by sample.
 #[derive(Clone, Copy, Debug)]
 pub struct Signals<'a> {
     /// What the output shall be \[y\].
@@ -72,6 +73,8 @@ pub struct Signals<'a> {
     pub feedforward: Option<&'a [f64]>,
     /// A command that is added behind the limits, unseen by the controller \[u\].
     pub disturbance: Option<&'a [f64]>,
+    /// Added to what is measured, and so not part of the true output \[y\].
+    pub noise: Option<&'a [f64]>,
 }
 
 impl<'a> Signals<'a> {
@@ -81,6 +84,7 @@ impl<'a> Signals<'a> {
             reference,
             feedforward: None,
             disturbance: None,
+            noise: None,
         }
     }
 
@@ -91,6 +95,7 @@ impl<'a> Signals<'a> {
         let beside = [
             ("feedforward", self.feedforward),
             ("disturbance", self.disturbance),
+            ("noise", self.noise),
         ];
         for (name, signal) in beside {
             let Some(signal) = signal else { continue };
@@ -117,7 +122,22 @@ impl<'a> Signals<'a> {
     fn disturbance_at(&self, k: usize) -> Option<f64> {
         self.disturbance.map(|added| at(added, k))
     }
+
+    /// What is added to the measurement of sample `k`.
+    #[inline(always)]
+    fn noise_at(&self, k: usize) -> Option<f64> {
+        self.noise.map(|added| at(added, k))
+    }
 }
+
+/// White noise of a standard deviation, the same for a seed on every platform.
+pub fn white_noise(deviation: f64, samples: usize, seed: u64) -> Vec<f64> {
+    let mut random = Random::stream(seed, NOISE);
+    (0..samples).map(|_| deviation * random.normal()).collect()
+}
+
+/// The stream of a seed from which noise is drawn: it is independent of the search's own numbers.
+const NOISE: u64 = 0x6e6f_6973_6531;
 
 #[inline(always)]
 fn at(signal: &[f64], k: usize) -> f64 {
@@ -273,6 +293,9 @@ impl Run {
                 (Some(before), Some(now)) => (now - before) / per_speed,
                 _ => y,
             };
+            let measured = signals
+                .noise_at(k)
+                .map_or(measured, |added| measured + added);
             // The counter itself is kept and not the position: what an encoder has rounded off once is not measured
             // later either.
             before = now;

@@ -37,6 +37,8 @@ pub struct Task<'a, P> {
     pub references: &'a [&'a [f64]],
     /// A command that is added behind the limits along each reference \[u\], as long as that; empty for none at all.
     pub disturbances: &'a [&'a [f64]],
+    /// Noise on what is measured of each plant along the references \[y\], as long as the longest; empty for none at all.
+    pub noise: &'a [&'a [f64]],
     /// Load steps that it has to bear, each with the same weight; of their runs only recovery, deviation and `|u|` count.
     pub loads: &'a [LoadStep<'a>],
     /// The encoder of plants that bring none; `None` for ideal feedback.
@@ -221,19 +223,23 @@ impl<'a, P> Task<'a, P> {
         self.loads.len() + self.references.len()
     }
 
-    /// What acts on a run from outside.
-    fn signals(&self, run: usize) -> Signals<'a> {
+    /// What acts on a plant's run from outside.
+    fn signals(&self, plant: usize, run: usize) -> Signals<'a> {
         match self.loads.get(run) {
+            // Without noise: a recovery is the last time beyond a band, and of noise that is one of its peaks.
             Some(load) => load.signals(),
-            None => self.along(run - self.loads.len()),
+            None => self.along(plant, run - self.loads.len()),
         }
     }
 
-    /// A reference with what disturbs it.
-    fn along(&self, reference: usize) -> Signals<'a> {
+    /// A reference with what disturbs it, and what disturbs its measurement.
+    fn along(&self, plant: usize, reference: usize) -> Signals<'a> {
+        let r = self.references[reference];
+        let noise = self.noise.get(plant);
         Signals {
             disturbance: self.disturbances.get(reference).copied(),
-            ..Signals::new(self.references[reference])
+            noise: noise.map(|noise| &noise[..noise.len().min(r.len())]),
+            ..Signals::new(r)
         }
     }
 
@@ -278,7 +284,12 @@ impl<'a, P> Task<'a, P> {
                 self.disturbances.len()
             )));
         }
-        (0..self.references.len()).try_for_each(|i| self.along(i).check())
+        for plant in 0..self.noise.len().max(1) {
+            for reference in 0..self.references.len() {
+                self.along(plant, reference).check()?;
+            }
+        }
+        Ok(())
     }
 
     fn check_loads(&self) -> Result<()> {

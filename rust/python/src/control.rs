@@ -102,7 +102,7 @@ fn unknown_form(form: &str) -> Error {
 }
 
 #[pyfunction]
-#[pyo3(signature = (plant, controller, reference, *, counts_per_unit, encoder_phase=0.5, feedforward=None, disturbance=None))]
+#[pyo3(signature = (plant, controller, reference, *, counts_per_unit, encoder_phase=0.5, feedforward=None, disturbance=None, noise=0.0, seed=0))]
 #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
 fn closed_loop<'py>(
     py: Python<'py>,
@@ -113,6 +113,8 @@ fn closed_loop<'py>(
     encoder_phase: f64,
     feedforward: Option<Values<'py>>,
     disturbance: Option<Values<'py>>,
+    noise: f64,
+    seed: u64,
 ) -> PyResult<Bound<'py, PyDict>> {
     let (model, design) = (Model::of(plant)?, controller.design());
     let beside = |values: &'_ Option<Values<'py>>, name| -> PyResult<Option<Vec<f64>>> {
@@ -121,10 +123,13 @@ fn closed_loop<'py>(
     };
     let feedforward = beside(&feedforward, "feedforward")?;
     let disturbance = beside(&disturbance, "disturbance")?;
+    let reference = slice(&reference, "reference")?;
+    let noise = (noise != 0.0).then(|| looped::white_noise(noise, reference.len(), seed));
     let signals = Signals {
-        reference: slice(&reference, "reference")?,
+        reference,
         feedforward: feedforward.as_deref(),
         disturbance: disturbance.as_deref(),
+        noise: noise.as_deref(),
     };
     let run = watched_over(py, signals.reference.len(), |monitor| {
         let encoder = looped::encoder(counts_per_unit, encoder_phase)?;

@@ -274,6 +274,7 @@ fn candidates(encoded: bool) -> Call {
             plants: &plants,
             references: &[&r],
             disturbances: &[],
+            noise: &[],
             loads: &[],
             encoder: encoder(counts(encoded), 0.5).expect("an encoder"),
             start: designs[0],

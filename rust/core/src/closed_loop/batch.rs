@@ -223,7 +223,7 @@ impl<'a, V: F64x8, C: LaneController<V>> Loops<'a, V, C> {
 
     /// Measures; gives the lanes whose outputs have left all bounds.
     #[inline(always)]
-    fn measure(&mut self) -> u64 {
+    fn measure(&mut self, signals: &Signals<'_>, k: usize) -> u64 {
         let y: V = self.plants.output();
         // As `Run::through` tests it, bit by bit of a mask; NaN is not below.
         let mut sound = y.abs().are_less(V::splat(RUNAWAY));
@@ -233,6 +233,9 @@ impl<'a, V: F64x8, C: LaneController<V>> Loops<'a, V, C> {
             self.measured = now.sub(self.before).div(V::splat(per_speed));
             self.before = now;
             sound &= self.measured.abs().are_less(V::splat(f64::INFINITY));
+        }
+        if let Some(added) = signals.noise_at(k) {
+            self.measured = self.measured.add(V::splat(added));
         }
         // Bits beyond the controllers of the last group name no loop: `Ends::running` begins without them.
         u64::from(!sound)
@@ -303,7 +306,7 @@ impl<V: F64x8, C: LaneController<V>, S: Notes> Meanwhile for Decision<'_, '_, V,
         match self.stage {
             0 => {
                 // A group's lanes have its place among the bits of all.
-                let runaway = self.loops.measure() << (LANES * g);
+                let runaway = self.loops.measure(signals, k) << (LANES * g);
                 self.ends.note(runaway, Outcome::Diverged(k));
             }
             1 => self.loops.controllers.take(k == 0, self.loops.measured),

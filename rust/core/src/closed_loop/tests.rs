@@ -288,3 +288,37 @@ fn a_disturbance_acts_behind_the_limits() {
     assert!(run.u.iter().all(|u| u.abs() <= 0.5));
     assert!((run.y[1999] - 490.0 * 1.5).abs() < 1e-6);
 }
+
+#[test]
+fn noise_is_measured_and_no_part_of_the_output() {
+    let model = lag();
+    let mut plant = LaggedPlant::new(&model, TS).unwrap();
+    let noise = white_noise(3.0, 2000, 1);
+    let signals = Signals {
+        noise: Some(&noise),
+        ..Signals::new(&[100.0; 2000])
+    };
+    let monitor = Monitor::default();
+    let mut c = controller(pi(1e-3, 0.1), 1);
+    let run = closed_loop_with(&mut plant, &mut c, signals, None, &monitor).unwrap();
+    for (k, added) in noise.iter().enumerate() {
+        assert_eq!(run.feedback[k], run.y[k] + added);
+    }
+    // the loop answers to it
+    let calm = closed_loop(&mut plant, &mut c, signals.reference, None, &monitor).unwrap();
+    assert_ne!(run.u, calm.u);
+}
+
+#[test]
+fn noise_is_white_of_its_deviation_and_of_its_seed() {
+    let noise = white_noise(2.0, 100_000, 7);
+    let mean_product = |lag: usize| {
+        let pairs = noise[lag..].iter().zip(&noise);
+        pairs.map(|(a, b)| a * b).sum::<f64>() / (noise.len() - lag) as f64
+    };
+    assert!((mean_product(0) - 4.0).abs() < 0.06);
+    // four standard errors of a correlation that is zero
+    assert!((1..20).all(|lag| mean_product(lag).abs() < 0.05));
+    assert_eq!(noise[..50], white_noise(2.0, 50, 7)[..]);
+    assert_ne!(noise[..50], white_noise(2.0, 50, 8)[..]);
+}

@@ -37,7 +37,7 @@ impl<P: Plant + Clone> Bench<P> {
     pub(super) fn new(task: &Task<'_, P>) -> Result<Self> {
         let (u_min, u_max) = task.start.limits();
         let weights = task.cost.weights(span(task.references), u_max - u_min)?;
-        let longest = (0..task.runs()).map(|k| task.signals(k).reference.len());
+        let longest = (0..task.runs()).map(|k| task.signals(0, k).reference.len());
         let longest = longest.max().unwrap_or(0);
         let measure = |r: &&[f64]| {
             let measure = Measure::needed(r, &weights);
@@ -179,7 +179,7 @@ impl<P: Plant + Clone> Bench<P> {
             Some(known) if Batch::take(&controllers) => {
                 let course = Runs {
                     known,
-                    signals: task.signals(run),
+                    signals: task.signals(plant, run),
                     encoder: task.encoder.as_ref(),
                     load: task.loads.get(run),
                     measure: run.checked_sub(task.loads.len()).map(|r| self.measures[r]),
@@ -224,7 +224,7 @@ impl<P: Plant + Clone> Bench<P> {
         controller: &mut AnyController<f64>,
         monitor: &Monitor,
     ) -> Option<Terms> {
-        let signals = task.signals(run);
+        let signals = task.signals(plant, run);
         let (plant, encoder) = (&mut self.plants[plant], task.encoder.as_ref());
         self.run
             .record_with(plant, controller, signals, encoder, monitor);

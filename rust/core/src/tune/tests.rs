@@ -57,6 +57,7 @@ fn with_task<T>(
         plants: &plants,
         references: &[&r],
         disturbances: &[],
+        noise: &[],
         loads: &[],
         encoder: Some(Encoder::new(26.2, 0.5)),
         start,

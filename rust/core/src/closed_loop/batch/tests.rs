@@ -9,7 +9,7 @@ use sewfast_control::{
 use super::*;
 use crate::closed_loop::kernel_plant::{AnyOrder, ScalarPlant, SecondOrder};
 use crate::closed_loop::{Constant, LoopController};
-use crate::closed_loop::{LaggedPlant, Plant, Run, Varied, encoder};
+use crate::closed_loop::{LaggedPlant, Plant, Run, Varied, encoder, white_noise};
 use crate::lagged::Lags;
 use crate::linear::LinearModel;
 use crate::neural::{NeuralOE, Scaling, Shape};
@@ -212,15 +212,17 @@ proptest! {
         limit in prop_oneof![Just(f64::INFINITY), 0.3..3.0],
         (gain, delay) in (0.5..1.5, 0_usize..5),
         counts in prop_oneof![Just(0.0), Just(26.2)],
-        (pushed, fed) in any::<(bool, bool)>(),
+        (pushed, fed, noisy) in any::<(bool, bool, bool)>(),
     ) {
         let model = network(seed, Lags::new(na, nb, nk, 1).unwrap(), hidden, bypass, limit);
         let plant = Varied::new(LaggedPlant::new(&model, TS).unwrap(), gain, delay).unwrap();
         let reference = references(seed, 200);
+        let noise = white_noise(2.0, 200, seed);
         let beside: Vec<f64> = (0..200).map(|k| if k > 90 { -2.5 } else { 0.25 }).collect();
         let signals = Signals {
             disturbance: pushed.then_some(&beside),
             feedforward: fed.then_some(&beside[..150]),
+            noise: noisy.then_some(&noise),
             ..Signals::new(&reference)
         };
         check(&plant, &designs, signals, encoder(counts, 0.5).unwrap().as_ref());
@@ -387,7 +389,7 @@ proptest! {
     fn a_lane_of_state_feedback_is_its_loop_to_the_bit(
         designs in prop::collection::vec(state_designs(), 1..=MOST),
         seed in any::<u64>(), counts in prop_oneof![Just(0.0), Just(26.2)],
-        (pushed, fed) in any::<(bool, bool)>(),
+        (pushed, fed, noisy) in any::<(bool, bool, bool)>(),
         huge in prop_oneof![Just(1.0), Just(1e300)],
     ) {
         // gains that no number holds: the command stays, and the observer begins again
@@ -396,10 +398,12 @@ proptest! {
         let model = network(seed, Lags::new(2, 2, 1, 1).unwrap(), 6, true, f64::INFINITY);
         let plant = LaggedPlant::new(&model, TS).unwrap();
         let reference = references(seed, 200);
+        let noise = white_noise(2.0, 200, seed);
         let beside: Vec<f64> = (0..200).map(|k| if k > 90 { -2.5 } else { 0.25 }).collect();
         let signals = Signals {
             disturbance: pushed.then_some(&beside),
             feedforward: fed.then_some(&beside[..150]),
+            noise: noisy.then_some(&noise),
             ..Signals::new(&reference)
         };
         let controllers: Vec<_> = designs.iter().map(|d| StateFeedback::new(*d).unwrap()).collect();

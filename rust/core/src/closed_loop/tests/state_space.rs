@@ -88,6 +88,7 @@ proptest! {
             reference: &reference,
             feedforward: Some(&feedforward),
             disturbance: Some(&disturbance),
+            noise: None,
         };
         let run = closed_loop_with(
             &mut LaggedPlant::new(&model, TS).unwrap(),

@@ -47,6 +47,7 @@ fn controllers_side_by_side_are_worth_what_they_are_worth_alone() {
                 constraints,
                 references: &references,
                 disturbances: &[],
+                noise: &[],
                 ..task.clone()
             };
             compare(&task, &designs(&task.start));

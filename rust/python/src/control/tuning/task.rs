@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use numpy::{Complex64, PyReadonlyArray1};
 use pyo3::prelude::*;
 use sewfast_control::AnyDesign;
-use sewfast_core::closed_loop::{Varied, encoder};
+use sewfast_core::closed_loop::{Varied, encoder, white_noise};
 use sewfast_core::tune::{
     self as tuning, Aggregate, Constraints, Cost, LoadLimit, LoadStep, Parameter, Sensitivity,
     Task, Variable,
@@ -47,6 +47,7 @@ pub struct Asked<'py> {
     plants: Vec<Bound<'py, PyAny>>,
     references: Vec<Values<'py>>,
     disturbances: Vec<Values<'py>>,
+    noise: Vec<f64>,
     load_steps: Vec<Load<'py>>,
     start: AnyGiven<'py>,
     counts_per_unit: f64,
@@ -64,6 +65,7 @@ pub struct Given {
     models: Vec<Model>,
     references: Vec<Vec<f64>>,
     disturbances: Vec<Vec<f64>>,
+    noise: Vec<f64>,
     load_steps: Vec<OwnedLoad>,
     variations: Vec<(f64, usize)>,
     counts_per_unit: f64,
@@ -183,6 +185,7 @@ impl Given {
                 .collect::<PyResult<_>>()?,
             references: owned("references", &asked.references)?,
             disturbances: owned("disturbances", &asked.disturbances)?,
+            noise: asked.noise.clone(),
             load_steps: asked
                 .load_steps
                 .iter()
@@ -213,6 +216,8 @@ impl Given {
         let plants = varied(&self.models, &self.variations, self.start.ts())?;
         let references: Vec<&[f64]> = self.references.iter().map(Vec::as_slice).collect();
         let disturbances: Vec<&[f64]> = self.disturbances.iter().map(Vec::as_slice).collect();
+        let noise = self.noise();
+        let noise: Vec<&[f64]> = noise.iter().map(Vec::as_slice).collect();
         let load_steps: Vec<LoadStep<'_>> = self.load_steps.iter().map(OwnedLoad::step).collect();
         if self.ms.is_some() && self.loops.is_empty() && self.measured.is_empty() {
             return Err(Error::setting(
@@ -242,6 +247,7 @@ impl Given {
             plants: &plants,
             references: &references,
             disturbances: &disturbances,
+            noise: &noise,
             loads: &load_steps,
             encoder,
             start: self.start,
@@ -258,6 +264,17 @@ impl Given {
         let limits = self.load_limits(&task, monitor)?;
         task.constraints.loads = &limits;
         work(&task)
+    }
+
+    /// What is added to the measurement of each plant in each of its variations; none if no plant has noise.
+    fn noise(&self) -> Vec<Vec<f64>> {
+        if self.noise.iter().all(|deviation| *deviation == 0.0) {
+            return Vec::new();
+        }
+        let longest = self.references.iter().map(Vec::len).max().unwrap_or(0);
+        let each = self.noise.iter();
+        each.flat_map(|&deviation| vec![white_noise(deviation, longest, 0); self.variations.len()])
+            .collect()
     }
 
     /// Whether a rival is a measure on plant `k`: on plants as they are, where these are among the variations.
