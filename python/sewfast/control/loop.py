@@ -335,8 +335,9 @@ def _given(
 
 def noise_in_loop(controller: SampledController, plant: Plant) -> float:
     """Standard deviation of the noise that a loop measures [y]: with an encoder there is none."""
-    is_counted = controller.counts_per_unit > 0.0 or not isinstance(plant, Model)
-    return 0.0 if is_counted else plant.noise
+    if not isinstance(plant, Model) or controller.counts_per_unit > 0.0:
+        return 0.0
+    return plant.noise
 
 
 def _noise(on: Any, noise: float) -> float:
