@@ -78,7 +78,7 @@ class SecondOpinion:
         return int(np.argmin(np.where(self.allowed, worst, np.inf)))
 
     @property
-    def warning(self) -> str | None:
+    def warning(self) -> tuple[str, str] | None:
         """The contradiction and its remedy; None if the models agree."""
         if not self.is_contradiction:
             return None
@@ -88,8 +88,8 @@ class SecondOpinion:
             f"the gains tuned on the models cost {_times(on_rival)} the rival's own gains on the "
             f"rival, and those {_times(on_models)} the models' own gains on the models: one of the "
             f"two is wrong in closed loop; taken are {_TITLES[self.pick]}, at most "
-            f"{_times(worst)} the least on either. Record a closed loop at the speeds and commands "
-            "of the references and identify again"
+            f"{_times(worst)} the least on either",
+            "record a closed loop at the speeds and commands of the references and identify again",
         )
 
 
@@ -123,7 +123,10 @@ def second_opinion(
     if not found.is_contradiction:
         return found
     least_wrong = found.candidates[int(np.argmin(found.relative.max(axis=0)))]
-    both = replace(task, plants=[*task.plants, *rival.plants], start=least_wrong)
+    both = replace(
+        task, plants=[*task.plants, *rival.plants], start=least_wrong,
+        loops=task.loops + rival.loops,
+    )  # fmt: skip
     try:
         third = search(both)
     except FitError:
