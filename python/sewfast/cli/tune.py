@@ -157,7 +157,7 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--speed", type=float, metavar="Y",
-        help="output about which to linearise models for Ms (middle of the references, and half way "
+        help="output about which models are linearised for Ms (middle of the references, half way "
         "to their ends)",
     )  # fmt: skip
     parser.add_argument(

@@ -86,7 +86,7 @@ class Tuning:
         stamp: str = "",
     ) -> None:
         from ..analysis.analysis import slowest_time
-        from ..analysis.points import plant_points
+        from ..analysis.points import plant_points, recorded_way
         from ..analysis.responses import default_steps
         from ..control.biquad import Biquad
         from ..control.loop import check_fits, each_plant, titles
@@ -114,6 +114,7 @@ class Tuning:
         self.steps = default_steps(
             self.start, self.points, self.slowest,
             level=None, step=None, disturbance=None, seconds=None,
+            span=recorded_way(self.members),
         )  # fmt: skip
         self._found: list[Found] = []
 

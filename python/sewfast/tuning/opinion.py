@@ -19,6 +19,7 @@ from .. import _core
 from ..control.controller import SampledController
 from ..errors import FitError
 from .task import TuningTask
+from .verdict import Objection
 
 SHARE = 0.2
 """Evaluations of each search of a second opinion, as a share of those on the models."""
@@ -78,13 +79,19 @@ class SecondOpinion:
         return int(np.argmin(np.where(self.allowed, worst, np.inf)))
 
     @property
-    def warning(self) -> tuple[str, str] | None:
+    def warning(self) -> str | None:
         """The contradiction and its remedy; None if the models agree."""
+        return None if self.objection is None else str(self.objection)
+
+    @property
+    def objection(self) -> Objection | None:
+        """The contradiction as a reason of the verdict: the gains are poor."""
         if not self.is_contradiction:
             return None
         on_rival, on_models = self._crossed
         worst = float(self.relative[:, self.pick].max())
-        return (
+        return Objection(
+            "poor",
             f"the gains tuned on the models cost {_times(on_rival)} the rival's own gains on the "
             f"rival, and those {_times(on_models)} the models' own gains on the models: one of the "
             f"two is wrong in closed loop; taken are {_TITLES[self.pick]}, at most "

@@ -137,7 +137,9 @@ def _of(
             time.lose("all looks at the largest sensitivity Ms")
             break
         try:
-            points.append((operating_point(plant, level), level))
+            point = operating_point(plant, level)
+            margins(controller, point, speed=level)  # refuses a standstill, where nothing answers
+            points.append((point, level))
         except (SettingError, FitError) as error:
             reason = error
     # the core takes every plant at every point of a schedule, also where the plant never is

@@ -35,7 +35,7 @@ from .task import (
     cut_short,
     threads_or_all,
 )
-from .verdict import Objection, Verdict, out_of_reach, verdict_of
+from .verdict import Verdict, out_of_reach, verdict_of
 
 Method: TypeAlias = Literal["genetic", "cma-es"]
 
@@ -350,8 +350,8 @@ def tune(
     known = list(out_of_reach(task)) if references is not None else []
     if other is not None and not time.over(_RIVAL):
         result = _asked(result, task, other.with_loops(time), search, variables)
-        if result.opinion is not None and result.opinion.warning is not None:
-            known.append(Objection("poor", *result.opinion.warning))
+        if result.opinion is not None and result.opinion.objection is not None:
+            known.append(result.opinion.objection)
     try:
         verdict = verdict_of(task, result.controller, time, limit=task.constraints.Ms, others=known)
     except KeyboardInterrupt:
