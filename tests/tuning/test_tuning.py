@@ -221,9 +221,7 @@ def test_the_worst_plant_counts_alone() -> None:
     assert tune(plants, SHORT, **settings).cost == pytest.approx(np.mean(apart), rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    "limits", [{"Ms": 1.0}, {"u": -1.0}, {"overshoot": math.inf}]
-)
+@pytest.mark.parametrize("limits", [{"Ms": 1.0}, {"u": -1.0}, {"overshoot": math.inf}])
 def test_limits_that_make_no_sense_are_refused(limits: dict[str, float]) -> None:
     with pytest.raises(SettingError, match="above"):
         Constraints(**limits)

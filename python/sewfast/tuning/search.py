@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -232,7 +233,8 @@ def tune(
 
     Every candidate runs on every plant in every variation over every reference, with encoder,
     feedback filter and limits in the loop. A run's cost is a weighted sum of terms (`Cost`). A seed
-    gives the same bits at any number of threads. The result is never worse than the start.
+    gives the same bits at any number of threads. The result is never worse than a start that keeps
+    to the constraints.
 
     Parameters
     ----------
@@ -409,7 +411,7 @@ class _Search:
             if not is_strict:
                 # gains that only exceed the default limit are kept
                 Ms, limit = task.loops.worst(result.controller)[0], task.constraints.Ms
-                violation -= max(0.0, Ms / (limit or Ms or 1.0) - 1.0)
+                violation -= max(0.0, HAIR * Ms / (limit or math.inf) - 1.0)
             return _in_time(result, violation)
         if result.termination == "interrupted":
             raise Interrupted(result.controller)
@@ -470,7 +472,7 @@ def _asked(
 
 
 def _in_time(result: TuningResult, violation: float) -> TuningResult:
-    if violation > HAIR - 1.0:
+    if violation > 0.0:
         raise FitError(
             name="time_budget", expected=f"time for {_KEEPS}",
             received=f"the best of {result.evaluations}, which exceeds them by {violation:.3g} of "
