@@ -97,7 +97,7 @@ def linear_loops(task: TuningTask, time: Budget) -> LinearLoops:
     if not isinstance(controller, Controller):
         return LinearLoops()
     if given is None:
-        plants = [p for p in task.plants if isinstance(p, Model)]
+        plants = [p for p in task.plants if isinstance(p, Model) and len(p.input_names) == 1]
     else:
         listed = list(given) if isinstance(given, (list, tuple)) else [given]
         plants = [m for plant in listed for m in (getattr(plant, "members", ()) or (plant,))]
