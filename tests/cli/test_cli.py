@@ -280,7 +280,7 @@ def test_tune_refuses_a_model_that_identify_called_useless(tmp_path: Path, walk:
     verdict = {"grade": "useless", "text": "useless: it explains 3 %", "fit_percent": 3.0}
     stored["training"]["verdict"] = {**verdict, "next": []}
     (tmp_path / "poor.json").write_text(json.dumps(stored))
-    few = ("--evaluations", 5, "-o", "c.json")
+    few = ("--evaluations", 60, "-o", "c.json")
     assert "useless" not in sewfast(tmp_path, "tune", walk / "drive.json", *few).err
     (tmp_path / "c.json").unlink()
     refused = sewfast(tmp_path, "tune", "poor.json", *few, done=2).err

@@ -318,7 +318,6 @@ def test_reference_file_without_r_or_at_another_rate(folder: Path) -> None:
         ("--variables", "Kq"),
         ("--evaluations", 0),
         ("--front", "front.csv"),
-        ("--speed", "1500"),
         ("--pareto", "tracking"),
         ("--pareto", "tracking,chatter", "--front", "front.txt"),
         ("--pareto", "tracking,chatter", "--method", "cma-es"),

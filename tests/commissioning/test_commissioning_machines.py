@@ -27,6 +27,7 @@ from sewfast.commissioning.slow import HARMONICS, TurnLoad, basis, turn_load
 from sewfast.commissioning.small_signal import SmallSignal, small_signal
 from sewfast.control.margins import margins
 from sewfast.recording import Recording
+from sewfast.tuning.objective import LARGEST_MS
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benches"))
 drives = pytest.importorskip("drives")
@@ -82,15 +83,15 @@ def test_first_gains_are_quiet_where_eq_12_alone_would_wake_the_shaft() -> None:
     assert found is not None
     r, settled = held(wanted, 6000.0, on.Ts)
     wild = first_gains(step, on, wanted)
-    assert margins(wild, found.model).Ms > 2.0
+    assert margins(wild, found.model).Ms > LARGEST_MS
     swing = swing_of(on.follow(wild, r, "wild"), settled)
     assert swing is not None
     assert swing.frequency == pytest.approx(60.0, rel=0.2)
     quiet = first_gains(step, on, wanted, found)
-    assert margins(quiet, found.model).Ms <= 2.0
+    assert margins(quiet, found.model).Ms <= LARGEST_MS
     assert [b.kind for b in quiet.biquads] == ["notch"]
     # it allows more than gains that are lowered alone
-    plain = lowered(wild, found.model, 2.0)
+    plain = lowered(wild, found.model, LARGEST_MS)
     assert quiet.gains.to("parallel").Ki > 1.2 * plain.gains.to("parallel").Ki
     assert swing_of(on.follow(quiet, r, "quiet"), settled) is None
 

@@ -108,7 +108,7 @@ def test_ctrl_c_within_the_second_opinion_keeps_the_gains() -> None:
         raise Interrupted(None)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(search._Search, "brief", lambda self: type("S", (), {"on": stopped})())
+        patch.setattr(search._Search, "brief", lambda self: type("S", (), {"within": stopped})())
         with pytest.raises(Interrupted) as caught:
             tuned(rival=drive(gain=470.0))
     assert found
@@ -138,7 +138,7 @@ def test_the_command_asks_a_rival(tmp_path: Path) -> None:
         tmp_path, "tune", "wrong.json", "--rival", "right.json", "--reference", "trapezoid",
         "--evaluations", "300", "-o", "c.json",
     )  # fmt: skip
-    assert "warning" in told.out
+    assert "verdict   poor: the gains tuned on the models" in told.out
     assert load_controller(tmp_path / "c.json").gains.Kp > 0.0
     said = refused(
         tmp_path, "tune", "wrong.json", "--rival", "right.json", "--pareto", "tracking,chatter",

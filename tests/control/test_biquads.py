@@ -334,11 +334,11 @@ def test_the_command_line_proposes_and_tunes_with_notches(tmp_path: Path, capsys
     limits = ["--constraint", "Ms=3", "--response", response]
     assert not main([*tune_it, "--notch", "60:0.2:0.4", *limits])
     assert [b.kind for b in load_controller(out).biquads] == ["notch"]
+    assert not main([*tune_it, "--response", response])  # the default limit holds for it, too
     for more, message in (
         (["--notch", "x"], "HZ:DEPTH"),
         (["--notch", "60:1:1:1"], "HZ:DEPTH"),
         (["--notch", "900"], "half the sample rate"),
-        (["--response", response], "limit of Ms"),
     ):
         assert main([*tune_it, *more]) == 2
         assert message in capsys.readouterr().err

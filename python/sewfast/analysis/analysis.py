@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,12 +26,15 @@ from ..control.loop import (
 )
 from ..control.systems import LinearLoop
 from ..errors import FitError, SettingError
+from ..evidence.card import Line
 from ..tables import Table
 from ..trust import Judgement, Limits, judge
-from ..tuning.objective import Cost
+from ..tuning.objective import LARGEST_MS, Cost
+from ..tuning.robustness import HAIR
+from ..tuning.verdict import LIVELY
 from ..units import duration, time_unit
 from .changes import Change
-from .points import LoopBode, PlantPoint, loop_bodes, plant_points
+from .points import LoopBode, PlantPoint, loop_bodes, plant_points, recorded_way
 from .responses import (
     Responses,
     Steps,
@@ -233,10 +236,12 @@ def analyse(
         With one input each; every member of an ensemble is a plant.
     speeds : sequence of float, optional
         Steady outputs about which the plants are linearised [y]; by default three within the range
-        covered by the first model's training data.
+        covered by the first model's training data, of a drive that was recorded in both directions
+        one in the other direction. A linear model has one, in the middle of this range or, if it
+        covers both directions, half way from rest to its farther end.
     level, step : float, optional
         Output before the steps and size of the reference step [y]; by default the middle of
-        `speeds` and a tenth of it.
+        `speeds`, and a twentieth of the way from rest to the farther end of the recorded output.
     disturbance : float, optional
         Disturbance step at the plant's input [u]; by default one that would move the output by
         `step` without control. On a virtual machine it is the load torque with the same effect.
@@ -285,24 +290,25 @@ def analyse(
     slowest = slowest_time(controller, points[main])
     steps = default_steps(
         controller, points[main], slowest,
-        level=level, step=step, disturbance=disturbance, seconds=seconds,
+        level=level, step=step, disturbance=disturbance, seconds=seconds, span=recorded_way(plants),
     )  # fmt: skip
     wanted = each_reference(references, _default_references(controller, plants[0], steps))
     task = Task(
         tuple(plants[:MOST]), tuple(names[:MOST]), points[main][:MOST], tuple(wanted),
         cost, seed,
     )  # fmt: skip
+    loops = loop_bodes(controller, points, slowest)
     return Analysis(
         controller=controller,
         plants=tuple(names),
         references=tuple(r if isinstance(r, str) else "reference" for r in wanted),
-        loops=loop_bodes(controller, points, slowest),
+        loops=loops,
         main=main,
         responses=_responses(controller, plants, names, steps),
         score=task.score(controller),
         sensitivity=gain_sensitivity(controller, task, threads=threads),
         what_if=what_if(controller, task, changes, threads=threads),
-        judgement=_judgement(controller, plants, wanted, limits, seed),
+        judgement=_judgement(controller, plants, wanted, limits, seed, loops),
     )
 
 
@@ -341,13 +347,37 @@ def _responses(
 
 
 def _judgement(
-    controller: Controller, plants: Sequence[Any], references: Any, limits: Limits | None, seed: int
-) -> Judgement | None:
-    """Objections to the loops; None if a loop diverges, which the score shows."""
+    controller: Controller, plants: Sequence[Any], references: Any, limits: Limits | None,
+    seed: int, loops: Sequence[LoopBode],
+) -> Judgement | None:  # fmt: skip
+    """Objections to margins and loops; None if a loop diverges, which the score shows."""
     try:
-        return judge(controller, plants, references, limits=limits, seed=seed, refuse=False)
+        found = judge(controller, plants, references, limits=limits, seed=seed, refuse=False)
     except FitError:
         return None
+    return replace(found, lines=(_margins_line(loops, controller.y_unit), *found.lines))
+
+
+def _margins_line(loops: Sequence[LoopBode], unit: str) -> Line:
+    """Is the loop far enough from instability, by the limits of `tune`?"""
+    worst = max(loops, key=lambda loop: loop.Ms)
+    name, limit = "margins", f"Ms <= {LARGEST_MS:g}"
+    place = f"about {in_unit(f'{worst.level:.4g}', unit)}"
+    if not worst.worst.stable:
+        text = "the linear loop is unstable: lower the gains, or identify again"
+        return Line(name, math.inf, f"unstable {place}", limit, "fail", text)
+    shown = f"Ms {worst.Ms:.3g}, {worst.worst.phase_margin_deg:.3g} deg {place}"
+    if worst.Ms <= HAIR * LARGEST_MS:
+        text = "the loop keeps its distance from instability"
+        return Line(name, worst.Ms, shown, limit, "ok", text)
+    if worst.Ms <= HAIR * LIVELY:
+        text = "the loop is lively: an older belt or a longer delay makes it ring"
+        return Line(name, worst.Ms, shown, limit, "info", text)
+    text = (
+        "the loop is close to instability and rings at one frequency; lower the gains, tune again, "
+        "or take delay out of the loop"
+    )
+    return Line(name, worst.Ms, shown, limit, "warn", text)
 
 
 # --- An analysis as text --------------------------------------------------------------------------

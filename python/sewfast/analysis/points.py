@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..control.controller import Controller
+from ..control.defaults import recorded_outputs
 from ..control.loop import Plant
 from ..control.margins import Margins, loop_response, margins, operating_point
 from ..dataset import FloatArray
@@ -26,6 +27,8 @@ from ..models.linear import LinearDifference
 
 SHARES = (0.1, 0.5, 0.9)
 """Positions within the outputs near the training data at which plants are linearised."""
+BOTH = 0.25
+"""Least way in one direction as a share of that in the other, as of references over both."""
 _MACHINE_SPEEDS = (300.0, 1000.0, 2000.0)
 
 
@@ -125,16 +128,34 @@ def _speeds(plants: Sequence[Plant]) -> list[float]:
     first = next((p for p in plants if isinstance(p, Model)), None)
     if first is None:
         return list(_MACHINE_SPEEDS)
+    low, high = first.training.get("output_range", (0.0, 0.0))
+    shares: Sequence[float] = SHARES
     if isinstance(first, LinearDifference) or not first.training.get("input_range"):
-        low, high = first.training.get("output_range", (0.0, 0.0))
-        return [float(f"{0.5 * (low + high):.2g}")]
-    known = [p for p in operating_range(first).points if p.known and p.settled and not p.saturated]
-    if not known:
-        low, high = first.training["output_range"]
-        return [float(f"{0.5 * (low + high):.2g}")]
-    low, high = min(p.y for p in known), max(p.y for p in known)
+        shares = (0.5,)
+    else:
+        near = operating_range(first).points
+        known = [p.y for p in near if p.known and p.settled and not p.saturated]
+        low, high = (min(known), max(known)) if known else (low, high)
+        shares = SHARES if known else (0.5,)
+    rest = first.rest.y
+    ways = sorted((end - rest for end in (low, high)), key=abs)
+    if ways[0] * ways[1] < 0.0 and abs(ways[0]) > BOTH * abs(ways[1]):
+        # a motor in the middle of both directions stands in its dry friction
+        levels = [rest + share * ways[1] for share in shares[-2:]]
+        levels = [rest + 0.5 * ways[0], *levels] if len(shares) > 1 else levels
+    else:
+        levels = [low + share * (high - low) for share in shares]
     # two digits are enough for a default
-    return [float(f"{low + share * (high - low):.2g}") for share in SHARES]
+    return [float(f"{level:.2g}") for level in levels]
+
+
+def recorded_way(plants: Sequence[Plant]) -> float | None:
+    """From rest to the farther end of the first model's recorded output [y]; None if unknown."""
+    first = next((p for p in plants if isinstance(p, Model)), None)
+    known = None if first is None else recorded_outputs(first)
+    if first is None or known is None:
+        return None
+    return max(abs(end - first.rest.y) for end in known) or None
 
 
 def _of(plant: Plant, name: str, speed: float) -> PlantPoint:

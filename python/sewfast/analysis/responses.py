@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..control.controller import Controller
-from ..control.loop import ClosedLoopRun, Plant, check_fits, reference_samples, run
+from ..control.loop import (
+    ClosedLoopRun,
+    Plant,
+    check_fits,
+    common_rest,
+    reference_samples,
+    run,
+)
 from ..dataset import FloatArray
 from ..errors import DataError, SettingError
 from ..gains import real, vector
@@ -324,7 +331,7 @@ def responses(
     """Reference step and disturbance step with encoder, filters and limits, without noise."""
     n = steps.samples
     lead = 3 * n
-    ramp = np.interp(np.arange(lead), [0, n], [0.0, steps.level])
+    ramp = np.interp(np.arange(lead), [0, n], [common_rest(plants).y, steps.level])
     r = np.concatenate([ramp, np.full(n, steps.level)])
     raised = np.concatenate([ramp, np.full(n, steps.level + steps.step)])
     d = np.where(np.arange(len(r)) < lead, 0.0, steps.disturbance)
@@ -366,8 +373,9 @@ def default_steps(
     step: float | None,
     disturbance: float | None,
     seconds: float | None,
+    span: float | None = None,
 ) -> Steps:
-    """Default steps for a plant: a tenth of its level, and a disturbance of the same effect.
+    """Default steps: a twentieth of the recorded span, and a disturbance of the same effect.
 
     Parameters
     ----------
@@ -378,6 +386,9 @@ def default_steps(
         Time constant of the slowest closed-loop pole [s].
     level, step, disturbance, seconds : float or None
         Instead of the defaults.
+    span : float, optional
+        From rest to the farther end of the recorded output [y]; without it the step is a tenth of
+        the level.
 
     Raises
     ------
@@ -396,7 +407,7 @@ def default_steps(
     half = 0.5 * (controller.u_max - controller.u_min)
     if step is None:
         small = 0.01 * half * gain if math.isfinite(half * gain) else 1.0
-        step = 0.1 * abs(level) if level else small
+        step = 0.05 * span if span else 0.1 * abs(level) if level else small
     if disturbance is None:
         disturbance = -step / gain if math.isfinite(gain) else -0.05 * (
             half if math.isfinite(half) else 1.0

@@ -75,7 +75,7 @@ def add(commands: Commands) -> None:
         "(a tenth of --u-max; 0: not required)",
     )  # fmt: skip
     parser.add_argument(
-        "--Ms", type=float, default=2.0, metavar="MS", help="largest sensitivity allowed (2)"
+        "--Ms", type=float, metavar="MS", help="largest sensitivity allowed (1.8; inf: no limit)"
     )
     parser.add_argument(
         "--time-budget", type=float, metavar="S", help="time of the search for gains (no limit)"
@@ -149,7 +149,7 @@ def _commissioned(args: argparse.Namespace) -> Commissioning:
             "members": args.members,
             "evaluations": args.evaluations,
             "load": args.load,
-            "Ms": args.Ms,
+            **({} if args.Ms is None else {"Ms": args.Ms}),
             "time_budget": args.time_budget,
             "seed": args.seed,
             "progress": lambda done, total, stage: progress.say(stage),

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ..tuning.objective import Constraints, Cost, LoadStep
     from ..tuning.search import TuningResult
     from ..tuning.task import Wanted
+    from ..tuning.verdict import Verdict
 
 
 FORMS = ("standard", "parallel", "per_sample")
@@ -54,8 +55,12 @@ Several references are tuned for together.
 The cost of a run is a weighted sum of tracking [y], chatter [u], effort [u], overshoot [%], rise
 [ms], lag [ms], saturation (a share), and under load steps (--load) recovery [ms] and load (rms
 deviation); --cost NAME=WEIGHT sets a weight, overshoot_limit the overshoot without a cost.
---constraint sets limits that come first: Ms, overshoot, u, recovery, load. --pareto OBJECTIVES
-searches for a Pareto front instead, and picks its knee.
+--constraint sets limits that come first: Ms (1.8 without one; inf: none), overshoot, u, recovery,
+load. --pareto OBJECTIVES searches for a Pareto front instead, and picks its knee.
+
+Gains that destabilise a model, that keep the command at a limit although the reference needs none,
+or that leave the recorded inputs and outputs for most of a run, are refused: exit code 2, and no
+file. --force writes them all the same.
 """
 
 TUNE_EXAMPLES = """\
@@ -121,8 +126,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--response", metavar="RESPONSE.json",
-        help="a response measured by sewfast bode, for whose bands Ms must hold as well; needs "
-        "--constraint Ms=..",
+        help="a response measured by sewfast bode, for whose bands Ms must hold as well",
     )  # fmt: skip
     parser.add_argument(
         "--rival", metavar="MODEL.json",
@@ -131,7 +135,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--force", action="store_true",
-        help="tune on a model that identify called useless, too",
+        help="tune on a model that identify called useless, and write gains that are unfit, too",
     )  # fmt: skip
     _add_search(parser)
     add_plot(parser, "draw the loops of the result and the start; with --pareto the front")
@@ -149,11 +153,12 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--constraint", action="append", metavar="NAME=LIMIT",
-        help="limit of Ms, overshoot [%%], u, recovery [ms] or load; may repeat",
+        help="limit of Ms (1.8; inf: none), overshoot [%%], u, recovery [ms] or load; may repeat",
     )  # fmt: skip
     parser.add_argument(
         "--speed", type=float, metavar="Y",
-        help="output about which to linearise networks for --constraint Ms=..",
+        help="output about which models are linearised for Ms (middle of the references, half way "
+        "to their ends)",
     )  # fmt: skip
     parser.add_argument(
         "--load", action="append", metavar="LEVEL:COMMAND",
@@ -225,12 +230,14 @@ def tune_command(args: argparse.Namespace) -> int | None:
     try:
         if args.pareto is None:
             found = _tuned(args, models, references, settings)
+            _require_fit(args, found.verdict)
             found.controller.save(args.out)
             if args.plot is not None:
                 found.plot(first, references[0] if references else None, file=args.plot)
             _show_tuned(args, found)
         else:
             front = _front(args, models, references, settings)
+            _require_fit(args, front.verdict)
             front.picked.save(args.out)
             _show_front(args, front)
     except Interrupted as e:
@@ -238,6 +245,12 @@ def tune_command(args: argparse.Namespace) -> int | None:
         print(f"interrupted; kept the best so far in {args.out}", file=sys.stderr)
         return 130
     return None
+
+
+def _require_fit(args: argparse.Namespace, verdict: Verdict) -> None:
+    """Refuse unfit gains unless they are forced."""
+    if not args.force:
+        verdict.require_fit()
 
 
 def _settings(args: argparse.Namespace) -> dict[str, Any]:
@@ -258,46 +271,27 @@ def _settings(args: argparse.Namespace) -> dict[str, Any]:
 def _on_response(
     args: argparse.Namespace, constraints: Constraints, models: list[Any]
 ) -> Constraints:
-    """Ms on the linear models, on networks about a speed, and on the bands of a response.
+    """Ms about a speed, and on the bands of a response.
 
     Raises
     ------
     SettingError
-        For a response without a limit of Ms, or without a linear model.
+        For a response without a linear model.
     """
     if args.speed is not None:
-        constraints = _about(args, constraints, models)
+        constraints = replace(constraints, speed=args.speed)
     if args.response is None:
         return constraints
     from ..frequency import load_response
 
     response = load_response(args.response)
-    if constraints.Ms is None:
-        raise SettingError(
-            "--response: expected a limit of Ms to take on it as well; give --constraint Ms=1.7"
-        )
-    linear = constraints.plant or [model for model in models if hasattr(model, "to_tf")]
+    linear = [model for model in models if hasattr(model, "to_tf")]
     if not linear:
         raise SettingError(
             "--response: expected a linear model among those to tune on, as a response does not "
             "tell whether a loop is stable; add that of sewfast bode --model"
         )
     return replace(constraints, plant=[*linear, response])
-
-
-def _about(args: argparse.Namespace, constraints: Constraints, models: list[Any]) -> Constraints:
-    """Ms on every model, or every member of an ensemble, about the given speed.
-
-    Raises
-    ------
-    SettingError
-        For a speed without a limit of Ms.
-    """
-    if constraints.Ms is None:
-        raise SettingError(
-            "--speed: expected a limit of Ms to linearise for; give --constraint Ms=1.7"
-        )
-    return replace(constraints, plant=models, speed=args.speed)
 
 
 def _started(args: argparse.Namespace, models: list[Any]) -> dict[str, Any]:
@@ -416,6 +410,7 @@ def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
                 "method": found.method,
                 "lost": list(found.lost),
                 "grade": found.grade,
+                "verdict": found.verdict.to_json(),
                 "warning": found.warning,
                 "plot": None if args.plot is None else str(args.plot),
                 "weights": found.weights.named(),
@@ -449,7 +444,8 @@ def _show_front(args: argparse.Namespace, front: ParetoFront) -> None:
                 "evaluations": front.evaluations,
                 "lost": list(front.lost),
                 "grade": front.grade,
-                "warning": front.sensitive,
+                "verdict": front.verdict.to_json(),
+                "warning": front.warning,
                 **_controller(front.picked),
             }
         )

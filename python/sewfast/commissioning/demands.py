@@ -13,7 +13,7 @@ from ..dataset import FloatArray
 from ..errors import FitError, SettingError
 from ..gains import real, whole
 from ..report.commissioned import file_name
-from ..tuning.objective import Constraints
+from ..tuning.objective import LARGEST_MS, Constraints
 from ..tuning.task import budget
 
 if TYPE_CHECKING:
@@ -48,8 +48,6 @@ LONGEST_NAME = 100
 """Longest name of a reference's file [bytes]; file systems allow 255, including the endings."""
 
 MOST_MEMBERS = 100
-MS = 2.0
-"""Default of the largest sensitivity."""
 OVER = 1.25
 """Training covers this multiple of the top of the working range, as the loop overshoots it."""
 
@@ -94,7 +92,7 @@ class Demands:
     seed: int
     threads: int
     load: float | None = None
-    Ms: float | None = MS
+    Ms: float | None = LARGEST_MS
     time_budget: float | None = None
 
     @property
@@ -115,7 +113,7 @@ def demands(
     seed: int,
     threads: int,
     load: float | None = None,
-    Ms: float | None = MS,
+    Ms: float | None = LARGEST_MS,
     time_budget: float | None = None,
 ) -> Demands:
     """The demands, checked against the machine's limits.
@@ -164,7 +162,7 @@ def demands(
         whole("seed", seed),
         _at_least(1, "threads", threads),
         _load(load, volt),
-        None if Ms is None else Constraints(Ms=Ms).Ms,
+        None if Ms in (None, math.inf) else Constraints(Ms=Ms).Ms,
         None if time_budget is None else budget(time_budget),
     )
 

@@ -23,7 +23,7 @@ from ..gains import Gains
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
 from ..rules import Fopdt, Rule, eq_12, simc
-from ..tuning.objective import Constraints, Cost, LoadStep
+from ..tuning.objective import LARGEST_MS, Constraints, Cost, LoadStep
 from ..tuning.search import TuningResult, costs, recoveries, tune
 from .bench import Aborted
 from .demands import Demands, Refusal
@@ -37,8 +37,6 @@ from .small_signal import SHAKEN_AT, Resonance, SmallSignal
 FILTER = 8e-3
 """Length of the feedback's moving average [s]: one count of 1,572 per ms is 38 RPM."""
 DERIVATIVE_FILTER = 10.0
-FIRST_MS, SAFE_MS = 1.8, 2.0
-"""Ms of the first gains for first order with dead time; largest Ms for the small signals' model."""
 LOWER, STEPS = 0.85, 29
 """Factor from one trial of lower gains to the next, and the number of trials."""
 SEARCHED = ("Kp", "Ti", "Td", "alpha", "beta", "N", "filter_samples", "filter_time")
@@ -62,7 +60,7 @@ def first_gains(
     if it has a resonance, with a notch there.
     """
     samples = max(1, min(64, round(FILTER / machine.Ts)))
-    rule = _rule(fopdt, (samples - 1) / 2 * machine.Ts, FIRST_MS)
+    rule = _rule(fopdt, (samples - 1) / 2 * machine.Ts, LARGEST_MS)
     found = Controller(
         gains=rule.gains,
         Ts=machine.Ts,
@@ -78,8 +76,8 @@ def first_gains(
     if small is None:
         return found
     if small.resonance is None:
-        return lowered(found, small.model, SAFE_MS)
-    return notched(found, small.model, small.resonance, SAFE_MS)
+        return lowered(found, small.model, LARGEST_MS)
+    return notched(found, small.model, small.resonance, LARGEST_MS)
 
 
 def notched(controller: Controller, plant: Model, resonance: Resonance, Ms: float) -> Controller:
@@ -151,12 +149,12 @@ def stretched(controller: Controller, share: float) -> Controller:
 
 
 def ruled(fopdt: Fopdt, like: Controller) -> Controller:
-    """Eq. 12's gains with an Ms of at most 2, and all other settings of another controller.
+    """Eq. 12's gains with an Ms of at most 1.8, and all other settings of another controller.
 
     Without that limit, the short dead time of small signals leads to gains that move the command by
     volts for every count of the encoder.
     """
-    rule = _rule(fopdt, (like.filter_samples - 1) / 2 * like.Ts + like.filter_time, SAFE_MS)
+    rule = _rule(fopdt, (like.filter_samples - 1) / 2 * like.Ts + like.filter_time, LARGEST_MS)
     return replace(
         like, gains=rule.gains, alpha=rule.alpha, beta=rule.beta, schedule=(),
         notes=f"{rule.name} on the recorded step response",
@@ -242,7 +240,7 @@ def search(
     """
     asked = requirements or Requirements()
     try:
-        found = tune(
+        return tune(
             models,
             list(references.values()),
             start=start,
@@ -259,8 +257,6 @@ def search(
             time_budget=demands.time_budget,
             progress=lambda done, total, best: progress(done, total),
         )
-        # the demands limit Ms, unless the caller has chosen to have no limit
-        return replace(found, sensitive=None)
     except FitError as error:
         raise Refusal(
             f"expected gains under which every member of the ensemble does what is required "
@@ -302,7 +298,7 @@ class Requirements:
 
     loads: tuple[LoadStep, ...] = ()
     rival: Controller | None = None
-    constraints: Constraints = field(default_factory=Constraints)
+    constraints: Constraints = field(default_factory=lambda: Constraints(Ms=math.inf))
 
     @classmethod
     def of(
@@ -329,7 +325,7 @@ class Requirements:
         own = [margins(rival, m, speed=speed).Ms for m in linear] if bears and is_stiff else []
         constraints = Constraints(
             # gains as fast as the rule's can hardly have a smaller Ms
-            Ms=_limit(demands.Ms, own) if linear else None,
+            Ms=_limit(demands.Ms, own) if linear else math.inf,
             recovery=rival if bears else None,
             plant=linear or None,
             speed=speed,
@@ -340,7 +336,7 @@ class Requirements:
         """How a controller meets them on the members without variations, as JSON values."""
         members = self.constraints.plant or ()
         found: dict[str, Any] = {
-            "Ms_limit": self.constraints.Ms,
+            "Ms_limit": self.constraints.Ms if self.constraints.limits_Ms else None,
             "Ms": [margins(controller, m, speed=self.constraints.speed).Ms for m in members],
         }
         if self.rival is None:

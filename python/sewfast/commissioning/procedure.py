@@ -27,13 +27,13 @@ from ..progress import shown_in_notebooks
 from ..recording import Recording
 from ..rules import Fopdt
 from ..threads import available
-from ..tuning.objective import Cost
+from ..tuning.objective import LARGEST_MS, Cost
 from ..tuning.search import TuningResult
 from ..tuning.task import GAINS
 from . import excitations
 from .bench import ABORTED, RecordedBench, bench_of, description_of
 from .checkpoint import STAGES, Checkpoint
-from .demands import MS, Demands, Refusal, demands
+from .demands import Demands, Refusal, demands
 from .excitations import first_motion, standard, step_response
 from .gains import (
     Requirements,
@@ -78,7 +78,7 @@ def commission(
     members: int = MEMBERS,
     evaluations: int = EVALUATIONS,
     load: float | None = None,
-    Ms: float | None = MS,
+    Ms: float | None = LARGEST_MS,
     time_budget: float | None = None,
     seed: int = 0,
     threads: int | None = None,
@@ -130,7 +130,7 @@ def commission(
     Ms : float or None
         Largest sensitivity on the model of the machine's small signals or, without one, on every
         member linearised at three quarters of the top speed; that of Eq. 12's gains if it is larger
-        and a load is required.
+        and a load is required. None or inf for no limit.
     time_budget : float, optional
         Time of the search [s], after which the best gains so far are used. Then the same seed no
         longer gives the same gains.

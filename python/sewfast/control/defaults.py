@@ -91,6 +91,12 @@ def _output_range(model: Model) -> tuple[float, float] | None:
     return (min(ends), max(ends)) if ends and np.isfinite(ends).all() else None
 
 
+def recorded_outputs(model: Model) -> tuple[float, float] | None:
+    """Least and largest output that a model was identified on, and at rest [y]; None if unknown."""
+    known, rest = _output_range(model), model.rest.y
+    return None if known is None else (min(known[0], rest), max(known[1], rest))
+
+
 def command_limits(
     models: Sequence[Any], u_min: float | None, u_max: float | None
 ) -> tuple[float, float, str]:
@@ -167,8 +173,8 @@ def require_one_input(model: Model) -> None:
         )  # fmt: skip
 
 
-# both the start of a search and its default references need it
-@lru_cache(maxsize=8)
+# the start of a search, its default references and its verdict need it, of every member
+@lru_cache(maxsize=32)
 def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
     """The step response at the first size and length at which it settles.
 
@@ -203,6 +209,7 @@ def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
     ) from reason  # fmt: skip
 
 
+@lru_cache(maxsize=32)
 def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
     """The step response of the output's rate [y/s], for a model that integrates; None for others.
 

@@ -86,7 +86,7 @@ class Tuning:
         stamp: str = "",
     ) -> None:
         from ..analysis.analysis import slowest_time
-        from ..analysis.points import plant_points
+        from ..analysis.points import plant_points, recorded_way
         from ..analysis.responses import default_steps
         from ..control.biquad import Biquad
         from ..control.loop import check_fits, each_plant, titles
@@ -114,6 +114,7 @@ class Tuning:
         self.steps = default_steps(
             self.start, self.points, self.slowest,
             level=None, step=None, disturbance=None, seconds=None,
+            span=recorded_way(self.members),
         )  # fmt: skip
         self._found: list[Found] = []
 
@@ -269,7 +270,7 @@ class Tuning:
         SettingError
         """
         search.cost()
-        search.limits(self.model, self.level)
+        search.limits()
 
     def search(
         self,
@@ -300,7 +301,7 @@ class Tuning:
         try:
             result = tune(
                 self.model, start=start, cost=search.cost(),
-                constraints=search.limits(self.model, self.level),
+                constraints=search.limits(),
                 evaluations=search.evaluations, time_budget=search.seconds, seed=search.seed,
                 progress=progress,
             )  # fmt: skip
@@ -310,7 +311,7 @@ class Tuning:
         return Found(
             self._values_of(result.pid), result.pid, start,
             None if result.termination == "time" else replace(search, seconds=None),
-            result.cost, result.start_cost, result.termination,
+            result.cost, result.start_cost, result.termination, str(result.verdict),
         )  # fmt: skip
 
     def keep(self, found: Found) -> dict[str, Any]:
@@ -323,6 +324,7 @@ class Tuning:
             "ended": found.ended,
             "cost": found.cost,
             "start_cost": found.start_cost,
+            "verdict": found.verdict,
         }
 
     def _values_of(self, controller: Controller) -> dict[str, float]:
@@ -348,7 +350,7 @@ class Tuning:
         else:
             lines.append(f"start = {_call(found.start)}")
             assert found.search is not None
-            options = found.search.python(self.model, self.level)
+            options = found.search.python()
             lines.append(f"controller = sewfast.tune(model, start=start, {options}).controller")
         lines += [f"controller.save({file!r})", "print(sewfast.analyse(controller, model))"]
         return "\n".join(lines) + "\n"
@@ -362,7 +364,7 @@ class Tuning:
         else:
             assert found.search is not None
             written = f"start-{file}"
-            options = found.search.command(self.model, self.level)
+            options = found.search.command()
             lines = [f"sewfast tune {model} --start {written} {options} -o {file}"]
         first = self.controller(values) if found is None else found.start
         document = [f"cat > {written} <<'END'", _document(first), "END"]
@@ -488,8 +490,8 @@ class Search:
 
         return Cost(**self.weights)
 
-    def limits(self, model: Model, level: float) -> Constraints:
-        """The constraints; Ms of networks is that about the level [y].
+    def limits(self) -> Constraints:
+        """The constraints.
 
         Raises
         ------
@@ -497,29 +499,22 @@ class Search:
         """
         from ..tuning import Constraints
 
-        if "Ms" not in self.constraints or _is_linear(model):
-            return Constraints(**self.constraints)
-        return Constraints(**self.constraints, plant=model, speed=level)
+        return Constraints(**self.constraints)
 
-    def python(self, model: Model, level: float) -> str:
+    def python(self) -> str:
         """Arguments of `sewfast.tune`."""
         words = [f"evaluations={self.evaluations}, seed={self.seed}"]
         if self.weights:
             words.append(f"cost=sewfast.Cost({_named(self.weights)})")
         if self.constraints:
-            limits = _named(self.constraints)
-            if "Ms" in self.constraints and not _is_linear(model):
-                limits += f", plant=model, speed={level!r}"
-            words.append(f"constraints=sewfast.Constraints({limits})")
+            words.append(f"constraints=sewfast.Constraints({_named(self.constraints)})")
         return ", ".join(words)
 
-    def command(self, model: Model, level: float) -> str:
+    def command(self) -> str:
         """Options of `sewfast tune`."""
         words = [f"--evaluations={self.evaluations}", f"--seed={self.seed}"]
         words += [f"--cost {name}={value!r}" for name, value in self.weights.items()]
         words += [f"--constraint {name}={value!r}" for name, value in self.constraints.items()]
-        if "Ms" in self.constraints and not _is_linear(model):
-            words.append(f"--speed={level!r}")
         return " ".join(words)
 
 
@@ -534,12 +529,8 @@ class Found:
     cost: float | None = None
     start_cost: float | None = None
     ended: str = "interrupted"
+    verdict: str | None = None
 
 
 def _named(values: Mapping[str, float]) -> str:
     return ", ".join(f"{name}={value!r}" for name, value in values.items())
-
-
-def _is_linear(model: Model) -> bool:
-    """Whether `sewfast.tune` finds a plant to take Ms on by itself."""
-    return all(hasattr(member, "to_tf") for member in model.members or (model,))

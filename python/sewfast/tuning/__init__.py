@@ -1,7 +1,8 @@
 """From models to a controller.
 
 Read in this order: `objective` (`Cost`, `Constraints`, `LoadStep`), `task` (plants, variables and
-start of a search), `search` (`tune`), `opinion` (a second opinion), `front` (`pareto`).
+start of a search), `robustness` (Ms and its default limit), `search` (`tune`), `opinion` (a second
+opinion), `verdict`, `front` (`pareto`).
 """
 
 from .front import ParetoFront, pareto

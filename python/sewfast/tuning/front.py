@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -32,11 +33,10 @@ from .task import (
     TuningTask,
     Wanted,
     budget,
-    close_to_instability,
     cut_short,
-    grade_of,
     threads_or_all,
 )
+from .verdict import Verdict, verdict_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,11 +67,10 @@ class ParetoFront(Plotted):
         its range on the front, on a logarithmic scale for ranges wider than 1 to 10.
     evaluations : int
         Controllers tried.
-    sensitive : str or None
-        As `TuningResult.sensitive`, of the knee; None if Ms is an objective.
+    verdict : Verdict
+        As `TuningResult.verdict`, of the knee.
     lost : tuple of str
-    grade : str
-        As of `TuningResult`.
+        As `TuningResult.lost`.
     """
 
     controllers: tuple[Controller, ...]
@@ -80,9 +79,18 @@ class ParetoFront(Plotted):
     values: NDArray[np.float64]
     pick: int
     evaluations: int
-    sensitive: str | None = None
+    verdict: Verdict = field(default_factory=Verdict)
     lost: tuple[str, ...] = ()
-    grade: str = ""
+
+    @property
+    def grade(self) -> str:
+        """As `TuningResult.grade`."""
+        return self.verdict.model
+
+    @property
+    def warning(self) -> str | None:
+        """As `TuningResult.warning`."""
+        return "; ".join(self.verdict.reasons) or None
 
     @property
     def cut(self) -> str | None:
@@ -163,7 +171,7 @@ class ParetoFront(Plotted):
             for i, row in enumerate(self.values)
         ]
         note = "* the knee: closest to the best of every objective, in shares of its range here"
-        remarks = (("in time", self.cut), ("warning", self.sensitive))
+        remarks = (("in time", self.cut), ("verdict", str(self.verdict)))
         warning = [f"  {name:<9} {text}" for name, text in remarks if text is not None]
         return "\n".join([f"{len(self)} controllers", head, *rows, note, *warning])
 
@@ -196,7 +204,8 @@ def pareto(
     Parameters
     ----------
     models, references, start, variables, aggregate, constraints, variations, loads, seed, threads
-        As in `tune`; without a start, that of `tune` with its default limits.
+        As in `tune`; without a start, that of `tune` with its default limits. If Ms is an
+        objective, it has no limit by default.
     objectives : sequence of str
         Two or more of tracking, chatter, effort, overshoot, rise, lag, saturation, recovery, load,
         cost, Ms.
@@ -239,6 +248,11 @@ def pareto(
         "variations": variations,
         "loads": loads,
     }
+    limit = getattr(constraints, "Ms", None)
+    if limit is None and "Ms" in names:
+        # the front shows what less of it costs
+        limit = math.inf
+        settings["constraints"] = replace(constraints or Constraints(), Ms=limit)
     first = max(1, int(_TUNED * total))
     tuned = tune(
         models,
@@ -252,7 +266,9 @@ def pareto(
         progress=_shifted(progress, 0, total),
         **settings,
     )
+    settings["constraints"] = tuned.constraints
     task = TuningTask.of(models, references, start=tuned.start, first={}, **settings)
+    task = task.with_loops(time)
     rest = max(1, total - first)
     deadline = Deadline(time, time.share(1.0 - LOOK), _shifted(progress, first, total))
     try:
@@ -277,8 +293,9 @@ def pareto(
     if "time" in (found["termination"], tuned.termination):
         left = total - tuned.evaluations - int(found["evaluations"])
         time.lose(f"{left} of {total} controllers")
-    front = _front(found, task, names, tuned, time)
-    return replace(front, lost=tuple(time.lost), grade=grade_of(task.plants))
+    front = _front(found, task, names, tuned)
+    verdict = verdict_of(task, front.picked, time, limit=limit)
+    return replace(front, lost=tuple(time.lost), verdict=verdict)
 
 
 def _unfinished(time: Budget, size: int) -> FitError:
@@ -306,9 +323,7 @@ def _shifted(progress: Progress | None, before: int, total: int) -> Progress | N
     return lambda done, _, best: progress(before + done, total, best)
 
 
-def _front(
-    found: Any, task: TuningTask, objectives: list[str], tuned: TuningResult, time: Budget
-) -> ParetoFront:
+def _front(found: Any, task: TuningTask, objectives: list[str], tuned: TuningResult) -> ParetoFront:
     interrupted = found["termination"] == "interrupted"
     if interrupted and not found["controllers"]:
         raise Interrupted(tuned.pid)
@@ -329,9 +344,6 @@ def _front(
         values=values,
         pick=pick,
         evaluations=tuned.evaluations + int(found["evaluations"]),
-        sensitive=(
-            None if "Ms" in objectives else close_to_instability(task, controllers[pick], time)
-        ),
     )
     if interrupted:
         raise Interrupted(front)

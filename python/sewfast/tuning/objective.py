@@ -144,6 +144,12 @@ def terms(run: ClosedLoopRun) -> dict[str, float]:
 # --- Constraints ----------------------------------------------------------------------------------
 
 
+LARGEST_MS = 1.8
+"""Limit of Ms if none is given: a gain margin of 2.25 and a phase margin of 32 degrees for sure.
+Without one the search goes as close to instability as calm references allow: to 2.6 to 3.7 with
+seeds 0 to 2 on the linear model of docs/reading-margins.md."""
+
+
 @dataclass(frozen=True)
 class Constraints:
     """Limits that come before the cost (docs/CONVENTIONS.md, Tuning).
@@ -155,7 +161,8 @@ class Constraints:
     ----------
     Ms : float, optional
         Largest sensitivity of the linear loop (`sewfast.margins`), 1.4 to 2 for a robust one; with
-        a gain schedule at each of its points.
+        a gain schedule at each of its points. By default `LARGEST_MS`, which gives way if no
+        controller keeps to it; inf for no limit.
     overshoot : float, optional
         Largest overshoot on steps and trapezoids [%], on every plant.
     u : float, optional
@@ -169,10 +176,11 @@ class Constraints:
         Largest rms deviation under any load step [y], likewise.
     plant : linear plant or list of them, optional
         The plants for Ms: anything that `sewfast.margins` accepts. A `FrequencyResponse` next to
-        one of these counts with its bands: Ms is the largest that they allow. By default the linear
-        models among the plants used for tuning.
+        one of these counts with its bands: Ms is the largest that they allow. By default the models
+        used for tuning.
     speed : float, optional
-        Output at which a nonlinear `plant` is linearised [y].
+        Output at which nonlinear models are linearised [y]; by default the middle of the references
+        and half way to their ends.
 
     Raises
     ------
@@ -194,7 +202,7 @@ class Constraints:
             if value is None or (name in BY_RIVAL and isinstance(value, Controller)):
                 continue
             limit = real(name, value)
-            if not (limit > least and math.isfinite(limit)):
+            if not (limit > least and (math.isfinite(limit) or name == "Ms")):
                 raise SettingError(
                     f"expected a finite limit above {least:g} for {name}, got {value!r}"
                 )
@@ -203,10 +211,17 @@ class Constraints:
             object.__setattr__(self, "speed", real("speed", self.speed))
 
     @property
+    def limits_Ms(self) -> bool:
+        """Whether there is a limit of Ms."""
+        return self.Ms is not None and math.isfinite(self.Ms)
+
+    @property
     def limits(self) -> _core._Limits:
         """The limits by name, for the core."""
         values = {name: getattr(self, name) for name in LIMITS}
         cores = {n: v.core() if isinstance(v, Controller) else v for n, v in values.items()}
+        if not self.limits_Ms:
+            cores["Ms"] = None
         return cast("_core._Limits", cores)
 
     def __str__(self) -> str:
@@ -222,6 +237,8 @@ BY_RIVAL = ("recovery", "load")
 def _described(name: str, limit: float | Controller) -> str:
     if isinstance(limit, Controller):
         return f"{name} no larger than under {limit.notes or 'another controller'}"
+    if math.isinf(limit):
+        return f"{name} not limited"
     return f"{name} <= {limit:g}{LIMITS[name]}"
 
 

@@ -19,6 +19,7 @@ from .. import _core
 from ..control.controller import SampledController
 from ..errors import FitError
 from .task import TuningTask
+from .verdict import Objection
 
 SHARE = 0.2
 """Evaluations of each search of a second opinion, as a share of those on the models."""
@@ -80,16 +81,22 @@ class SecondOpinion:
     @property
     def warning(self) -> str | None:
         """The contradiction and its remedy; None if the models agree."""
+        return None if self.objection is None else str(self.objection)
+
+    @property
+    def objection(self) -> Objection | None:
+        """The contradiction as a reason of the verdict: the gains are poor."""
         if not self.is_contradiction:
             return None
         on_rival, on_models = self._crossed
         worst = float(self.relative[:, self.pick].max())
-        return (
+        return Objection(
+            "poor",
             f"the gains tuned on the models cost {_times(on_rival)} the rival's own gains on the "
             f"rival, and those {_times(on_models)} the models' own gains on the models: one of the "
             f"two is wrong in closed loop; taken are {_TITLES[self.pick]}, at most "
-            f"{_times(worst)} the least on either. Record a closed loop at the speeds and commands "
-            "of the references and identify again"
+            f"{_times(worst)} the least on either",
+            "record a closed loop at the speeds and commands of the references and identify again",
         )
 
 
@@ -123,7 +130,10 @@ def second_opinion(
     if not found.is_contradiction:
         return found
     least_wrong = found.candidates[int(np.argmin(found.relative.max(axis=0)))]
-    both = replace(task, plants=[*task.plants, *rival.plants], start=least_wrong)
+    both = replace(
+        task, plants=[*task.plants, *rival.plants], start=least_wrong,
+        loops=task.loops + rival.loops,
+    )  # fmt: skip
     try:
         third = search(both)
     except FitError:

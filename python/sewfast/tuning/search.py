@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..progress import TimeUp, shown_in_notebooks
 from ..tables import Table, significant
 from .objective import Constraints, Cost, LoadStep
 from .opinion import SHARE, SecondOpinion, second_opinion
+from .robustness import HAIR, within_default
 from .task import (
     LOOK,
     Aggregate,
@@ -31,12 +33,10 @@ from .task import (
     Variable,
     Wanted,
     budget,
-    close_to_instability,
     cut_short,
-    grade_of,
-    out_of_reach,
     threads_or_all,
 )
+from .verdict import Verdict, out_of_reach, verdict_of
 
 Method: TypeAlias = Literal["genetic", "cma-es"]
 
@@ -49,6 +49,8 @@ _ENDED_BY = {
     "interrupted": "Ctrl-C",
 }
 """The terminations in words."""
+_KEEPS = "a controller that keeps to the constraints"
+"""Missing in a search without gains within its limits, in the words of the core."""
 _RIVAL = "the second opinion of the rival"
 
 
@@ -75,20 +77,17 @@ class TuningResult:
     aggregate : str
         ``mean`` or ``worst``, over the plants.
     constraints : Constraints
-        The constraints that applied.
+        The constraints that applied, with the limit of Ms.
     method : str
         ``genetic`` or ``cma-es``.
     lost : tuple of str
         The work that a time budget cut short, in words; empty if it cut nothing.
-    grade : str
-        The worst grade that the models' verdicts give; empty if they have none.
+    verdict : Verdict
+        Grade and reasons: gains that destabilise a model, saturate on a calm reference or leave the
+        record for most of a run are ``unfit``; those whose Ms is above 2, or on which two kinds of
+        model contradict each other, ``poor``; no gains are better than their models.
     opinion : SecondOpinion or None
         The comparison with a rival; None without one, or if no gains suit it.
-    beyond : str or None
-        References that are out of reach with the least gain of the variations, in words.
-    sensitive : str or None
-        An Ms above 2 that no constraint limits, in words: the loop is close to instability. Only
-        for PIDs and models, about the levels of the references and of a gain schedule.
     """
 
     controller: SampledController
@@ -103,21 +102,18 @@ class TuningResult:
     constraints: Constraints
     method: str
     lost: tuple[str, ...] = ()
-    grade: str = ""
+    verdict: Verdict = field(default_factory=Verdict)
     opinion: SecondOpinion | None = None
-    beyond: str | None = None
-    sensitive: str | None = None
+
+    @property
+    def grade(self) -> str:
+        """The worst grade that the models' verdicts give; empty if they have none."""
+        return self.verdict.model
 
     @property
     def warning(self) -> str | None:
-        """Objections to the gains, and what to do; None if there are none.
-
-        They are models of two kinds that contradict each other about good gains, references that
-        the drive cannot follow with the least gain of the variations, and a loop that is close to
-        instability.
-        """
-        opinion = None if self.opinion is None else self.opinion.warning
-        return "; ".join(text for text in (opinion, self.beyond, self.sensitive) if text) or None
+        """The reasons of the verdict, with what to do; None if there are none."""
+        return "; ".join(self.verdict.reasons) or None
 
     @property
     def cut(self) -> str | None:
@@ -190,7 +186,7 @@ class TuningResult:
         ).to_html([f"{name}: {text}" for name, text in self._remarks()])
 
     def _remarks(self) -> list[tuple[str, str]]:
-        pairs = (("in time", self.cut), ("warning", self.warning))
+        pairs = (("in time", self.cut), ("verdict", str(self.verdict)))
         return [(name, text) for name, text in pairs if text is not None]
 
     def __str__(self) -> str:
@@ -237,7 +233,8 @@ def tune(
 
     Every candidate runs on every plant in every variation over every reference, with encoder,
     feedback filter and limits in the loop. A run's cost is a weighted sum of terms (`Cost`). A seed
-    gives the same bits at any number of threads. The result is never worse than the start.
+    gives the same bits at any number of threads. The result is never worse than a start that keeps
+    to the constraints.
 
     Parameters
     ----------
@@ -276,7 +273,9 @@ def tune(
     aggregate : "mean" or "worst"
         Aggregate over the plants in their variations; over the references it is the mean.
     constraints : Constraints, optional
-        Requirements that come before the cost.
+        Requirements that come before the cost. Without a limit of Ms, that of every model is at
+        most `sewfast.tuning.objective.LARGEST_MS`, 1.8, about the levels of the references; if no
+        gains keep to it, the verdict says so. ``Constraints(Ms=math.inf)`` has no limit.
     variations : sequence of (gain, delay), optional
         Output gain and extra input delay in samples, applied to every plant. By default the plant
         unchanged, and with the gains .8 and 1.25 and a delay of a quarter of the moving average, at
@@ -348,16 +347,18 @@ def tune(
     )  # fmt: skip
     # check the rival before the search, which may take long
     other = None if rival is None else replace(task, plants=_rivals(rival, task))
-    result = search.on(task, variables)
-    if references is not None:
-        result = replace(result, beyond=out_of_reach(task))
+    task = task.with_loops(time)
+    result = search.within(task, variables)
+    known = list(out_of_reach(task)) if references is not None else []
     if other is not None and not time.over(_RIVAL):
-        result = _asked(result, task, other, search, variables)
+        result = _asked(result, task, other.with_loops(time), search, variables)
+        if result.opinion is not None and result.opinion.objection is not None:
+            known.append(result.opinion.objection)
     try:
-        result = replace(result, sensitive=close_to_instability(task, result.controller, time))
+        verdict = verdict_of(task, result.controller, time, limit=task.constraints.Ms, others=known)
     except KeyboardInterrupt:
         raise Interrupted(result.controller) from None
-    return replace(result, lost=tuple(time.lost), grade=grade_of(task.plants))
+    return replace(result, lost=tuple(time.lost), verdict=verdict)
 
 
 @dataclass(frozen=True)
@@ -372,7 +373,22 @@ class _Search:
     progress: Progress | None
     part: float
 
-    def on(self, task: TuningTask, variables: Sequence[Wanted] | None) -> TuningResult:
+    def within(self, task: TuningTask, variables: Sequence[Wanted] | None) -> TuningResult:
+        """The search within the default limit of Ms, if the task has none and gains keep to it."""
+        refused: FitError | None = None
+        for tried in within_default(task):
+            try:
+                return self._on(tried, variables, is_strict=tried is task)
+            except FitError as error:
+                if _KEEPS not in (error.expected or ""):
+                    raise
+                refused = error
+        assert refused is not None
+        raise refused
+
+    def _on(
+        self, task: TuningTask, variables: Sequence[Wanted] | None, *, is_strict: bool
+    ) -> TuningResult:
         deadline = Deadline(self.budget, self.budget.share(self.part), self.progress)
         try:
             found = _core.tune(
@@ -391,7 +407,12 @@ class _Search:
         if deadline.passed and result.termination == "interrupted":
             left = self.evaluations - result.evaluations
             self.budget.lose(f"{left} of {self.evaluations} controllers")
-            return _in_time(result, found["violation"])
+            violation = found["violation"]
+            if not is_strict:
+                # gains that only exceed the default limit are kept
+                Ms, limit = task.loops.worst(result.controller)[0], task.constraints.Ms
+                violation -= max(0.0, HAIR * Ms / (limit or math.inf) - 1.0)
+            return _in_time(result, violation)
         if result.termination == "interrupted":
             raise Interrupted(result.controller)
         return result
@@ -430,7 +451,7 @@ def _asked(
 
     def brief(on: TuningTask) -> SampledController:
         try:
-            found.append(search.brief().on(on, variables))
+            found.append(search.brief().within(on, variables))
         except Interrupted:
             raise Interrupted(result.controller) from None
         except FitError as error:
@@ -453,7 +474,7 @@ def _asked(
 def _in_time(result: TuningResult, violation: float) -> TuningResult:
     if violation > 0.0:
         raise FitError(
-            name="time_budget", expected="time for a controller that keeps to the constraints",
+            name="time_budget", expected=f"time for {_KEEPS}",
             received=f"the best of {result.evaluations}, which exceeds them by {violation:.3g} of "
             "their limits in sum", remedy="give more time, or relax them",
         )  # fmt: skip

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -20,7 +19,6 @@ from ..control.defaults import (
     default_references,
     drive_step,
     filter_length,
-    moves_on,
     rate_step,
     require_one_input,
 )
@@ -37,7 +35,6 @@ from ..control.loop import (
     plant_units,
     reference_samples,
 )
-from ..control.margins import margins, sampled
 from ..errors import FitError, SettingError
 from ..gains import Gains, real, vector, whole
 from ..models import Model
@@ -47,6 +44,7 @@ from ..rules import Fopdt, Rule, table_1
 from ..threads import available
 from ..units import revolutions_per_second, spelled
 from .objective import Constraints, Cost, LoadStep
+from .robustness import LinearLoops, linear_loops
 
 Progress: TypeAlias = Callable[[int, int, float], object]
 Aggregate: TypeAlias = Literal["mean", "worst"]
@@ -69,6 +67,7 @@ class TuningTask:
     aggregate: str
     constraints: Constraints
     assumed: str
+    loops: LinearLoops = field(default_factory=LinearLoops)
 
     @classmethod
     def of(
@@ -122,16 +121,19 @@ class TuningTask:
         """The level at which the loops begin."""
         return common_rest(self.plants)
 
+    def with_loops(self, time: Budget) -> TuningTask:
+        """The task with the linear loops on which Ms is limited and looked at."""
+        return replace(self, loops=linear_loops(self, time))
+
     def core(self, names: Sequence[Wanted] | None = None, *, ms: bool = False) -> _core._Task:
         """The task for the core, with variables by name; `ms` if Ms is an objective."""
-        asked = ms or self.constraints.Ms is not None
+        asked = ms or self.constraints.limits_Ms
         if asked and not isinstance(self.start, Controller):
             raise SettingError(
                 name="Ms", expected="a PID to take it of", received=type(self.start).__name__,
                 remedy="leave it out: plants with other gains and delays (variations) are among "
                 "those that the controller has to serve",
             )  # fmt: skip
-        loops, measured = self._loops() if asked else ([], [])
         rest = self.rest
         return {
             "plants": [p.about(rest) if isinstance(p, Model) else p.core for p in self.plants],
@@ -148,121 +150,9 @@ class TuningTask:
             "cost": self.cost.named(),
             "aggregate": self.aggregate,
             "limits": self.constraints.limits,
-            "linear_plants": loops,
-            "measured": measured,
+            "linear_plants": self.loops.core(self.start.Ts) if asked else [],
+            "measured": [r.lines(self.start) for r in self.loops.measured] if asked else [],
         }
-
-    def _loops(self) -> tuple[list[Any], list[Any]]:
-        """The plants for Ms: linear ones as fractions, and measured ones as lines."""
-        given = self.constraints.plant
-        if given is None:
-            plants = [p for p in self.plants if hasattr(p, "to_tf")]
-        else:
-            plants = list(given) if isinstance(given, (list, tuple)) else [given]
-            plants = [m for plant in plants for m in (getattr(plant, "members", ()) or (plant,))]
-        if not plants:
-            raise SettingError(
-                "expected a linear plant to take Ms on, got none among the plants; give "
-                "Constraints(plant=...), for example a linear model of the same drive, or add one "
-                "to the plants"
-            )
-        seen = [plant for plant in plants if hasattr(plant, "lines")]
-        if len(seen) == len(plants):
-            raise SettingError(
-                "expected a linear plant beside the measured response, which does not tell whether "
-                "a loop is stable; give plant=[response, fit_shaft(response).to_model()]"
-            )
-        known = [plant for plant in plants if not hasattr(plant, "lines")]
-        return (
-            [sampled(plant, self.start.Ts, self.constraints.speed) for plant in known],
-            [response.lines(self.start) for response in seen],
-        )
-
-
-def out_of_reach(task: TuningTask) -> str | None:
-    """A warning about references that no gains can follow with the least gain of the variations.
-
-    None if there are none. Tuning on them would minimise the loss at the limit of the command.
-    """
-    (plant, *_), start = task.plants, task.start
-    gain = min(gain for gain, _ in task.variations)
-    if not isinstance(plant, Model) or gain >= 1.0 or moves_on(plant, start.u_min, start.u_max):
-        return None
-    try:
-        fopdt = drive_step(plant, start.u_min, start.u_max).fopdt
-    except (FitError, SettingError):
-        return None  # its reach is unknown
-    rest = plant.rest.y
-    reach = (fopdt.K * u + fopdt.offset for u in (start.u_min, start.u_max))
-    low, high = sorted(rest + gain * (y - rest) for y in reach)
-    top, bottom = max(r.max() for r in task.references), min(r.min() for r in task.references)
-    if bottom >= min(low, rest) and top <= max(high, rest):
-        return None
-    unit = f" {start.y_unit}" if start.y_unit else ""
-    return (
-        f"the references ask for {bottom:.4g} to {top:.4g}{unit}, with {gain:g} of its gain the "
-        f"drive reaches {low:.4g} to {high:.4g} at the limits of its command: there no gains help, "
-        "and those found look for the least loss; lower the references, raise the limits, or give "
-        "variations without that gain"
-    )
-
-
-LARGEST_MS = 2.0
-"""Ms up to which a loop surely has a gain margin of 2 and a phase margin of 29 degrees."""
-
-
-def close_to_instability(
-    task: TuningTask, controller: SampledController, time: Budget
-) -> str | None:
-    """A warning about a PID whose Ms on one of the models is above `LARGEST_MS`, or None.
-
-    The cost does not show how close a loop is to instability, and the search goes as close as calm
-    references allow. None as well if the task limits Ms, and where no model has a linear loop.
-    """
-    if task.constraints.Ms is not None or not isinstance(controller, Controller):
-        return None
-    low = min(float(r.min()) for r in task.references)
-    high = max(float(r.max()) for r in task.references)
-    # at rest, in the middle of references of both signs, a motor stands in its dry friction
-    rest = task.rest.y
-    halves = (rest + 0.5 * (end - rest) for end in (high, low) if end != rest)
-    levels = [0.5 * (low + high), *halves]
-    levels += [speed for speed, _ in controller.schedule]
-    found, about, linear = 0.0, 0.0, True
-    for plant in task.plants:
-        if not isinstance(plant, Model):
-            continue
-        depends = bool(controller.schedule) or not hasattr(plant, "to_tf")
-        for level in levels if depends else levels[:1]:
-            if time.over("all looks at the largest sensitivity Ms"):
-                break
-            # a model without a steady state there has no Ms
-            with contextlib.suppress(SettingError, FitError):
-                Ms = margins(controller, plant, speed=level).Ms
-                linear = linear and hasattr(plant, "to_tf")
-                if Ms > found:
-                    found, about = Ms, level
-    if found <= LARGEST_MS:
-        return None
-    limit = f"Ms={LARGEST_MS:g}"
-    python, command, place = limit, limit, ""
-    if not linear:
-        python, command = (
-            f"{limit}, plant=models, speed={about:.4g}",
-            f"{limit} --speed={about:.4g}",
-        )
-    if controller.schedule or not linear:
-        place = f" about {about:.4g} {controller.y_unit}".rstrip()
-    remedy = (
-        f"limit it (Constraints({python}), --constraint {command}), or look at the margins "
-        "(sewfast analyse)"
-    )
-    if math.isinf(found):
-        return f"on one of the models the linear loop{place} is unstable: Ms is infinite; {remedy}"
-    return (
-        f"Ms is {found:.3g}{place}: at one frequency the loop amplifies disturbances "
-        f"{found:.3g} times, which is close to instability; {remedy}"
-    )
 
 
 def _assumed(start: SampledController, given: list[Any], *, derived: bool) -> str:
@@ -291,17 +181,6 @@ def _instance(given: Any, kind: type[Any], example: str) -> Any:
             f"expected a {kind.__name__}, got {type(given).__name__}; for example {example}"
         )
     return kind() if given is None else given
-
-
-GRADES = ("useless", "poor", "fair", "good")
-"""Grades of a model's verdict, the worst first."""
-
-
-def grade_of(plants: Sequence[Any]) -> str:
-    """The worst grade of the models' verdicts; empty if none has one."""
-    known = [p.training.get("verdict") or {} for p in plants if isinstance(p, Model)]
-    grades = [v["grade"] for v in known if v.get("grade") in GRADES]
-    return min(grades, key=GRADES.index, default="")
 
 
 def cut_short(lost: Sequence[str], grade: str) -> str | None:

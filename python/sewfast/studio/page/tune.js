@@ -169,7 +169,7 @@ export function mount(root, { ask, on }) {
 
   /** Limits as words and signs, never by colour alone. */
   function lights() {
-    const limit = parseFloat($("limit-Ms").value) || 2, over = parseFloat($("limit-overshoot").value), most = parseFloat($("limit-u").value);
+    const limit = parseFloat($("limit-Ms").value) || 1.8, over = parseFloat($("limit-overshoot").value), most = parseFloat($("limit-u").value);
     const rows = [["stable", now.stable && !now.diverges, now.stable ? "yes" : "no"], [`Ms at most ${limit}`, now.stable && now.Ms <= limit, text(now.Ms)]];
     if (Number.isFinite(over)) rows.push([`overshoot at most ${over} %`, !now.diverges && now.overshoot_percent <= over, text(now.overshoot_percent)]);
     if (Number.isFinite(most)) rows.push([`command at most ${most} ${opened.u_unit}`, !now.diverges && now.u_peak <= most, text(now.u_peak)]);
@@ -244,7 +244,7 @@ export function mount(root, { ask, on }) {
     busy = false; $("tune-progress").textContent = ""; enable();
     if (m.error) return tell(new Error(m.error));
     if (!opened) return;
-    $("tune-progress").textContent = m.found.interrupted ? "cancelled: the best so far" : `${m.found.ended === "time" ? "time is up; found" : "found"}: cost ${m.found.cost.toPrecision(4)}, began at ${m.found.start_cost.toPrecision(4)}`;
+    $("tune-progress").textContent = m.found.interrupted ? "cancelled: the best so far" : `${m.found.ended === "time" ? "time is up; found" : "found"}: cost ${m.found.cost.toPrecision(4)}, began at ${m.found.start_cost.toPrecision(4)}; ${m.found.verdict}`;
     set(m.found.values);
   });
   on("state", s => {

@@ -1,0 +1,179 @@
+"""Ms in a search: the linear loops that it is taken on, and its limit if none was given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from ..control.controller import Controller, SampledController
+from ..control.margins import margins, operating_point, sampled
+from ..errors import FitError, SettingError
+from ..models import Model
+from .objective import LARGEST_MS
+
+if TYPE_CHECKING:
+    from .task import Budget, TuningTask
+
+HAIR = 1.001
+"""Share above which an Ms exceeds a limit: rounding in the search for its frequency."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearLoops:
+    """The linear plants of a search.
+
+    Attributes
+    ----------
+    looked_at : tuple of (plant, float or None)
+        Every plant with the output about which it and a gain schedule are taken [y].
+    searched : tuple
+        The plants on which the core takes Ms of every candidate, at every point of a schedule.
+    measured : tuple of FrequencyResponse
+        Measured responses, whose bands count with them.
+    depends : bool
+        Whether Ms depends on the output.
+    reason : Exception or None
+        Why a plant was left out.
+    """
+
+    looked_at: tuple[tuple[Any, float | None], ...] = ()
+    searched: tuple[Any, ...] = ()
+    measured: tuple[Any, ...] = ()
+    depends: bool = False
+    reason: Exception | None = None
+
+    def __add__(self, other: LinearLoops) -> LinearLoops:
+        return LinearLoops(
+            self.looked_at + other.looked_at,
+            self.searched + other.searched,
+            self.measured or other.measured,
+            self.depends or other.depends,
+            self.reason or other.reason,
+        )
+
+    def worst(self, controller: SampledController) -> tuple[float, float | None]:
+        """The largest Ms of a PID, and the output about which it is; 0 without a plant."""
+        if not (self.looked_at and isinstance(controller, Controller)):
+            return 0.0, None
+        found = [
+            (margins(controller, plant, speed=level).Ms, level) for plant, level in self.looked_at
+        ]
+        return max(found, key=lambda pair: pair[0])
+
+    def core(self, Ts: float) -> list[Any]:
+        """The fractions in z^-1 for the core.
+
+        Raises
+        ------
+        SettingError
+            If there is none.
+        """
+        if not self.searched:
+            raise SettingError(
+                name="Ms", expected="a model, or another linear plant, to take it on",
+                received="none" if self.reason is None else f"none ({self.reason})",
+                remedy="give Constraints(plant=...), for example a linear model of the same drive, "
+                "or add one to the plants",
+            ) from self.reason  # fmt: skip
+        return [sampled(plant, Ts) for plant in self.searched]
+
+
+def linear_loops(task: TuningTask, time: Budget) -> LinearLoops:
+    """The linear plants of a task, from the plants of its constraints or else its models.
+
+    A nonlinear model is linearised in the middle of the references and half way to their ends, as a
+    motor stands in its dry friction in the middle of references of both signs; with a gain schedule
+    also at its points; with a speed in the constraints only there. Levels at which a model has no
+    steady state are left out.
+
+    Raises
+    ------
+    SettingError
+        For measured responses without a linear plant beside them.
+    """
+    controller, given = task.start, task.constraints.plant
+    if not isinstance(controller, Controller):
+        return LinearLoops()
+    if given is None:
+        plants = [p for p in task.plants if isinstance(p, Model) and len(p.input_names) == 1]
+    else:
+        listed = list(given) if isinstance(given, (list, tuple)) else [given]
+        plants = [m for plant in listed for m in (getattr(plant, "members", ()) or (plant,))]
+    measured = tuple(plant for plant in plants if hasattr(plant, "lines"))
+    if measured and len(measured) == len(plants):
+        raise SettingError(
+            name="plant", expected="a linear plant beside the measured response, which does not "
+            "tell whether a loop is stable", received="none",
+            remedy="give plant=[response, fit_shaft(response).to_model()]",
+        )  # fmt: skip
+    found = LinearLoops(measured=measured)
+    ends = time.share(LOOKING)
+    for plant in plants:
+        if not hasattr(plant, "lines"):
+            found += _of(plant, task, controller, time, ends)
+    return found
+
+
+LOOKING = 0.1
+"""Part of a time budget for linearising: a grey box takes .14 s for each level."""
+
+
+def _of(
+    plant: Any, task: TuningTask, controller: Controller, time: Budget, ends: float
+) -> LinearLoops:
+    """The loops of one plant."""
+    scheduled, speed = [at for at, _ in controller.schedule], task.constraints.speed
+    if not isinstance(plant, Model) or hasattr(plant, "to_tf"):
+        about: Sequence[float | None] = scheduled or [None]
+        return LinearLoops(
+            tuple((plant, level) for level in about), (plant,), depends=bool(scheduled)
+        )
+    levels = [*_levels(task), *scheduled] if speed is None else [speed]
+    points, reason = [], None
+    for level in levels:
+        if time.spent > ends:
+            time.lose("all looks at the largest sensitivity Ms")
+            break
+        try:
+            point = operating_point(plant, level)
+            margins(controller, point, speed=level)  # refuses a standstill, where nothing answers
+            points.append((point, level))
+        except (SettingError, FitError) as error:
+            reason = error
+    # the core takes every plant at every point of a schedule, also where the plant never is
+    is_paired = bool(scheduled) and speed is None
+    searched = () if is_paired else tuple(point for point, _ in points)
+    return LinearLoops(tuple(points), searched, depends=True, reason=reason)
+
+
+def _levels(task: TuningTask) -> list[float]:
+    """The middle of the references, and half way from rest to their ends [y]."""
+    low = min(float(r.min()) for r in task.references)
+    high = max(float(r.max()) for r in task.references)
+    rest = task.rest.y
+    halves = [rest + 0.5 * (end - rest) for end in (high, low) if end != rest]
+    return list(dict.fromkeys([0.5 * (low + high), *halves]))
+
+
+def within_default(task: TuningTask) -> Iterator[TuningTask]:
+    """The task with the default limit of Ms; then, if nothing is within, with wider ones.
+
+    They are the start's own Ms, which the start keeps to, and none. A task with a limit of its own,
+    or without a linear plant in its search, is yielded as it is.
+    """
+    loops = task.loops
+    if task.constraints.Ms is not None or not loops.searched:
+        yield task
+        return
+    yield with_limit(task, LARGEST_MS)
+    own = HAIR * loops.worst(task.start)[0]
+    if LARGEST_MS < own < math.inf:
+        yield with_limit(task, own)
+    yield with_limit(task, math.inf)
+
+
+def with_limit(task: TuningTask, Ms: float) -> TuningTask:
+    """The same task with this limit of Ms."""
+    return replace(task, constraints=replace(task.constraints, Ms=Ms))

@@ -1,0 +1,310 @@
+"""The verdict on tuned gains: a grade and its reasons, which every command, page and file shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..arrays import in_unit
+from ..control.controller import SampledController
+from ..control.defaults import (
+    drive_step,
+    moves_on,
+    rate_step,
+    recorded_limits,
+    recorded_outputs,
+)
+from ..control.loop import ClosedLoopRun, run
+from ..dataset import FloatArray
+from ..errors import FitError, SettingError
+from ..models import Model
+from .objective import LARGEST_MS
+from .robustness import HAIR
+
+if TYPE_CHECKING:
+    from .task import Budget, TuningTask
+
+GRADES = ("unfit", "poor", "fair", "good")
+"""Grades of a controller, the worst first."""
+MODEL_GRADES = ("useless", "poor", "fair", "good")
+"""Grades of a model's verdict, the worst first."""
+LIVELY = 2.0
+"""Ms above which gains are poor: a gain margin of 2 and a phase margin of 29 degrees."""
+MOST = 0.5
+"""Share of a run above which gains that saturate, or leave the record, are unfit: most of it."""
+ROOM = 0.05
+"""Share of the command's range that a calm reference leaves to either limit."""
+WIDER = 0.1
+"""Share of a recorded range by which it is wider at either end, as the guards of models have it."""
+
+
+@dataclass(frozen=True)
+class Objection:
+    """A reason against tuned gains.
+
+    Attributes
+    ----------
+    grade : str
+        The best grade that it allows.
+    text, remedy : str
+        The reason, and what to do.
+    """
+
+    grade: str
+    text: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.text}; {self.remedy}"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict on tuned gains.
+
+    Attributes
+    ----------
+    objections : tuple of Objection
+        The worst first; empty for good gains.
+    model : str
+        The worst grade of the models, ``good`` to ``useless``; empty if they have none.
+    """
+
+    objections: tuple[Objection, ...] = ()
+    model: str = ""
+
+    @property
+    def grade(self) -> str:
+        """``good``, ``fair``, ``poor`` or ``unfit``: never better than that of the models."""
+        of_model = [GRADES[MODEL_GRADES.index(self.model)]] if self.model else []
+        given = [o.grade for o in self.objections] + of_model
+        return min(given, key=GRADES.index, default="good")
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """The objections in words, with what to do."""
+        return tuple(str(o) for o in self.objections)
+
+    @property
+    def unfit(self) -> tuple[Objection, ...]:
+        """The objections for which the gains must not be used."""
+        return tuple(o for o in self.objections if o.grade == "unfit")
+
+    def require_fit(self) -> None:
+        """Refuse gains that must not be used.
+
+        Raises
+        ------
+        FitError
+            If the loop is unstable, at a limit or outside the record for most of a run.
+        """
+        if self.unfit:
+            raise FitError(
+                name="controller", expected="one that the drive can be run with",
+                received="; ".join(o.text for o in self.unfit),
+                remedy=f"{self.unfit[0].remedy}, or write it all the same with --force",
+            )  # fmt: skip
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {"grade": self.grade, "reasons": list(self.reasons)}
+
+    def __str__(self) -> str:
+        graded = f"the model is graded {self.model}" if self.model not in ("", "good") else ""
+        return f"{self.grade}: " * bool(graded or self.reasons) + (
+            "; ".join(filter(None, (*self.reasons, graded))) or self.grade
+        )
+
+
+def model_grade(plants: Sequence[Any]) -> str:
+    """The worst grade of the models' verdicts; empty if none has one."""
+    known = [p.training.get("verdict") or {} for p in plants if isinstance(p, Model)]
+    grades = [v["grade"] for v in known if v.get("grade") in MODEL_GRADES]
+    return min(grades, key=MODEL_GRADES.index, default="")
+
+
+def verdict_of(
+    task: TuningTask,
+    controller: SampledController,
+    time: Budget,
+    *,
+    limit: float | None = None,
+    others: Sequence[Objection] = (),
+) -> Verdict:
+    """The verdict on gains for a task.
+
+    Parameters
+    ----------
+    task : TuningTask
+        With its linear loops. Its references are run on its models as they are.
+    controller : Controller or StateFeedback
+    time : Budget
+        Without time for the runs, they are among what it lost.
+    limit : float, optional
+        The user's own limit of Ms.
+    others : sequence of Objection
+        Those known otherwise.
+    """
+    found = [*others, *_of_loops(task, controller, limit)]
+    if not time.over("the runs for the verdict"):
+        found += _of_runs(task, controller)
+    found.sort(key=lambda o: GRADES.index(o.grade))
+    return Verdict(tuple(found), model_grade(task.plants))
+
+
+# --- Ms -------------------------------------------------------------------------------------------
+
+
+def _of_loops(
+    task: TuningTask, controller: SampledController, limit: float | None
+) -> Iterator[Objection]:
+    """An Ms above the default limit."""
+    Ms, level = task.loops.worst(controller)
+    if Ms <= HAIR * LARGEST_MS:
+        return
+    place = ""
+    if level is not None and task.loops.depends:
+        place = f" about {in_unit(f'{level:.4g}', controller.y_unit)}"
+    if math.isinf(Ms):
+        yield Objection(
+            "unfit",
+            f"on one of the models the linear loop{place} is unstable: Ms is infinite",
+            "lower the gains, search more variables, or look at the margins (sewfast analyse)",
+        )
+        return
+    yield Objection(
+        "fair" if Ms <= HAIR * LIVELY else "poor",
+        f"Ms is {Ms:.3g}{place}: at one frequency the loop amplifies disturbances {Ms:.3g} times, "
+        "which is close to instability",
+        f"no gains with at most {LARGEST_MS:g} were found: search more variables, give more "
+        "evaluations, or take delay out of the loop"
+        if limit is None
+        else f"without a limit of its own the search keeps to {LARGEST_MS:g}",
+    )
+
+
+# --- Runs -----------------------------------------------------------------------------------------
+
+
+def _of_runs(task: TuningTask, controller: SampledController) -> list[Objection]:
+    """What the references show on the models as they are, each share in the mean of the models."""
+    models = [p for p in task.plants if isinstance(p, Model)]
+    at_limit, outside = 0.0, 0.0
+    for r in task.references if models else ():
+        try:
+            runs = [run(controller, model, r) for model in models]
+        except FitError:
+            return [
+                Objection(
+                    "unfit", "the loop on one of the models diverges",
+                    "begin with smaller gains, or check the model on new data",
+                )
+            ]  # fmt: skip
+        pairs = list(zip(runs, models, strict=True))
+        at_limit = max(at_limit, float(np.mean([_at_limit(*pair) for pair in pairs])))
+        outside = max(outside, float(np.mean([_outside(*pair) for pair in pairs])))
+    found = []
+    if at_limit > MOST:
+        found.append(
+            Objection(
+                "unfit",
+                f"the command is at a limit for {100 * at_limit:.0f} % of the samples at which "
+                "the reference needs none, so that the loop swings between the limits or is stuck",
+                "lower the gains, check the model on new data, or raise the limits",
+            )
+        )
+    if outside > MOST:
+        found.append(
+            Objection(
+                "unfit",
+                f"the loop is outside the recorded inputs and outputs for {100 * outside:.0f} % of "
+                "a run, where the model is a guess",
+                "record such operation, or lower the references and the limits",
+            )
+        )
+    return found
+
+
+def _at_limit(found: ClosedLoopRun, model: Model) -> float:
+    """Share of samples at a limit among those at which the reference needs no limit.
+
+    0 if these are less than half of the reference, or if it is not known what it needs.
+    """
+    c = found.controller
+    try:
+        needed = command_for(model, found.r, c.u_min, c.u_max)
+    except (FitError, SettingError):
+        return 0.0
+    room = ROOM * (c.u_max - c.u_min)
+    calm = (needed > c.u_min + room) & (needed < c.u_max - room)
+    if not np.mean(calm) > MOST:
+        return 0.0
+    hair = 1e-9 * (c.u_max - c.u_min)
+    railed = (found.u >= c.u_max - hair) | (found.u <= c.u_min + hair)
+    return float(np.mean(railed[calm]))
+
+
+def command_for(model: Model, r: FloatArray, u_min: float, u_max: float) -> FloatArray:
+    """The command with which a first-order model of the step response follows a reference [u].
+
+    `(r + T dr/dt - offset)/K` without the dead time; for a model that integrates, the same of the
+    reference's rate.
+
+    Raises
+    ------
+    FitError, SettingError
+        If no step of the model settles.
+    """
+    moving = rate_step(model, u_min, u_max)
+    step = drive_step(model, u_min, u_max) if moving is None else moving
+    followed = r if moving is None else np.diff(r, append=r[-1:]) / model.Ts
+    slope = np.diff(followed, append=followed[-1:]) / model.Ts
+    fopdt = step.fopdt
+    needed: FloatArray = (followed + fopdt.T * slope - fopdt.offset) / fopdt.K
+    return needed
+
+
+def _outside(found: ClosedLoopRun, model: Model) -> float:
+    """Share of samples whose command or output the record and the rest do not come near."""
+    outside = np.zeros(len(found.r), dtype=bool)
+    for known, values in (
+        (recorded_limits([model]), found.u),
+        (recorded_outputs(model), found.y),
+    ):
+        if known is not None:
+            room = WIDER * (known[1] - known[0])
+            outside |= (values < known[0] - room) | (values > known[1] + room)
+    return float(np.mean(outside))
+
+
+def out_of_reach(task: TuningTask) -> Iterator[Objection]:
+    """References that no gains can follow with the least gain of the variations.
+
+    Tuning on them minimises the loss at the limit of the command.
+    """
+    (plant, *_), start = task.plants, task.start
+    gain = min(gain for gain, _ in task.variations)
+    if not isinstance(plant, Model) or gain >= 1.0 or moves_on(plant, start.u_min, start.u_max):
+        return
+    try:
+        fopdt = drive_step(plant, start.u_min, start.u_max).fopdt
+    except (FitError, SettingError):
+        return  # its reach is unknown
+    rest = plant.rest.y
+    reach = (fopdt.K * u + fopdt.offset for u in (start.u_min, start.u_max))
+    low, high = sorted(rest + gain * (y - rest) for y in reach)
+    top, bottom = max(r.max() for r in task.references), min(r.min() for r in task.references)
+    if bottom >= min(low, rest) and top <= max(high, rest):
+        return
+    unit = f" {start.y_unit}" if start.y_unit else ""
+    yield Objection(
+        "fair",
+        f"the references ask for {bottom:.4g} to {top:.4g}{unit}, with {gain:g} of its gain the "
+        f"drive reaches {low:.4g} to {high:.4g} at the limits of its command: there no gains help, "
+        "and those found look for the least loss",
+        "lower the references, raise the limits, or give variations without that gain",
+    )

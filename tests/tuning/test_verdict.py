@@ -1,0 +1,219 @@
+"""The default limit of Ms, and the verdict on tuned gains."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cli import refused, sewfast
+from kinds import model_of
+from loops import QUIET
+from sewfast import _core, pareto, signals
+from sewfast.control import Controller, Gains
+from sewfast.control.loop import run
+from sewfast.control.margins import margins, operating_point
+from sewfast.errors import FitError, SettingError
+from sewfast.machine import VirtualMachine
+from sewfast.models import Ensemble, LinearOE, Model
+from sewfast.tuning import tune
+from sewfast.tuning.objective import LARGEST_MS, Constraints
+from sewfast.tuning.verdict import GRADES, Objection, Verdict, _at_limit, command_for
+
+SHORT = signals.reference("trapezoid")[:900]
+FIXED: dict[str, Any] = {"variables": ["alpha"], "evaluations": 10, "seed": 0}
+"""A search that changes nothing in the loop."""
+
+
+def drive(gain: float = 490.0, **record: Any) -> LinearOE:
+    p, q = math.exp(-0.001 / 0.252), math.exp(-0.001 / 0.0074)
+    b = gain * (1 - p) * (1 - q) / 2
+    core = _core.LinearModel(np.array([-p - q, p * q]), np.array([[b, b]]), 1, 0.0)
+    known = {"input_range": [[-20.0, 20.0]], **record}
+    return LinearOE(core, 0.001, ("u",), "y", ("V",), "RPM", ("counts", 1572.0), known)
+
+
+def with_ms_of(limit: float, plant: Model, level: float, start: Controller) -> Controller:
+    """The controller with the share of its gain at which Ms is this."""
+    low, high = 1e-3, 30.0
+    about = plant if hasattr(plant, "to_tf") else operating_point(plant, level)
+    for _ in range(50):
+        middle = math.sqrt(low * high)
+        scaled = replace(start, gains=replace(start.gains, Kp=middle * start.gains.Kp))
+        is_calm = margins(scaled, about, speed=level).Ms < limit
+        low, high = (middle, high) if is_calm else (low, middle)
+    return scaled
+
+
+# --- The default limit ----------------------------------------------------------------------------
+
+
+def test_without_a_limit_of_its_own_a_search_keeps_to_the_default() -> None:
+    settings: dict[str, Any] = {"evaluations": 300, "threads": 2, "variations": [(1.0, 0)]}
+    calm = np.interp(np.arange(2000), [0, 800, 2000], [0.0, 1500.0, 1500.0])
+    free = tune(drive(), calm, constraints=Constraints(Ms=math.inf), **settings)
+    assert margins(free.pid, drive()).Ms > 1.1 * LARGEST_MS
+    assert "Ms not limited" in str(free)
+    assert free.verdict.grade in ("fair", "poor")
+    assert "close to instability" in (free.warning or "")
+    usual = tune(drive(), calm, **settings)
+    assert margins(usual.pid, drive()).Ms <= 1.001 * LARGEST_MS
+    assert usual.constraints == Constraints(Ms=LARGEST_MS)
+    assert (usual.verdict.grade, usual.warning) == ("good", None)
+    assert "Ms <= 1.8" in str(usual)
+    assert usual.cost >= free.cost
+    front = pareto(drive(), SHORT, evaluations=200, size=10, threads=2)
+    assert max(margins(c, drive()).Ms for c in front) <= 1.001 * LARGEST_MS
+    assert front.verdict.grade == "good"
+
+
+def test_an_objective_has_no_default_limit() -> None:
+    front = pareto(drive(), SHORT, objectives=["tracking", "Ms"], evaluations=400, threads=2)
+    assert front.values[:, 1].max() > LARGEST_MS
+
+
+@pytest.mark.nightly(
+    "every kind on both sides", by_day=["linear-1.1", "neural_oe-0.9", "ensemble of neural_oe-1.1"]
+)
+@pytest.mark.parametrize("share", [0.9, 1.1])
+@pytest.mark.parametrize("kind", ["linear", "neural_oe", "ensemble of neural_oe"])
+def test_gains_above_the_limit_are_kept_and_said_if_there_are_no_others(
+    kind: str, share: float
+) -> None:
+    """Gains just below and just above the limit at the level where the loop is liveliest."""
+    model, level, start = drive(), 500.0, QUIET
+    if kind != "linear":
+        model, level = model_of("neural_oe"), 1.0
+        gains = Gains.standard(0.5, 0.2, u_unit="V", y_unit=model.output_unit)
+        start = Controller(gains, Ts=model.Ts, u_min=-20, u_max=20)
+    r = level * np.repeat([0.0, 1.0, 2.0], 150)
+    worst = {lv: margins(start, model, speed=lv).Ms for lv in (level, 0.5 * level)}
+    at_limit = with_ms_of(LARGEST_MS, model, max(worst, key=lambda lv: worst[lv]), start)
+    start = replace(at_limit, gains=replace(at_limit.gains, Kp=share * at_limit.gains.Kp))
+    plant = model if not kind.startswith("ensemble") else Ensemble.of([model, model], "mean")
+    found = tune(plant, [r], start=start, **FIXED)
+    assert found.pid.gains.Kp == pytest.approx(start.gains.Kp)
+    said = [o for o in found.verdict.objections if o.text.startswith("Ms is ")]
+    assert bool(said) is (share > 1.0)
+    if said:
+        assert "no gains with at most 1.8 were found" in said[0].remedy
+        assert str(said[0]) in str(found)
+    # with the gain free there are others
+    kept = tune(plant, [r], start=start, evaluations=60, variables=["Kp"])
+    assert max(margins(kept.pid, model, speed=lv).Ms for lv in worst) <= LARGEST_MS * 1.001
+
+
+def test_ms_is_taken_on_both_sides_and_at_every_point() -> None:
+    model = model_of("grey_box")
+    r = 5.0 * np.repeat([0.0, 1.0, 0.0, -1.0], 100)
+    gains = Gains.standard(1.0, 0.05, u_unit="V", y_unit=model.output_unit)
+    base = Controller(gains, Ts=model.Ts, u_min=-20, u_max=20)
+    lively = with_ms_of(2.4, model, 2.5, base)
+    assert "about 2.5 " in (tune(model, [r], start=lively, **FIXED).warning or "")
+    # a schedule that is lively only where the references do not stay
+    quiet, hot = QUIET.gains, with_ms_of(2.5, drive(), 0.0, QUIET).gains
+    scheduled = replace(QUIET, schedule=((100.0, hot), (1000.0, quiet)))
+    found = tune(drive(), [np.repeat([1000.0, 4000.0], 150)], start=scheduled, **FIXED)
+    assert "about 100 RPM" in (found.warning or "")
+    assert found.verdict.grade == "poor"
+    # two fixed gains as a front: its knee is what is judged
+    front = pareto(drive(), [SHORT], start=replace(QUIET, gains=hot), variables=["alpha"],
+                   objectives=["tracking", "chatter"], evaluations=20)  # fmt: skip
+    assert front.verdict.grade == "poor"
+    assert str(front.verdict) in str(front)
+
+
+def test_a_machine_and_state_feedback_have_no_default_limit() -> None:
+    found = tune(VirtualMachine(), SHORT, start=QUIET, evaluations=5, threads=1)
+    assert found.constraints == Constraints()
+    states = tune(drive(), SHORT, controller="state_feedback", evaluations=5, threads=1)
+    assert states.constraints == Constraints()
+    with pytest.raises(SettingError, match="a model, or another linear plant"):
+        tune(VirtualMachine(), SHORT, start=QUIET, constraints=Constraints(Ms=1.6))
+
+
+def test_a_limit_that_is_asked_for_stays_a_requirement() -> None:
+    with pytest.raises(FitError, match="constraints"):
+        tune(drive(), [SHORT], start=QUIET, constraints=Constraints(Ms=1.0001), **FIXED)
+    # of a nonlinear model it is taken at the same levels as the default
+    model = model_of("neural_oe")
+    gains = Gains.standard(0.5, 0.2, u_unit="V", y_unit=model.output_unit)
+    start = Controller(gains, Ts=model.Ts, u_min=-20, u_max=20)
+    limits = Constraints(Ms=1.3)
+    found = tune(model, [np.repeat([0.0, 1.0], 150)], start=start, constraints=limits,
+                 evaluations=60, threads=2)  # fmt: skip
+    assert margins(found.pid, model, speed=0.5).Ms <= 1.3 * 1.001
+
+
+# --- The verdict ----------------------------------------------------------------------------------
+
+
+def test_a_controller_is_no_better_than_its_model() -> None:
+    assert Verdict().grade == "good"
+    for model, grade in (("useless", "unfit"), ("poor", "poor"), ("fair", "fair")):
+        assert Verdict((), model).grade == grade
+        assert f"the model is graded {model}" in str(Verdict((), model))
+    both = Verdict((Objection("fair", "a", "b"), Objection("poor", "c", "d")), "good")
+    assert both.grade == "poor"
+    assert both.to_json() == {"grade": "poor", "reasons": ["a; b", "c; d"]}
+    both.require_fit()
+    with pytest.raises(FitError, match=r"received c; d, or write it all the same with --force"):
+        Verdict((Objection("unfit", "c", "d"),)).require_fit()
+    weak = drive(verdict={"grade": "poor", "text": "poor"})
+    assert tune(weak, [SHORT], start=QUIET, **FIXED).verdict.grade == "poor"
+
+
+def test_gains_that_destabilise_the_model_are_unfit() -> None:
+    wild = replace(QUIET, gains=replace(QUIET.gains, Kp=30.0 * QUIET.gains.Kp))
+    found = tune(drive(), [1.0 * SHORT], start=wild, **FIXED)
+    assert found.verdict.grade == "unfit"
+    assert "the linear loop is unstable" in (found.warning or "")
+
+
+def test_a_loop_that_is_stuck_at_a_limit_is_unfit_only_if_its_reference_is_calm() -> None:
+    model = drive()
+    calm = np.interp(np.arange(2000), [0, 1000, 2000], [500.0, 1500.0, 1500.0])
+    needed = command_for(model, calm, -20.0, 20.0)
+    assert needed[500] == pytest.approx((calm[500] + 0.26 * 1000.0) / 490.0, rel=0.02)
+    backwards = replace(QUIET, gains=replace(QUIET.gains, Kp=-QUIET.gains.Kp))
+    assert _at_limit(run(backwards, model, calm), model) > 0.8
+    assert _at_limit(run(QUIET, model, calm), model) == 0.0
+    # beyond its reach, at 9,800 RPM, the command has to be at the limit
+    far = np.full(2000, 12_000.0)
+    assert np.mean(run(QUIET, model, far).u == 20.0) > 0.8
+    assert _at_limit(run(QUIET, model, far), model) == 0.0
+
+
+@pytest.mark.parametrize(("top", "grade"), [(1000.0, "good"), (3000.0, "unfit")])
+def test_a_loop_outside_the_record_is_unfit(top: float, grade: str) -> None:
+    model = drive(input_range=[[0.0, 3.0]], output_range=[0.0, 1400.0])
+    r = top * np.minimum(1.0, np.arange(1500) / 500.0)
+    found = tune(model, [r], start=QUIET, evaluations=40, threads=1)
+    assert found.verdict.grade == grade
+    assert ("outside the recorded" in (found.warning or "")) is (grade == "unfit")
+
+
+def test_the_command_refuses_unfit_gains_unless_it_is_forced(tmp_path: Path) -> None:
+    drive().save(tmp_path / "drive.json")
+    wild = replace(QUIET, gains=replace(QUIET.gains, Kp=30.0 * QUIET.gains.Kp))
+    wild.save(tmp_path / "wild.json")
+    asked = ("tune", "drive.json", "--start", "wild.json", "--variables", "alpha",
+             "--reference", "trapezoid", "--evaluations", "20", "-o", "c.json")  # fmt: skip
+    for more in ((), ("--pareto", "tracking,chatter", "--front", "front.csv")):
+        said = refused(tmp_path, *asked, *more)
+        assert "controller: expected one that the drive can be run with" in said
+        assert "the linear loop is unstable" in said
+        assert "--force" in said
+        assert not (tmp_path / "c.json").exists()
+        assert not (tmp_path / "front.csv").exists()
+    told = json.loads(sewfast(tmp_path, *asked, "--force", "--json").out)
+    assert (tmp_path / "c.json").exists()
+    assert told["verdict"]["grade"] == GRADES[0]
+    assert told["verdict"]["reasons"][0] in told["warning"]
+    usual = ("tune", "drive.json", "--reference", "trapezoid", "--evaluations", "20")
+    free = sewfast(tmp_path, *usual, "--constraint", "Ms=inf", "-o", "free.json").out
+    assert "Ms not limited" in free
+    assert "within    Ms <= 1.8" in sewfast(tmp_path, *usual, "-o", "usual.json").out
