@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sewfast import Gains, LinearOE, load_model
+from sewfast import Dataset, Gains, LinearOE, check, identify, load_model
 from sewfast.analysis.changes import with_gain
 from sewfast.control.controller import Controller
 from sewfast.control.defaults import drive_references, drive_step, recorded_limits
@@ -112,3 +112,17 @@ def test_files_keep_the_rest_and_refuse_a_damaged_one(tmp_path: Path) -> None:
     del values["training"]["rest"]
     path.write_text(json.dumps(values))
     assert load_model(path).rest.is_zero
+
+
+def test_the_report_card_names_a_model_that_begins_at_another_level() -> None:
+    rng, u = np.random.default_rng(0), np.repeat([0.0, 40.0, 10.0, 60.0], 150)
+    y = heater(0.0, 24.5).simulate(u) + 0.05 * rng.normal(size=len(u))
+    names = {"input_names": ["duty"], "output_name": "T", "output_unit": "degC"}
+    record = Dataset.from_arrays(u, y, 5.0, **names)
+    model = identify(record, model="oe", nk=1)
+    assert model.rest.y == pytest.approx(24.5, abs=0.05)
+    assert not [line for line in check(model, record).lines if line.name == "rest"]
+    older = replace(model, training={k: v for k, v in model.training.items() if k != "rest"})
+    (line,) = [line for line in check(older, record).lines if line.name == "rest"]
+    assert (line.verdict, line.value) == ("warn", pytest.approx(24.5, abs=0.05))
+    assert "identify it again" in line.meaning

@@ -244,7 +244,9 @@ def test_a_late_command_is_found_and_shifted(tmp_path: Path, late: int) -> None:
     api.write_table(tmp_path / "x.csv", {"t": 0.01 * np.arange(len(e)), "u": e.u[:, 0], "y": e.y})
     assert f"--shift-input {late}" in sewfast(tmp_path, "look", "x.csv").out
     fit = ("identify", "x.csv", "--model", "arx", "-o", "m.json")
-    assert f"logged {late} samples late" in sewfast(tmp_path, *fit).out
+    said = sewfast(tmp_path, *fit).out
+    assert f"verdict: not good enough to tune a controller on: y moves {late - 1}" in said
+    assert f"logged {late} samples late" in said
     assert "samples late" not in sewfast(tmp_path, *fit, "--shift-input", str(late)).out
 
 

@@ -112,6 +112,7 @@ def check(
         judged = np.concatenate([d[init:] for d in far])
         outside, farthest = float(np.mean(judged > 1.0)), float(judged.max())
     lines.append(verdicts.region(outside, farthest))
+    lines += verdicts.rest(model, data)
     operating = operating_range(model) if model.training.get("input_range") else None
     if operating is not None:
         lines += verdicts.operation(operating)

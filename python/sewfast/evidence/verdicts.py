@@ -9,7 +9,10 @@ import math
 
 import numpy as np
 
-from ..dataset import FloatArray
+from ..arrays import in_unit
+from ..dataset import Dataset, FloatArray
+from ..dataset.standing import SIGMAS, standing
+from ..dynamic_model import DynamicModel
 from ..validation import FAIR, Scores, judged
 from .card import Line, Verdict
 from .correlations import LEVEL, ResidualTest
@@ -335,6 +338,28 @@ def region(outside: float, farthest: float) -> Line:
         )
     text += f" (up to {farthest:.3g} times the region's bound)"
     return Line(name, outside, shown, limit, "warn", text)
+
+
+def rest(model: DynamicModel, data: Dataset) -> list[Line]:
+    """A line if a record stands still at another level than that at which loops begin."""
+    stored = model.training.get("rest") or {}
+    u, y = tuple(stored.get("u", [0.0] * data.n_inputs)), float(stored.get("y", 0.0))
+    unit = data.output_unit
+    for found in map(standing, data.experiments):
+        if found is None or found.u != u or abs(found.y - y) <= SIGMAS * found.scatter:
+            continue
+        text = (
+            "the record stands still there, and loops on the model begin at "
+            f"{in_unit(f'{y:.4g}', unit)}: identify it again on this record; a model file of an "
+            "earlier version begins at 0"
+        )
+        return [
+            Line(
+                "rest", found.y - y, in_unit(f"{found.y:.4g}", unit),
+                in_unit(f"{y:.4g}", unit), "warn", text,
+            )
+        ]  # fmt: skip
+    return []
 
 
 def operation(found: OperatingRange) -> list[Line]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Literal
@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import require_whole
 from ..dataset import Dataset, diagnose, require_dataset
 from ..dataset.experiment import in_effect
-from ..dataset.faults import sound
+from ..dataset.faults import Fault, sound
 from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted, SettingError
@@ -227,24 +227,14 @@ def identify(
             return _with_losses(found, clock)
     else:
         found = _within_budget(_KINDS[kind], task)
-    unstable = next((f for f in faults if f.kind == "unstable"), None)
-    said = [*found.training.get("notes", []), *(f.warning for f in faults if f is not unstable)]
+    said = [*found.training.get("notes", []), *(f.warning for f in faults if f.kind not in _JUDGED)]
     if said:
         found = with_provenance(found, {"notes": said})
     try:
         if "verdict" not in found.training:
             own = _verdict(found, task.data, task.validation)
             found = with_provenance(found, {"verdict": own})
-        own = found.training["verdict"]
-        if (
-            unstable is not None
-            and own["grade"] in ("poor", "useless")
-            and _largest_pole(found) <= 1.0
-        ):
-            # a free run that explains the record would show that the pole is none of the plant's
-            text = f"useless: {unstable.text}, and no free run describes it ({own['text']})"
-            own = {**own, "grade": "useless", "text": text, "next": [unstable.remedy]}
-            found = with_provenance(found, {"verdict": own})
+        found = _judged_by(found, faults)
         excerpt = _excerpt(found, task.data, clock)
         if not clock.can_close:
             clock.lose("evidence")
@@ -343,6 +333,33 @@ def _excerpt(model: Model, data: Dataset, clock: Clock) -> Dataset:
         (len(m.core.theta) for m in model.members or (model,) if m.kind[:2] == "ne"), default=10
     )
     return thinned(data, max(LEAST_EVIDENCE, round(left * EVIDENCE_RATE / width)))
+
+
+_JUDGED = ("unstable", "late_input")
+"""Faults of a record that the verdict names, and the notes so need not."""
+
+
+def _judged_by(model: Model, faults: Sequence[Fault]) -> Model:
+    """The model with a verdict that is no better than its record allows."""
+    own: Provenance = model.training["verdict"]
+    for fault in faults:
+        grade, evidence = own["grade"], own["text"].partition(": ")[2]
+        if fault.kind == "late_input":
+            # it may fit, with a delay that the plant does not have
+            grade = "poor" if grade in ("good", "fair") else grade
+            text = f"{TEXTS[grade]}: {fault.text} ({evidence})"
+        elif (
+            fault.kind == "unstable"
+            and grade in ("poor", "useless")
+            and _largest_pole(model) <= 1.0
+        ):
+            # a free run that explains the record would show that the pole is none of the plant's
+            grade = "useless"
+            text = f"useless: {fault.text}, and no free run describes it ({evidence})"
+        else:
+            continue
+        own = {**own, "grade": grade, "text": text, "next": [fault.remedy]}
+    return with_provenance(model, {"verdict": own})
 
 
 def _verdict(model: Model, data: Dataset, validation: Dataset | None) -> Provenance:
