@@ -357,12 +357,12 @@ def made(name: str, seed: int, folder: Path) -> tuple[Path, Drive]:
     n = round(stranger.seconds / stranger.Ts)
     hold = max(2, round(stranger.hold * drive.tau / stranger.Ts))
     u = excitation(stranger.excited, n, hold, stranger.limit, seed)
-    y, _ = drive.responds(stranger.Ts, n, lambda k, _: float(u[k]), seed)
+    y, true = drive.responds(stranger.Ts, n, lambda k, _: float(u[k]), seed)
     t = np.arange(n) * stranger.Ts
     if stranger.write is uneven:
         # rows come late by up to a third of a period, and a few not at all
         late = t + stranger.Ts * rng.uniform(0.0, 0.33, n)
-        y, keep = np.interp(late, t, y), rng.uniform(size=n) > 0.005
+        y, keep = np.interp(late, t, true) + (y - true), rng.uniform(size=n) > 0.005
         t, u, y = late[keep], u[keep], y[keep]
     path = folder / f"{name}.csv"
     stranger.write(path, Written(t, u, y, rng))
