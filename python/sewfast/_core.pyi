@@ -1002,6 +1002,27 @@ def host_loop(
     (None: not asked for; empty: locked; else the refusal). Ctrl-C is an outcome, not an exception.
     """
 
+# --- guard.rs ---------------------------------------------------------------------------------------------
+
+class Guard:
+    """The device's guard for a run on a machine without one: speed [RPM], a motor that stands under a large command of up to
+    ``volt``, and a command that swings between the limits ``between`` of a loop. What it sees is a reason (Speed, NoMotion,
+    Swinging) with the value that passed its limit [RPM, V, Hz].
+    """
+
+    def __init__(
+        self, *, Ts: float, counts_per_rev: float, volt: float, speed: float, between: tuple[float, float] | None = None
+    ) -> None: ...
+    def take(self, counts: float) -> tuple[str, float] | None:
+        """Takes the counts of a sample, before its command acts."""
+
+    def watch(self, u: _F, counts: _F) -> tuple[int, tuple[str, float]] | None:
+        """Takes the counts and commands of samples, both (N,); with the place of the sample at which something was seen."""
+
+    @property
+    def at_rest(self) -> bool:
+        """No count for a tenth of a second."""
+
 # --- device.rs --------------------------------------------------------------------------------------------
 
 @final

@@ -8,14 +8,16 @@ import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
 
+from .. import _core
 from ..control.controller import SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import (
+    TOO_FAST,
     Followed,
     Machine,
     MachineBench,
@@ -85,39 +87,46 @@ class Aborted(Refusal):
         )
 
 
-LARGE, NEAR, WAYS, SPAN = 0.5, 0.05, 8, 0.25
-"""Bounds of the guard, the same as those of a device (docs/PROTOCOL.md, 9 and 12).
-
-A command of `LARGE` times the largest one moves every motor. A command within `NEAR` of a limit, as
-a share of the range between the limits, counts as at that limit. More than `WAYS` swings from one
-limit to the other in a row are an oscillation. `SPAN` is the longest time of a motor that does not
-move, and between two such swings [s].
-"""
+_SEEN = {
+    "Speed": "expected at most {limit:g} RPM, it turned at {value:.4g}; " + TOO_FAST,
+    "NoMotion": "expected the encoder to move, it has not by a count for .25 s at {value:.3g} V; "
+    "look for a lost encoder, an amplifier that has tripped, a shaft that is blocked",
+    "Swinging": "expected a command that does not swing, it went 8 times in a row from limit to "
+    "limit, at {value:.3g} Hz; look for play, for a shaft that gives, for a delay",
+}
 
 
 class Guard:
-    """Ends a loop whose motor or encoder has failed, and one that swings from limit to limit.
+    """Ends a run that is too fast, whose motor or encoder has failed, or that swings.
 
-    Under feedback, a lost encoder means a motor at full speed until the end of the reference.
+    It is a device's own guard (docs/PROTOCOL.md, 9 and 12). Under feedback, a lost encoder means a
+    motor at full speed until the end of the reference.
 
     Parameters
     ----------
     controller : Controller or StateFeedback
     name : str
         Name of the run.
-    counts_per_rev : float
+    counts_per_rev, speed : float
+        Speed above which it ends the run [RPM].
     """
 
-    def __init__(self, controller: SampledController, name: str, counts_per_rev: float) -> None:
+    def __init__(
+        self,
+        controller: SampledController,
+        name: str,
+        counts_per_rev: float,
+        speed: float = math.inf,
+    ) -> None:
         self._controller, self._name, self._per_turn = controller, name, counts_per_rev
+        self._speed = speed
         low, high = controller.u_min, controller.u_max
-        self._large, near = LARGE * max(-low, high), NEAR * (high - low)
-        self._low, self._high = low + near, high - near
-        self._span = max(10, round(SPAN / controller.Ts))
+        self._guard = _core.Guard(
+            Ts=controller.Ts, counts_per_rev=counts_per_rev, volt=max(-low, high), speed=speed,
+            between=(low, high),
+        )  # fmt: skip
         self._u: list[FloatArray] = []
         self._counts: list[FloatArray] = []
-        self._done, self._last = 0, math.nan
-        self._still, self._side, self._ways = 0, 0, [0]
 
     def __call__(self, first: int, u: FloatArray, counts: FloatArray) -> None:
         """Check samples `first`, `first + 1`, ...
@@ -125,43 +134,20 @@ class Guard:
         Raises
         ------
         Aborted
-            If the encoder stands still under a large command, or the command swings.
         """
         self._u.append(u.copy())
         self._counts.append(counts.copy())
-        for command, count in zip(u.tolist(), counts.tolist(), strict=True):
-            self._done += 1
-            is_still = count == self._last and abs(command) >= self._large
-            self._still, self._last = self._still + 1 if is_still else 0, count
-            if self._still >= self._span:
-                self._end(
-                    f"expected the encoder to move, it has not by a count for {SPAN:g} s at "
-                    f"{command:.3g} V; look for a lost encoder, an amplifier that has tripped, a "
-                    "shaft that is blocked"
-                )
-            side = int(command >= self._high) - int(command <= self._low)
-            if side and side != self._side:
-                self._turn(side)
-
-    def _turn(self, side: int) -> None:
-        """Count a swing: the command has reached the opposite limit."""
-        now = self._done
-        in_row = self._side != 0 and now - self._ways[-1] <= self._span
-        self._side, self._ways = side, [*self._ways, now] if in_row else [now]
-        if len(self._ways) > WAYS:
-            seconds = (self._ways[-1] - self._ways[0]) * self._controller.Ts
-            hertz = 0.5 * WAYS / seconds
-            self._end(
-                f"expected a command that does not swing, it went {WAYS} times in a row from limit "
-                f"to limit, at {hertz:.3g} Hz; look for play, for a shaft that gives, for a delay",
-                hertz,
-            )
-
-    def _end(self, reason: str, frequency: float | None = None) -> None:
-        u, counts = (np.concatenate(x)[: self._done] for x in (self._u, self._counts))
+        found = self._guard.watch(u, counts)
+        if found is None:
+            return
+        (after, (reason, value)) = found
+        end = sum(map(len, self._u[:-1])) + after + 1
+        all_u, all_counts = (np.concatenate(x)[:end] for x in (self._u, self._counts))
         raise Aborted.after(
-            reason, self._name, u, counts, self._controller, self._per_turn, frequency=frequency
-        )
+            _SEEN[reason].format(limit=self._speed, value=value), self._name, all_u, all_counts,
+            self._controller, self._per_turn,
+            frequency=value if reason == "Swinging" else None,
+        )  # fmt: skip
 
 
 @dataclass
@@ -271,6 +257,7 @@ class RecordedBench(MachineWrapper):
         if recording is None:
             recording = self.inner.excite(u, name)
             require_record(self.inner, name, len(u), recording)
+            self._require_speed(name, recording)
         self.note(name, key, recording, None)
         return recording
 
@@ -280,7 +267,7 @@ class RecordedBench(MachineWrapper):
         key = key_of(r, controller)
         found = self.kept_run(name, key, controller)
         if found is None:
-            guard = Guard(controller, name, self.counts_per_rev)
+            guard = Guard(controller, name, self.counts_per_rev, self._stated)
 
             def both(first: int, u: FloatArray, counts: FloatArray) -> None:
                 guard(first, u, counts)
@@ -296,6 +283,25 @@ class RecordedBench(MachineWrapper):
             _require_run(self.inner, name, len(r), found)
         self.note(name, key, found.recording, found)
         return found
+
+    @property
+    def _stated(self) -> float:
+        """The speed that the machine must not pass [RPM]; a drive's device watches its own."""
+        return math.inf if isinstance(self.inner, DriveBench) else self.inner.speed
+
+    def _require_speed(self, name: str, recording: Recording) -> None:
+        """Refuse an excitation, which nobody could interrupt, that was faster than stated."""
+        guard = _core.Guard(
+            Ts=self.Ts, counts_per_rev=self.counts_per_rev, volt=math.inf, speed=self._stated
+        )
+        found = guard.watch(recording.u, recording.counts)
+        if found is not None:
+            k, (reason, value) = found
+            raise Aborted(
+                f"{name!r}, {k * self.Ts:.3g} s after its start: "
+                + _SEEN[reason].format(limit=self._stated, value=value),
+                replace(recording, name=f"{name}{ABORTED}"),
+            )
 
 
 def require_record(machine: Machine, name: str, samples: int, found: object) -> None:

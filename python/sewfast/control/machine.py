@@ -7,6 +7,7 @@ any that is advanced sample by sample. A drive behind a port is itself a `Machin
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import math
 import os
@@ -18,8 +19,9 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeGuard, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .. import _core
 from ..arrays import FloatArray
-from ..errors import DataError, SettingError
+from ..errors import DataError, LinkError, SettingError
 from ..gains import real
 from ..machine import VirtualMachine
 from ..recordfile.writer import require_replaceable
@@ -371,6 +373,15 @@ class MachineBench:
         return RecordedRun.of(found, recording)
 
 
+COAST = 5.0
+"""Longest wait for rest after a machine has been too fast [s]."""
+TOO_FAST = (
+    "look for a load that drives it, a turned sign of command or encoder, a gain larger than "
+    "recorded, wrong counts_per_rev"
+)
+"""What to do about a machine that is faster than stated: never a higher limit."""
+
+
 class Stepped(Protocol):
     """A machine that is advanced one sample at a time: a simulator, or a test rig without a clock.
 
@@ -393,7 +404,8 @@ class Stepped(Protocol):
 class SteppedBench:
     """A machine that is advanced sample by sample, with the controller computed here.
 
-    Every run, even an aborted one, ends with a sample at 0 V.
+    Every run, even an aborted one, ends with a sample at 0 V. The guard of a device watches every
+    sample (docs/PROTOCOL.md, section 9): a mean speed over 8 samples above `speed` ends the run.
 
     Parameters
     ----------
@@ -407,7 +419,7 @@ class SteppedBench:
         Largest command in either direction [V]; larger ones are clipped.
     name : str
     speed : float
-        Speed above which it stops by itself [RPM].
+        Speed above which a run is ended with 0 V and a `LinkError` [RPM].
 
     Raises
     ------
@@ -433,7 +445,7 @@ class SteppedBench:
 
     def excite(self, u: FloatArray, name: str) -> Recording:
         require_finite("command", u)
-        return self._recording(u, *self._played(lambda k, counts: float(u[k]), len(u)), name)
+        return self._played(lambda k, counts: float(u[k]), len(u), name)
 
     def follow(
         self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
@@ -451,7 +463,7 @@ class SteppedBench:
             feedback[k], before[0], seen[k] = core.filtered, counts, counts
             return float(u[k])
 
-        recording = self._recording(u, *self._played(decide, len(r)), name)
+        recording = self._played(decide, len(r), name)
         truth = recording.speed_true
         t = np.arange(len(r), dtype=np.float64) * self.Ts
         y = recording.y if truth is None else truth
@@ -459,27 +471,61 @@ class SteppedBench:
             t, np.array(r), u, y, feedback, controller, self.name, name, recording=recording
         )
 
-    def _played(
-        self, decide: Callable[[int, float], float], samples: int
-    ) -> tuple[FloatArray, FloatArray | None]:
+    def _played(self, decide: Callable[[int, float], float], samples: int, name: str) -> Recording:
         """Counts, from 0, and true speeds, each read before the sample's command acts."""
         machine = self.machine
         machine.reset()
         first = real(f"counts of {self.name}", machine.counts)
-        counts, speed = np.zeros(samples), np.zeros(samples)
+        guard = _core.Guard(
+            Ts=self.Ts, counts_per_rev=self.counts_per_rev, volt=self.volt, speed=self.speed
+        )
+        u, counts, speed = np.zeros(samples), np.zeros(samples), np.zeros(samples)
+
+        def recording(until: int) -> Recording:
+            true = speed[:until] if hasattr(machine, "speed_rpm") else None
+            return Recording.of_counts(
+                u[:until], counts[:until], Ts=self.Ts, counts_per_rev=self.counts_per_rev,
+                name=name, speed_true=true,
+            )  # fmt: skip
+
         try:
             for k in range(samples):
                 counts[k], speed[k] = machine.counts - first, getattr(machine, "speed_rpm", np.nan)
-                machine.step(min(max(decide(k, float(counts[k])), -self.volt), self.volt))
+                seen = guard.take(counts[k]) if math.isfinite(counts[k]) else None
+                if seen is not None:
+                    rests = self._rests(guard, first)
+                    raise self._tripped(name, k, seen[1], u[max(0, k - 1)], rests, recording)
+                u[k] = min(max(decide(k, float(counts[k])), -self.volt), self.volt)
+                machine.step(u[k])
         finally:
             # a test rig holds its last command: no run may leave it turning, however it ends
             machine.step(0.0)
-        return counts, speed if hasattr(machine, "speed_rpm") else None
+        return recording(samples)
 
-    def _recording(
-        self, u: FloatArray, counts: FloatArray, speed: FloatArray | None, name: str
-    ) -> Recording:
-        return Recording.of_counts(
-            np.clip(u, -self.volt, self.volt), counts, Ts=self.Ts,
-            counts_per_rev=self.counts_per_rev, name=name, speed_true=speed,
+    def _rests(self, guard: _core.Guard, first: float) -> bool:
+        """Command rest until the machine stands, for `COAST` at most; whether it does."""
+        for _ in range(round(COAST / self.Ts)):
+            self.machine.step(0.0)
+            counts = self.machine.counts - first
+            if not math.isfinite(counts):
+                return False
+            guard.take(counts)
+            if guard.at_rest:
+                return True
+        return False
+
+    def _tripped(
+        self, name: str, k: int, speed: float, u: float, rests: bool,
+        recording: Callable[[int], Recording],
+    ) -> LinkError:  # fmt: skip
+        after = (
+            "it stands now" if rests else f"it still turns {COAST:g} s after the command of rest"
+        )
+        error = LinkError(
+            name=f"{self.name}, {name}", expected=f"at most {self.speed:g} RPM",
+            received=f"{speed:.4g} RPM after {k * self.Ts:.3g} s, under {u:.3g} V; rest was commanded, and {after}",
+            remedy=TOO_FAST,
         )  # fmt: skip
+        with contextlib.suppress(DataError):  # too few samples for a speed
+            error.recording = recording(k)
+        return error

@@ -3,6 +3,7 @@
 mod control;
 mod device;
 mod greybox;
+mod guard;
 mod host_loop;
 mod link;
 mod loop_transfer;
@@ -27,5 +28,6 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     control::register(module)?;
     loop_transfer::register(module)?;
     link::register(module)?;
+    guard::register(module)?;
     device::register(module)
 }

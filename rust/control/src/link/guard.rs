@@ -35,9 +35,57 @@ const HISTORY: usize = 32;
 const STANDSTILL: u64 = 100_000;
 /// A large command may stay without motion for this long \[us\].
 const PATIENCE: u64 = 250_000;
+/// Fewest samples of a large command without motion, or between two ways that are not in a row, at long periods.
+const LEAST: u64 = 10;
 
 /// Why a run must end, with the value that passed its limit.
-pub(super) type Trip = (Reason, f32);
+pub type Trip = (Reason, f32);
+
+/// The guard in front of a machine without a device of its own: a host gives it the counts and the command of each sample.
+#[derive(Clone, Debug)]
+pub struct Watch {
+    guard: Guard,
+    limits: Limits,
+    between: Option<(f32, f32)>,
+}
+
+impl Watch {
+    /// A guard for a sample time \[s\]; `between` are the limits of a loop's command, which must not swing from one to the other.
+    pub fn new(ts: f32, counts_per_rev: f32, limits: Limits, between: Option<(f32, f32)>) -> Self {
+        let period = (ts * 1e6) as u32;
+        Self {
+            guard: Guard::new(period, ts, counts_per_rev),
+            limits,
+            between,
+        }
+    }
+
+    /// Takes the counts of a sample, read before its command acts; a counter may wrap.
+    ///
+    /// # Errors
+    /// The limit that the motion passes.
+    pub fn take(&mut self, counts: i32) -> Result<(), Trip> {
+        self.guard.take(counts);
+        self.guard.check(&self.limits, f32::NAN)
+    }
+
+    /// Takes the command of the sample.
+    ///
+    /// # Errors
+    /// A command that moves nothing, or that swings between its limits.
+    pub fn sent(&mut self, u: f32) -> Result<(), Trip> {
+        self.guard.expect_motion(&self.limits, u)?;
+        match self.between {
+            Some((low, high)) => self.guard.expect_calm(low, high, u),
+            None => Ok(()),
+        }
+    }
+
+    /// No count for a tenth of a second.
+    pub fn at_rest(&self) -> bool {
+        self.guard.at_rest()
+    }
+}
 
 /// The last counts, what follows from them.
 #[derive(Clone, Debug)]
@@ -212,7 +260,7 @@ impl Guard {
         }
         let first = self.side == 0;
         self.side = side;
-        let in_row = u64::from(self.since).saturating_mul(self.period) <= SWING;
+        let in_row = u64::from(self.since).saturating_mul(self.period) <= self.at_least(SWING);
         if first || !in_row || self.swings == 0 {
             (self.swings, self.swinging) = (u32::from(!first), 0);
         } else {
@@ -236,10 +284,15 @@ impl Guard {
         } else {
             0
         };
-        if u64::from(self.stuck).saturating_mul(self.period) > PATIENCE {
+        if u64::from(self.stuck).saturating_mul(self.period) > self.at_least(PATIENCE) {
             return Err((Reason::NoMotion, u));
         }
         Ok(())
+    }
+
+    /// A time \[us\], or that of the fewest samples.
+    fn at_least(&self, time: u64) -> u64 {
+        time.max(LEAST.saturating_mul(self.period))
     }
 }
 
@@ -264,6 +317,38 @@ mod tests {
 
     fn guard() -> Guard {
         Guard::new(1000, 1e-3, 1500.0)
+    }
+
+    #[test]
+    fn a_watch_trips_on_speed_on_a_lost_encoder_and_on_swinging() {
+        let limits = Limits {
+            speed: 1000.0,
+            ..FREE
+        };
+        let watch = || Watch::new(1e-3, 1500.0, limits, Some((-20.0, 20.0)));
+        // 25 counts a millisecond are 1000 RPM, and a counter may wrap
+        let mut turning = watch();
+        let turned = |k: i32| (i32::MAX - 200).wrapping_add(26 * k);
+        let fast = (0..20).position(|k| turning.take(turned(k)).is_err());
+        assert_eq!(fast, Some(8));
+        assert_eq!(turning.take(turned(9)), Err((Reason::Speed, 1040.0)));
+        let mut lost = watch();
+        let stuck = (0..1000).position(|_| lost.take(7).and_then(|()| lost.sent(15.0)).is_err());
+        assert_eq!(stuck, Some(250));
+        assert!(lost.at_rest());
+        let mut swings = watch();
+        let ended = (0..1000).find_map(|k| {
+            let seen = swings
+                .take(k)
+                .and_then(|()| swings.sent(if k % 40 < 20 { 20.0 } else { -20.0 }));
+            seen.err()
+        });
+        assert_eq!(ended.map(|(reason, _)| reason), Some(Reason::Swinging));
+        assert!(ended.is_some_and(|(_, hertz)| (hertz - 25.0).abs() < 1.0));
+        // at a period of a second ten samples pass before a motor is said to stand
+        let mut slow = Watch::new(1.0, 1500.0, limits, None);
+        let stuck = (0..100).position(|_| slow.take(7).and_then(|()| slow.sent(15.0)).is_err());
+        assert_eq!(stuck, Some(10));
     }
 
     #[test]
