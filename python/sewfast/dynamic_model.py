@@ -44,15 +44,9 @@ class AtRest(NamedTuple):
 
 class FreeRunJacobian(NamedTuple):
     """A free run and its derivatives, all in the output's unit.
-
-    Attributes
-    ----------
-    y : array, shape (N,)
-        The free run.
-    theta : array, shape (N, p)
-        Derivatives by the parameters, in the order of `Model.theta` and `Model.parameter_names`.
-    state : array, shape (N, s)
-        Derivatives by the initial state, in the order of `Model.state_names`.
+    `y` (N,) is the free run. `theta` (N, p) holds its derivatives by the parameters, in the order
+    of `Model.theta` and `Model.parameter_names`, and `state` (N, s) those by the initial state, in
+    the order of `Model.state_names`.
     """
 
     y: FloatArray

@@ -18,13 +18,8 @@ _NEWTON = 30
 @dataclass(frozen=True, eq=False)
 class Linearised:
     """x+ = A x + B v, y = C x + D v in small signals, v(k) = u(k - delay); in the data's units.
-
-    Attributes
-    ----------
-    state : array
-        State of the linearisation, as for the compiled model's `simulate`.
-    drift : float
-        Change of an integrator's output per sample at this state; 0 for other models.
+    `state` is that of the linearisation, as for the compiled model's `simulate`. `drift` is the
+    change of an integrator's output per sample at this state, 0 for other models.
     """
 
     y: float
@@ -43,19 +38,9 @@ def linearise(
     core: Any, u: FloatArray, state: FloatArray | None = None, level: float | None = None
 ) -> Linearised:
     """Linearise about the equilibrium at a constant input, searched from `state` (None: rest).
-
-    Parameters
-    ----------
-    core : compiled model
-    u : array, shape (nu,)
-    state : array, optional
-    level : float, optional
-        Output level for an integrator, which rests at any level or at none.
-
-    Raises
-    ------
-    SettingError
-        For an object that is no compiled model, linear, lagged or state space.
+    `u` has shape (nu,). `level` is the output level for an integrator, which rests at any level or
+    at none. Raises `SettingError` for an object that is no compiled model, linear, lagged or state
+    space.
     """
     u = np.ascontiguousarray(u, dtype=np.float64)
     if hasattr(core, "a") and hasattr(core, "offset"):
@@ -170,7 +155,6 @@ def _state_space(
 
 def _moved_to(core: Any, u: FloatArray, x: FloatArray, level: float) -> FloatArray:
     """The integrator's state, the last one, at which the output is `level`, by Newton's method.
-
     If the output function does not reach that level, the state is returned unchanged.
     """
     moved = x.copy()

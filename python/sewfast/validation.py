@@ -29,16 +29,10 @@ AT_THE_NOISE = 1.5
 @dataclass(frozen=True)
 class Scores:
     """Scores of an error series.
-
-    Attributes
-    ----------
-    rmse, max_abs : float
-        Root mean square and largest magnitude [output unit].
-    fit_percent : float
-        100 (1 - |y - yhat| / |y - mean(y)|), Euclidean norms; NaN for constant y.
-
-    With weights, mean squares and means are weighted: rmse is sqrt(sum w e^2 / sum w), and norms
-    are of sqrt(w) times their argument. The largest magnitude is not weighted.
+    The fit is 100 (1 - |y - yhat| / |y - mean(y)|) in Euclidean norms, NaN for constant y; `rmse`
+    and the largest magnitude `max_abs` are in the unit of the output. With weights, rmse is
+    sqrt(sum w e^2 / sum w), means are weighted, and norms are of sqrt(w) times their argument; the
+    largest magnitude is not weighted.
     """
 
     rmse: float
@@ -63,15 +57,9 @@ class Scores:
 @dataclass(frozen=True, eq=False, repr=False)
 class ExperimentErrors:
     """Series and scores of one experiment; its first `init` samples are not scored.
-
-    Attributes
-    ----------
-    init : int
-        Samples before the scored ones, with the measured outputs that determine the state.
-    y, simulated, one_step : array, shape (N,)
-        Reference, free run and one-step prediction [output unit]. NaN in y is not scored.
-    weights : array, shape (N,), or None
-        Weight of each sample; None: all equal.
+    The measured outputs of these determine the state. `y`, `simulated` and `one_step` (N,) are
+    reference, free run and one-step prediction [output unit]; NaN in y is not scored. `weights`
+    (N,) has the weight of each sample; with None, all are equal.
     """
 
     name: str
@@ -300,17 +288,10 @@ def noise_of(outputs: Sequence[FloatArray]) -> float:
 
 def grade_of(fit: float, rmse: float, noise: float) -> str:
     """`good`, `fair`, `poor` or `useless`; empty for a constant output.
-
-    An error at the level of the measurement noise is good even with a low fit: no model can do
-    better. If the output itself is hardly larger than its noise, that is no evidence, so a fit
-    below `POOR` is useless in any case.
-
-    Parameters
-    ----------
-    fit : float
-        Fit of the free run [%].
-    rmse, noise : float
-        Error of the free run, and white measurement noise of the output, in one unit.
+    An error at the level of the noise is good even with a low fit: no model can do better. If the
+    output itself is hardly larger than its noise, that is no evidence, so a fit below `POOR` is
+    useless in any case. `fit` is that of the free run [%]; its error `rmse` and the output's white
+    measurement noise `noise` are in one unit.
     """
     if not math.isfinite(fit):
         return ""
@@ -327,7 +308,6 @@ def _beside_a_constant(scores: Scores) -> str:
 
 def by_input(error: float, resting: float) -> float:
     """Part explained by the input's motion [%]: 100 (1 - error of the free run / error at rest).
-
     It equals the fit if only the input moves the output. A ramp, a decay to rest or different
     levels of recordings are explained by the initial state alone.
     """
@@ -338,15 +318,8 @@ def by_input(error: float, resting: float) -> float:
 
 def judged(fit: float, error: float, noise: float, share: float) -> tuple[str, str]:
     """The grade, and a remark if the input explains too small a part of the fit.
-
-    Parameters
-    ----------
-    fit : float
-        Fit of the free run [%].
-    error, noise : float
-        Error of the free run, and white measurement noise of the output, in one unit.
-    share : float
-        Part explained by the input's motion [%], from `by_input`.
+    `fit` is that of the free run [%]; its `error` and the output's white measurement noise `noise`
+    are in one unit. `share` is the part explained by the input's motion [%], from `by_input`.
     """
     by_fit, grade = grade_of(fit, error, noise), grade_of(min(fit, share), error, noise)
     if grade == by_fit:
@@ -359,7 +332,6 @@ def judged(fit: float, error: float, noise: float, share: float) -> tuple[str, s
 
 def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
     """`free_run_error` with the inputs held at their means after the initial samples.
-
     An experiment that begins at rest would have stayed there: the mean of a single step is nearly
     the step itself.
     """
@@ -379,10 +351,8 @@ def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
 
 
 def free_run_error(model: DynamicModel, data: Dataset, init: int) -> float:
-    """Root mean square error of the free run.
-
-    Weighted, over the known outputs after the initial samples [output unit]; infinite if the free
-    run diverges.
+    """Root mean square error of the free run [output unit]; infinite if the run diverges.
+    It is weighted, over the known outputs after the initial samples.
     """
     return _error(lambda: model.simulate(data, init=init), data, init)
 

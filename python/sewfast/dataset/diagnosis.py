@@ -54,19 +54,10 @@ _REFERENCE = re.compile(
 @dataclass(frozen=True)
 class Finding:
     """One property of a record.
-
-    Attributes
-    ----------
-    kind : str
-        `dead_sensor`, `no_dynamics`, `exchanged`, `late_input`, `at_once`, `unstable`,
-        `integrator`, `wraps`, `closed_loop`, `repeats`, `two_level_input`, `rests`, `short_record`,
-        `limited_input` or `coarse_output`.
-    text : str
-        The finding and its meaning, one sentence without a full stop.
-    remedy : str
-        What to do about it, in the same form.
-    evidence : mapping of str to number or str
-        The figures behind it, in SI units and those of the columns.
+    `kind` is `dead_sensor`, `no_dynamics`, `exchanged`, `late_input`, `at_once`, `unstable`,
+    `integrator`, `wraps`, `closed_loop`, `repeats`, `two_level_input`, `rests`, `short_record`,
+    `limited_input` or `coarse_output`. `text`, the finding and its meaning, and `remedy` are
+    sentences without a full stop; `evidence` has the figures, in SI units and those of the columns.
     """
 
     kind: str

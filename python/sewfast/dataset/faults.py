@@ -87,7 +87,6 @@ of `tests/dataset/test_faults.py` the worst has 4.5 (a saturation), of 766 dead 
 @dataclass(frozen=True)
 class Dead:
     """A stretch in which the output's sensor says nothing: samples `start` to `stop`, excluded.
-
     Samples are those of the file, 0-based; `experiment` is the index in the data set.
     """
 
@@ -160,7 +159,6 @@ class _Rest:
 
     def _covers(self, first: int, count: int) -> bool:
         """Whether an input reaches the levels here that it has while the output moves.
-
         Friction, a dead zone or a closed valve keep an output still at some levels, but not at the
         middle half of those at which it moves.
         """
@@ -172,7 +170,6 @@ class _Rest:
 
     def _jumps(self, first: int, count: int) -> bool:
         """Whether the output can be at no limit: it is inside the range, or reached it at a jump.
-
         A saturated output and an end stop are reached by motion.
         """
         y, value = self.y, self.y[first]
@@ -246,17 +243,10 @@ def copied(data: Dataset) -> Copy | None:
 @dataclass(frozen=True)
 class Order:
     """Which of two signals moves first.
-
-    Attributes
-    ----------
-    kind : "exchanged", "late" or "at_once"
-        The input answers the output; the input was logged `shift` samples late; or the output moves
-        in the sample in which the input does.
-    input : int
-    shift : int
-        Samples by which the input is to be read earlier, so that the output moves one sample after.
-    evidence : float
-        Twice the log-likelihood that shows it.
+    `kind` is "exchanged" (the input answers the output), "late" (the input was logged `shift`
+    samples late; read so much earlier, it moves one sample before the output) or "at_once" (the
+    output moves in the sample in which the input does). `evidence` is twice the log-likelihood that
+    shows it.
     """
 
     kind: str
@@ -267,11 +257,10 @@ class Order:
 
 def order_in_time(data: Dataset) -> Order | None:
     """Whether an input moves after the output that it should drive; None if no input does.
-
     An input that keeps its value to the last bit for most samples is no answer to a noisy output:
-    if the output moves before it, it was logged late. Of other inputs, late ones cannot be told
-    from those that a controller computed, so only exchanged columns are found: the past of the
-    output predicts the input, and the past of the input says nothing about the output.
+    if the output moves before it, it was logged late. Other late inputs look like those that a
+    controller computed, so only exchanged columns are found: the past of the output predicts the
+    input, and the past of the input says nothing about the output.
     """
     if data.looks_ahead:
         return None
@@ -309,17 +298,10 @@ def _evidence(
     pieces: list[FloatArray], of: int, past: tuple[int, ...], more: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """How much `more` columns say of column `of`, beyond the past of the columns `past`.
-
-    Parameters
-    ----------
-    more : sequence of array, shape (rows,)
-        Columns beside the rows `PAST` to `-PAST` of all pieces.
-
-    Returns
-    -------
-    whole, certain : array, shape (len(more),)
-        Twice the log-likelihood that each of `more` and those behind it add together; and without
-        the part of the record that says most, as one bump into an end stop can look like anything.
+    The `more` columns (rows,) stand beside the rows `PAST` to `-PAST` of all pieces. Returns two
+    arrays (len(more),): twice the log-likelihood that each of `more` and those behind it add
+    together; and without the part of the record that says most, as one bump into an end stop can
+    look like anything.
     """
     y = _beside(pieces, of, 0)
     lags = [_beside(pieces, c, -i) for c in past for i in range(1, PAST + 1)]
@@ -498,12 +480,8 @@ def _unstable_fault(data: Dataset) -> Iterator[Fault]:
 
 def sound(data: Dataset) -> tuple[Dataset, tuple[Fault, ...]]:
     """The data without dead stretches, and what was found, for `identify`.
-
-    Raises
-    ------
-    DataError
-        If the columns are no input and output of a plant: one is computed from the other, or they
-        are exchanged.
+    Raises `DataError` if the columns are no input and output of a plant: one is computed from the
+    other, or they are exchanged.
     """
     found = faults(data)
     wrong = next((f for f in found if f.kind in ("no_dynamics", "exchanged")), None)

@@ -45,22 +45,10 @@ TINY = float(np.finfo(np.float64).tiny)
 @dataclass(frozen=True)
 class Integration:
     """How an output that inputs drive returns to its level, over the whole record.
-
-    Attributes
-    ----------
-    is_integral : bool
-        The output integrates an input: the record shows no restoring force.
-    input : int
-        The input that drives it most clearly.
-    lengths : float
-        Length of the longest experiment in time constants of the slowest pole; 0 or below for an
-        integral.
-    time_constant : float
-        Of the slowest pole [s]; where several are slow, their sum. inf for an integral.
-    gain : float
-        Change of the output per second and unit of that input at low frequencies.
-    restoring, driving : float
-        Standard errors by which the pole lies inside, and by which the input drives the change.
+    `gain` is the output's change per second and unit of `input`, which drives it most clearly, at
+    low frequencies. `time_constant` [s] is that of the slowest pole, a sum if several are slow, inf
+    for an integral; `lengths` is the longest experiment in it, 0 or below for an integral. The pole
+    lies inside by `restoring` standard errors, and the input drives the change by `driving`.
     """
 
     is_integral: bool
@@ -73,29 +61,11 @@ class Integration:
 
 
 def integration(data: Dataset) -> Integration | None:
-    r"""Test for a pole at 1 that an input drives; None where the record is too short or still.
-
-    The record is cut into blocks, and over their means this regression is solved (the augmented
-    Dickey-Fuller regression with inputs):
-
-    .. math:: \Delta y_k = c + d k - \epsilon y_{k-1} + \sum_i a_i \Delta y_{k-i}
-              + \sum_i b_i u_{k-i} + f\,\mathrm{sign}(\Delta y_{k-1}) + \sum_i q_i u_{k-i}^2
-
-    The slowest time constant is `(1 - sum a) / epsilon` blocks, and `sum b / (1 - sum a)` the
-    gain into it. The constant models offsets, the line drift, the sign dry friction and the squares
-    an asymmetric input. Means over blocks of three lengths reduce sensor noise and fast motion. The
-    output is an integral if
-
-    - at no length the pole lies significantly inside (`RESTORED`); a time constant of more than two
-      records counts as infinite (`NEGLIGIBLE`), since a slow drive that was recorded for a time
-      constant or more visibly returns;
-    - the input drives the change at some length (`DRIVEN`): drift of a sensor also has a pole at 1,
-      but no input drives it;
-    - the restoring part is small beside the driving part (`BALANCE`): at rest both are equal;
-    - the integral of the input is a large part of the output (`EXPLAINED`).
-
-    Source: D. Dickey, W. Fuller, J. American Statistical Association 74 (1979) 427-431. The bounds
-    separate some 50 simulated families.
+    """Test for a pole at 1 that an input drives; None where the record is too short or still.
+    An augmented Dickey-Fuller regression (D. Dickey, W. Fuller, J. American Statistical Association
+    74 (1979) 427-431) with inputs, their squares, a line and the sign of the motion (dry friction)
+    is solved over block means of three lengths. For an integral, no pole lies inside (`RESTORED`)
+    and an input drives the change (`DRIVEN`, `BALANCE`) and explains the output (`EXPLAINED`).
     """
     experiments = sorted(data.experiments, key=len, reverse=True)[:MOST_EXPERIMENTS]
     longest = len(experiments[0])
@@ -289,19 +259,10 @@ _SMOOTH = 12
 
 @dataclass(frozen=True)
 class Feedback:
-    """How one input follows the output's innovations.
-
-    Attributes
-    ----------
-    input : int
-    lead : int
-        Samples after which the input follows.
-    correlation : float
-        Correlation of the innovations at this lead.
-    significance : float
-        That correlation in standard errors.
-    misfit : float
-        The largest correlation with the input's past beyond the regression, in standard errors.
+    """How one input follows the output's innovations, `lead` samples later.
+    `correlation` is that of the innovations at this lead, and `significance` the same in standard
+    errors. `misfit` is the largest correlation with the input's past beyond the regression, in
+    standard errors.
     """
 
     input: int
@@ -313,27 +274,10 @@ class Feedback:
 
 def feedback(data: Dataset) -> Feedback | None:
     """The input with the clearest response to noise of the output; None if no input responds.
-
-    Both are whitened first: the output by a regression on its own past and that of all inputs (and
-    the sign of its motion, for dry friction), each input by a regression on its own past. The
-    residuals, e of the output and w of the input, correlate at positive leads, e(k) with w(k + 1)
-    and later, only if the input was computed from the output (Granger 1969; Box, Jenkins, Reinsel
-    2008, section 12.1). Standard errors allow for products that are neither normal nor white
-    (Newey, West 1987), and both residuals are clipped at 5 robust standard deviations, so that
-    steps of a reference do not hide the noise.
-
-    At lead 0, a controller that responds within the sample looks like a plant that does. Their
-    signs differ: a controller opposes the output, so that e(k) w(k) has the opposite sign to the
-    plant's response, and is small beside it.
-
-    A nonlinear plant leaves a part of the input in e. That part also correlates with the input's
-    past beyond the regression, while feedback does not: a lead counts only if it is twice as
-    significant as any such correlation.
-
-    An input that keeps its value for most samples while the output is noisy is not fed back; where
-    it changes at regular intervals, only those samples are used. An output computed by a smoother
-    from later samples anticipates the input, which looks like feedback; it is not tested
-    (`Dataset.looks_ahead`).
+    Innovations of output and input correlate at positive leads only if the input was computed from
+    the output (Granger 1969; Box, Jenkins, Reinsel 2008, section 12.1; standard errors: Newey, West
+    1987). At lead 0 the signs of controller and plant differ. Only a misfit also correlates with
+    the input's past. The output of a smoother is not tested (`Dataset.looks_ahead`).
     """
     pieces = [] if data.looks_ahead else _pieces(data)
     found: list[Feedback] = []
@@ -443,7 +387,6 @@ def _motion(y: FloatArray, past: int) -> FloatArray:
 
 def _innovation(X: FloatArray, u: FloatArray, y: FloatArray) -> tuple[FloatArray | None, Any]:
     """Clipped residual of y, and the coefficients with u as an additional column.
-
     The residual is None if it is only rounding.
     """
     X = np.column_stack([X, np.ones(len(X))])

@@ -30,9 +30,8 @@ _SAME = 1e-9
 
 def white_noise(column: FloatArray) -> float:
     """Standard deviation of the white noise of a column; NaN if unknown.
-
-    From third differences: they suppress smooth motion, and their variance is 20 times that of
-    white noise. The median makes single jumps harmless.
+    Third differences suppress smooth motion, and their variance is 20 times that of white noise.
+    The median makes single jumps harmless.
     """
     changes = np.diff(column, 3)
     changes = changes[np.isfinite(changes)]
@@ -43,9 +42,8 @@ def white_noise(column: FloatArray) -> float:
 
 def quantum(column: FloatArray) -> float | None:
     """The step of a grid on which all values lie; None if there is none.
-
-    Requires at least three values that occur twice or more on average: a few values always lie on
-    some grid.
+    It requires at least three values that occur twice or more on average: a few values always lie
+    on some grid.
     """
     values = np.unique(column[np.isfinite(column)])
     if len(values) < 3 or len(values) > 0.5 * np.isfinite(column).sum():
@@ -84,13 +82,9 @@ LOW, HIGH, TOP = 0.05, 0.95, 0.999
 
 def power_spectrum(columns: Iterable[FloatArray], Ts: float) -> tuple[FloatArray, FloatArray]:
     """Power density of one signal over pieces without gaps, by Welch's method.
-
-    Segments of one length overlap by half; their mean is removed and a Hann window applied.
-
-    Returns
-    -------
-    frequency, power : array, shape (M,)
-        [Hz] and [unit^2/Hz], without frequency 0; empty where no piece has 32 samples.
+    Segments of one length overlap by half; their mean is removed and a Hann window applied. Returns
+    frequency [Hz] and power [unit^2/Hz], both (M,), without frequency 0; they are empty where no
+    piece has 32 samples.
     """
     pieces = [c[a : a + n] for c in columns for a, n in runs(np.isfinite(c)) if n >= SHORTEST]
     if not pieces:
@@ -252,7 +246,6 @@ def mark_outliers(
 
 def usual_threshold(data: Dataset) -> float:
     """Robust standard deviations that mark an output: 6 up to 20,000 samples, then slowly more.
-
     For white noise alone, 6 would suffice for a hundred million samples; in 2,000,000 samples of a
     moving plant, chance reaches 7.3.
     """
@@ -273,9 +266,8 @@ def _series(data: Dataset, model: Simulates | None) -> list[FloatArray]:
 
 def distances(y: FloatArray, window: int = 7) -> FloatArray:
     """Distance of each value from its window, in robust standard deviations.
-
-    The smaller of two distances to the window's median: over the record's deviation, and, after
-    removing the window's slope, over the larger of the window's and the record's deviation.
+    It is the smaller of two distances to the window's median: over the record's deviation, and,
+    after removing the window's slope, over the larger of the window's and the record's deviation.
     """
     known = y[np.isfinite(y)]
     if len(known) == 0:

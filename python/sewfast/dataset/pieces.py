@@ -67,13 +67,8 @@ def require_inputs(data: Dataset) -> None:
 
 def require_measured(data: Dataset, least: int = 1) -> None:
     """Raise `DataError` unless every input is known and enough outputs were measured.
-
-    An output that is NaN was not measured and is no error; an infinite one is.
-
-    Parameters
-    ----------
-    least : int
-        Measured outputs that every experiment must have.
+    An output that is NaN was not measured and is no error; an infinite one is. Every experiment
+    must have at least `least` measured outputs.
     """
     require_inputs(data)
     for e in data.experiments:
@@ -140,7 +135,6 @@ def require_excited(data: Dataset) -> None:
 
 def require_fittable(data: Dataset) -> None:
     """Raise `DataError` if values are so large, or move so little, that their squares overflow.
-
     Call it after `require_measured`, which reports infinite values.
     """
     require_sane(data, LARGEST_FITTED)
@@ -178,13 +172,8 @@ SHORTEST_PIECE = 100
 
 def take(data: Dataset, text: str) -> Dataset:
     """`"A:B"` of every experiment, 0-based, end excluded; A or B can be left out.
-
-    Raises
-    ------
-    SettingError
-        If the text is not a range.
-    DataError
-        If the range leaves an experiment or is empty.
+    Raises `SettingError` if the text is not a range, and `DataError` if the range leaves an
+    experiment or is empty.
     """
     pieces = (e.cut(*range_of_text(text, e)) for e in data.experiments)
     return replace(data, experiments=tuple(pieces))
@@ -380,15 +369,9 @@ def mask(data: Dataset, where: Where, *, why: str = "masked") -> Dataset:
 
 def shift_inputs(data: Dataset, samples: int) -> Dataset:
     """The data with inputs read `samples` earlier, for a command that was logged late.
-
     `u(k + samples)` takes the place of `u(k)`; outputs and channels stay. The last samples of every
     experiment, for which no input is left, are cut off. Negative numbers read the inputs later, and
-    cut off the first samples.
-
-    Raises
-    ------
-    SettingError
-        If it is not a whole number, or an experiment has no more samples than that.
+    cut off the first samples. Raises `SettingError` if an experiment has no more samples than that.
     """
     shortest = min(map(len, data.experiments))
     if not (is_whole(samples) and abs(samples) < shortest):

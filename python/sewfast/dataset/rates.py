@@ -314,13 +314,7 @@ def differentiate(data: Dataset, *, method: Method = "kalman") -> Dataset:
 
 
 def rate_unit(unit: str) -> str:
-    """The unit of a derivative per second; unknown stays unknown.
-
-    Examples
-    --------
-    >>> [rate_unit(unit) for unit in ("deg", "mm/s", "m/s^2", "")]
-    ['deg/s', 'mm/s^2', 'm/s^3', '']
-    """
+    """The unit of a derivative per second, m/s^3 for m/s^2; unknown stays unknown."""
     head, slash, power = unit.rpartition("/s")
     if slash and not power:
         return f"{head}/s^2"
@@ -371,7 +365,6 @@ def _rate(y: FloatArray, Ts: float, method: Method) -> FloatArray:
 
 def _in_steps(y: FloatArray) -> tuple[float, FloatArray]:
     """The sensor's step and the position in such steps: the smoother expects counts.
-
     For values on a grid the step is the grid's, and the positions are whole numbers, which the
     smoother takes as exact to their rounding. Otherwise it is the white noise of the position: the
     smoother searches noise and jerk over many decades around 1.

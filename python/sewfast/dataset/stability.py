@@ -31,7 +31,6 @@ _MOST = 20_000
 
 def unstable_pole(data: Dataset) -> float | None:
     """Modulus of an unstable pole per sample; None if the record shows none.
-
     A bounded record of an unstable plant comes from a closed loop. There least squares of many
     orders is still consistent if a reference or a dither moves the loop (Ljung 1999, section 13.4).
     Both halves of a record have to show a pole that would have grown a hundredfold in open loop.

@@ -24,17 +24,9 @@ _ROUNDING = 1e-9
 @dataclass(frozen=True)
 class Standing:
     """The samples of an experiment before its inputs first move, if its output stood still.
-
-    Attributes
-    ----------
-    samples : int
-        Their number.
-    u : tuple of float
-        The inputs.
-    y : float
-        Mean output; zero if the inputs are zero and noise explains the difference.
-    scatter : float
-        Standard deviation of the outputs, of the whole record's white noise at least.
+    `samples` is their number. `y` is the mean output; zero if the inputs are zero and noise
+    explains the difference. `scatter` is the standard deviation of the outputs, of the whole
+    record's white noise at least.
     """
 
     samples: int
@@ -45,7 +37,6 @@ class Standing:
 
 def standing(experiment: Experiment) -> Standing | None:
     """The standing samples at the beginning of an experiment; None if there are none.
-
     The inputs keep their first values, and the output has at least three measured samples whose
     drift is explained by noise.
     """

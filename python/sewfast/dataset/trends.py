@@ -28,11 +28,8 @@ SETTLED = 0.05
 @dataclass(frozen=True, eq=False)
 class Trend:
     """The lines removed from an experiment: one per column, inputs first, output last.
-
-    Attributes
-    ----------
-    level, slope : array, shape (n_inputs + 1,)
-        Value at sample 0 of the recording and change per sample [column's unit].
+    `level` and `slope` (n_inputs + 1,) are the value at sample 0 of the recording and the change
+    per sample [column's unit].
     """
 
     level: FloatArray

@@ -226,13 +226,8 @@ class Simulation:
 
     def derivative(self, x: FloatArray, u: float, p: Mapping[str, Any]) -> FloatArray:
         """Derivative of the state (n,) or (n, columns), with its shape checked.
-
-        Raises
-        ------
-        FitError
-            If the function raises.
-        SettingError
-            If it returns another shape, or no numbers.
+        Raises `FitError` if the function raises, and `SettingError` if it returns another shape, or
+        no numbers.
         """
         try:
             found = self.equations(x, u, p)
@@ -257,11 +252,7 @@ class Simulation:
 
     def settle(self, theta: FloatArray, u: float, speed: float) -> None:
         """Test whether the function accepts all columns at once, with the same results.
-
-        Raises
-        ------
-        FitError, SettingError
-            As `derivative`, at the start; also if it returns no finite number there.
+        Raises as `derivative`, at the start; also if it returns no finite number there.
         """
         x = np.zeros(self.states)
         x[0] = speed

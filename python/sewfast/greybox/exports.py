@@ -98,19 +98,10 @@ def _mujoco(motor: Motor, factor: float, gear: float) -> str:
 
 class Phase:
     """A motor in the quantities of boards: amplitudes of phase to neutral.
-
-    Attributes
-    ----------
-    resistance, inductance : float
-        Of a phase [ohm], [H]; the inductance is None if the record does not show the lag.
-    flux : float
-        Amplitude of a phase's back-EMF per speed [V s/rad].
-    torque_constant : float
-        Torque per amplitude of the current along q [N m/A].
-    KV : float
-        Speed [rpm] per amplitude of the back-EMF between two terminals [V].
-    inertia, inertia_of_turns : float
-        Inertia [kg m^2], and the same per turn instead of radian.
+    `resistance` [ohm] and `inductance` [H] are those of a phase; the latter is None if the lag is
+    not shown. `flux` is the amplitude of a phase's back-EMF per speed [V s/rad], `torque_constant`
+    is per amplitude of the current along q [N m/A], and `KV` per amplitude of the back-EMF between
+    two terminals [rpm/V]. `inertia` is in kg m^2, `inertia_of_turns` per turn instead of radian.
     """
 
     def __init__(self, motor: Motor, is_q: bool) -> None:

@@ -67,8 +67,7 @@ TOGETHER = 1.25
 
 def searched(task: Task, *, wants_network: bool = False) -> Model:
     """The network if it is credibly better, else linear output error.
-
-    If one is wanted, the state-space network, even if it is not better.
+    If one is wanted, it is the state-space network, even if that is not better.
     """
     parts = folds(task.data, task.validation)
     if not parts:
@@ -152,7 +151,6 @@ class Choice(Finals):
 
     def _joining(self, best: Candidate, able: Sequence[Candidate]) -> list[Candidate]:
         """Others that reduce the median's error; on little data all that are about as good.
-
         On few held-out samples, a structure that leads narrowly can do far worse elsewhere, and
         other structures fail at other places: any gain is accepted.
         """
@@ -206,9 +204,8 @@ class Choice(Finals):
 
     def _refitted(self, c: Candidate, most: int) -> list[Network]:
         """A few iterations on all data, including the held-out part, if the model stays sound.
-
-        None if a budget has cut the training short, except on little data: models that have not
-        reached their minimum do worse after some steps towards another one.
+        There are none if a budget has cut the training short, except on little data: models that
+        have not reached their minimum do worse after some steps towards another one.
         """
         search, models = self.search, c.models[:most]
         is_early = self.is_hurried and not search.is_small

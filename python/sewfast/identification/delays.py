@@ -29,15 +29,8 @@ DEPENDENT = 1e-10
 @dataclass(frozen=True)
 class Solution:
     """Least squares on some of the columns.
-
-    Attributes
-    ----------
-    columns : tuple of int
-    theta : array, shape (len(columns),)
-    squares : float
-        Sum of squared residuals.
-    rank : int
-        Number of parameters that the data determine.
+    `squares` is the sum of squared residuals, and `rank` the number of parameters that the data
+    determine.
     """
 
     columns: tuple[int, ...]
@@ -48,20 +41,10 @@ class Solution:
 
 class LaggedRegression:
     """The triangle R of [y(k), y(k-1) .., u_1(k) u_1(k-1) .., u_2(k) .., 1] over all whole rows.
-
-    A regression on some of these columns has the same sums of squares as the regression on those
-    columns of R, which has only as many rows as columns: hundreds of structures cost less than
-    reading the data once. The Gram matrix R'R is never formed, since its condition number is the
-    square of R's.
-
-    Parameters
-    ----------
-    data : Dataset
-        Rows with a sample that is not finite are left out.
-    na : int
-        Past outputs.
-    lags : int
-        Values of each input, u(k) .. u(k - lags + 1).
+    A regression on some of these columns has the same sums of squares as the one on those columns
+    of R, which has only as many rows as columns. R'R is never formed: its condition number is the
+    square of R's. There are `na` past outputs and `lags` values of each input from u(k) on back;
+    rows with a sample that is not finite are left out.
     """
 
     def __init__(self, data: Dataset, na: int, lags: int) -> None:
@@ -132,7 +115,6 @@ class InputDelay:
 
     Attributes
     ----------
-    name : str
     nk : int
         Delay of the model with the lowest cost in free run [samples].
     low, high : int
@@ -141,7 +123,6 @@ class InputDelay:
     first_correlated : int or None
         First lag at which input and output, both filtered to make the input white, correlate beyond
         chance; None if there is no such lag.
-    lags : array, shape (L,)
     cost : array, shape (L,)
         Mean square free-run error of a model with each delay [output unit squared]; inf if there is
         no such model.

@@ -249,23 +249,10 @@ def seeded(
     data: Dataset, *, iterations: int | None = None, progress: Progress | None = None
 ) -> Callable[[int, Progress | None], Model]:
     """A function of a seed and a progress callback that trains one network.
-
     Each network equals that of `identify(data, model="neural_oe", starts=1, select=False)` bit by
-    bit, without evidence and verdict. The linear model at which all of them start is fitted here,
-    once: it takes longer than three networks.
-
-    Parameters
-    ----------
-    data : Dataset
-    iterations : int, optional
-        At most this many, for the linear fits and for each network.
-    progress : callable, optional
-        Progress of the linear fits.
-
-    Raises
-    ------
-    DataError, FitError
-        As `identify`.
+    bit, without evidence and verdict. The linear model at which all start is fitted here, once,
+    which takes longer than three networks; `progress` is that of this fit. `iterations` limits the
+    linear fits and each network. Raises the errors of `identify`.
     """
     task = Task(
         data=_in_effect(data, "data"), validation=None, na=_LAGS, nb=_LAGS, nk=None, nx=None,
@@ -364,7 +351,6 @@ def _judged_by(model: Model, faults: Sequence[Fault]) -> Model:
 
 def _verdict(model: Model, data: Dataset, validation: Dataset | None) -> Provenance:
     """The verdict on a kind requested by name, for which no data were held out.
-
     It is judged on the validation data, else on its training data; the text states which.
     """
     part = Split(data, validation or data, is_given=validation is not None)

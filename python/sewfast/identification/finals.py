@@ -53,15 +53,8 @@ FINISHED = 0.995
 
 @dataclass
 class Finals:
-    """The candidates that can be chosen from a search, with the reasons.
-
-    Attributes
-    ----------
-    search : Search
-    reasons : list of str
-        Reasons for the decisions so far, for the model's file.
-    is_hurried : bool
-        Whether a time budget cuts the full training short.
+    """The candidates that can be chosen from a search, with the reasons for the model's file.
+    `is_hurried` says whether a time budget cuts the full training short.
     """
 
     search: Search
@@ -121,7 +114,6 @@ class Finals:
 
     def _verified(self, ranked: Sequence[Candidate], linear: LinearCandidate) -> list[Candidate]:
         """Those that beat linear models on two later parts, most starts also on their own.
-
         Forward chaining: the best structure of each size is trained again on the data before an
         earlier fifth, so that a start or part with luck does not decide.
         """
@@ -173,7 +165,6 @@ class Finals:
 
     def _learned_again(self, able: Sequence[Candidate]) -> list[tuple[Candidate, Candidate]]:
         """Those that could be trained afresh on the data before the earlier fifth, with the result.
-
         A time budget limits the number of starts; if there is no time for two of each, only the
         best structures are trained.
         """
@@ -190,7 +181,6 @@ class Finals:
 
     def _usual(self, c: Candidate, held: Split) -> float:
         """The error of the median of the starts, or of the median start if that is larger.
-
         One start of six that is stuck does not count against the others.
         """
         each = [errors_of(free_runs(m, held), held).rmse for m in c.models]
@@ -200,7 +190,6 @@ class Finals:
 
     def finalists(self, ranked: Sequence[Candidate]) -> list[Candidate]:
         """Up to three different structures about as good as the best, different sizes first.
-
         A search that ends at a wrong size ends there with all its neighbours.
         """
         within = WITHIN_LARGE if len(self.task.data) >= 20_000 else WITHIN
@@ -313,7 +302,6 @@ class Finals:
 
     def _better(self, before: Candidate, starts: Sequence[Start], count: int) -> Candidate:
         """The candidate after a leg of its first `count` starts, unless it became worse.
-
         Starts for which there was no time stay in the median, unless the median is credibly better
         without them.
         """

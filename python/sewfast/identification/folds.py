@@ -41,16 +41,9 @@ RUN_UP = 10 * INIT
 @dataclass(frozen=True)
 class Split:
     """Data to fit to and data to choose by.
-
-    Attributes
-    ----------
-    fitted : Dataset
-    held : Dataset
-        Begins in the fitted data, where only the first `INIT` outputs are known.
-    is_given : bool
-        Whether these are the user's own validation data, which are never trained on.
-    sources : tuple of dict
-        The scored ranges, as JSON values.
+    `held` begins in the fitted data, where only the first `INIT` outputs are known. If `is_given`,
+    it is the user's own validation data, which are never trained on. `sources` are the scored
+    ranges, as JSON values.
     """
 
     fitted: Dataset
@@ -66,8 +59,7 @@ class Split:
     @property
     def spread(self) -> float:
         """Error of a constant, the mean of the fitted data: the largest meaningful error.
-
-        Without its outermost percent, since one outlier would make every error look small.
+        Its outermost percent is left out, since one outlier would make every error look small.
         """
         fitted = np.concatenate([e.y for e in self.fitted.experiments])
         low, high = np.nanquantile(fitted, [0.005, 0.995])
@@ -84,15 +76,8 @@ class Split:
 
 def split(data: Dataset, skipped: float = 0.0) -> Split | None:
     """Hold out the end of every experiment that is long enough; None if none is.
-
-    A short experiment is used for training as a whole; it must not prevent comparisons on the
-    others. If all are short, the last ones are held out whole.
-
-    Parameters
-    ----------
-    data : Dataset
-    skipped : float
-        Part of every experiment, at its end, that is left out altogether.
+    A short experiment is used for training as a whole; if all are short, the last ones are held out
+    whole. `skipped` is the part of every experiment, at its end, that is left out altogether.
     """
     fitted: list[Experiment] = []
     held: list[Experiment] = []
@@ -130,7 +115,6 @@ def _whole(data: Dataset, skipped: float) -> tuple[list[Experiment], list[Experi
 
 def folds(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]:
     """Forward chaining: the last fifth after all data before it, then the fifth before, and so on.
-
     The newest fold comes first; there is none if experiments are too short, or if the inputs move
     only once: what follows a single step is its response, in the fitted part as in the held one.
     Validation data, if given, are the only fold.
@@ -201,13 +185,8 @@ RESAMPLES = 400
 @dataclass(frozen=True, eq=False)
 class Errors:
     """Squared free-run errors on held-out data, summed block by block.
-
-    Attributes
-    ----------
-    squares : array, shape (B,)
-        Sum of squared errors of each block, each times its weight.
-    counts : array, shape (B,)
-        Sum of the weights of the known outputs in it: their number if all weights are equal.
+    `squares` (B,) holds the sum of squared errors of each block, each times its weight; `counts`
+    (B,) the sum of the weights of the known outputs in it: their number if all weights are equal.
     """
 
     squares: FloatArray
@@ -256,7 +235,6 @@ def free_runs(core: Core, held: Split) -> list[FloatArray] | None:
 
 def compared(one: Errors, other: Errors) -> tuple[float, float]:
     """Logarithm of the ratio of two rms errors, and its standard error.
-
     Neighbouring errors are correlated, so whole blocks are resampled, the same ones for both models
     (Kuensch 1989; Efron and Tibshirani 1993, section 8.6).
     """
@@ -293,22 +271,10 @@ def verdict(
     where: str = UNSEEN_DATA,
 ) -> Provenance:
     """Whether the model is good enough to tune a controller on, in words and as values.
-
-    Parameters
-    ----------
-    model : Model
-    data : Dataset
-        Its training data.
-    part : Split
-        Data to judge by, described by `where`.
-    error : float, optional
-        Free-run error of other samples, which counts instead of that of the part [output unit].
-
-    Returns
-    -------
-    dict
-        `grade` ("good", "fair", "poor" or "useless"), `fit_percent`, `text`, and `next`: a list of
-        things to do, the most important one first.
+    `data` are its training data, and `part` those to judge by, described by `where`; the free-run
+    error of other samples, `error` [output unit], counts instead of that of the part. The result
+    has `grade` ("good", "fair", "poor" or "useless"), `fit_percent`, `text`, and `next`: a list of
+    things to do, the most important one first.
     """
     # `error` can come from other samples; the share explained by the input needs the same ones
     own = free_run_error(model, part.held, INIT)
@@ -350,7 +316,6 @@ def verdict(
 
 def unstable_verdict(model: Model, part: Split, pole: float, where: str) -> Provenance:
     """`verdict` on an unstable model, which leaves all bounds in free run.
-
     It is judged by its predictions as far ahead as it doubles, and is at most "fair": nobody has
     seen its plant run freely.
     """

@@ -22,19 +22,10 @@ STARTING_SCALE = 1.0
 
 def trained(model: Model, task: Task) -> Model:
     """The model after further iterations of its kind of fit on the task's data.
-
-    Raises
-    ------
-    SettingError
-        For a model of a kind that cannot be trained further, or an ensemble with one; if the data
-        differ from the model's in inputs or sample time.
-    DataError
-        If the data have other units.
-    FitError
-        If the model's free run on the data diverges.
-    Interrupted
-        On Ctrl-C and at the end of a time budget. `best` is at least as good as the model: the
-        model itself if no step was made, an ensemble with the members trained so far.
+    Raises `SettingError` for a kind that cannot be trained further, an ensemble with one, and other
+    inputs or sample time than the model's; `DataError` for other units; `FitError` if its free run
+    diverges; `Interrupted` on Ctrl-C and at the end of a time budget, whose `best` is at least as
+    good as the model: the model itself without a step, an ensemble with the members trained so far.
     """
     members = list(model.members or (model,))
     for m in members:

@@ -94,15 +94,7 @@ def grey_box(task: Task) -> Model:
 
 
 def require_motor(data: Dataset) -> None:
-    """Require one command and a speed.
-
-    Raises
-    ------
-    DataError
-        For another number of inputs.
-    SettingError
-        For an output without a unit of speed.
-    """
+    """Raise `DataError` unless there is one input, `SettingError` without a unit of speed."""
     if data.n_inputs != 1:
         raise DataError(
             name="inputs", expected="one input, the motor's command",
@@ -172,8 +164,7 @@ class Motors:
 
     def candidate(self, part: Split, pool: Pool, until: float | None) -> MotorCandidate | None:
         """A motor fitted to a part; None if the data are not those of a motor.
-
-        First without a network, which is the result if time is short.
+        It is first fitted without a network, which is the result if time is short.
         """
         try:
             require_motor(part.fitted)
@@ -223,7 +214,6 @@ class Motors:
         self, core: _core.GreyBox, data: Dataset, hidden: int, look: Look | None
     ) -> _core.GreyBox:
         """Motor and network together, at the least-squares solution of the free run.
-
         The network begins without effect. Its starts are trained on an excerpt, the best one on all
         data.
         """
@@ -309,7 +299,6 @@ def trained_from(
     core: _core.GreyBox, start: FloatArray, data: Dataset, iterations: int, look: Look | None = None
 ) -> _core.GreyBox:
     """Descend from the motor's parameters and the weights to the least squares of the free run.
-
     The prior holds weights near 0 as if each had been measured once.
     """
     asked, free = _at_any_time(look), len(core.settings["free"])

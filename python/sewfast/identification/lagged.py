@@ -71,10 +71,9 @@ def paper(task: Task) -> Model:
 
 def neural_oe(task: Task) -> Model:
     """The network, trained in free run from the linear output-error model.
-
     The result is always a trained network. If the held-out blocks stop the training before its
-    first step, because no step is better there than the linear model, the network is trained on
-    all data instead, with a note.
+    first step, because no step is better there than the linear model, the network is trained on all
+    data instead, with a note.
     """
     networks = Networks.of(task)
     return networks.selected() if task.select else networks.unselected()
@@ -98,14 +97,8 @@ def _provenance(fit: _core.NeuralFit, seed: int) -> Provenance:
 @dataclass(frozen=True)
 class Networks:
     """Lagged networks of one task, all trained in free run from the same linear model.
-
-    Attributes
-    ----------
-    task : Task
-    linear : compiled linear model
-        Linear output error of the data, with which a network is compared.
-    start : compiled linear model
-        The start of the training: `linear`, or a smaller one if that one is misled.
+    `linear` is the linear output error of the data, with which a network is compared. The training
+    starts at `start`: `linear`, or a smaller model if that one is misled.
     """
 
     task: Task
@@ -184,7 +177,6 @@ class Networks:
 
     def _best(self, data: Dataset, held: Dataset | None) -> tuple[_core.NeuralFit, Provenance]:
         """The network with the strongest weight decay that does about as well as the best.
-
         Held-out blocks lie where the drive has been before; elsewhere a smoother network is safer
         (the one-standard-error rule: Hastie, Tibshirani, Friedman 2009, section 7.10). A network
         that diverges or does not forget its initial state is chosen only if all do.
@@ -254,7 +246,6 @@ def _linear(task: Task) -> _core.LinearModel:
 
 def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
     """The start of the training: the linear model, or a smaller one if that one is misled.
-
     Networks that start at a slow pole which the drive does not have (`linear.is_misled`) rarely
     leave it.
     """
@@ -284,7 +275,6 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
 
 def _with_blocks_held_out(data: Dataset, lag: int) -> tuple[Dataset, Dataset | None]:
     """The data without two of eight blocks of every experiment, and these blocks.
-
     None is held out if the blocks would be too short.
     """
     kept: list[Experiment] = []
@@ -354,9 +344,8 @@ def _chosen(
     tried: list[Provenance],
 ) -> Mapping[str, int]:
     """The structure with the least held-out error, or a simpler one that does about as well.
-
     Unless the order was given, one pole less is tried too: a superfluous pole follows trends and
-    spoils the steady gain. If the share of a time budget is used up, the best so far.
+    spoils the steady gain. If the share of a time budget is used up, it is the best so far.
     """
     parts = folds(task.data, task.validation)[:1]
     if len(structures) == 1 or not parts:

@@ -84,11 +84,10 @@ AS_GOOD = 1.05
 
 def short(task: Task, reason: str) -> Model:
     """Output error on all data in the task's orders, or with one pole less.
-
     A free initial state and a pole near 1 can follow any drift over a short record, and the steady
-    gain of such a model is arbitrary. The smaller order is used if the record can show all its
-    poles and it does about as well, on the whole record or on its later part when fitted to the
-    earlier one. A drive that really integrates has such a pole in both, or needs the larger order.
+    gain is then arbitrary. The smaller order is used if the record can show all its poles and it
+    does about as well, on the whole record or on its later part when fitted to the earlier one. A
+    drive that really integrates has such a pole in both, or needs the larger order.
     """
     model, data = oe(task), task.data
     own, smaller = task.fit_options(), task.fit_options(na=task.na - 1)
@@ -196,14 +195,8 @@ class LinearCandidate:
 @dataclass
 class LinearTable:
     """Linear models fitted for a decision.
-
-    Parameters
-    ----------
-    given_nk : int or None
-        The delay, if it is given.
-    folds : sequence of Split
-        The newest first; models are fitted to thinned excerpts of their training data.
-    pool : Pool
+    The newest of the `folds` comes first; models are fitted to thinned excerpts of their training
+    data. `given_nk` is None if the delay is not given.
     """
 
     given_nk: int | None
@@ -225,7 +218,6 @@ class LinearTable:
 
     def search(self, until: float | None) -> None:
         """Try orders upwards until two bring no gain, then delays of the best small order.
-
         A long dead time is tried before large orders, which mimic one and take most of the time;
         the smallest orders come first, as networks start from them.
         """
@@ -258,7 +250,6 @@ class LinearTable:
 
     def _late(self) -> list[tuple[int, int]]:
         """Small orders with the estimated dead time, if it is longer than `DELAYS`.
-
         Large orders mimic a dead time with poles that the drive does not have. The estimate can be
         late by a sample.
         """
@@ -298,7 +289,6 @@ class LinearTable:
     @property
     def eligible(self) -> list[LinearCandidate]:
         """Models that can be chosen.
-
         Direct feedthrough is only a network's start, unless requested. A delay makes a model
         smaller, and is accepted only if it does as well as the best model without.
         """
@@ -334,9 +324,8 @@ class LinearTable:
 
     def start(self, order: int, nk: int) -> _core.LinearModel | None:
         """A model of that order as a network's start.
-
-        If the fit of that order is misled (it has found a spurious slow pole), the smaller one with
-        additional fast poles.
+        If the fit of that order is misled (it has found a spurious slow pole), it is the smaller
+        one with additional fast poles.
         """
         fitted_ = self.candidates.get((order, nk))
         smaller = [c for (o, k), c in self.candidates.items() if o < order and k == nk]
@@ -382,7 +371,6 @@ def fitted(data: Dataset, order: int, nk: int, look: Look) -> _core.LinearModel 
 
 def is_misled(model: _core.LinearModel, smaller: _core.LinearModel, part: Split) -> bool:
     """Whether a model is clearly worse than a smaller one, on held-out or on fitted data.
-
     A drive that saturates can mislead a fit to a slow pole which the drive does not have: the free
     initial state follows each record's trend. Started from a few samples, such a model fails even
     on the record to which it was fitted.

@@ -19,7 +19,6 @@ M = TypeVar("M", bound=Model)
 
 def with_noise(model: M, data: Dataset) -> M:
     """The model with the noise of its output in `training`, and so its alternatives.
-
     It stays unchanged without noise, and if its output was computed from counts: a loop then has
     the encoder itself.
     """
@@ -31,7 +30,6 @@ def with_noise(model: M, data: Dataset) -> M:
 
 def _noisy(model: M, data: Dataset) -> M:
     """Third differences show white noise, and fast motion beside it that a free run explains.
-
     What is rounded to a grid has at least the noise of rounding (Widrow, Kollar and Liu 1996).
     """
     outputs = [e.y for e in data.experiments]

@@ -40,7 +40,6 @@ class Structure:
 
     Attributes
     ----------
-    na, nb, nk : int
     parameters : int
         Number of parameters that the training data determine.
     one_step : float
@@ -384,7 +383,6 @@ def _models(
     arx: Solution, train: Dataset, na: int, nb: int, nk: int
 ) -> Iterator[_core.LinearModel]:
     """The structure by least squares and by instrumental variables.
-
     For a nonlinear drive, instrumental variables can follow the record's trend with a slow pole
     that no other record shows; least squares cannot.
     """
@@ -463,22 +461,10 @@ SHARE = 0.02
 
 def lipschitz_index(data: Dataset, na: int, nb: int, nk: int) -> float:
     """Geometric mean of the largest quotients |dy| / |dphi|, times sqrt(n) (He and Asada 1993).
-
     With too few lags two nearly equal regressors can have very different outputs: the index is
-    large. It falls to a level as lags are added; the order is where it stops falling. Noise raises
-    that level. Inputs and output are taken in units of their standard deviations.
-
-    Parameters
-    ----------
-    data : Dataset
-        Samples that were not measured are left out.
-    na, nb, nk : int
-        The regressor's lags.
-
-    Returns
-    -------
-    float
-        NaN if there are too few samples.
+    large. It falls to a level, which noise raises, as lags are added; the order is where it stops
+    falling. Inputs and output are in units of their standard deviations. Samples that were not
+    measured are left out; NaN if too few are left.
     """
     mean, scale = _moments(data)
     rows = np.vstack([_regressors(e, na, nb, nk, mean, scale) for e in data.experiments])

@@ -126,7 +126,6 @@ def rectified_start(
     data: Dataset, order: int, nk: int, look: Look | None = None
 ) -> _core.LinearModel | None:
     """The linear model whose magnitude is closest to a rectified output.
-
     Alternating projections (Fienup 1982): the model's sign is applied to the measured magnitude,
     and output error is fitted to the result. The first signs are those of the input through
     low-pass filters with several time constants.
@@ -210,7 +209,6 @@ def rms_error(
     seen: Callable[[FloatArray], FloatArray] = lambda s: s,
 ) -> float:
     """Root mean square of y - seen(free run), each run from its own estimated state.
-
     Behind a rectifying sensor, states of both signs explain the first samples, which are therefore
     not counted.
     """

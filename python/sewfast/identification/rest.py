@@ -51,7 +51,6 @@ def _standing(data: Dataset) -> Rest | None:
 
 def _equilibrium(model: Model, data: Dataset) -> Rest | None:
     """The model's equilibrium without a command, or with the least recorded one.
-
     The record has been at rest or not, so the level is kept within the recorded outputs. It is zero
     if the model's own error does not tell it from zero.
     """

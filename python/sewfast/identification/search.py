@@ -69,7 +69,6 @@ class Search(Trials):
 
     def run(self) -> None:
         """Linear models, then networks of every likely size, then larger ones from the best.
-
         The equations of a motor come after the smallest linear model: where they hold, no other
         second of the search gains as much, and a time budget must not end before it.
         """
@@ -108,7 +107,6 @@ class Search(Trials):
     @property
     def is_exact(self) -> bool:
         """Whether the linear model's error is only rounding, so that a network cannot help.
-
         A network requested by name is trained in any case.
         """
         if self.wants_network or not self.linear.eligible:
@@ -119,7 +117,6 @@ class Search(Trials):
     @property
     def is_hopeless(self) -> bool:
         """Whether no network is visibly better so far than linear models or a motor's equations.
-
         Larger ones would not help.
         """
         if self.wants_network or not self.linear.eligible or self.best is None:
@@ -144,7 +141,6 @@ class Search(Trials):
 
     def _at_once(self, likely: Sequence[Structure]) -> list[Structure]:
         """Networks without delay, of the smallest order whose linear model is not far behind.
-
         Additional states can replace the missing sample of a slowly changing input, at great cost:
         among large networks it is too late to try this.
         """
@@ -178,7 +174,6 @@ class Search(Trials):
 
     def halve(self, alive: Sequence[Candidate], iterations: int) -> list[Candidate]:
         """Train the better half further, together with fresh starts.
-
         The first time it includes the best of every number of states, unless that is far behind:
         after few iterations it is hard to rank sizes.
         """
@@ -195,7 +190,6 @@ class Search(Trials):
 
     def climb(self) -> None:
         """Try larger networks, other decays and delays from the best so far, while steps gain.
-
         State-space and lagged networks climb side by side, as long as neither is far behind. If the
         search was cheap so far, the best state-space network of another order does too: which of
         the two leads at this point is often luck.
@@ -329,7 +323,6 @@ class Search(Trials):
 
     def _integrates(self) -> bool:
         """Whether the best linear models have a pole at 1 and an unbounded steady gain.
-
         Friction or limits also lead larger orders to a pole near 1, but these do worse on held-out
         data: only the best models count.
         """

@@ -36,14 +36,9 @@ CLOSING = 0.3
 
 
 class Clock:
-    """Time since it was created or began anew, and a budget; without one it never runs out.
-
-    Attributes
-    ----------
-    budget : float or None
-        Seconds.
-    lost : list of str
-        The work that the budget cut short, in words: the result then depends on the machine.
+    """Time since it was created or began anew, and a budget [s]; without one it never runs out.
+    `lost` lists the work that the budget cut short, in words: the result then depends on the
+    machine.
     """
 
     def __init__(self, budget: float | None) -> None:
@@ -86,7 +81,6 @@ class Clock:
     @property
     def for_fits(self) -> float:
         """The part of the budget for fits [s]: verdict and evidence follow in time (`latest`).
-
         They get at most half of it: if they take longer, it is the evidence that is lost.
         """
         if self.budget is None:
@@ -123,7 +117,6 @@ class Clock:
 
     def limited(self, progress: Progress | None, share: float, what: str) -> Progress | None:
         """`progress` that ends a fit, as Ctrl-C would, when this share of the budget is used up.
-
         Then `what` is lost.
         """
         if self.budget is None:
@@ -149,13 +142,7 @@ class Stopped(Exception):
 
 class Pool:
     """Runs compiled work on several threads while the calling one listens.
-
-    Parameters
-    ----------
-    threads : int
-    clock : Clock
-    progress : callable(done, total, best) or None
-        Called from the calling thread, at most every `PERIOD`.
+    `progress(done, total, best)` is called from the calling thread, at most every `PERIOD`.
     """
 
     def __init__(self, threads: int, clock: Clock, progress: Progress | None) -> None:
@@ -175,24 +162,10 @@ class Pool:
         what: str = "",
     ) -> list[R | None]:
         """`work(item, look)` of every item, in the order of the items.
-
-        Parameters
-        ----------
-        work : callable
-            Passes `look` to the compiled function, which then ends at a deadline or on Ctrl-C with
-            its best result so far.
-        items : sequence
-        until : float or None
-            Deadline on `time.perf_counter`; items not begun by then give None.
-        share : float or None
-            Part of the whole identification that is done after the items, for the progress.
-        what : str
-            The work in words, which is lost if the deadline comes first.
-
-        Raises
-        ------
-        Stopped
-            On Ctrl-C.
+        `work` passes `look` to the compiled function, which then ends at a deadline or on Ctrl-C
+        with its best result so far. Items not begun by the deadline `until`, on
+        `time.perf_counter`, give None, and `what` is lost. `share` is the part of the whole
+        identification that is done after the items, for the progress. Raises `Stopped` on Ctrl-C.
         """
         stopping = threading.Event()
         began, ended = self.share, self.share if share is None else share

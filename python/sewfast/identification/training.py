@@ -33,22 +33,10 @@ Network: TypeAlias = _core.NeuralSS | _core.NeuralOE
 @dataclass(frozen=True)
 class Structure:
     """The structure of a network: its sizes, delay, weight decay and output function.
-
-    Attributes
-    ----------
-    nx : int
-        States; for a lagged network the past outputs, with nx + 1 past inputs.
-    nk : int
-        Delay [samples].
-    hidden : int
-        Hidden units (tanh).
-    decay : float
-        Weight decay.
-    output : Output
-        Output function of a state-space network.
-    integrator : bool
-        Whether the last state is the sum of a function of the others.
-    kind : {"neural_ss", "neural_oe"}
+    `nx` counts the states, or the past outputs of a lagged network, which has nx + 1 past inputs.
+    `nk` is the delay [samples], `hidden` counts the hidden units (tanh), and `output` belongs to a
+    state-space network. With an `integrator`, the last state is the sum of a function of the
+    others. `kind` is "neural_ss" or "neural_oe".
     """
 
     nx: int
@@ -88,14 +76,8 @@ class Structure:
 @dataclass(frozen=True)
 class Start:
     """One trained start.
-
-    Attributes
-    ----------
-    model : compiled network
-    cost : float
-        J on held-out data, else on the training data.
-    fault : str
-        The fault found by the guard; empty for a sound start.
+    `cost` is J on held-out data, else on the training data; `fault` is what the guard found, empty
+    for a sound start.
     """
 
     model: Network
@@ -111,7 +93,6 @@ class Start:
 @dataclass(frozen=True)
 class Request:
     """Some starts of one structure on some data.
-
     `initial` are models to train further, one start each; otherwise `starts` new ones are drawn
     around `linear`, numbered from `first` on.
     """
@@ -232,25 +213,9 @@ def train(
     what: str,
 ) -> list[list[Start]]:
     """Starts with a finite free run of every request, in their order.
-
-    Parameters
-    ----------
-    requests : sequence of Request
-    pool : Pool
-    seed : int
-        Start `i` of a structure draws from stream `i`.
-    workers : executor or None
-        Trains the state-space networks; the bits are the same.
-    until : float or None
-        Deadline on `time.perf_counter`; starts then return their best so far.
-    share : float or None
-    what : str
-        As in `Pool.map`.
-
-    Raises
-    ------
-    Stopped
-        On Ctrl-C.
+    Start `i` of a structure draws from stream `i` of the seed. `workers` train the state-space
+    networks; the bits are the same. At the deadline `until`, on `time.perf_counter`, starts return
+    their best so far; `share` and `what` are those of `Pool.map`. Raises `Stopped` on Ctrl-C.
     """
     jobs = [job for request in requests for job in _jobs(request, seed, until)]
     if workers is None:

@@ -114,16 +114,8 @@ def median_of(models: Sequence[Network]) -> Any:
 @dataclass
 class Trials:
     """Data of a search, the effort it has spent, and the candidates it found.
-
-    Attributes
-    ----------
-    trials : tuple of Split
-        The folds, shortened for trials; the newest first.
-    linear : LinearTable
-    candidates : dict of Structure to Candidate
-        Candidates on the newest fold, each after its latest training.
-    operations : float
-        Multiplications spent.
+    `trials` are the folds, shortened for trials, the newest first. `candidates` are those on the
+    newest fold, each after its latest training; `operations` counts multiplications.
     """
 
     task: Task

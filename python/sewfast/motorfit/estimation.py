@@ -63,21 +63,10 @@ def covariance_of(
     known: FloatArray | None = None,
 ) -> FloatArray:
     """Covariance of an estimate, (n, n), from sums of scores over a window.
-
-    A fit follows each window by the window's share `h` of the information, so that its sum has a
-    variance of h (1 - h) instead of h: each sum is divided by sqrt(1 - h) (Bell and McCaffrey 2002,
-    Survey Methodology 28). With 18 parameters on 5 s this matters.
-
-    Parameters
-    ----------
-    jacobian, residuals : array, shape (m, n) and (m,)
-        Piece by piece, the channels of a piece one after the other.
-    lengths, windows : sequence of int
-        Samples of each piece, and length over which its scores are correlated.
-    channels : int
-        Rows per sample.
-    known : array, shape (k, k), optional
-        Inverse prior covariance of the first k parameters.
+    A fit follows a window by its share h of the information: each sum is divided by sqrt(1 - h)
+    (Bell and McCaffrey 2002, Survey Methodology 28). `jacobian` (m, n) and `residuals` (m,) are
+    sorted by piece, then channel. `lengths` are the pieces' samples, `windows` those over which
+    scores correlate, and `known` (k, k) is the inverse prior covariance of the first k parameters.
     """
     n = jacobian.shape[1]
     before = np.zeros((n, n))
@@ -122,7 +111,6 @@ def inverse(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _root(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Root of the inverse, (n, determined directions), and a huge covariance for the others.
-
     A step to a single speed, say, does not separate friction from back-EMF: such a direction holds
     only rounding. Inverting it would give a false value, omitting it a false certainty.
     """
@@ -168,16 +156,8 @@ FLAT = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """The end of a descent.
-
-    Attributes
-    ----------
-    x : array, shape (n,)
-        Parameters.
-    cost : float
-        Sum of squares there.
-    left : float
-        Squared distance to the minimum in standard errors, by the linear model.
+    """The end of a descent: parameters `x` (n,) and their sum of squares `cost`.
+    `left` is the squared distance to the minimum in standard errors, by the linear model.
     """
 
     x: FloatArray
@@ -195,28 +175,11 @@ def minimised(
     enough: float,
     iterations: int,
 ) -> Minimum:
-    """Find the least-squares solution near a start.
-
-    Parameters
-    ----------
-    normal, cost : callable
-        Functions of the parameters, shape (n,); a cost that is not finite rejects a trial.
-    start : array, shape (n,)
-        Start, within the bounds.
-    bounds : pair of array, shape (n,)
-        Least and largest values.
-    count : int
-        Number of residuals; their mean square is the variance for the standard errors.
-    enough : float
-        Squared distance in standard errors at which the descent ends.
-    iterations : int
-        Most Jacobians.
-
-    Raises
-    ------
-    TimeUp
-        If one of the functions raises it at the start. Raised later, it ends the descent where it
-        is.
+    """Find the least-squares solution near a start (n,), within the bounds, both (n,).
+    A `cost` that is not finite rejects a trial. The mean square of the `count` residuals is the
+    variance for the standard errors. The descent ends at the squared distance `enough` in standard
+    errors, or after `iterations` Jacobians. Raises `TimeUp` if one of the functions raises it at
+    the start. Raised later, it ends the descent where it is.
     """
     low, high = bounds
     x, mu = start, DAMPING

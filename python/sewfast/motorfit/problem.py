@@ -263,7 +263,6 @@ class Problem:
 
     def weigh(self, state: State, order: int = WHITE) -> None:
         """Set the filters that whiten the residuals of this fit, to variance 1.
-
         Encoder steps in a difference of counts cancel from sample to sample, while an unmodelled
         load lasts for many: each has its colour, and receives the proper weight.
         """
@@ -290,7 +289,6 @@ class Problem:
 
     def settle_starts(self, state: State) -> None:
         """Estimate the pieces' initial speeds by least squares together with the free parameters.
-
         A line through the first samples is only a first guess if the motor is fast compared with
         the sampling, or the record noisy.
         """
@@ -315,7 +313,6 @@ class Problem:
 
     def _starts(self, state: State) -> tuple[FloatArray, list[int]]:
         """Derivatives of the residuals by the initial speeds of pieces that begin in motion.
-
         They decay with the motor's time constant; a piece that begins at standstill is held there
         by dry friction.
         """
@@ -334,7 +331,6 @@ class Problem:
 
     def is_slow(self, state: State) -> bool:
         """Whether the accelerating part of the command hardly changes compared with the whole.
-
         A constant acceleration, as in a ramp, cannot be separated from dry friction.
         """
         rates = [np.diff(y) / self.records.Ts for y, *_ in self.simulated(state, ())]
@@ -344,7 +340,6 @@ class Problem:
 
     def parts_sides(self, w_s: float) -> bool:
         """Whether friction that falls off over this speed [rad/s] can be told apart by direction.
-
         At lower speeds there are no samples; at higher ones the difference is a constant load.
         """
         least, usual = self.stribeck_speeds()
@@ -368,9 +363,8 @@ class Problem:
 
     def covariance(self, state: State) -> FloatArray:
         """Covariance of the estimate, (n, n), including the estimation of the initial speeds.
-
-        From sums of scores over a window, plus the inexactness of clocks and integration steps
-        within a sample.
+        It is computed from sums of scores over a window, plus the inexactness of clocks and
+        integration steps within a sample.
         """
         n, J = len(state.names()), [self.jacobian(state), self._starts(state)[0]]
         k_v = max(state.theta[0] + state.theta[1], 1e-12)

@@ -25,20 +25,10 @@ SPIKE = 8.0
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A run without gaps.
-
-    Attributes
-    ----------
-    u, y : array, shape (N,)
-        Command and speed [rad/s].
-    used : array of bool, shape (N,)
-        Samples compared in the fit.
-    speed : float
-        Speed at the first sample [rad/s].
-    angle : array, shape (N,)
-        Angle of the shaft [rad], from the counts, or as the sum of the speeds.
-    current : array, shape (N,), or None
-        Measured current.
+    """A run without gaps; its arrays have shape (N,).
+    `u` and `y` are command and speed [rad/s], `used` are the samples compared in the fit, and
+    `speed` is that of the first sample [rad/s]. `angle` is that of the shaft [rad], from the
+    counts, or the sum of the speeds; `current` is measured.
     """
 
     u: FloatArray
@@ -52,9 +42,8 @@ class Piece:
 @dataclass(frozen=True, eq=False)
 class Records:
     """All pieces, with the meaning of their values.
-
-    `mean`: the speed is the mean over the previous sample, as a difference of counts is;
-    `quantum`: the step of its values [rad/s], 0 without quantisation.
+    With `mean`, the speed is the mean over the previous sample, as a difference of counts is.
+    `quantum` is the step of its values [rad/s], 0 without quantisation.
     """
 
     pieces: tuple[Piece, ...]
@@ -68,7 +57,6 @@ class Records:
 
     def liveliest(self, n: int) -> Records:
         """The `n` consecutive samples whose speed varies most; all if there are no more.
-
         The pieces are views: a sample left out of one is left out of the other.
         """
         if sum(len(p.u) for p in self.pieces) <= n:
@@ -100,13 +88,8 @@ def records_of(
     data: Recording | Dataset, current: str | ArrayLike | None, speed_unit: str | None
 ) -> Records:
     """The records to fit.
-
-    Raises
-    ------
-    DataError
-        If no usable samples are left, or a current is missing.
-    SettingError
-        Without a unit of the speed.
+    Raises `DataError` if no usable samples are left or a current is missing, and `SettingError`
+    without a unit of the speed.
     """
     if isinstance(data, Recording):
         return _of_recording(data, current, speed_unit)
@@ -233,7 +216,6 @@ def _window(p: Piece, start: int, stop: int, quantum: float) -> Piece:
 
 def spikes_of(y: FloatArray, quantum: float) -> NDArray[np.bool_]:
     """Samples far from the median of themselves and their four neighbours.
-
     The usual distance is that of nine in ten samples: up to eleven of 300 samples can be spikes. At
     a corner, and at either end, a signal is off by at most two of its quicker steps.
     """

@@ -91,7 +91,6 @@ Smoothed: TypeAlias = tuple[FloatArray, FloatArray, NDArray[np.bool_]]
 
 def _smoothed(records: Records, width: float) -> list[Smoothed]:
     """Signals smoothed by a bell of this width, for pieces that are longer.
-
     The derivative of the bell replaces that of the speed (modulating functions, Shinbrot 1957).
     """
     half = math.ceil(3.0 * width)

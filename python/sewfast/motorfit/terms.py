@@ -56,19 +56,10 @@ WORSE = 1.1
 @dataclass(frozen=True, eq=False)
 class Estimated:
     """Result of the fit of a motor.
-
-    Attributes
-    ----------
-    state : State
-        All parameters at the least-squares solution, and the terms that are shown.
-    covariance : array, shape (n, n)
-        Covariance of the free parameters of the state.
-    reasons : mapping of str by name
-        Terms (or the inertia) that the record does not show, and why.
-    records : Records
-        The records with estimated initial speeds and without spikes.
-    problem : Problem
-        The least-squares problem of the final fit.
+    `state` has all parameters at the least-squares solution and the terms that are shown;
+    `covariance` (n, n) is that of its free parameters. `reasons` says why the record does not show
+    a term (or the inertia). `records` have estimated initial speeds and no spikes; `problem` is
+    that of the final fit.
     """
 
     state: State
@@ -86,17 +77,10 @@ def estimated(
     if_clear: tuple[str, ...] = (),
 ) -> Estimated:
     """The parameters, and which of the terms the records show.
-
     Terms in `if_clear` are fitted only if the residuals without them show them clearly. `look` is
     called from time to time; an exception of it ends the fit. If it raises `TimeUp` when a motor is
-    known, the result is the motor so far, whose covariance is infinite.
-
-    Raises
-    ------
-    DataError
-        If the speed falls as the command rises.
-    FitError
-        If nothing converges to a motor.
+    known, the result is the motor so far, whose covariance is infinite. Raises `DataError` if the
+    speed falls as the command rises, and `FitError` if nothing converges to a motor.
     """
     reasons = _too_fast(records, terms)
     terms = tuple(t for t in terms if t not in reasons)
@@ -177,7 +161,6 @@ def _refined(
 
 def _trued(records: Records, *, c: float, s: float) -> Records:
     """Records with angles of the shaft instead of those shown by an eccentric encoder.
-
     Otherwise a wave of order n would have sidebands at n - 1 and n + 1.
     """
     if c == 0.0 and s == 0.0:
@@ -290,7 +273,6 @@ def _shown_terms(
     problem: Problem, start: State, needed: Mapping[str, float], steps: int
 ) -> tuple[State, dict[str, float], FloatArray]:
     """Fit all terms together, then drop those that are not shown, in as many steps as needed.
-
     `needed` has the statistic above which each is kept. Returns the state, the statistics of the
     dropped terms, and the covariance of the free parameters. The covariance allows for a dead zone
     or Stribeck friction that is not shown but hidden in the resistance or in dry friction.
@@ -334,7 +316,6 @@ def _shown_terms(
 
 def _explained(problem: Problem, state: State, term: str, covariance: FloatArray) -> float:
     """Deviance of a fit without a term, over its expectation for errors of this colour.
-
     If the shape of a term is uncertain, so is its amplitude, however much it explains: Wald's
     statistic is then inadequate (Chandler and Bate 2007, Biometrika 94, for the factor).
     """
@@ -397,17 +378,9 @@ def profiled(
     found: Estimated, of: Callable[[Values], float], slope: FloatArray, half: float
 ) -> tuple[float, float]:
     """Ends of the 95 % interval of a quantity.
-
-    Parameters
-    ----------
-    found : Estimated
-        The least-squares estimate.
-    of : callable
-        The quantity as a function of all parameters by name and the resistance `R`.
-    slope : array, shape (n,)
-        Its derivatives with respect to the free parameters.
-    half : float
-        Half-width of the interval by curvature, above 0: the start of the search.
+    `of` is the quantity as a function of all parameters by name and the resistance `R`, and `slope`
+    (n,) are its derivatives with respect to the free parameters. The search starts at `half`, the
+    half-width of the interval by curvature, above 0.
     """
     problem, state = found.problem, found.state
     x = state.vector()

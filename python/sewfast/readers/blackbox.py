@@ -194,14 +194,9 @@ class _Header:
 
 def blackbox_series(raw: bytes) -> Iterator[tuple[str, FloatArray, Any]]:
     """Names, times [s] and values of the fields of a black box log; of several flights the longest.
-
     A field is `motor.0` where the log calls it `motor[0]`. S frames are `slow` fields of the main
-    frames' times. GPS frames are left out.
-
-    Raises
-    ------
-    ValueError
-        If the header is damaged or no frame can be read.
+    frames' times. GPS frames are left out. Raises `ValueError` if the header is damaged or no frame
+    can be read.
     """
     starts = [m.start() for m in re.finditer(re.escape(BLACKBOX), raw)]
     names: list[str] = []
@@ -402,11 +397,7 @@ def _event(data: _Bytes) -> bool:
 
 def saleae_series(raw: bytes) -> tuple[FloatArray, Any]:
     """Times [s] and voltages [V] of an analogue channel that Logic 2 exported as binary, version 0.
-
-    Raises
-    ------
-    ValueError
-        For a digital channel, another version, or a file that ends too early.
+    Raises `ValueError` for a digital channel, another version, or a file that ends too early.
     """
     version, kind = struct.unpack_from("<ii", raw, 8)
     if version != 0 or kind not in (0, 1):

@@ -27,10 +27,8 @@ MAX_COLUMNS = 10_000
 class Table:
     """Columns of one file by name; `table["speed"]` is a float64 array of shape (N,).
 
-    Parameters
+    Attributes
     ----------
-    path : Path
-        The file.
     columns : mapping of name to array
         Columns can differ in length if the format allows it (`.mat`, `.npz`).
     units : mapping of name to text
@@ -77,11 +75,7 @@ class Table:
 
     def resolve(self, name: str) -> str:
         """The column's own name for `name`, which can also be the whole header (`u [V]`).
-
-        Raises
-        ------
-        DataError
-            If the file has no such column, or it cannot be used.
+        Raises `DataError` if the file has no such column, or it cannot be used.
         """
         name = printable(name)
         for candidate in (name, split_unit(name)[0]):
@@ -130,7 +124,6 @@ def from_headers(
     lines: Sequence[int] | None = None,
 ) -> Table:
     """A table from a header row; `bad` holds the reason for each column that cannot be used.
-
     A column that occurs twice with the same header and values (some loggers repeat the time) is
     used once.
     """
@@ -172,7 +165,6 @@ Value: TypeAlias = Any
 
 def read_npz(path: Path, raw: bytes) -> Table:
     """Read the arrays of an `.npz` archive; pickled objects are never loaded.
-
     An archive can unpack to a thousand times its size. The claimed sizes of its members are
     therefore checked before any is unpacked, and a member never yields more than it claims.
     """
@@ -202,7 +194,6 @@ def _npz_member(archive: Any, name: str) -> Value:
 
 def read_mat(path: Path, raw: bytes) -> Table:
     """Read a MATLAB file of version 4, 5 (SciPy) or 7.3 (HDF5, h5py).
-
     Row and column vectors both become columns. A matrix of shape (N, n) with n <= N gives `NAME.0`
     to `NAME.n-1`, a struct `NAME.FIELD`, struct arrays and cells `NAME.0`, `NAME.1`, all 0-based.
     """

@@ -52,19 +52,10 @@ class _Layout:
 
 def read_delimited(path: Path, raw: bytes) -> Table:
     """Read delimited text with a header row.
-
-    Lines above the header, as oscilloscopes write them, are skipped, with a note in `Table.notes`;
-    a row of units below it gives the units. The delimiter is comma, semicolon, tab, bar or space;
-    decimal commas and thousands separators are recognised from the cells. Lines that begin with `#`
-    are comments, and a few shorter lines at the end are left out, with a note. Up to 1 % of the
-    lines can be corrupt, with cells that are missing or no numbers: they are skipped, with a note.
-    Empty cells are NaN, dates and times of day become seconds from the first one. Columns with text
-    are marked unusable, each with line and cell, so that they raise an error only if selected.
-
-    Raises
-    ------
-    DataError
-        If the file is not a table of that kind.
+    Lines above the header, a few shorter ones at the end and up to 1 % of corrupt lines are
+    skipped, with a note in `Table.notes`; a row of units below the header gives the units.
+    Delimiter (comma, semicolon, tab, bar, space), decimal commas and thousands separators are
+    recognised; `#` begins a comment. Empty cells are NaN, moments are seconds from the first one.
     """
     layout = _layout(path, _decode(path, raw))
     fast = _fast_pass(layout)
@@ -128,7 +119,6 @@ def _is_number(cell: str) -> bool:
 
 def _layout(path: Path, text: str) -> _Layout:
     """Find the header: the first line with content, or the comment above bare numbers.
-
     Where numbers begin farther down, below a line of names that fits them, the lines above are not
     part of the table but a preamble, such as that of an oscilloscope's export.
     """
@@ -178,7 +168,6 @@ def _layout(path: Path, text: str) -> _Layout:
 
 def _below_preamble(path: Path, text: str) -> _Layout | None:
     """The layout of a table with lines above its header.
-
     None where the table begins in the first line with content, or where its beginning is not clear:
     the first line is then the header.
     """
@@ -301,7 +290,6 @@ def _decimal(delimiter: str, body: str) -> str:
 
 def _written(layout: _Layout, rows: list[list[str]]) -> _Layout:
     """The layout with the decimal mark and thousands separator found in the cells.
-
     A cell with both marks shows which is which. Without such a cell, a comma is a decimal mark if
     no cell has a point. `"1,234"` alone, quoted between commas, is ambiguous and not read.
     """
@@ -426,7 +414,6 @@ def _rows(
     layout: _Layout,
 ) -> tuple[list[int], list[list[str]], tuple[str, ...], list[tuple[int, str]]]:
     """Line numbers and cells of the rows, a note on lines below them, and corrupt lines.
-
     Blank lines and comments do not count as rows. Lines of another width are corrupt; more of them
     than `CORRUPT` are refused.
     """

@@ -26,23 +26,11 @@ Found = tuple[str, FloatArray | None, str, str]
 
 
 def table_of(frame: Any) -> Table:
-    """The numeric columns of a table in memory.
-
-    Parameters
-    ----------
-    frame : pandas, polars or xarray object, mapping of name to array, or Arrow stream
-        Anything with `__arrow_c_stream__` is read by pyarrow; a structured array of NumPy is a
-        table, too. A pandas index becomes a column if it is named or holds moments; without a name
-        it is `t`; of several levels only the named ones become columns. Units come from headers
-        such as `u [V]`, from `attrs["units"]` (pandas, xarray) or a field's metadata `unit`
-        (Arrow).
-
-    Raises
-    ------
-    DataError
-        If it has no rows, or no column holds numbers.
-    SettingError
-        For another object, or where pyarrow is needed and not installed.
+    """The numeric columns of a table in memory: pandas, polars, xarray, NumPy, mapping or Arrow.
+    pyarrow reads anything with `__arrow_c_stream__`. A pandas index becomes a column if it is named
+    or holds moments, `t` without a name; of several levels only the named ones do. Units are from
+    headers such as `u [V]`, `attrs["units"]` (pandas, xarray) or a field's metadata `unit` (Arrow).
+    Raises `DataError` without rows or numbers, `SettingError` for other objects or without pyarrow.
     """
     kinds = {c.__module__.partition(".")[0] for c in type(frame).__mro__}
     if "polars" in kinds and hasattr(frame, "collect"):
@@ -80,13 +68,7 @@ def _collected_lazily(frame: Any) -> Any:
 
 
 def collected(path: Path, found: Iterator[Found]) -> Table:
-    """A table made of the columns found.
-
-    Raises
-    ------
-    DataError
-        If there are no rows.
-    """
+    """A table made of the columns found; raises `DataError` if there are no rows."""
     headers, columns, bad, units = [], [], {}, {}
     for i, (header, values, unit, why) in enumerate(found):
         headers.append(header)

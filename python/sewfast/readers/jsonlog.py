@@ -26,14 +26,9 @@ def is_json(raw: bytes) -> bool:
 
 def read_json(path: Path, raw: bytes) -> Table:
     """Read the numbers of a JSON log; true and false are 1 and 0, null and missing values NaN.
-
     Fields of an object within an object are `NAME.FIELD`. Dates and times of day become seconds
-    from the first one. Up to 1 % of corrupt lines of JSON lines are skipped, with a note.
-
-    Raises
-    ------
-    DataError
-        If the file is no log of that kind, or too many of its lines are corrupt.
+    from the first one. Up to 1 % of corrupt lines of JSON lines are skipped, with a note; more
+    raise `DataError`.
     """
     found: Any = None
     text = raw.decode("utf-8-sig", errors="replace").rstrip("\0\x1a")

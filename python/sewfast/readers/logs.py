@@ -60,13 +60,8 @@ def is_log(raw: bytes) -> bool:
 
 def read_log(path: Path, raw: bytes) -> Table:
     """Read every signal of a log.
-
-    Raises
-    ------
-    DataError
-        If it is damaged, or holds no series of numbers.
-    SettingError
-        If its package is not installed.
+    Raises `DataError` if it is damaged or holds no series of numbers, and `SettingError` if its
+    package is not installed.
     """
     name = _kind_of(raw)
     assert name is not None
@@ -113,7 +108,6 @@ def _from_a_process(path: Path, raw: bytes, name: str) -> list[Signal]:
 
 def send(name: str) -> None:
     """Write the signals of the file named on the command line to stdout, as `.npz`.
-
     This is the whole program of a reader's process.
     """
     out, sys.stdout = sys.stdout.buffer, sys.stderr
@@ -147,11 +141,7 @@ def _bound_memory(most: int) -> None:
 
 def joined(path: Path, signals: Sequence[Signal], kind: str) -> Table:
     """One table of all signals; time is its column `t`, from the first sample of any.
-
-    Raises
-    ------
-    DataError
-        If there is no series of numbers, or there are too many.
+    Raises `DataError` if there is no series of numbers, or there are too many.
     """
     names = _unique([printable(s.name) for s in signals])
     usable: dict[str, Signal] = {}
@@ -293,7 +283,6 @@ def _rosbag(path: Path, raw: bytes) -> Iterator[Signal]:
 
 def _mcap(path: Path, raw: bytes) -> Iterator[Signal]:
     """MCAP files with JSON messages: `/topic.field`, stamped when they were logged.
-
     Topics in other encodings are listed without values.
     """
     from mcap.reader import make_reader

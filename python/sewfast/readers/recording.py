@@ -45,13 +45,8 @@ LOG = logging.getLogger("sewfast")
 
 def read_parquet(path: Path, raw: bytes) -> Table:
     """Read the numeric columns of a Parquet file; nulls are NaN.
-
-    Raises
-    ------
-    DataError
-        If the file is damaged or has no rows.
-    SettingError
-        If pyarrow is not installed.
+    Raises `DataError` if the file is damaged or has no rows, and `SettingError` if pyarrow is not
+    installed.
     """
     try:
         import pyarrow.parquet as pq
@@ -72,11 +67,7 @@ def read_parquet(path: Path, raw: bytes) -> Table:
 
 def read_mcap(path: Path, raw: bytes) -> Table:
     """Time and columns of a recording, NaN in its gaps and where it is damaged.
-
-    Raises
-    ------
-    DataError
-        If the file is not a recording of sewfast, or has no samples.
+    Raises `DataError` if the file is not a recording of sewfast, or has no samples.
     """
     found = decode_recording(path, raw)
     columns = {name: freeze(c) for name, c in found.table_columns().items()}
@@ -98,13 +89,8 @@ OWN = frozenset({"csv", "tsv", "txt", "mat", "npz", "npy", "parquet", "mcap", "x
 
 def read_installed(path: Path) -> Table | None:
     """Read a file by the installed package that handles its ending; None if there is none.
-
-    Raises
-    ------
-    DataError
-        If the package's function fails, or returns no table of numbers.
-    SettingError
-        If several packages handle the ending, or the function cannot be imported.
+    Raises `DataError` if the package's function fails or returns no table of numbers, and
+    `SettingError` if several packages handle the ending or the function cannot be imported.
     """
     ending = path.suffix.lower().removeprefix(".")
     if not ending or ending in OWN:
@@ -486,15 +472,7 @@ def _speed(table: Table, column: str, counts_per_rev: float, Ts: float) -> Float
 
 def parse_source(text: str) -> tuple[str, tuple[str, ...] | None, str | None]:
     """Split `FILE:IN:OUT` into file, input names (joined by `+` where several) and output name.
-
     A text that exists as a file, or has no two colons after a drive letter, is a file alone.
-
-    Examples
-    --------
-    >>> parse_source("run.csv:u:speed")
-    ('run.csv', ('u',), 'speed')
-    >>> parse_source("C:/data/run.csv")
-    ('C:/data/run.csv', None, None)
     """
     parts = text.rsplit(":", 2)
     is_drive = len(parts) == 3 and len(parts[0]) == 1 and parts[0].isalpha()

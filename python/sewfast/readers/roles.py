@@ -71,15 +71,8 @@ _WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+(?![^\W\d_A-Z])")
 @dataclass(frozen=True)
 class Roles:
     """Input and output of a table, recognised by names and units.
-
-    Attributes
-    ----------
-    input : str
-        The first input where several were named.
-    output : str or None
-        None where the output is a speed from `counts`.
-    counts : str or None
-        Column of encoder counts.
+    `input` is the first one where several were named. `output` is None where it is a speed from
+    `counts`, the column of encoder counts.
     """
 
     input: str
@@ -96,15 +89,10 @@ def roles(
     time: str | None = None,
 ) -> Roles | None:
     """Input and output of a table; None if its names and units leave any doubt.
-
-    Columns that are named here keep their role, the others are recognised. Time, references, row
-    numbers, supplies and columns that never change are neither input nor output. The plain names
-    `u` and `y` come first, then a voltage or a command (a current only where there is no voltage)
-    as input and a speed or a position (a temperature, a level, a pressure or a flow only where
-    there is neither) as output. A column with both a matching name and a matching unit comes before
-    one with a single match. Where one role is decided and one column is left, that column takes the
-    other role. A recording that states the counts of one turn has its output from the column
-    `counts`.
+    Named columns keep their role; time, references, row numbers, supplies and constant columns have
+    none. `u` and `y` come first, then a voltage or command (else a current) as input, a speed or
+    position (else temperature, level, pressure, flow) as output; name and unit together beat one
+    alone. The last column takes the last role. Stated counts per turn make `counts` the output.
     """
     time = time_column(table) if time is None else table.resolve(time)
     named = [table.resolve(name) for name in (*inputs, output, counts) if name is not None]
@@ -137,13 +125,8 @@ def recognised(
     counts: str | None = None,
     time: str | None = None,
 ) -> Roles:
-    """Input and output of a table, as `roles`; without an output if inputs are named and none is
-    recognised.
-
-    Raises
-    ------
-    DataError
-        If its names and units leave any doubt.
+    """Input and output of a table, as `roles`; raises `DataError` where they are in doubt.
+    There is no output if inputs are named and none is recognised.
     """
     found = roles(table, inputs=inputs, output=output, counts=counts, time=time)
     if found is None and inputs:

@@ -56,16 +56,8 @@ the year 5138, milliseconds reached it in 1973."""
 
 @dataclass(frozen=True, eq=False)
 class TimeBase:
-    """Sample time of a table, and how its rows become samples.
-
-    Attributes
-    ----------
-    Ts : float
-        Sample time [s].
-    grid : Grid or None
-        How rows become samples; None where every row is one.
-    notes : tuple of str
-        Assumptions that were made.
+    """Sample time of a table [s], and how its rows become samples.
+    `grid` is None where every row is one; `notes` are the assumptions that were made.
     """
 
     Ts: float
@@ -76,21 +68,10 @@ class TimeBase:
 @dataclass(frozen=True, eq=False)
 class Grid:
     """An even grid over uneven time stamps.
-
-    Attributes
-    ----------
-    count : int
-        Rows of the table.
-    rows : array of int
-        Indices of the rows used: of several with one time stamp the last.
-    t : array, shape (rows,)
-        Their times [s], the first at 0.
-    Ts : float
-        Step of the grid [s].
-    period : float
-        Median step of the time stamps [s].
-    exact : bool
-        Whether every row lies on the grid: nothing is interpolated, rows are missing.
+    `count` is the number of the table's rows; `rows` are the indices of those used, of several with
+    one time stamp the last, and `t` (rows,) their times [s], the first at 0. `Ts` is the step of
+    the grid [s], and `period` the median step of the time stamps [s]. If `exact`, every row lies on
+    the grid: nothing is interpolated, rows are missing.
     """
 
     count: int
@@ -132,9 +113,8 @@ class Grid:
 
     def held(self, column: FloatArray) -> FloatArray:
         """The mean over each step of the grid of a column that is held from row to row.
-
-        This keeps the input's integral, as `Dataset.resample` does. NaN where a part of the step
-        lies in a gap or belongs to a row without a value.
+        This keeps the input's integral, as `Dataset.resample` does. It is NaN where a part of the
+        step lies in a gap or belongs to a row without a value.
         """
         if self.exact:
             found = self.output(column)
@@ -189,7 +169,6 @@ def _means(values: FloatArray, edges: FloatArray, ends: FloatArray) -> FloatArra
 
 def time_column(table: Table) -> str | None:
     """The column with a name for time: t, time, timestamp, seconds, also time_ms and the like.
-
     Where there is none, dates with times of day are the time, whatever the name.
     """
     names = [n for n in table.names if _is_time(n)] or [
@@ -205,23 +184,10 @@ def _is_time(name: str) -> bool:
 
 def time_base(table: Table, given: float | None, column: str | None = None) -> TimeBase:
     """Sample time and, where its time stamps are uneven, a grid for a table.
-
-    Parameters
-    ----------
-    table : Table
-    given : float or None
-        The caller's sample time [s]: checked against even time stamps, the step of the grid for
-        uneven ones.
-    column : str or None
-        Name of the time column; found by its name where None.
-
-    Raises
-    ------
-    DataError
-        If time goes back, or even time stamps disagree with `given` by more than 1 %, or are
-        such that a grid would have far more samples than there are rows.
-    SettingError
-        If there is neither a time column nor a sample time.
+    `given` is the caller's sample time [s]: checked against even time stamps, the step of the grid
+    for uneven ones. Raises `DataError` if time goes back, or even time stamps disagree with `given`
+    by more than 1 %, or a grid would have far more samples than there are rows; `SettingError` if
+    there is neither a time column nor a sample time.
     """
     if given is not None and not (
         isinstance(given, (int, float, np.number)) and math.isfinite(given) and given > 0
@@ -272,7 +238,6 @@ def _agreed(table: Table, source: str, found: float, given: float) -> float:
 
 def _unit(table: Table, name: str) -> tuple[float | None, tuple[str, ...]]:
     """Seconds per unit of a time column, from its header, else from its name (time_ms).
-
     Numbers too large for seconds since 1970 count a smaller unit, which a note states. None if no
     unit is stated.
     """
@@ -296,14 +261,9 @@ def _guessed(
     table: Table, name: str, step: float, given: float | None
 ) -> tuple[float, tuple[str, ...]]:
     """Seconds per unit of a time column that states no unit, from its median step.
-
     The unit is seconds, unless the caller's sample time fits a smaller one. Steps that are long for
-    a drive cause a warning, since the column then probably counts milliseconds.
-
-    Raises
-    ------
-    SettingError
-        If seconds would make a sample time that no machine uses.
+    a drive cause a warning, since the column then probably counts milliseconds. Raises
+    `SettingError` if seconds would make a sample time that no machine uses.
     """
     for unit, scale in _SMALLER if given is not None and given < 0.01 * step else ():
         # not for a grid far finer than the rows
@@ -332,11 +292,8 @@ def _guessed(
 
 def _seconds(table: Table, name: str, unit: float) -> FloatArray:
     """Times [s] from 0 on, never decreasing.
-
-    Raises
-    ------
-    DataError
-        For fewer than two times, values that are not finite, or a time that goes back.
+    Raises `DataError` for fewer than two times, values that are not finite, or a time that goes
+    back.
     """
     raw = table[name]
     if len(raw) < 2:
@@ -423,7 +380,6 @@ def is_moment(text: str) -> bool:
 
 def seconds_of_texts(texts: Sequence[str]) -> FloatArray | None:
     """Seconds from the first moment; None if a text is not a moment.
-
     A date is year, month, day, or day, month, year between points; between slashes the month comes
     first if that gives valid dates. Times of day without a date continue after midnight.
     """
@@ -443,7 +399,6 @@ def seconds_of_texts(texts: Sequence[str]) -> FloatArray | None:
 
 def seconds_of_objects(values: Sequence[Any]) -> FloatArray | None:
     """Seconds of Python's datetimes or times of day (from the first one) or durations.
-
     None for anything else; NaN where a value is missing (None, NaT, NaN).
     """
     known = [v for v in values if v is not None and v == v]

@@ -46,13 +46,7 @@ def marked(path: Path) -> Mark | None:
 
 
 def require_writable(path: Path, *, overwrite: bool) -> None:
-    """Raise the errors that `Sink` would raise, without changing anything.
-
-    Raises
-    ------
-    SettingError, DataError
-        As `Sink`.
-    """
+    """Raise the errors that `Sink` would raise, without changing anything."""
     if path.exists() and not path.is_dir():
         if not overwrite:
             raise exists(path)
@@ -78,11 +72,7 @@ def _try(path: Path, opened: Path, flags: int) -> None:
 
 def _own(path: Path, file: int) -> None:
     """Lock an open file: two recorders would overwrite each other's chunks.
-
-    Raises
-    ------
-    SettingError
-        If another recorder holds the lock.
+    Raises `SettingError` if another recorder holds the lock.
     """
     try:
         _lock(file)
@@ -99,11 +89,7 @@ def _own(path: Path, file: int) -> None:
 
 def _lock(file: int, *, free: bool = False) -> None:
     """Take or release the lock of an open file; the code for Windows has not run there.
-
-    Raises
-    ------
-    BlockingIOError
-        If another process holds it.
+    Raises `BlockingIOError` if another process holds it.
     """
     try:
         import fcntl
@@ -143,19 +129,8 @@ def _folder(path: Path) -> DataError:
 
 class Sink:
     """An open file; a piece that cannot be written completely is removed again.
-
-    Parameters
-    ----------
-    path : Path
-    overwrite : bool
-        Whether to replace an existing file.
-
-    Raises
-    ------
-    SettingError
-        If the file exists and `overwrite` is False, or another recorder is writing to it.
-    DataError
-        If it cannot be created: a folder, no such folder, no permission.
+    Raises `SettingError` if the file exists and `overwrite` is False, or another recorder is
+    writing to it, and `DataError` if it cannot be created.
     """
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
@@ -183,11 +158,7 @@ class Sink:
 
     def append(self, piece: bytes) -> None:
         """Pass a piece to the operating system: from then on it survives `kill -9`.
-
-        Raises
-        ------
-        OSError
-            If it does not fit; the file then ends before the piece.
+        Raises `OSError` if it does not fit; the file then ends before the piece.
         """
         rest = memoryview(piece)
         try:
@@ -223,11 +194,7 @@ def batched(pieces: Iterable[bytes]) -> Iterator[bytes]:
 @contextmanager
 def replacing(target: Path) -> Iterator[Path]:
     """A temporary name beside a file, renamed to the file if the block succeeds.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
+    Raises `DataError` if the file cannot be written.
     """
     if target.is_dir():
         raise _folder(target)

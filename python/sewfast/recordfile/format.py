@@ -37,7 +37,6 @@ class Topic(IntEnum):
 
 def schema(topic: Topic, columns: Mapping[str, str], *, single: bool = False) -> bytes:
     """JSON schema of a topic's messages, for a recording with these columns.
-
     `single` is for one message a sample: numbers in place of arrays.
     """
     content = _object(**_PROPERTIES[topic]) if topic in _PROPERTIES else _samples(columns, single)
@@ -109,13 +108,9 @@ EXACT = 2**53
 
 def numbers(name: str, values: object) -> list[Any]:
     """A column as JSON values that parse to the same float64; NaN is null.
-
-    Whole numbers are written as such, float32 as the shortest text of the same float32.
-
-    Raises
-    ------
-    DataError
-        For anything but one column of real numbers, for infinity and whole numbers above 2^53.
+    Whole numbers are written as such, float32 as the shortest text of the same float32. Raises
+    `DataError` for anything but one column of real numbers, for infinity and whole numbers above
+    2^53.
     """
     array = np.asarray(values)
     if array.ndim != 1 or array.dtype.kind not in "biuf":
@@ -170,11 +165,7 @@ def dumps(content: Mapping[str, Any]) -> bytes:
 
 def parse(data: bytes) -> dict[str, Any]:
     """A message's JSON object.
-
-    Raises
-    ------
-    ValueError
-        If it is not a JSON object, or holds numbers that are not finite.
+    Raises `ValueError` if it is not a JSON object, or holds numbers that are not finite.
     """
     try:
         content = json.loads(data, parse_constant=_refuse)
@@ -198,12 +189,8 @@ class Block(NamedTuple):
 
 def decode(content: Mapping[str, Any], names: Iterable[str]) -> Block:
     """The samples of a parsed message.
-
-    Raises
-    ------
-    ValueError
-        If columns are missing or differ in length, numbers are not finite, or the samples'
-        numbers do not increase.
+    Raises `ValueError` if columns are missing or differ in length, numbers are not finite, or the
+    samples' numbers do not increase.
     """
     index = _column(content, "index", (int,))
     if len(index) == 0 or index.min() < 0 or index.max() > EXACT or np.any(np.diff(index) <= 0):
@@ -303,13 +290,8 @@ def _channel(topic: Topic) -> bytes:
 
 class Assembler:
     """Chunks and the summary of one file, as bytes to append.
-
-    It keeps 47 bytes a chunk for the summary, so that its memory stays small over hours.
-
-    Raises
-    ------
-    SettingError
-        If chunks are to be compressed and zstandard is not installed.
+    It keeps 47 bytes a chunk for the summary, so that its memory stays small over hours. Raises
+    `SettingError` if chunks are to be compressed and zstandard is not installed.
     """
 
     def __init__(
@@ -324,7 +306,6 @@ class Assembler:
 
     def chunk(self, messages: Sequence[Message], at: int, *, leading: bool = False) -> bytes:
         """A chunk of messages on one topic, and its index; `at` is its position in the file.
-
         The first chunk is `leading`: it contains the schemas and channels.
         """
         topic = messages[0].topic
@@ -420,13 +401,7 @@ def _chunk_index(
 
 
 def zstandard(purpose: str) -> Any:
-    """The package that compresses chunks.
-
-    Raises
-    ------
-    SettingError
-        If it is not installed.
-    """
+    """The package that compresses chunks; raises `SettingError` if it is not installed."""
     try:
         import zstandard as found
     except ImportError as e:

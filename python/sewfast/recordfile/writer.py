@@ -32,11 +32,7 @@ _COMPUTED = 1 << 5
 
 def require_ending(path: str | os.PathLike[str]) -> Path:
     """The path of a recording, whose ending other programs rely on.
-
-    Raises
-    ------
-    SettingError
-        For another ending.
+    Raises `SettingError` for another ending.
     """
     if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
         raise SettingError(
@@ -55,21 +51,9 @@ def require_ending(path: str | os.PathLike[str]) -> Path:
 
 def require_replaceable(path: str | os.PathLike[str], *, overwrite: bool) -> None:
     """Protect recordings: an `.mcap` is replaced only if it can be computed again.
-
     That holds for recordings of a virtual machine and for exports of a recording. A file that
-    cannot be read is protected, since it can be a recording of a drive.
-
-    Parameters
-    ----------
-    path : path
-        File about to be written.
-    overwrite : bool
-        Whether to allow its replacement in any case.
-
-    Raises
-    ------
-    SettingError
-        If the file is protected.
+    cannot be read is protected, since it can be a recording of a drive. Raises `SettingError` if
+    the file is protected; `overwrite` allows its replacement in any case.
     """
     found = Path(path)
     if overwrite or found.suffix.lower() != ENDING or not _is_there(found):
@@ -85,11 +69,7 @@ def require_replaceable(path: str | os.PathLike[str], *, overwrite: bool) -> Non
 
 def require_free(paths: Iterable[str | os.PathLike[str] | None], *, overwrite: bool) -> None:
     """Refuse to overwrite any file: for output that is the only record of a run on a drive.
-
-    Raises
-    ------
-    SettingError
-        If one of the files exists.
+    Raises `SettingError` if one of the files exists.
     """
     for path in paths:
         if path is not None and not overwrite and _is_there(Path(path)):
@@ -379,16 +359,9 @@ def save_curves(
     path: str | os.PathLike[str], recording: RecordedFile, *, compress: bool = False
 ) -> None:
     """Write a recording again with one message per sample; the file is complete or absent.
-
     `read_recording` reads it like any other. Samples in gaps have no message, damaged parts are
-    left out, and a torn recording stays marked as torn.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
-    SettingError
-        For compression without zstandard.
+    left out, and a torn recording stays marked as torn. Raises `DataError` if the file cannot be
+    written, and `SettingError` for compression without zstandard.
     """
     with replacing(Path(path)) as temporary:
         assembler = Assembler(recording.header.columns, single=True, compress=compress)
