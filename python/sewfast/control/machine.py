@@ -523,7 +523,8 @@ class SteppedBench:
         )
         error = LinkError(
             name=f"{self.name}, {name}", expected=f"at most {self.speed:g} RPM",
-            received=f"{speed:.4g} RPM after {k * self.Ts:.3g} s, under {u:.3g} V; rest was commanded, and {after}",
+            received=f"{speed:.4g} RPM after {k * self.Ts:.3g} s, under {u:.3g} V; rest was "
+            f"commanded, and {after}",
             remedy=TOO_FAST,
         )  # fmt: skip
         with contextlib.suppress(DataError):  # too few samples for a speed
