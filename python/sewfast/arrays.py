@@ -137,13 +137,7 @@ def texts(value: str | Sequence[str] | None, default: tuple[str, ...]) -> tuple[
 
 
 def runs(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
-    """First index and length of each run of True in a mask of shape (N,).
-
-    Examples
-    --------
-    >>> runs(np.array([True, True, False, True]))
-    ((0, 2), (3, 1))
-    """
+    """First index and length of each run of True in a mask of shape (N,)."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
     return tuple((int(a), int(b - a)) for a, b in edges.reshape(-1, 2))
 
@@ -157,10 +151,9 @@ _AT_ONCE = 2**17
 
 def gram(a: FloatArray, b: FloatArray | None = None) -> FloatArray:
     """a'b, or a'a, of tall matrices (N, p) and (N, q): a sum over blocks of rows.
-
     A block is so small that BLAS takes one thread for it. The bits are then the same with any
-    number of processors; and a busy computer does not keep it waiting for threads, which took
-    eight times as long.
+    number of processors; and a busy computer does not keep it waiting for threads, which took eight
+    times as long.
     """
     b = a if b is None else b
     total = np.zeros((a.shape[1], b.shape[1]))

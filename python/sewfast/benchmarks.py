@@ -28,19 +28,10 @@ _DEFAULT_WINDOW = 50
 
 
 class Benchmark(NamedTuple):
-    """Records with their official windows.
-
-    Attributes
-    ----------
-    train : Dataset
-        Training data, which must also provide any data for selection.
-    test : Dataset
-        Its experiments are the official test records, in the package's order.
-    n : int
-        First samples of each test record that determine the initial state and are not scored.
-    name : str
-    version : str
-        Version of the package that defines the windows.
+    """Records with their official windows. `train` must also provide any data for selection; the
+    experiments of `test` are the official test records, in the package's order. The first `n`
+    samples of each test record determine the initial state and are not scored. `version` is that of
+    the package that defines the windows.
     """
 
     train: Dataset
@@ -57,32 +48,10 @@ def names() -> tuple[str, ...]:
 
 def load(name: str, folder: str | os.PathLike[str] | None = None) -> Benchmark:
     """Read a benchmark with the windows of the package `nonlinear_benchmarks`.
-
-    The package downloads a record the first time, from its authors' page, and keeps it.
-
-    Parameters
-    ----------
-    name : str
-        One of `names()`.
-    folder : path, optional
-        Where the package keeps its files; its own cache by default.
-
-    Returns
-    -------
-    Benchmark
-        Unpacks into `train, test, n, name, version`.
-
-    Raises
-    ------
-    SettingError
-        For an unknown name, or if the package is missing.
-    DataError
-        If the record can be neither found nor downloaded.
-
-    Notes
-    -----
-    M. Schoukens and others, https://www.nonlinearbenchmark.org; windows as in Champneys et al.
-    2024, arXiv 2405.10779.
+    The package downloads a record the first time, from its authors' page, and keeps it in `folder`,
+    by default its own cache. Raises `DataError` if the record can be neither found nor downloaded.
+    Source: M. Schoukens and others, https://www.nonlinearbenchmark.org; windows as in Champneys et
+    al. 2024, arXiv 2405.10779.
     """
     if name not in _NAMES:
         raise SettingError(f"benchmark: expected one of {', '.join(_NAMES)}, received {name!r}")

@@ -41,13 +41,7 @@ def whole(name: str, value: Any) -> int:
 
 
 def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """The values as float64, shape (N,), C-contiguous.
-
-    Raises
-    ------
-    DataError
-        For values that are not numbers or not one-dimensional.
-    """
+    """The values as float64, shape (N,), C-contiguous, or a `DataError`."""
     try:
         if np.iscomplexobj(values):
             raise TypeError("complex ones; take their real part")

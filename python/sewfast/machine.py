@@ -21,14 +21,9 @@ _LARGEST_SEED = 2**64 - 1
 
 @dataclass(frozen=True, eq=False)
 class MachineRun:
-    """The response of a machine, at the instants at which each command starts to act.
-
-    Attributes
-    ----------
-    counts
-        Encoder counts since the reset, (N,); whole numbers unless quantisation is off.
-    speed_rpm
-        True speed [RPM], (N,). A real experiment cannot measure it; it is for tests and scores.
+    """The response of a machine, at the instants at which each command starts to act. `counts` (N,)
+    are encoder counts since the reset, whole numbers unless quantisation is off. `speed_rpm` (N,)
+    is the true speed [RPM], which a real experiment cannot measure; it is for tests and scores.
     """
 
     counts: NDArray[np.float64]

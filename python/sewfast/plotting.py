@@ -134,17 +134,9 @@ def panels(
 
 def thin(x: Float, y: Float, buckets: int = BUCKETS) -> tuple[Float, Float]:
     """The smallest and largest value of each bucket, in their order: no peak is lost.
-
-    A gap (NaN) of half a bucket or more is a gap in the line; a shorter one would not be visible.
-
-    Parameters
-    ----------
-    x, y : array, shape (N,)
-
-    Returns
-    -------
-    x, y : array, shape (M,), M at most 3 `buckets` + 2
-        The series itself if it is short; the first and last samples are always included.
+    The result has at most 3 `buckets` + 2 points, always with the first and last; a short series
+    (N,) is unchanged. A gap (NaN) of half a bucket or more is a gap in the line; a shorter one
+    would not be visible.
     """
     n = len(y)
     if n <= 2 * buckets:
@@ -396,11 +388,7 @@ def loop_panels(
     traces: Sequence[Trace], y_unit: str, u_unit: str, limits: tuple[float, float] | None = None
 ) -> tuple[Panel, Panel, Panel]:
     """Output and reference, error and command of closed loops; the first loop lies on top.
-
-    Parameters
-    ----------
-    limits : (float, float), optional
-        Limits of the command, marked if a loop reaches one.
+    `limits` are those of the command, marked if a loop reaches one.
     """
     first = traces[0]
 
@@ -439,17 +427,9 @@ def fit_panels(
     errors: Mapping[str, Sequence[Float]], *, label: str, unit: str, title: str = "",
 ) -> tuple[Panel, Panel]:  # fmt: skip
     """Computed outputs over the measured one, and errors; experiments one after the other.
-
-    Parameters
-    ----------
-    Ts : float or None
-        Sample time [s]; None to count samples.
-    measured : sequence of array, shape (N,)
-        One per experiment.
-    computed, errors : mapping of label to sequence of array, shape (N,)
-        One look per label, the same in both.
-    label : str
-        Label of the output, with its unit.
+    `measured` has an array (N,) per experiment; `computed` and `errors` have the same under each
+    label, which has one look in both. Without `Ts` [s] samples are counted. `label` is that of the
+    output, with its unit.
     """
     looks = {name: CYCLE[i % len(CYCLE)] for i, name in enumerate({**computed, **errors})}
     when = "sample" if Ts is None else "time [s]"
@@ -508,20 +488,10 @@ def _joined(parts: Sequence[Float]) -> Float:
 
 @dataclass(frozen=True)
 class Picture:
-    """One figure of the report.
-
-    Attributes
-    ----------
-    key : str
-        Its anchor on the page.
-    number : str
-        `Fig. 8` for the paper's Fig. 8; `Fig. A` and so on for figures that are not in the paper.
-    title, alt, caption : str
-        Its title, a description for readers who cannot see it, and what to look for.
-    svg : str
-        Inline SVG.
-    numbers : Table or None
-        Its numbers as a table.
+    """One figure of the report, as inline SVG with its `numbers` as a table.
+    `key` is its anchor on the page; `number` is `Fig. 8` for the paper's Fig. 8, and `Fig. A` and
+    so on for figures that are not in the paper. `alt` describes it for readers who cannot see it;
+    `caption` says what to look for.
     """
 
     key: str

@@ -31,7 +31,6 @@ _shown = threading.local()
 
 class TimeUp(KeyboardInterrupt):
     """Raised by a progress callback at the end of a time budget.
-
     Compiled work stops and returns its best result, as after Ctrl-C. A result that is complete by
     then is kept, whereas Ctrl-C still interrupts the caller.
     """
@@ -43,21 +42,11 @@ def latest(seconds: float) -> float:
 
 
 class Progress:
-    """Shows `done/total`, the best cost or the stage, and the elapsed seconds.
-
-    On a terminal it redraws one line. In a notebook a bar appears after half a second and goes when
-    the work ends. Elsewhere (a file, a pipe, a build's log) a line is printed after 10 s and then
-    at growing intervals, so that long work does not look like a hang. Use it in a `with` block,
-    whose end clears the line and the bar.
-
-    Parameters
-    ----------
-    title : str
-        Name of the work, such as `identify`.
-    value : str
-        Name of the number shown with the counts.
-    quiet : bool
-        Show nothing.
+    """Shows `done/total`, the best cost or the stage, and the elapsed seconds, until its `with`
+    block ends. On a terminal it redraws one line; in a notebook a bar appears after half a second.
+    Elsewhere (a file, a pipe, a build's log) it prints a line after 10 s and then at growing
+    intervals. `title` names the work, such as `identify`, and `value` the number shown with the
+    counts.
     """
 
     def __init__(self, title: str, value: str = "best", *, quiet: bool = False) -> None:
@@ -129,7 +118,6 @@ def shown_in_notebooks(
     title: str, value: str = "best"
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorate a function with a `progress` argument to show progress when a caller omits it.
-
     A notebook shows a bar; at level INFO the logger `sewfast` gets an occasional line, and the
     duration at the end. This happens only in the main thread, where cells run, and only for the
     outermost work. `progress=None` shows nothing.

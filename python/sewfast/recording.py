@@ -190,12 +190,7 @@ class Recording:
 
 
 def require_finite(name: str, values: FloatArray) -> None:
-    """Refuse NaN and infinity.
-
-    Raises
-    ------
-    DataError
-    """
+    """Refuse NaN and infinity with a `DataError`."""
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         raise DataError(

@@ -118,14 +118,9 @@ SHORTEST = 5
 def speed_between_gaps(
     counts: FloatArray, Ts: float, counts_per_rev: float, *, method: Method = "kalman"
 ) -> FloatArray:
-    """As `speed_from_counts`, separately for each piece between gaps (NaN).
-
-    NaN in gaps and in pieces too short for the method; shape (N,).
-
-    Raises
-    ------
-    DataError
-        If no piece is long enough.
+    """As `speed_from_counts`, separately for each piece between gaps (NaN); shape (N,).
+    The speed is NaN in gaps and in pieces too short for the method. Raises `DataError` if no piece
+    is long enough.
     """
     if not np.isnan(counts).any():
         return speed_from_counts(counts, Ts, counts_per_rev, method=method)
@@ -154,29 +149,11 @@ def speed_or_nan(
 
 
 def floor_of_J(estimate: ArrayLike, truth: ArrayLike, y_scale: float = 1000.0) -> float:
-    """The least J possible with a speed estimate: ``mean((estimate - truth)^2) / 2``, scaled.
-
-    A model with the exact true speed would still score this J against the estimate, so no honest J
-    of a free run is lower. For raw differences of 1,572 counts/rev at 1 ms it is about 1.2e-4.
-
-    Parameters
-    ----------
-    estimate, truth
-        Estimated and true speed, shape (N,), the same unit.
-    y_scale
-        The speed that is 1 in the model's scaled units; the paper's is 1,000 RPM.
-
-    Returns
-    -------
-    float
-        J in scaled units (paper Eq. 4).
-
-    Raises
-    ------
-    DataError
-        For columns that are empty, not finite or of different length.
-    SettingError
-        For a scale that is not finite and above zero.
+    """The least J possible with a speed estimate: ``mean((estimate - truth)^2) / 2``, scaled (paper
+    Eq. 4). A model with the exact true speed would still score this J against the estimate, so no
+    honest J of a free run is lower. For raw differences of 1,572 counts/rev at 1 ms it is about
+    1.2e-4. Both speeds (N,) have the same unit; the speed `y_scale` is 1 in the model's scaled
+    units (the paper's is 1,000 RPM).
     """
     a, b = _column(estimate, "estimate"), _column(truth, "truth")
     if len(a) != len(b) or len(a) == 0:

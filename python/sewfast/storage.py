@@ -30,23 +30,15 @@ LOG = logging.getLogger(__package__)
 
 def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
     """Write `content` to a temporary file in the same folder, then rename it to `path`.
-
-    Raises
-    ------
-    OSError
-        If the folder does not exist or is not writable, or if `path` is a folder, a device or a
-        pipe, which must not be replaced; nothing is left behind.
+    Raises `OSError` if the folder is not writable, or if `path` is a folder, a device or a pipe,
+    which must not be replaced; nothing is left behind.
     """
     replace_files({path: content})
 
 
 def replace_files(contents: Mapping[Any, bytes]) -> None:
-    """Write several files together: none is renamed before the last one is written.
-
-    Raises
-    ------
-    OSError
-        As `replace_file`, with the name of the file that failed; then no file is changed.
+    """Write several files together: none is renamed before the last one is written. Raises
+    `OSError` as `replace_file`, with the name of the file that failed; then no file is changed.
     """
     staged: list[tuple[Path, Path]] = []
     try:
@@ -90,21 +82,10 @@ LARGEST_FILE = 16 * 1024 * 1024
 def write(
     path: str | os.PathLike[str], format: str, version: int, payload: Mapping[str, Any]
 ) -> None:
-    """Write ``payload`` under its format and version; the file is either complete or absent.
-
-    Parameters
-    ----------
-    path
-        File to write; an existing one is replaced in one step.
-    format, version
-        Name and number that :func:`read` checks, stored as ``format`` and ``version``.
-    payload
-        JSON values: dicts with string keys, lists, text, booleans, None, finite numbers.
-
-    Raises
-    ------
-    ModelFileError
-        If a value is not finite or not a JSON value, or the folder is not writable.
+    """Write ``payload`` (JSON values) under its ``format`` and ``version``, which :func:`read`
+    checks; the file is either complete or absent. An existing file is replaced in one step. Raises
+    `ModelFileError` if a number is not finite or a value is no JSON value, or the folder is not
+    writable.
     """
     try:
         document = {"format": format, "version": version, **payload}
@@ -117,13 +98,7 @@ def write(
 
 
 def replace(path: str | os.PathLike[str], content: str | bytes) -> None:
-    """As :func:`replace_file`, with an error that has a remedy.
-
-    Raises
-    ------
-    ModelFileError
-        If the folder does not exist or is not writable.
-    """
+    """As :func:`replace_file`, with an error that has a remedy: `ModelFileError`."""
     try:
         replace_file(path, content.encode() if isinstance(content, str) else content)
     except OSError as error:
@@ -131,18 +106,10 @@ def replace(path: str | os.PathLike[str], content: str | bytes) -> None:
 
 
 def read(path: str | os.PathLike[str], format: str, versions: Collection[int]) -> dict[str, Any]:
-    """Read a document of a known format and version; nothing in it is executed.
-
-    Returns
-    -------
-    dict
-        The document, including ``version`` but not ``format``.
-
-    Raises
-    ------
-    ModelFileError
-        If the file is missing, larger than 16 MB or not JSON, contains a number that is not finite
-        or a key twice, or has another format or an unknown version.
+    """Read a document of a known format and version, without its ``format``; nothing in it is
+    executed. Raises `ModelFileError` if the file is missing, larger than 16 MB or not JSON,
+    contains a number that is not finite or a key twice, or has another format or an unknown
+    version.
     """
     document = _parse(path, _text(path))
     if not isinstance(document, dict):
@@ -388,11 +355,7 @@ def write_table(
 
 def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
     """Write `content` to a file: under a temporary name beside it, renamed once it is complete.
-
-    Raises
-    ------
-    DataError
-        If the folder does not exist or cannot be written to.
+    Raises `DataError` if the folder does not exist or cannot be written to.
     """
     try:
         replace_file(path, content)

@@ -68,18 +68,8 @@ def _raised(exponent: int) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows whose first cell is a header.
-
-    Attributes
-    ----------
-    caption : str
-        Title of the table.
-    header : tuple of str
-    rows : tuple of tuple of str
-    best : frozenset of (row, column)
-        Cells to set in bold.
-    words : bool
-        Whether its cells hold words, aligned to the left, rather than numbers.
+    """Rows whose first cell is a header. `best` has the cells (row, column) to set in bold; `words`
+    says whether the cells hold words, aligned to the left, rather than numbers.
     """
 
     caption: str
@@ -89,12 +79,8 @@ class Table:
     words: bool = False
 
     def to_html(self, notes: Sequence[str] = ()) -> str:
-        """As HTML for a notebook, with everything escaped, without style or script.
-
-        Parameters
-        ----------
-        notes : sequence of str
-            Lines below the table.
+        """As HTML for a notebook, with everything escaped, without style or script; `notes` are
+        lines below the table.
         """
         heads = "".join(f'<th scope="col">{escape(h)}</th>' for h in self.header)
         head = f"<thead><tr>{heads}</tr></thead>\n" if self.header else ""

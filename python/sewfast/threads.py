@@ -14,11 +14,7 @@ VARIABLE = "SEWFAST_THREADS"
 
 def available() -> int:
     """The processors available to this process, at most as many as `SEWFAST_THREADS` allows.
-
-    Raises
-    ------
-    SettingError
-        If the variable is not a whole number of 1 or more.
+    Raises `SettingError` if the variable is not a whole number of 1 or more.
     """
     affinity = getattr(os, "sched_getaffinity", None)
     processors = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
@@ -62,10 +58,8 @@ def require_workers(workers: object) -> None:
 
 
 def spread(workers: Workers, function: Callable[[J], R], jobs: Sequence[J]) -> list[R]:
-    """`function` of every job, in the order of the jobs.
-
-    Other processes receive and return pickled objects. Futures, which the `map` of a Dask client
-    returns, are waited for.
+    """`function` of every job, in the order of the jobs. Other processes receive and return pickled
+    objects. Futures, which the `map` of a Dask client returns, are waited for.
     """
     mapped = cast(Callable[..., Iterable[Any]], getattr(workers, "map", workers))
     return [_result(r) for r in mapped(function, jobs)]

@@ -39,12 +39,8 @@ SPEEDS = ANGULAR_SPEEDS | frozenset(["m/s", "cm/s", "mm/s", "m/min", "km/h"])
 
 
 def spelled(unit: str) -> str:
-    """A unit in lower case and in the package's spelling, so that equal units compare equal.
-
-    Examples
-    --------
-    >>> spelled("U/min"), spelled("RPM"), spelled("mm/s")
-    ('rpm', 'rpm', 'mm/s')
+    """A unit in lower case and in the package's spelling, so that equal units compare equal:
+    "U/min" becomes "rpm".
     """
     key = unit.strip().lower()
     return _SPELLINGS.get(key, key)
@@ -56,32 +52,10 @@ def revolutions_per_second(unit: str) -> float | None:
 
 
 def counts_per_unit(counts_per_rev: float, unit: str = "rpm") -> float:
-    """Encoder counts per second at a speed of one ``unit``.
-
-    A change of ``n`` counts in ``Ts`` seconds is a speed of ``n / (Ts * counts_per_unit)``.
-    With 1,572 counts/rev and 1 ms one count is 38.168 RPM.
-
-    Parameters
-    ----------
-    counts_per_rev
-        Counts per revolution [counts/rev], above zero.
-    unit
-        One of ``rpm``, ``rev/s``, ``rad/s``, ``deg/s``, in any usual spelling.
-
-    Returns
-    -------
-    float
-        Counts per (unit x second).
-
-    Raises
-    ------
-    SettingError
-        For a resolution that is not finite and above zero, or an unknown unit.
-
-    Examples
-    --------
-    >>> round(1 / (0.001 * counts_per_unit(1572, "rpm")), 3)
-    38.168
+    """Encoder counts per second at a speed of one ``unit`` (``rpm``, ``rev/s``, ``rad/s`` or
+    ``deg/s``, in any usual spelling) [counts/(unit s)]. A change of ``n`` counts in ``Ts`` seconds
+    is a speed of ``n / (Ts * counts_per_unit)``. With 1,572 counts/rev and 1 ms one count is 38.168
+    RPM.
     """
     if not (math.isfinite(counts_per_rev) and counts_per_rev > 0):
         raise SettingError(
@@ -101,9 +75,8 @@ def counts_per_unit(counts_per_rev: float, unit: str = "rpm") -> float:
 
 
 def time_unit(seconds: float) -> tuple[float, str]:
-    """The unit that suits a time, as a factor from seconds and its name.
-
-    ms below a second, s below ten minutes, min below three hours, h above.
+    """The unit that suits a time, as a factor from seconds and its name: ms below a second, s below
+    ten minutes, min below three hours, h above.
     """
     if not 1.0 <= abs(seconds) < math.inf:
         return 1e3, "ms"
@@ -113,13 +86,7 @@ def time_unit(seconds: float) -> tuple[float, str]:
 
 
 def duration(seconds: float, digits: int = 4) -> str:
-    """A time in the unit that suits it.
-
-    Examples
-    --------
-    >>> duration(0.0494), duration(8139.4571), duration(97200.0)
-    ('49.4 ms', '135.7 min', '27 h')
-    """
+    """A time [s] in the unit that suits it, such as '49.4 ms' for 0.0494."""
     factor, unit = time_unit(seconds)
     return f"{factor * seconds:.{digits}g} {unit}"
 
@@ -181,14 +148,8 @@ _LETTERED = re.compile(
 
 def unit_in_name(name: str) -> tuple[str, str]:
     """`speed_rpm` -> `("speed", "RPM")`; a name without a unit at its end gives an empty one.
-
     Only unambiguous endings count. A lone `A`, `C` or `K` can also be a phase or a channel, so it
-    is a unit only behind a word for a current or a temperature.
-
-    Examples
-    --------
-    >>> unit_in_name("speed_rad/s"), unit_in_name("temp_C"), unit_in_name("phase_C")
-    (('speed', 'rad/s'), ('temp', 'degC'), ('phase_C', ''))
+    is a unit only behind a word for a current or a temperature (`temp_C`, not `phase_C`).
     """
     if (match := _LETTERED.fullmatch(name)) is not None:
         return match[1] or match[3], _LETTERS[match[2] or match[4]]

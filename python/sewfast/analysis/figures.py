@@ -31,13 +31,7 @@ LARGE_MS = 2.0
 
 
 def figures(a: Analysis) -> dict[str, Figure]:
-    """All figures of an analysis by name.
-
-    Raises
-    ------
-    SettingError
-        If matplotlib is not installed.
-    """
+    """All figures of an analysis by name. Raises `SettingError` if matplotlib is not installed."""
     return {name: drawing(a, name).figure() for name in names(a)}
 
 
@@ -51,13 +45,7 @@ def names(a: Analysis) -> list[str]:
 
 
 def drawing(a: Analysis, name: str | None = None) -> Drawing:
-    """One figure of an analysis, by default steps and Bode together.
-
-    Raises
-    ------
-    SettingError
-        For another name.
-    """
+    """One figure of an analysis, by default steps and Bode together."""
     if name is None:
         return overview(a)
     there = names(a)

@@ -88,19 +88,9 @@ class PlantPoint:
 def plant_points(
     plants: Sequence[Plant], names: Sequence[str], speeds: Sequence[float] | None
 ) -> tuple[tuple[PlantPoint, ...], ...]:
-    """The plants at each of the operating points, without those that cannot rest there.
-
-    Parameters
-    ----------
-    plants : sequence of Model or VirtualMachine
-    names : sequence of str
-    speeds : sequence of float, optional
-        Steady outputs [y]; by default spread over the training data of the first model.
-
-    Raises
-    ------
-    SettingError
-        For a model with several inputs, or if no plant can rest at any of the outputs.
+    """The plants at each of the operating points, without those that cannot rest there. `speeds`
+    are steady outputs [y], by default spread over the training data of the first model. Raises
+    `SettingError` for a model with several inputs, or if no plant can rest at any of the outputs.
     """
     for plant in plants:
         if isinstance(plant, Model) and len(plant.input_names) != 1:
@@ -285,14 +275,8 @@ def margins_json(found: Margins) -> dict[str, Any]:
 def loop_bodes(
     controller: Controller, points: Sequence[Sequence[PlantPoint]], slowest: float
 ) -> tuple[LoopBode, ...]:
-    """The loop at every operating point.
-
-    Parameters
-    ----------
-    controller : Controller
-    points : sequence (operating points) of sequence (plants) of PlantPoint
-    slowest : float
-        Time constant of the slowest closed-loop pole [s], from which the frequencies begin.
+    """The loop at every operating point. Each of `points` has its plants; `slowest` is the time
+    constant of the slowest closed-loop pole [s], from which the frequencies begin.
     """
     low = min(_BELOW / (2.0 * math.pi * slowest), 0.01 / controller.Ts)
     hertz = np.geomspace(low, 0.5 / controller.Ts, FREQUENCIES)

@@ -33,13 +33,7 @@ T = TypeVar("T")
 
 
 def finite(name: str, value: Any) -> float:
-    """The value as a finite float.
-
-    Raises
-    ------
-    SettingError
-        For anything else, by name.
-    """
+    """The value as a finite float, or a `SettingError` with its name."""
     number = real(name, value)
     if not math.isfinite(number):
         raise SettingError(f"expected a finite number for {name}, got {value!r}")
@@ -47,13 +41,7 @@ def finite(name: str, value: Any) -> float:
 
 
 def finite_each(name: str, values: Any) -> list[float]:
-    """The values as finite floats, at least one.
-
-    Raises
-    ------
-    SettingError
-        For anything but a sequence of numbers, and for an empty one.
-    """
+    """The values as finite floats, at least one."""
     try:
         given = [] if isinstance(values, str) else list(values)
     except TypeError:
@@ -64,13 +52,7 @@ def finite_each(name: str, values: Any) -> list[float]:
 
 
 def required(name: str, value: Any, kind: type[T]) -> T:
-    """The value if it is of that kind; the kind's defaults for None.
-
-    Raises
-    ------
-    SettingError
-        For anything else.
-    """
+    """The value if it is of that kind; the kind's defaults for None."""
     if not (value is None or isinstance(value, kind)):
         raise SettingError(
             f"expected {kind.__name__} for {name}, got {type(value).__name__}; for example "
@@ -80,13 +62,7 @@ def required(name: str, value: Any, kind: type[T]) -> T:
 
 
 def each_change(changes: Any) -> Sequence[Change] | None:
-    """The changes, or None for the default ones.
-
-    Raises
-    ------
-    SettingError
-        For anything but a sequence of changes.
-    """
+    """The changes, or None for the default ones."""
     if changes is None:
         return None
     try:
@@ -307,16 +283,9 @@ def _since(t: FloatArray, holds: Any) -> float | None:
 
 @dataclass(frozen=True)
 class Steps:
-    """The steps: their operating point, sizes and duration.
-
-    Attributes
-    ----------
-    level, step : float
-        The output before the step, and the reference's step [y].
-    disturbance : float
-        Disturbance at the plant's input [u].
-    samples : int
-        Samples after the step; as many lead to the operating point, half of which are shown.
+    """The steps: their operating point, sizes and duration. `level` is the output before the step
+    and `step` the reference's step [y]; `disturbance` acts at the plant's input [u]. `samples`
+    follow the step; as many lead to the operating point, half of which are shown.
     """
 
     level: float
@@ -376,24 +345,9 @@ def default_steps(
     span: float | None = None,
 ) -> Steps:
     """Default steps: a twentieth of the recorded span, and a disturbance of the same effect.
-
-    Parameters
-    ----------
-    controller : Controller
-    points : sequence of PlantPoint
-        The plants at the operating point.
-    slowest : float
-        Time constant of the slowest closed-loop pole [s].
-    level, step, disturbance, seconds : float or None
-        Instead of the defaults.
-    span : float, optional
-        From rest to the farther end of the recorded output [y]; without it the step is a tenth of
-        the level.
-
-    Raises
-    ------
-    SettingError
-        For numbers that are not finite, a step of 0, or seconds not above 0.
+    `points` are the plants at the operating point, and `slowest` is the time constant of the
+    slowest closed-loop pole [s]. `span` reaches from rest to the farther end of the recorded output
+    [y]; without it the step is a tenth of the level.
     """
     given = {"level": level, "step": step, "disturbance": disturbance, "seconds": seconds}
     checked = {name: finite(name, v) for name, v in given.items() if v is not None}

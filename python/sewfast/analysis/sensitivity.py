@@ -60,17 +60,8 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """The plants, references and cost that score a controller.
-
-    Attributes
-    ----------
-    plants : tuple of Model or VirtualMachine
-    names : tuple of str
-    points : tuple of PlantPoint
-        The plants at the operating point for Ms.
-    references : tuple of str or array
-    cost : Cost
-    seed : int
+    """The plants, references and cost that score a controller; `points` are the plants at the
+    operating point for Ms.
     """
 
     plants: tuple[Plant, ...]
@@ -152,14 +143,7 @@ def gain_sensitivity(
     controller: Controller, task: Task, *, threads: int | None = None
 ) -> tuple[GainSensitivity, ...]:
     """Vary every setting that is neither 0 nor infinite by each of `FACTORS`.
-
-    Parameters
-    ----------
-    controller : Controller
-    task : Task
-        Plants, references and cost.
-    threads : int, optional
-        All processors by default; the result is the same at any number.
+    The result is the same at any number of threads (by default all processors).
     """
     values = {n: v for n in NAMES if (v := _value(controller, n)) and math.isfinite(v)}
     jobs = [(n, f) for n in values for f in FACTORS]
@@ -224,18 +208,9 @@ def what_if(
     *,
     threads: int | None = None,
 ) -> tuple[WhatIf, ...]:
-    """Score the controller on changed plants.
-
-    Parameters
-    ----------
-    controller : Controller
-    task : Task
-        Plants, references and cost.
-    changes : sequence of Change, optional
-        By default `ON_MODELS` and, for virtual machines, `ON_MACHINES`. A change that applies to no
-        plant is left out.
-    threads : int, optional
-        All processors by default; the result is the same at any number.
+    """Score the controller on changed plants. The changes are by default `ON_MODELS` and, for
+    virtual machines, `ON_MACHINES`; one that applies to no plant is left out. The result is the
+    same at any number of threads (by default all processors).
     """
     if changes is None:
         machines = [isinstance(p, VirtualMachine) for p in task.plants]

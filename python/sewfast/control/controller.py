@@ -48,10 +48,8 @@ _Kind = TypeVar("_Kind", bound="SampledController")
 
 
 class SampledController:
-    """Base class of all kinds of controllers, for `run`, `tune` and drives.
-
-    A kind has its settings as fields, and implements the members that raise NotImplementedError
-    here.
+    """Base class of all kinds of controllers, for `run`, `tune` and drives. A kind has its settings
+    as fields, and implements the members that raise NotImplementedError here.
     """
 
     KIND: ClassVar[str]
@@ -400,13 +398,7 @@ def _standard(own: Gains, values: Mapping[str, float], names: Sequence[str]) -> 
 
 
 def pid_of(controller: SampledController, use: str) -> Controller:
-    """The controller as a PID, for code that supports no other kind; `use` names it.
-
-    Raises
-    ------
-    SettingError
-        For another kind.
-    """
+    """The controller as a PID, for code that supports no other kind; `use` names that code."""
     if isinstance(controller, Controller):
         return controller
     raise SettingError(

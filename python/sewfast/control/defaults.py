@@ -66,7 +66,6 @@ _MOST_TUNED = 60_000
 
 def recorded_limits(models: Sequence[Any]) -> tuple[float, float] | None:
     """Least and largest command that the models were identified on, and at rest; None if unknown.
-
     A controller must be able to give the command of a plant at rest: 0, unless the record shows
     another by standing still.
     """
@@ -101,12 +100,8 @@ def command_limits(
     models: Sequence[Any], u_min: float | None, u_max: float | None
 ) -> tuple[float, float, str]:
     """Limits of the command [u], as given or as recorded, and a note on them.
-
-    Raises
-    ------
-    SettingError
-        If one is not given and the models do not store the range of their inputs: a limit must not
-        be guessed.
+    Raises `SettingError` if one is not given and the models do not store the range of their inputs:
+    a limit must not be guessed.
     """
     recorded = recorded_limits(models)
     missing = [name for name, value in (("u_min", u_min), ("u_max", u_max)) if value is None]
@@ -137,7 +132,6 @@ def beyond_record(models: Sequence[Any], u_min: float, u_max: float) -> str:
 
 def filter_length(Ts: float, time_constant: float) -> int:
     """Samples of the feedback's moving average: 8 ms, at most a tenth of the time constant.
-
     It is 1, no filter, if the sample time is longer than that.
     """
     wanted = min(FILTER_TIME, _FILTER_SHARE * time_constant) / Ts
@@ -146,17 +140,9 @@ def filter_length(Ts: float, time_constant: float) -> int:
 
 @dataclass(frozen=True)
 class DriveStep:
-    """A model's step response from rest.
-
-    Attributes
-    ----------
-    fopdt : Fopdt
-        First order with dead time.
-    rest : float
-        Output at the command of rest [y].
-    slowest : float
-        The dominant time constant [s]: for a response with overshoot, a third of the time until it
-        stays within 5 %.
+    """A model's step response from rest: first order with dead time, the output `rest` at the
+    command of rest [y], and the dominant time constant `slowest` [s]. For a response with
+    overshoot, the latter is a third of the time until it stays within 5 %.
     """
 
     fopdt: Fopdt
@@ -176,14 +162,8 @@ def require_one_input(model: Model) -> None:
 # the start of a search, its default references and its verdict need it, of every member
 @lru_cache(maxsize=32)
 def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
-    """The step response at the first size and length at which it settles.
-
-    Raises
-    ------
-    SettingError
-        For a model with several inputs, or limits that are not finite or both 0.
-    FitError
-        If no step settles.
+    """The step response at the first size and length at which it settles. Raises `FitError` if no
+    step settles, `SettingError` for several inputs or limits that are not finite or both 0.
     """
     require_one_input(model)
     size, about = _largest_step(model, u_min, u_max), model.rest
@@ -212,13 +192,8 @@ def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
 @lru_cache(maxsize=32)
 def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
     """The step response of the output's rate [y/s], for a model that integrates; None for others.
-
-    A position keeps moving as long as the command acts; its rate settles.
-
-    Raises
-    ------
-    FitError
-        If the rate settles after no step.
+    A position keeps moving as long as the command acts; its rate settles. Raises `FitError` if the
+    rate settles after no step.
     """
     size = _largest_step(model, u_min, u_max)
     pole = integrating_pole(model)
@@ -282,7 +257,6 @@ def moves_on(model: Model, u_min: float, u_max: float) -> bool:
 
 def _moves_on(model: Model, size: float) -> bool:
     """Whether the response still changes in the second half of a long step.
-
     A pole at 1 that a zero nearly cancels does not integrate.
     """
     samples = _STEP_SAMPLES[-1]
@@ -306,7 +280,6 @@ class _Span:
 
 def catalogue_fits(model: Any, u_min: float, u_max: float, unit: str) -> bool:
     """Whether the references of `sewfast.signals` suit a drive's unit, sample time and range.
-
     A plant without a stored range is assumed to suit them.
     """
     if spelled(unit) != "rpm" or not math.isclose(model.Ts, signals.TS, rel_tol=1e-9):
@@ -409,7 +382,6 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
 
 def _lowest_held(model: Model, fopdt: Fopdt, rest: float, sign: float) -> float:
     """The lowest level above rest at which a held reference stays within the training region [y].
-
     A record of steps passes every level, but stays at the lowest ones for less time than a
     reference does.
     """
@@ -527,14 +499,8 @@ def default_references(
     plant: Any, controller: SampledController, names: Sequence[str] = NAMES
 ) -> list[str | FloatArray]:
     """Default references for a controller on a plant: names, or samples [y].
-
     They are names if the catalogue suits the plant, else the same shapes over its own range,
-    without those that have too many samples for tuning.
-
-    Raises
-    ------
-    SettingError, FitError
-        As for `drive_references`.
+    without those that have too many samples for tuning. Raises the errors of `drive_references`.
     """
     low, high = controller.u_min, controller.u_max
     if not isinstance(plant, Model) or catalogue_fits(plant, low, high, controller.y_unit):

@@ -39,13 +39,7 @@ def load_controller(path: str | os.PathLike[str]) -> SampledController:
 
 
 def load_pid(path: str | os.PathLike[str]) -> Controller:
-    """`load_controller` for code that supports only PIDs.
-
-    Raises
-    ------
-    ModelFileError
-        As `load_controller`, or for a controller of another kind.
-    """
+    """`load_controller` for code that supports only PIDs; another kind is a `ModelFileError`."""
     found = load_controller(path)
     if not isinstance(found, Controller):
         raise ModelFileError(

@@ -394,17 +394,9 @@ def reference_samples(
     reference: str | ArrayLike, controller: SampledController, seed: int = 0, *, plant: Any = None
 ) -> FloatArray:
     """The samples of a reference given by name or as samples, shape (N,), as a copy.
-
-    A name is the signal of the catalogue for a controller in RPM at 1 ms; otherwise, with a model,
-    the same shape over the model's recorded range (`sewfast.control.defaults.drive_references`).
-
-    Raises
-    ------
-    SettingError
-        For an unknown name, and for a name with a controller that is not in RPM at 1 ms, unless
-        there is a model with one input.
-    DataError
-        For samples that are not a vector of numbers.
+    A name is the signal of the catalogue for a controller in RPM at 1 ms; otherwise it is the same
+    shape over the recorded range of a model with one input
+    (`sewfast.control.defaults.drive_references`). Raises `SettingError` without such a model.
     """
     if not isinstance(reference, str):
         return vector("reference", reference).copy()
@@ -467,7 +459,6 @@ def single_core(plant: Plant, rest: Rest) -> Any:
 
 def common_rest(plants: Sequence[Any]) -> Rest:
     """The rest about which loops run on these plants: that of the first one, zero for machines.
-
     A loop is computed in deviations from rest: there a controller that is switched on without a
     bump begins at zero, and a constant added to input or output changes no gain.
     """
@@ -500,13 +491,7 @@ References: TypeAlias = str | ArrayLike | Sequence[str | ArrayLike] | None
 
 
 def each_plant(on: Plants | None) -> list[Plant]:
-    """A list of single plants: an ensemble is replaced by its members.
-
-    Raises
-    ------
-    SettingError
-        For anything but models and virtual machines.
-    """
+    """A list of single plants: an ensemble is replaced by its members."""
     if on is None:
         return []
     given = list(on) if isinstance(on, Sequence) else [on]
@@ -528,13 +513,7 @@ def titles(plants: Sequence[Plant]) -> list[str]:
 
 
 def each_reference(references: Any, default: Sequence[str]) -> list[Any]:
-    """A list of references: a name or a vector is one, a sequence of those is several.
-
-    Raises
-    ------
-    SettingError
-        For anything else.
-    """
+    """A list of references: a name or a vector is one, a sequence of those is several."""
     if references is None:
         return list(default)
     if isinstance(references, str):
@@ -555,13 +534,7 @@ def each_reference(references: Any, default: Sequence[str]) -> list[Any]:
 def trial(
     controller: SampledController, plant: Plant, reference: Any, title: str, seed: int = 0
 ) -> ClosedLoopRun:
-    """A run under the plant's title.
-
-    Raises
-    ------
-    FitError
-        If the loop diverges; the error names the plant.
-    """
+    """A run under the plant's title. If the loop diverges, the `FitError` names the plant."""
     try:
         return replace(run(controller, plant, reference, seed=seed), plant=title)
     except FitError as e:

@@ -164,7 +164,6 @@ class Machine(Protocol):
 
 class Streaming(Machine, Protocol):
     """A machine whose samples arrive during a run, such as a drive, and which writes files itself.
-
     Its `excite` and `follow` take `file`, `live`, `overwrite` and `cancel` as `record` and `run`
     do, `excite` also `method` and `settings`.
     """
@@ -191,11 +190,7 @@ MEMBERS = ("name", "Ts", "counts_per_rev", "volt", "speed", "excite", "follow")
 
 def machine_of(on: object) -> Machine:
     """The argument as a `Machine`: a virtual machine is wrapped, others are returned as they are.
-
-    Raises
-    ------
-    SettingError
-        For anything else; the message names the missing members.
+    Raises `SettingError` with the missing members for anything else.
     """
     if isinstance(on, VirtualMachine):
         return MachineBench(on)
@@ -321,15 +316,8 @@ def _command(u: ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True)
 class MachineBench:
-    """A virtual machine as a `Machine`.
-
-    Parameters
-    ----------
-    machine : VirtualMachine
-    speed : float
-        Speed above which it stops by itself [RPM].
-    method : "kalman", "savgol" or "difference"
-        Method of estimating the speed from the counts.
+    """A virtual machine as a `Machine` that stops by itself above `speed` [RPM].
+    `method` is that of estimating the speed from the counts: "kalman", "savgol" or "difference".
     """
 
     machine: VirtualMachine

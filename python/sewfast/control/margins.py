@@ -31,21 +31,10 @@ _HALVINGS = 20
 
 
 def sampled(plant: Any, Ts: float, speed: float | None = None) -> tuple[FloatArray, FloatArray]:
-    """Numerator and denominator in powers of z^-1, shapes (m,) and (n + 1,).
-
-    Parameters
-    ----------
-    plant : Fopdt, model, OperatingPoint, or system of python-control or scipy.signal
-    Ts : float
-        Sample time [s]; a continuous plant is sampled with a zero-order hold.
-    speed : float, optional
-        Steady output about which a nonlinear model is linearised.
-
-    Raises
-    ------
-    SettingError
-        For several inputs, another sample time, a nonlinear model without a speed, or anything but
-        a plant.
+    """Numerator and denominator in powers of z^-1, shapes (m,) and (n + 1,). `plant` is an Fopdt, a
+    model, an OperatingPoint, or a system of python-control or scipy.signal; a continuous one is
+    sampled at `Ts` [s] with a zero-order hold. A nonlinear model is linearised about the steady
+    output `speed`. Raises `SettingError` for several inputs or another sample time.
     """
     if all(hasattr(plant, name) for name in ("K", "T", "L")):
         return _core.sampled_fopdt(plant.K, plant.T, plant.L, Ts=Ts)
@@ -394,11 +383,7 @@ def _require_units(gains: Gains, plant: Any) -> None:
 
 def loop_path(controller: Controller, *, speed: float | None = None) -> _core.LoopPath:
     """The part of the controller in the feedback path, with a schedule's gains at `speed`.
-
-    Raises
-    ------
-    SettingError
-        For a schedule without a speed.
+    Raises `SettingError` for a schedule without a speed.
     """
     gains, slope = scheduled_gains(controller, speed)
     return _core.LoopPath(
@@ -417,15 +402,9 @@ def loop_path(controller: Controller, *, speed: float | None = None) -> _core.Lo
 
 
 def scheduled_gains(controller: Controller, speed: float | None) -> tuple[Gains, float]:
-    """Gains in standard form at the output `speed`, and the schedule's contribution to Kp there.
-
-    The contribution is `alpha r dKp/dy` at r = y [u/y], as `-Kp alpha r` varies with the output; 0
-    without a schedule.
-
-    Raises
-    ------
-    SettingError
-        For a schedule without a speed.
+    """Gains in standard form at the output `speed`, and the schedule's contribution to Kp there:
+    `alpha r dKp/dy` at r = y [u/y], as `-Kp alpha r` varies with the output; 0 without a schedule.
+    Raises `SettingError` for a schedule without a speed.
     """
     schedule = controller.schedule
     if not schedule:

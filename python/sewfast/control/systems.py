@@ -86,10 +86,9 @@ def observer(time: float, Ts: float) -> StateSpace:
 
 
 def cascade(controller: Controller) -> StateSpace:
-    """The controller's biquads, one after the other.
-
-    Each is in the canonical form of H = 1 + (1 - q)(c0 + c1 q)/(1 + a1 q + a2 q^2), q = 1/z, whose
-    numerator less the constant c0 is (c1 - c0 - a1 c0) q - (c1 + a2 c0) q^2.
+    """The controller's biquads, one after the other. Each is in the canonical form of
+    `H = 1 + (1 - q)(c0 + c1 q)/(1 + a1 q + a2 q^2)`, q = 1/z, whose numerator less the constant c0
+    is (c1 - c0 - a1 c0) q - (c1 + a2 c0) q^2.
     """
     found = gain(1.0)
     for c0, c1, a1, a2 in controller.sections():
@@ -108,13 +107,8 @@ def _first_order(a: float, c: float, d: float) -> StateSpace:
 
 
 def measurement(controller: Controller, encoder: bool) -> StateSpace:
-    """From the plant's output to the PID's input: encoder, feedback filters, biquads.
-
-    Parameters
-    ----------
-    controller : Controller
-    encoder : bool
-        Whether the output is measured by differences of positions: the mean over the sample before.
+    """From the plant's output to the PID's input: encoder, feedback filters, biquads. With
+    `encoder` the output is measured by differences of positions: the mean over the sample before.
     """
     found = moving_average(controller.filter_samples)
     if encoder:
@@ -126,13 +120,7 @@ def measurement(controller: Controller, encoder: bool) -> StateSpace:
 
 def pid(controller: Controller, speed: float = 0.0) -> StateSpace:
     """From reference and filtered output, in this order, to the command, with the biquads of the
-    reference.
-
-    Parameters
-    ----------
-    controller : Controller
-    speed : float
-        Output at which a gain schedule is evaluated [y].
+    reference. A gain schedule is evaluated at the output `speed` [y].
     """
     g, slope = scheduled_gains(controller, speed)
     Ts = controller.Ts
@@ -294,13 +282,7 @@ def response(system: StateSpace, hertz: FloatArray, Ts: float) -> NDArray[np.com
 
 
 def simulate(system: StateSpace, u: FloatArray) -> FloatArray:
-    """The output from rest for inputs (N, inputs), shape (N, outputs).
-
-    Raises
-    ------
-    DataError
-        For inputs of another shape.
-    """
+    """The output from rest for inputs (N, inputs), shape (N, outputs)."""
     A, B, C, D = system
     u = np.asarray(u, dtype=np.float64)
     if u.ndim != 2 or u.shape[1] != B.shape[1]:

@@ -31,7 +31,6 @@ def embedded_members(
     model: Model, precision: str
 ) -> tuple[list[Model], list[_core.EmbeddedModel], str]:
     """A model's members, their steps, and how their outputs are combined.
-
     In single precision a network keeps its scaled units, which lose fewer digits.
     """
     members = list(model.members) if isinstance(model, Ensemble) else [model]
@@ -139,7 +138,6 @@ def controller_step(controller: Controller, precision: str) -> tuple[Any, list[s
 
 def _controller_loss(controller: Controller, double: Any, single: Any) -> str:
     """A note on the loss of single precision; `SettingError` if it would change the controller.
-
     A gain that becomes 0 is lost. An integral as large as the limits is resolved to 2^-24 of them.
     An error that adds less than half of that per sample does not change it, so a steady error of
     this size remains.

@@ -152,18 +152,9 @@ def with_training_evidence(model: _M, data: Dataset) -> _M:
 
 
 def training_evidence(model: DynamicModel, data: Dataset) -> dict[str, Any]:
-    """Evidence for a model to store: `region`, `uncertainty`, `information`, as JSON values.
-
-    Parameters
-    ----------
-    model : Model
-    data : Dataset
-        Its training data.
-
-    Returns
-    -------
-    dict
-        Entries for `model.training`; parts that these data cannot provide are missing.
+    """Evidence for a model to store, from its training data: `region`, `uncertainty`,
+    `information`, as JSON values for `model.training`. Parts that these data cannot provide are
+    missing.
     """
     found: dict[str, Any] = {}
     try:

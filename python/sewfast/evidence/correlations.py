@@ -34,17 +34,7 @@ _MOST_TERMS = 100_000
 
 
 def chi2_tail(x: float, freedom: int) -> float:
-    """Probability that a chi-square variable exceeds `x`.
-
-    Parameters
-    ----------
-    x : float
-        0 or more; infinity has the tail 0.
-    freedom : int
-        Degrees of freedom, 1 or more.
-
-    Notes
-    -----
+    """Probability that a chi-square variable exceeds `x` (0 or more; infinity has the tail 0).
     Q(a, z) with a = freedom/2, z = x/2: power series of P below a + 1, Lentz's continued fraction
     above (Abramowitz and Stegun 6.5.29 and 6.5.31).
     """
@@ -93,9 +83,6 @@ def _away(value: float) -> float:
 @cache
 def chi2_quantile(tail: float, freedom: int) -> float:
     """The value that a chi-square variable exceeds with probability `tail`.
-
-    Notes
-    -----
     Bisection of `chi2_tail`, which decreases everywhere; the start is Wilson and Hilferty's.
     """
     if not 0.0 < tail < 1.0:
@@ -184,19 +171,10 @@ class ResidualTest:
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Sums over all samples, their covariance, and the scales of the correlations.
-
-    Attributes
-    ----------
-    values : array, shape (n,)
-    covariance : array, shape (n, n)
-    scales : array, shape (n,)
-        The values divided by these are correlations.
-    reference : array, shape (n,)
-        Variances of the values without any correction.
-    explained : float
-    room : float
-        Samples minus the parameters estimated on them.
+    """Sums over all samples (n,), their covariance (n, n), and the scales of the correlations (n,).
+    The values divided by `scales` are correlations; `reference` (n,) holds the variances of the
+    values without any correction. `room` is the number of samples minus that of the parameters
+    estimated on them.
     """
 
     values: FloatArray
@@ -214,18 +192,9 @@ class Sums:
         noise: Noise,
         directions: Sequence[FloatArray],
     ) -> Sums:
-        """Z'e, where the directions are projected out of Z.
-
-        Parameters
-        ----------
-        instruments : arrays, shape (N, n)
-            Z, one array per experiment.
-        target : arrays, shape (N,)
-            e.
-        noise : Noise
-            Noise of the target.
-        directions : arrays, shape (N, p)
-            Orthonormal over all experiments together.
+        """Z'e, where the directions are projected out of Z. Each argument has one array per
+        experiment: `instruments` Z (N, n), `target` e (N,), and `directions` (N, p), orthonormal
+        over all experiments together. `noise` is that of the target.
         """
         power = sum(float(e @ e) for e in target)
         squares = np.sum([np.square(z).sum(axis=0) for z in instruments], axis=0)
@@ -257,7 +226,6 @@ def verdict(
     white: Sums | None = None,
 ) -> ResidualTest:
     """The test of the sums, which are ordered by series, then by lag.
-
     With `white`, the same sums of the whitened series, the statistic is the mean of both.
     """
     shape = (len(series), len(lags))
@@ -284,7 +252,6 @@ def verdict(
 
 def _likelihood_ratio(statistic: float, freedom: int, room: float) -> float:
     """-(n - (m + 2)/2) ln(1 - S/n), Bartlett's correction for a regression with m regressors.
-
     It is closer to chi-square than the quadratic form, whose variance includes the tested effect.
     """
     share = statistic / max(room, 1.0)
@@ -333,7 +300,6 @@ def independent_directions(
     columns: Sequence[FloatArray], determined: float = 1e-10
 ) -> list[FloatArray]:
     """An orthonormal basis, over all experiments together, of the span of the columns (N, p).
-
     Directions with information below `determined` times the largest are left out.
     """
     scale = np.sqrt(np.sum([np.square(c).sum(axis=0) for c in columns], axis=0))

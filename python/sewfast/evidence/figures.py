@@ -30,17 +30,8 @@ _FARTHEST = 20.0
 
 
 def figures(card: ReportCard) -> dict[str, Figure]:
-    """All figures of a card by name, as far as it has the evidence.
-
-    Returns
-    -------
-    dict
-        `residuals`, `bands`, `bode`, `poles`, `region`: matplotlib figures.
-
-    Raises
-    ------
-    SettingError
-        If matplotlib is not installed.
+    """All figures of a card by name, as far as it has the evidence: `residuals`, `bands`, `bode`,
+    `poles`, `region`. Raises `SettingError` if matplotlib is not installed.
     """
     return {name: drawing(card, name).figure() for name in names(card)}
 
@@ -57,11 +48,7 @@ def names(card: ReportCard) -> list[str]:
 
 def drawing(card: ReportCard, name: str | None = None) -> Drawing:
     """One figure of a card; by default `bands`, else the first for which it has evidence.
-
-    Raises
-    ------
-    SettingError
-        For an unknown figure, or one for which the card has no evidence.
+    Raises `SettingError` for a figure for which the card has no evidence.
     """
     there = names(card)
     if name is None and there:
@@ -75,11 +62,7 @@ def drawing(card: ReportCard, name: str | None = None) -> Drawing:
 
 def save(card: ReportCard, folder: str | os.PathLike[str]) -> list[Path]:
     """Write every figure as a PNG into a folder, which is created if needed.
-
-    Raises
-    ------
-    SettingError
-        If matplotlib is not installed or the folder cannot be written to.
+    Raises `SettingError` if matplotlib is not installed or the folder cannot be written to.
     """
     written = []
     drawn = figures(card)

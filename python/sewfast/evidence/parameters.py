@@ -19,6 +19,8 @@ from .residuals import Noise, Residuals, representative
 @dataclass(frozen=True)
 class Criteria:
     """Criteria of a model on its training data; smaller is better, only differences matter.
+    They assume a white residual; with a coloured one they favour too many parameters. Sources:
+    Akaike (1974), Hurvich and Tsai (1989), Schwarz (1978), Akaike (1969); Ljung 1999, section 16.4.
 
     Attributes
     ----------
@@ -30,11 +32,6 @@ class Criteria:
         n ln(RSS/n) + 2 p; + 2 p (p + 1)/(n - p - 1); n ln(RSS/n) + p ln n. NaN without a residual.
     fpe : float
         RSS/n (1 + p/n)/(1 - p/n) [output unit squared].
-
-    Notes
-    -----
-    Akaike (1974), Hurvich and Tsai (1989), Schwarz (1978), Akaike (1969); Ljung 1999, section 16.4.
-    They assume a white residual; with a coloured one they favour too many parameters.
     """
 
     parameters: float
@@ -114,11 +111,7 @@ class Parameters:
 @dataclass(frozen=True, eq=False)
 class Information:
     """The normal matrix of a residual, with its inverse over the determined directions.
-
-    Attributes
-    ----------
-    gram, penalty : array, shape (p, p) and (p,)
-        Psi'Psi and the weight decay's diagonal.
+    `gram` (p, p) is Psi'Psi and `penalty` (p,) the weight decay's diagonal.
     """
 
     gram: FloatArray
@@ -158,7 +151,6 @@ class Information:
 
 def _unit_scale(squares: FloatArray) -> FloatArray:
     """Factors that normalise columns of these squared lengths; columns of zeros stay so.
-
     Weight decay can shrink the effect of a hidden unit to 1e-160, so that the inverse of its
     information overflows in any units.
     """
@@ -169,15 +161,8 @@ def _unit_scale(squares: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class StoredInformation:
-    """Stored with a model: how well its training data determine the parameters.
-
-    Attributes
-    ----------
-    number, samples : int
-        Parameters and samples.
-    effective, condition : float
-    undetermined : int
-        As for `Parameters`.
+    """Stored with a model: how well its training data determine the parameters. `number` counts the
+    parameters; `effective`, `condition` and `undetermined` are as for `Parameters`.
     """
 
     number: int
@@ -232,7 +217,6 @@ def estimate(model: DynamicModel, residuals: Residuals) -> Parameters | None:
 
 def penalty(model: DynamicModel, residuals: Residuals) -> FloatArray:
     """The weight decay as a diagonal added to Psi'Psi, in the data's units; zero without decay.
-
     The training cost is 1/(2N) sum (e/y_scale)^2 + decay/2 |w|^2 (docs/CONVENTIONS.md).
     """
     single = representative(model)

@@ -57,7 +57,6 @@ def residual_tests(residuals: Residuals, memory: int = LAGS) -> tuple[ResidualTe
 
 def _within_reach(residuals: Residuals) -> Residuals:
     """Residuals rescaled if their sixth powers would overflow or underflow.
-
     The tests are independent of units, and powers of two change no digit.
     """
     u = np.concatenate([r.u for r in residuals.runs])
@@ -82,9 +81,8 @@ def _exponents(sizes: FloatArray) -> NDArray[np.int32]:
 
 def parameter_test(residuals: Residuals, trained: int) -> ResidualTest | None:
     """Whether other parameters would do better on data not trained on.
-
-    Tests the residual against its significant sensitivities, allowing for the uncertainty that
-    `trained` samples leave. None without sensitivities or with too few samples.
+    The test takes the residual against its significant sensitivities, and allows for the
+    uncertainty that `trained` samples leave. None without sensitivities or with too few samples.
     """
     if residuals.is_nothing or residuals.n < LEAST_SAMPLES or residuals.width == 0:
         return None
@@ -182,7 +180,6 @@ def _innovations(
     errors: _Columns, basis: _Columns, known: list[NDArray[np.bool_]], noise: Noise
 ) -> _Columns:
     """Whitened residuals, with the sensitivities to the parameters projected out.
-
     A parameter change too small to see in the residual can be large compared with its innovation.
     """
     white = [
@@ -317,9 +314,8 @@ def _squares_about_mean(s: _Setting) -> _Columns:
 
 
 def _product(s: _Setting) -> ResidualTest:
-    """Test of e(k) with e(k-1-lag) u(k-1-lag).
-
-    For white w only the sum of u(k-1-a)^2 w(k)^2 w(k-1-a)^2 enters the covariance.
+    """Test of e(k) with e(k-1-lag) u(k-1-lag). For white w only the sum of
+    u(k-1-a)^2 w(k)^2 w(k-1-a)^2 enters the covariance.
     """
     lags = s.lags(len(s.names))
     inputs = s.centred(lambda u: u)

@@ -146,17 +146,10 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class TrainingRegion:
-    """The region of a model's training data.
-
-    Attributes
-    ----------
-    nearest : Region
-        Region of the points (inputs, output, change of the output over `lag`); without the output
-        for a model that integrates.
-    centre, level, peak : array, shape (nu + 1,)
-        Means of the inputs and the output; the bounds of rms and peak about them.
-    lag, window : int
-        Samples.
+    """The region of a model's training data. `nearest` is the region of the points (inputs, output,
+    change of the output over `lag`), without the output for a model that integrates. `centre`
+    (nu + 1,) holds the means of the inputs and the output; `level` and `peak` (nu + 1,) bound rms
+    and peak about them. `lag` and `window` are in samples.
     """
 
     nearest: Region
@@ -168,14 +161,8 @@ class TrainingRegion:
 
     @classmethod
     def of(cls, runs: Sequence[Signals], *, integrates: bool = False) -> TrainingRegion:
-        """The region of runs on training data.
-
-        Parameters
-        ----------
-        runs : sequence of (u, y)
-            Inputs, shape (N, nu), and output, shape (N,), of each experiment.
-        integrates : bool
-            Whether the model integrates, so that all rest positions are equivalent.
+        """The region of runs on training data: inputs (N, nu) and output (N,) of each experiment.
+        With `integrates` all rest positions of the model are equivalent.
         """
         lag = max(1, int(np.median([_lag(y) for _, y in runs])))
         points = np.concatenate([_points(u, y, lag, integrates) for u, y in runs])
@@ -197,16 +184,7 @@ class TrainingRegion:
 
     def distances(self, u: FloatArray, y: FloatArray) -> FloatArray:
         """Distance of every sample of a run, relative to the bounds: above 1 is outside.
-
-        Parameters
-        ----------
-        u : array, shape (N, nu)
-        y : array, shape (N,)
-
-        Returns
-        -------
-        array, shape (N,)
-            At most 1000.
+        `u` is (N, nu) and `y` (N,); the distances (N,) are at most 1000.
         """
         y = np.nan_to_num(y, nan=1e300, posinf=1e300, neginf=-1e300)
         points = _points(u, y, self.lag, self.integrates)
@@ -244,13 +222,7 @@ class TrainingRegion:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> TrainingRegion:
-        """What `to_json` gave.
-
-        Raises
-        ------
-        ValueError
-            If the values are of another form, such as an older version's.
-        """
+        """What `to_json` gave. Raises `ValueError` for another form, such as an older version's."""
         nearest = values.get("nearest")
         if values.get("form") != FORM or not isinstance(nearest, Mapping):
             raise ValueError(f"expected a region of form {FORM}, received {values.get('form')!r}")
@@ -293,14 +265,8 @@ def stored_region(model: DynamicModel) -> TrainingRegion | None:
 
 @dataclass(frozen=True, eq=False)
 class RegionRuns:
-    """Free runs and their distances from the training region.
-
-    Attributes
-    ----------
-    runs : list of (u, y)
-        Inputs, shape (N, nu), and simulated output, shape (N,), of each experiment.
-    distances : list of array, shape (N,)
-        Distances relative to the region's bounds: above 1 is outside.
+    """Free runs, as inputs (N, nu) and simulated output (N,) of each experiment, and their
+    distances (N,) from the training region, relative to its bounds: above 1 is outside.
     """
 
     region: TrainingRegion
@@ -315,7 +281,6 @@ def region_runs(
     model: DynamicModel, data: Dataset, training: Dataset | None = None, init: int = INIT
 ) -> RegionRuns | None:
     """Free runs in the region of the training data if given, else in the stored one.
-
     None if there is neither.
     """
     if training is not None:
@@ -356,7 +321,6 @@ def _lag(y: FloatArray) -> int:
 
 def _spread_out(points: FloatArray) -> tuple[FloatArray, float]:
     """Up to `CENTRES` points, each farthest from those before, and the largest distance left.
-
     The greedy k-centre of Gonzalez (1985): extremes are among the first.
     """
     chosen = [int(np.argmin(np.square(points).sum(axis=1)))]
@@ -398,7 +362,6 @@ def _window(
     signals: Sequence[FloatArray], centre: FloatArray, peak: FloatArray, lag: int
 ) -> tuple[int, FloatArray]:
     """The window and the bounds of the level: the shortest with the doubled inputs outside.
-
     Inputs are doubled about their mean and about zero. If no window suffices, the best one.
     """
     n = sum(map(len, signals))

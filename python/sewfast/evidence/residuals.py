@@ -23,16 +23,8 @@ LARGEST_ORDER = 40
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """e(k) = sum_i ar[i] e(k-1-i) + w(k), w white.
-
-    Attributes
-    ----------
-    ar : array, shape (p,)
-        p = 0: white.
-    innovation : float
-        Variance of w.
-    variance : float
-        Variance of e.
+    """e(k) = sum_i ar[i] e(k-1-i) + w(k), w white. `ar` is (p,), and p = 0 is white; `innovation`
+    is the variance of w, `variance` that of e.
     """
 
     ar: FloatArray
@@ -46,16 +38,10 @@ class Noise:
         spent: float = 0.0,
         sparing: bool = False,
     ) -> Noise:
-        """Least squares, the order by Akaike's criterion.
-
-        Parameters
-        ----------
-        series : pairs of values (N,) and whether each of them counts (N,)
-            One pair per experiment.
-        spent : float
-            Parameters estimated on these samples, each of which costs a degree of freedom.
-        sparing : bool
-            Use Schwarz's criterion, for a series that is white unless there is strong evidence.
+        """Least squares, the order by Akaike's criterion. `series` has per experiment the values
+        (N,) and whether each of them counts (N,); `spent` parameters estimated on these samples
+        cost a degree of freedom each. `sparing` takes Schwarz's criterion, for a series that is
+        white unless there is strong evidence.
         """
         n = sum(int(known.sum()) for _, known in series)
         squares = sum(float(e[known] @ e[known]) for e, known in series)
@@ -99,16 +85,8 @@ class Noise:
         return found
 
     def shaped(self, columns: FloatArray) -> FloatArray:
-        """Columns V with V'V = Z'RZ, R the covariance matrix of the noise.
-
-        Parameters
-        ----------
-        columns : array, shape (N, m)
-            Z, zero where a sample does not count.
-
-        Returns
-        -------
-        array, shape (M, m), M > N
+        """Columns V (M, m), M > N, with V'V = Z'RZ, R the covariance matrix of the noise.
+        `columns` Z (N, m) is zero where a sample does not count.
         """
         if self.is_white:
             scaled: FloatArray = columns * self.innovation**0.5
@@ -395,16 +373,8 @@ STEPS = (1, 5, 20)
 
 @dataclass(frozen=True)
 class HorizonScores:
-    """Scores by horizon.
-
-    Attributes
-    ----------
-    pooled : mapping of horizon to Scores
-        Horizons are `free run` and `1 step`, `5 steps`, ..
-    experiments : mapping of horizon to tuple of Scores
-        None if an experiment has no sample to score.
-    names : tuple of str
-        Names of the experiments, with their ranges.
+    """Scores by horizon: `free run` and `1 step`, `5 steps`, .. In `experiments` they are None if
+    an experiment has no sample to score; `names` are those of the experiments, with their ranges.
     """
 
     pooled: dict[str, Scores]
@@ -429,13 +399,7 @@ def horizon_scores(
     model: DynamicModel, data: Dataset, residuals: Residuals, steps: tuple[int, ...] = STEPS
 ) -> HorizonScores:
     """Errors at every horizon; those some steps ahead only if the outputs are complete.
-
-    Parameters
-    ----------
-    model, data
-    residuals : Residuals
-        Residuals of the free run.
-    steps : tuple of int
+    `residuals` are those of the free run.
     """
     series: dict[str, list[FloatArray]] = {"free run": [r.yhat for r in residuals.runs]}
     if all(np.isfinite(e.y).all() for e in data.experiments):

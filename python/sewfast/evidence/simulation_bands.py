@@ -48,16 +48,9 @@ _LARGEST_GROWTH = 3.0
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
     """Distribution of the distance of measured samples from a model's free run.
-
-    Attributes
-    ----------
-    spread : float
-        Standard deviation of the residual [output unit].
-    factor : array, shape (p, r)
-        F, where FF' is the significant part of the parameters' covariance; r = 0 for an ensemble.
-    probabilities, quantiles : array, shape (q,)
-        Distribution of e/s.
-    samples : int
+    `spread` is the standard deviation s of the residual [output unit]; `factor` F (p, r) gives the
+    significant part FF' of the parameters' covariance, r = 0 for an ensemble. `probabilities` and
+    `quantiles` (q,) are the distribution of e/s.
     """
 
     spread: float
@@ -83,13 +76,7 @@ class Uncertainty:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Uncertainty:
-        """What `to_json` gave.
-
-        Raises
-        ------
-        ValueError
-            If the values are of another form.
-        """
+        """What `to_json` gave. Raises `ValueError` if the values are of another form."""
         try:
             factor = np.array(values["factor"], dtype=np.float64)
             p, q = (np.array(values[k], dtype=np.float64) for k in ("probabilities", "quantiles"))
@@ -277,7 +264,6 @@ def _factor(found: Parameters, residuals: Residuals) -> FloatArray:
 
 def _left_out(model: DynamicModel, residuals: Residuals) -> list[FloatArray]:
     """Residuals of every block for parameters fitted to the other blocks only.
-
     To first order, e_b + Psi_b (H - H_b + L)^-1 Psi_b' e_b.
     """
     errors = [r.error for r in residuals.runs]

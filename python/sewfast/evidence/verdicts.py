@@ -86,15 +86,8 @@ _PASSED = {
 
 def accuracy(scores: HorizonScores, unit: str, noise: float, share: float) -> list[Line]:
     """Lines on the free run (judged) and on errors some steps ahead (information).
-
-    Parameters
-    ----------
-    scores : HorizonScores
-    unit : str
-    noise : float
-        White measurement noise of the output; NaN if unknown.
-    share : float
-        Part explained by the motion of the input [%].
+    `noise` is the white measurement noise of the output (NaN if unknown), `share` the part
+    explained by the motion of the input [%].
     """
     free = scores.pooled["free run"]
     found = [_free_run(free, unit, judged(free.fit_percent, free.rmse, noise, share))]

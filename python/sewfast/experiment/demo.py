@@ -75,10 +75,8 @@ def write(
     drawings: Mapping[str, str],
     commissioning: Commissioning | None = None,
 ) -> None:
-    """Replace the artefacts of an earlier experiment.
-
-    The report refuses a folder without `results.json`, so an interruption in between leaves no
-    mixture that looks complete.
+    """Replace the artefacts of an earlier experiment. The report refuses a folder without
+    `results.json`, so an interruption in between leaves no mixture that looks complete.
     """
     for name in ("results.json", "report.html"):
         (folder / name).unlink(missing_ok=True)

@@ -44,19 +44,9 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class ExperimentDrive(DriveBench):
-    """The virtual machine as a drive, with figures of its link.
-
-    Attributes
-    ----------
-    inner : Drive
-    machine : VirtualMachine
-        The machine behind the port, used only for figures that no drive can provide.
-    port : str
-        `pty` or `tcp`.
-    samples : int
-        Samples that the device took and the host received.
-    seconds : float
-        Time of the runs [s].
+    """The virtual machine as a drive, with figures of its link. `machine` is the one behind the
+    port (`port` is `pty` or `tcp`), used only for figures that no drive can provide. `samples`
+    counts those that the device took and the host received; `seconds` is the time of the runs [s].
     """
 
     machine: VirtualMachine
@@ -153,7 +143,6 @@ def paper(recordings: Mapping[str, Recording], seed: int) -> Model:
 
 def ideal_cost(machine: VirtualMachine, seed: int) -> float:
     """J of the paper's network in free run on Lo-Hi, on an ideal machine.
-
     It has exact positions instead of counts, and means of load, inertia and torque over the turn.
     """
     parameters = machine.parameters | {"angle_dependence": 0.0, "quantisation": 0.0}
@@ -305,7 +294,6 @@ def coarse_controller(fopdt: Fopdt, *, Ts: float, counts_per_rev: float) -> Cont
 
 def closed_loop(drive: ExperimentDrive, controller: Controller) -> Recording:
     """A recording of a closed loop that follows trapezoids with the first gains.
-
     The machine is deterministic: the command is replayed to record its counts.
     """
     return drive.record(drive.run(controller, "trapezoids").u, "closed_loop")

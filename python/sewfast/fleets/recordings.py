@@ -224,7 +224,6 @@ def _read(job: Job) -> Dataset:
 
 def _physical(model: Model, data: Dataset) -> dict[str, float]:
     """Gain and average residence time of a linear model, with their standard errors.
-
     The residence time is Ts (B'(1)/B(1) - A'(1)/A(1)) for G = B/A in the delay operator; a pole and
     a zero that nearly cancel do not affect it. The errors follow from the parameters' covariance by
     linear propagation.

@@ -272,7 +272,6 @@ def _ended(running: Collection[Any], connected: Any) -> Any:
 
 def _replaced(connected: Any) -> bool:
     """Let the client's own cluster start its missing workers; return whether any is starting.
-
     A LocalCluster gives up a worker that has been away for 15 s (`lost-worker-timeout`), which on a
     busy computer can be merely restarting, and one that failed to start; it replaces missing
     workers only when it is scaled.
@@ -373,10 +372,8 @@ def _workers_without_ctrl_c() -> Iterator[None]:
 
 @dataclass
 class Journal:
-    """A line for each finished row, next to the table to be written.
-
-    The first line has the settings; a journal with other settings is started afresh. A truncated
-    last line is ignored.
+    """A line for each finished row, next to the table to be written. The first line has the
+    settings; a journal with other settings is started afresh. A truncated last line is ignored.
     """
 
     out: Path | None

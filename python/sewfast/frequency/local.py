@@ -170,7 +170,6 @@ class _Piece:
     @cached_property
     def criterion(self) -> float:
         """Akaike's corrected criterion; real and imaginary part of a line are two observations.
-
         Outputs count as independent: in a loop they share one noise, with a determinant of 0.
         """
         n, k = 2 * (self.stop - self.start), 2 * len(self.solution)
@@ -271,9 +270,8 @@ def _regressors(source: Complex) -> Complex:
 
 
 def _leakage(pieces: list[_Piece]) -> FloatArray:
-    """Mean squares of the leakage's three coefficients over the outputs' power, shape (3,).
-
-    From the half of the intervals that determine them best.
+    """Mean squares of the leakage's three coefficients over the outputs' power, shape (3,), from
+    the half of the intervals that determine them best.
     """
     full = [piece for piece in pieces if len(piece.solution) == 6]
     if not full:
@@ -288,7 +286,6 @@ def _leakage(pieces: list[_Piece]) -> FloatArray:
 
 def _shrunk(piece: _Piece, source: Complex, outputs: Complex, leakage: FloatArray) -> _Piece:
     """The piece refitted with a prior on its leakage, from its size in other intervals.
-
     The prior adds three observations of 0 with that variance. If the command's own spectrum is
     smooth, as that of a chirp near its start, response and leakage cannot be separated otherwise.
     """

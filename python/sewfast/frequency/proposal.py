@@ -64,17 +64,9 @@ HALF = 1.0 / math.sqrt(2.0)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Proposal:
-    """A controller from a frequency response, and its performance on the fit.
-
-    Attributes
-    ----------
-    controller : Controller
-    bandwidth_hertz : float
-        Frequency up to which the loop weakens disturbances by 3 dB or more [Hz].
-    margins : Margins
-        Margins on the fitted machine.
-    without : Proposal or None
-        The best proposal without filters, if this one has any.
+    """A controller from a frequency response, and its margins on the fitted machine.
+    The loop weakens disturbances by 3 dB or more up to `bandwidth_hertz` [Hz]; `without` is the
+    best proposal without filters, if this one has any.
     """
 
     controller: Controller
@@ -106,31 +98,10 @@ def propose(
     u_max: float = math.inf,
 ) -> Proposal:
     """PID gains of the largest bandwidth under a largest sensitivity, with filters if they pay.
-
-    Parameters
-    ----------
-    fit : ShaftFit
-        Fit of the machine, rigid or with shafts.
-    Ms : float
-        Largest sensitivity, on the fit and on the measured lines with their bands.
-    notch : bool
-        Whether to try filters: a notch, or one or two biquads with free zeros and poles.
-    like : Controller, optional
-        Source of limits, moving average, encoder and units; by default a mean of 4 samples.
-    counts_per_rev, u_max : float, optional
-        Encoder and limit of the command, without `like`; by default the encoder of the measured
-        machine.
-
-    Returns
-    -------
-    Proposal
-
-    Raises
-    ------
-    SettingError
-        For an Ms not above 1, or a controller at another sample time.
-    FitError
-        If no gains are stable within Ms.
+    `Ms` holds on the fit and on the measured lines with their bands; `notch` allows a notch, or one
+    or two biquads with free zeros and poles. Limits, moving average, encoder and units are those of
+    `like`, by default a mean of 4 samples and the encoder of the measured machine. Raises
+    `FitError` if no gains are stable within Ms.
     """
     Ms = real("Ms", Ms)
     if not 1.0 < Ms < math.inf:
@@ -235,7 +206,6 @@ class _Task:
 
     def controller(self, x: FloatArray) -> Controller:
         """The controller of logarithms of Kp, Ti, Td, the lag, and the filters.
-
         A notch has frequency, depth and width; each of one or two biquads has frequency and damping
         of the zeros, then of the poles.
         """

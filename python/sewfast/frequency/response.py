@@ -340,12 +340,8 @@ def load_response(path: str | os.PathLike[str]) -> FrequencyResponse:
 
 
 def response_of(fields: storage.Fields) -> FrequencyResponse:
-    """The response of the values of `FrequencyResponse.to_dict`.
-
-    Raises
-    ------
-    ModelFileError
-        For anything else.
+    """The response of the values of `FrequencyResponse.to_dict`; anything else is a
+    `ModelFileError`.
     """
     hertz = fields.vector("hertz")
     noise = None if fields.any("noise") is None else fields.vector("noise")

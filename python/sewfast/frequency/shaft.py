@@ -259,7 +259,6 @@ def _shafts(theta: FloatArray) -> FloatArray:
 
 def _in_order(theta: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Reordered: the lowest resonance first, each antiresonance with the resonance above it.
-
     The response does not depend on which pair of zeros belongs to which pair of poles.
     """
     at = np.arange(len(theta))
@@ -276,10 +275,9 @@ def _mark(number: int) -> str:
 
 
 def _terms(theta: FloatArray, *, counted: bool) -> tuple[int, float, Complex, Complex]:
-    """Whole samples of delay, its fraction, and poles with their residues.
-
-    For the speed, or for its integral if it is counted. The factors are quadratics, so their roots
-    need no eigenvalue problem.
+    """Whole samples of delay, its fraction, and poles with their residues, for the speed, or for
+    its integral if it is counted. The factors are quadratics, so their roots need no eigenvalue
+    problem.
     """
     a1, a2 = np.exp(theta[1:3])
     shafts = _shafts(theta)
@@ -429,9 +427,8 @@ def _shaft_starts(task: _Task, rigid: FloatArray) -> list[FloatArray]:
 def _second_starts(
     task: _Task, rigid: FloatArray, shaft: tuple[float, FloatArray, FloatArray] | None
 ) -> list[FloatArray]:
-    """Starts from rational fits, and where the response is above that of one shaft.
-
-    The latter over as many lines as a shaft needs.
+    """Starts from rational fits, and where the response is above that of one shaft, the latter over
+    as many lines as a shaft needs.
     """
     starts = _rational_starts(task, rigid, 2)
     if shaft is None:
@@ -448,7 +445,6 @@ def _second_starts(
 
 def _rational_starts(task: _Task, fit: FloatArray, shafts: int) -> list[FloatArray]:
     """Starts from the poles and zeros of rational fits, which themselves need no start.
-
     Every choice of oscillating poles and zeros in the measured range is a start, if each
     antiresonance is below its resonance.
     """
@@ -467,10 +463,9 @@ def _rational_starts(task: _Task, fit: FloatArray, shafts: int) -> list[FloatArr
 
 def _with_lags(task: _Task, fit: FloatArray, shafts: FloatArray) -> list[FloatArray]:
     """Starts: these shafts with the lags of a fit, and with the gain, lags and delay that fit best.
-
-    Divided by the shafts, the response is `K / (1 + a1 s + a2 s^2)`, whose inverse is linear in
-    its coefficients; a few values of the delay are tried. Holding the command delays by half a
-    sample, a mean over a sample by another half.
+    Divided by the shafts, the response is `K / (1 + a1 s + a2 s^2)`, whose inverse is linear in its
+    coefficients; a few values of the delay are tried. Holding the command delays by half a sample,
+    a mean over a sample by another half.
     """
     s = 2j * np.pi * task.hertz
     shape = np.ones(len(s), dtype=np.complex128)
@@ -497,7 +492,6 @@ def _with_lags(task: _Task, fit: FloatArray, shafts: FloatArray) -> list[FloatAr
 
 def _rational(task: _Task, order: int) -> tuple[FloatArray, FloatArray]:
     """Numerator and denominator of a rational fit, in powers of a delay of one sample.
-
     The equation error is linear in the coefficients. Weighted by the denominator of the fit before,
     it approaches the output error (Sanathanan and Koerner 1963); the best iterate is returned.
     """
@@ -560,7 +554,6 @@ def _starts_at(
 
 def _beyond(task: _Task, rigid: tuple[float, FloatArray, FloatArray]) -> float | None:
     """Frequency of a resonance above the measured range [Hz]; None if there is no evidence.
-
     Its flank has to explain as much as a resonance within the range.
     """
     found = []
@@ -589,7 +582,6 @@ def _best_shaft(
 
 def _is_shaft(theta: FloatArray, f: FloatArray) -> bool:
     """Whether each pair of zeros and poles is a plausible shaft within the measured range.
-
     Command and speed belong to the same mass, so antiresonances and resonances alternate. Poles
     next to the zeros of another shaft only describe a line or two that fit badly.
     """

@@ -248,9 +248,8 @@ _OF_ALL_MEMBERS = ("input_range", "output_range", "region", "rest", "noise")
 @dataclass(frozen=True, eq=False)
 class EnsembleCore:
     """The members' arithmetic; the state consists of the members' states in order.
-
-    A member that diverges on an input is left out of that run; the median of the others remains.
-    If fewer than half are left, a `FitError` is raised.
+    A member that diverges on an input is left out of that run; the median of the others remains. If
+    fewer than half are left, a `FitError` is raised.
     """
 
     members: tuple[Core, ...]
@@ -278,7 +277,6 @@ class EnsembleCore:
 
     def jacobian(self, u: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The run and its derivatives with respect to all members' parameters and states.
-
         Columns are member by member. The median has the derivative of the middle member or two.
         """
         found = [m.jacobian(u, x) for m, x in self._with_states(state)]

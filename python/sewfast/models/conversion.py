@@ -78,11 +78,8 @@ def continuous(
     core: _core.LinearModel, Ts: float, input_names: tuple[str, ...], output_name: str
 ) -> ContinuousModel:
     """The inverse of the zero-order hold: `[[A, B], [0, 0]] Ts = log [[Ad, Bd], [0, I]]`.
-
-    Raises
-    ------
-    SettingError
-        If a pole is zero or negative: no differential equation has such a discretisation.
+    Raises `SettingError` if a pole is zero or negative: no differential equation has such a
+    discretisation.
     """
     spare = max(core.nk - 1, 0)
     s = observer_form(_core.LinearModel(core.a, core.b, core.nk - spare, core.offset))
@@ -96,9 +93,8 @@ def continuous(
 
 
 def logarithm(matrix: FloatArray) -> FloatArray:
-    """Principal logarithm by square roots until near I, then Gauss-Legendre (Higham 2008, ch. 11).
-
-    `log(I + X) = int_0^1 X (I + t X)^-1 dt`, and the logarithm of a square root is half of it.
+    """Principal logarithm by square roots until near I, then Gauss-Legendre (Higham 2008, ch.
+    11). `log(I + X) = int_0^1 X (I + t X)^-1 dt`, and the logarithm of a square root is half of it.
     """
     eye, roots = np.eye(len(matrix)), 0
     while np.linalg.norm(matrix - eye, 1) > NEAR and roots < 60:
@@ -163,13 +159,8 @@ def transfer_function(core: _core.LinearModel) -> tuple[FloatArray, FloatArray]:
 
 def difference_equation(num: ArrayLike, den: ArrayLike, offset: float) -> _core.LinearModel:
     """The model of a transfer function in powers of z^-1, the inverse of `transfer_function`.
-
-    Leading zeros common to all numerators become the delay; trailing ones are dropped.
-
-    Raises
-    ------
-    SettingError
-        If shapes are wrong, values are not finite, or the denominator begins with zero.
+    Leading zeros common to all numerators become the delay; trailing ones are dropped. Raises
+    `SettingError` if the denominator begins with zero.
     """
     numerators, denominator = np.atleast_2d(_finite(num, "num")), _finite(den, "den")
     if numerators.ndim != 2 or denominator.ndim != 1 or 0 in (numerators.size, denominator.size):
@@ -192,7 +183,6 @@ def difference_equation(num: ArrayLike, den: ArrayLike, offset: float) -> _core.
 
 def observer_form(core: _core.LinearModel) -> StateSpace:
     """State space of order max(na, nk + nb - 1) in observer form.
-
     `x_i(k)` is the contribution of inputs and outputs up to sample k - 1 to `y(k+i-1)`:
     `x_i(k) = sum_{m >= i} ( -a_m y(k-1-m+i) + beta_m u(k-1-m+i) )`, with the numerator
     `beta_0 + beta_1 z^-1 + ..`, whose leading zeros are the delay.
@@ -211,14 +201,8 @@ def from_state_space(
     A: ArrayLike, B: ArrayLike, C: ArrayLike, D: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
     """Numerators and denominator in powers of z^-1 of any state space with one output.
-
-    The denominator is the characteristic polynomial of A, `den(z) = det(z I - A)`; the numerator
-    is its product with the impulse response D, C B, C A B, .. In observer form both are read off.
-
-    Raises
-    ------
-    SettingError
-        If shapes disagree, values are not finite, or there are several outputs.
+    The denominator is the characteristic polynomial of A, `den(z) = det(z I - A)`; the numerator is
+    its product with the impulse response D, C B, C A B, .. In observer form both are read off.
     """
     s = _checked(A, B, C, D)
     n = len(s.A)
@@ -241,11 +225,8 @@ def with_common_denominator(
     numerators: list[FloatArray], denominators: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Fractions in descending powers of z, one per input, as rows in z^-1 over one denominator.
-
-    Raises
-    ------
-    SettingError
-        If a numerator has a higher degree than its denominator, which is not causal.
+    Raises `SettingError` if a numerator has a higher degree than its denominator, which is not
+    causal.
     """
     distinct: list[FloatArray] = []
     for den in denominators:
@@ -275,11 +256,7 @@ def in_descending_powers(core: _core.LinearModel) -> tuple[list[FloatArray], Flo
 
 def offset_at(core: _core.LinearModel, u0: ArrayLike, y0: float) -> float:
     """The offset that makes (u0, y0) a steady point: `(1 + sum a) y0 - sum_j u0_j sum_i b_ji`.
-
-    Raises
-    ------
-    SettingError
-        If `u0` has not one finite value per input.
+    Raises `SettingError` if `u0` has not one finite value per input.
     """
     u = np.atleast_1d(_finite(u0, "operating point"))
     if u.shape != (len(core.b),):
@@ -380,11 +357,7 @@ def scipy_system(numerators: list[FloatArray], den: FloatArray, s: StateSpace, T
 
 def polynomials_of(system: Any, Ts: float | None) -> tuple[FloatArray, FloatArray, float]:
     """Numerators and denominator in powers of z^-1, and the sample time [s], of a system's object.
-
-    Raises
-    ------
-    SettingError
-        For continuous time, several outputs, no sample time, or an object that is no system.
+    Raises `SettingError` for continuous time, several outputs or no sample time.
     """
     dt = _sample_time(getattr(system, "dt", None), Ts)
     if all(hasattr(system, name) for name in "ABCD"):

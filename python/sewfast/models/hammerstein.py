@@ -19,14 +19,8 @@ _SAMPLES = 5
 
 
 class Characteristic(NamedTuple):
-    """A static curve.
-
-    Attributes
-    ----------
-    name : str
-        Name of its input, or of the output.
-    x, y : array
-        Points on the curve, including the knots.
+    """A static curve: `name` is that of its input, or of the output; `x` and `y` are points on the
+    curve, including the knots.
     """
 
     name: str
@@ -35,16 +29,11 @@ class Characteristic(NamedTuple):
 
 
 class HammersteinWiener(StructuredModel):
-    """u -> f -> linear difference equation -> g -> y, fitted in free run.
-
-    Each input has a curve f, piecewise linear over its training range: a dead band, a saturation, a
-    valve. The output has a strictly increasing curve g, such as that of a nonlinear sensor. Each
-    curve is the identity at the ends of its range, which fixes the gain of the linear part.
-
-    References
-    ----------
-    Bai, *An optimal two-stage identification algorithm for Hammerstein-Wiener nonlinear systems*,
-    Automatica 34 (1998); docs/CONVENTIONS.md, Models.
+    """u -> f -> linear difference equation -> g -> y, fitted in free run. Each input has a
+    piecewise linear curve f over its training range (dead band, saturation, valve), the output a
+    strictly increasing g (sensor); each is the identity at the ends of its range, which fixes the
+    gain of the linear part. Bai, *An optimal two-stage identification algorithm for
+    Hammerstein-Wiener nonlinear systems*, Automatica 34 (1998); docs/CONVENTIONS.md, Models.
     """
 
     kind: ClassVar[str] = "hammerstein_wiener"
@@ -64,10 +53,9 @@ class HammersteinWiener(StructuredModel):
 
     @property
     def theta(self) -> FloatArray:
-        """`[a, b input by input, offset, f input by input, g]`, shape (p,).
-
-        f: deviation of the curve from the straight line at its inner knots, over the input's range;
-        g: logarithms of the slopes of its pieces relative to the first one.
+        """`[a, b input by input, offset, f input by input, g]`, shape (p,). f is the deviation of
+        the curve from the straight line at its inner knots, over the input's range; g are
+        logarithms of the slopes of its pieces relative to the first one.
         """
         return self.core.theta
 

@@ -8,17 +8,9 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Rest:
-    """Where a plant stands still: its constant inputs, and the output under them.
-
-    Attributes
-    ----------
-    u : tuple of float
-        One input each, in its own unit.
-    y : float
-        Output in its unit.
-    source : str
-        Where the level comes from: ``standing samples`` of the record before its first move,
-        ``equilibrium`` of the model, or empty for zero, which stands for an unknown rest.
+    """Where a plant stands still: its constant inputs `u`, each in its own unit, and the output `y`
+    under them. `source` is ``standing samples`` of the record before its first move,
+    ``equilibrium`` of the model, or empty for zero, which stands for an unknown rest.
     """
 
     u: tuple[float, ...]

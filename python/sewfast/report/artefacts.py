@@ -65,12 +65,10 @@ def record_of(scored: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Artefacts:
-    """The content of the report.
+    """The content of the report: `results` is `results.json`.
 
     Attributes
     ----------
-    results : mapping
-        `results.json`.
     recordings : mapping of record to columns
         t [s], u [V], counts, y (speed from counts) [RPM], speed_true [RPM].
     predictions : mapping of scored record to columns
@@ -89,13 +87,7 @@ class Artefacts:
     drawn: Mapping[str, str]
 
     def value(self, path: str) -> Any:
-        """One value of `results.json` by its dotted path.
-
-        Raises
-        ------
-        ModelFileError
-            If it is missing.
-        """
+        """One value of `results.json` by its dotted path; a missing one is a `ModelFileError`."""
         found: Any = self.results
         for key in path.split("."):
             if not isinstance(found, Mapping) or key not in found:
@@ -120,14 +112,8 @@ class Artefacts:
 
 
 def load(folder: str | os.PathLike[str]) -> Artefacts:
-    """Read a result folder.
-
-    Raises
-    ------
-    DataError
-        If there is no such folder or it has no results, or a recording or run is damaged.
-    ModelFileError
-        If `results.json` is damaged or has another version.
+    """Read a result folder. Raises `DataError` if it has no results or a recording or run is
+    damaged, `ModelFileError` if `results.json` is damaged or has another version.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -166,13 +152,7 @@ def _drawings(results: Mapping[str, Any]) -> list[str]:
 
 
 def drawing(path: Path) -> str:
-    """An SVG without active content.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, or is anything else.
-    """
+    """An SVG without active content; anything else is a `DataError`."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as e:

@@ -51,12 +51,8 @@ def is_commissioning(folder: Path) -> bool:
 
 
 def context(folder: Path) -> dict[str, Any]:
-    """The values for the template.
-
-    Raises
-    ------
-    DataError, ModelFileError
-        If a file is missing or damaged.
+    """The values for the template. Raises `DataError` or `ModelFileError` if a file is missing or
+    damaged.
     """
     found = storage.read(folder / NUMBERS, FORMAT, {VERSION})
     try:
@@ -273,11 +269,7 @@ _CAPTIONS = {
 
 def section(folder: Path) -> dict[str, Any] | None:
     """The values for the template `analysis.html`; None if the folder has no analysis.
-
-    Raises
-    ------
-    DataError, ModelFileError
-        If a file is missing or damaged.
+    Raises `DataError` or `ModelFileError` if a file is missing or damaged.
     """
     path = folder / analyses.NUMBERS
     if not path.is_file():
@@ -365,11 +357,7 @@ MOTOR = "motor.json"
 
 def motor_section(folder: Path) -> dict[str, Any] | None:
     """The values for the template `motor.html`; None if the folder has no motor.
-
-    Raises
-    ------
-    ModelFileError
-        If its file is damaged.
+    Raises `ModelFileError` if its file is damaged.
     """
     path = folder / MOTOR
     if not path.is_file():

@@ -24,15 +24,7 @@ _TESTS = ("chirp_hi_lo", "random")
 
 @dataclass(frozen=True)
 class Goal:
-    """One goal.
-
-    Attributes
-    ----------
-    demand, reached : str
-        The requirement and the measured value, in words.
-    met : bool or None
-        None if the value is undefined.
-    """
+    """One goal: requirement and measured value in words; `met` is None if that is undefined."""
 
     demand: str
     reached: str
@@ -376,7 +368,6 @@ def render(artefacts: Artefacts) -> str:
 
 def fill(template: str, context: Mapping[str, Any]) -> str:
     """A template filled with values and with the page's one script, which zooms into pictures.
-
     The page's policy allows that script by its hash: no other script on the page runs, and nothing
     is loaded from anywhere.
     """

@@ -125,15 +125,9 @@ class Cost:
 
 def terms(run: ClosedLoopRun) -> dict[str, float]:
     """The terms of a run's cost: tracking [y], chatter and effort [u], overshoot [%], rise and lag
-    [ms], saturation (a share), u_max (largest \\|u\\|) [u].
-
-    Overshoot and rise are 0 unless the reference is a step or trapezoid; if the response does not
-    reach 90 %, rise is the whole time available.
-
-    Raises
-    ------
-    DataError
-        If samples are missing.
+    [ms], saturation (a share), u_max (largest \\|u\\|) [u]. Overshoot and rise are 0 unless the
+    reference is a step or trapezoid; if the response does not reach 90 %, rise is the whole time
+    available. Raises `DataError` if samples are missing.
     """
     limits = run.controller
     return _core.cost_terms(

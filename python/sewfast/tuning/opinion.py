@@ -103,21 +103,9 @@ class SecondOpinion:
 def second_opinion(
     own: SampledController, task: TuningTask, rival: TuningTask, search: Search
 ) -> SecondOpinion | None:
-    """Compare tuned gains with those of a rival.
-
-    Parameters
-    ----------
-    own : Controller
-        The tuned gains.
-    task, rival : TuningTask
-        Their task, and the same task on the rival's plants.
-    search : callable
-        A brief search on a task.
-
-    Returns
-    -------
-    SecondOpinion or None
-        None if nothing on the rival meets the constraints.
+    """Compare tuned gains with those of a rival, which a brief `search` finds.
+    `task` is that of the tuned gains, and `rival` the same task on the rival's plants. None if
+    nothing on the rival meets the constraints.
     """
     # start from the cheaper of the two, so that gains that are good on both show as such
     starts = [own, task.start]

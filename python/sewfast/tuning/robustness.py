@@ -63,13 +63,7 @@ class LinearLoops:
         return max(found, key=lambda pair: pair[0])
 
     def core(self, Ts: float) -> list[Any]:
-        """The fractions in z^-1 for the core.
-
-        Raises
-        ------
-        SettingError
-            If there is none.
-        """
+        """The fractions in z^-1 for the core, or a `SettingError` if there is none."""
         if not self.searched:
             raise SettingError(
                 name="Ms", expected="a model, or another linear plant, to take it on",
@@ -82,16 +76,10 @@ class LinearLoops:
 
 def linear_loops(task: TuningTask, time: Budget) -> LinearLoops:
     """The linear plants of a task, from the plants of its constraints or else its models.
-
     A nonlinear model is linearised in the middle of the references and half way to their ends, as a
     motor stands in its dry friction in the middle of references of both signs; with a gain schedule
     also at its points; with a speed in the constraints only there. Levels at which a model has no
-    steady state are left out.
-
-    Raises
-    ------
-    SettingError
-        For measured responses without a linear plant beside them.
+    steady state are left out. Raises `SettingError` for measured responses without a linear plant.
     """
     controller, given = task.start, task.constraints.plant
     if not isinstance(controller, Controller):
@@ -159,7 +147,6 @@ def _levels(task: TuningTask) -> list[float]:
 
 def within_default(task: TuningTask) -> Iterator[TuningTask]:
     """The task with the default limit of Ms; then, if nothing is within, with wider ones.
-
     They are the start's own Ms, which the start keeps to, and none. A task with a limit of its own,
     or without a linear plant in its search, is yielded as it is.
     """

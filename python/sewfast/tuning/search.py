@@ -424,13 +424,7 @@ class _Search:
 
 
 def _rivals(rival: Plants, task: TuningTask) -> list[Plant]:
-    """The plants of a rival.
-
-    Raises
-    ------
-    SettingError
-        For a plant that does not suit the controller.
-    """
+    """The plants of a rival. Raises `SettingError` if one does not suit the controller."""
     plants = each_plant(rival)
     if not plants:
         raise SettingError("expected a model as rival, got none; leave rival out")

@@ -192,13 +192,7 @@ def cut_short(lost: Sequence[str], grade: str) -> str | None:
 
 
 def budget(seconds: Any) -> float:
-    """The time budget of a search [s], checked.
-
-    Raises
-    ------
-    SettingError
-        For anything but a number above 0.
-    """
+    """The time budget of a search [s], checked to be above 0."""
     time = real("time_budget", seconds)
     if not 0.0 < time < math.inf:
         raise SettingError(f"expected a time_budget above 0 s, got {time:g}; None for none")
@@ -211,13 +205,7 @@ LOOK = 0.1
 
 class Budget:
     """The time of a search, from now on, with everything that belongs to it.
-
-    Attributes
-    ----------
-    seconds : float or None
-        None never ends.
-    lost : list of str
-        The work that it cut short, in words.
+    Without `seconds` it never ends; `lost` names the work that it cut short, in words.
     """
 
     def __init__(self, seconds: float | None) -> None:
@@ -262,7 +250,6 @@ class Budget:
 @dataclass
 class Deadline:
     """A progress callback that ends a search at a time, whatever its costs are.
-
     The start is tried in any case, unless the whole call would be late (`latest`).
     """
 
@@ -308,17 +295,9 @@ _EDGE = 1e-3
 
 @dataclass(frozen=True)
 class Variable:
-    """A setting of the controller that was searched.
-
-    Attributes
-    ----------
-    name : str
-        ``Kp``, ``Ti``, ``Td``, a setting of `Controller`, ``Kp[0]``.. of a schedule's point, or
-        ``notch_frequency[0]``, ``notch_depth[0]``, ``notch_width[0]``.. of a biquad.
-    low, high : float
-        Its bounds.
-    value : float
-        The value found.
+    """A setting of the controller that was searched, with its bounds and the value found.
+    Its name is ``Kp``, ``Ti``, ``Td``, a setting of `Controller`, ``Kp[0]``.. of a schedule's
+    point, or ``notch_frequency[0]``, ``notch_depth[0]``, ``notch_width[0]``.. of a biquad.
     """
 
     name: str
@@ -342,12 +321,7 @@ def wanted(
     variables: Sequence[Wanted] | None, start: SampledController
 ) -> list[tuple[str, tuple[float, float] | None]]:
     """Names and bounds for the core; ``schedule`` stands for the gains of all points, ``notches``
-    for all numbers of the start's notches.
-
-    Raises
-    ------
-    SettingError
-        For anything but a name or a name with two bounds, and without any variable.
+    for all numbers of the start's notches. Raises `SettingError` without any variable.
     """
     if variables is None:
         return []
@@ -361,7 +335,6 @@ def wanted(
 
 def usual_variables(start: SampledController) -> list[Wanted] | None:
     """Default variables for a start outside the core's default bounds; None for any other.
-
     The core's bounds keep Ti at 4 sample times or more. The start for a drive with a time constant
     of a few sample times is below that.
     """
@@ -429,18 +402,11 @@ def first_controller(
     filter_samples: int | None = None,
     output_unit: str | None = None,
 ) -> Controller:
-    """A conservative controller from a model's own step response by Table 1 (nearest row).
-
-    If the output integrates the command, such as a position, SIMC on the rate's step response is
-    used instead. The moving average's delay counts as dead time. Parameters are those of `tune`.
-
-    Raises
-    ------
-    SettingError
-        For a machine: record its step response and use `fit_fopdt` and `table_1`. For limits that
-        are neither given nor recorded, and for an encoder on an output of unknown unit.
-    FitError
-        If no step of the model settles.
+    """A conservative controller from a model's own step response by Table 1 (nearest row), with the
+    parameters of `tune`. If the output integrates the command, such as a position, SIMC on the
+    rate's step response is used instead. The moving average's delay counts as dead time. Raises
+    `SettingError` for a machine, for limits that are neither given nor recorded, and for an encoder
+    on an output of unknown unit; `FitError` if no step of the model settles.
     """
     plant = _require_model(plant)
     low, high, note = command_limits([plant], u_min, u_max)
@@ -472,7 +438,6 @@ def first_controller(
 
 def _of_position(rate: Fopdt, Ts: float) -> Rule:
     """SIMC for `K e^(-sL) / (s (1 + sT))` (Skogestad 2003, Table 1), in standard form.
-
     The derivative cancels T. The loop must not be faster than the cancelled lag and the dead time,
     which includes the hold of a sample.
     """
@@ -493,12 +458,8 @@ def first_of(
     filter_samples: int | None = None,
     output_unit: str | None = None,
 ) -> SampledController:
-    """The first controller of a kind; parameters are those of `tune`.
-
-    Raises
-    ------
-    SettingError
-        For an unknown kind, or as `first_controller`.
+    """The first controller of a kind; parameters are those of `tune`, errors those of
+    `first_controller`.
     """
     if controller == Controller.KIND:
         return first_controller(

@@ -135,19 +135,9 @@ def verdict_of(
     limit: float | None = None,
     others: Sequence[Objection] = (),
 ) -> Verdict:
-    """The verdict on gains for a task.
-
-    Parameters
-    ----------
-    task : TuningTask
-        With its linear loops. Its references are run on its models as they are.
-    controller : Controller or StateFeedback
-    time : Budget
-        Without time for the runs, they are among what it lost.
-    limit : float, optional
-        The user's own limit of Ms.
-    others : sequence of Objection
-        Those known otherwise.
+    """The verdict on gains for a task, whose references are run on its models as they are.
+    Without `time` for the runs, they are among what it lost. `limit` is the user's own limit of Ms;
+    `others` are the objections known otherwise.
     """
     found = [*others, *_of_loops(task, controller, limit)]
     if not time.over("the runs for the verdict"):
@@ -231,7 +221,6 @@ def _of_runs(task: TuningTask, controller: SampledController) -> list[Objection]
 
 def _at_limit(found: ClosedLoopRun, model: Model) -> float:
     """Share of samples at a limit among those at which the reference needs no limit.
-
     0 if these are less than half of the reference, or if it is not known what it needs.
     """
     c = found.controller
@@ -249,15 +238,9 @@ def _at_limit(found: ClosedLoopRun, model: Model) -> float:
 
 
 def command_for(model: Model, r: FloatArray, u_min: float, u_max: float) -> FloatArray:
-    """The command with which a first-order model of the step response follows a reference [u].
-
+    """The command with which a first-order model of the step response follows a reference [u]:
     `(r + T dr/dt - offset)/K` without the dead time; for a model that integrates, the same of the
-    reference's rate.
-
-    Raises
-    ------
-    FitError, SettingError
-        If no step of the model settles.
+    reference's rate. Raises `FitError` or `SettingError` if no step of the model settles.
     """
     moving = rate_step(model, u_min, u_max)
     step = drive_step(model, u_min, u_max) if moving is None else moving
@@ -283,7 +266,6 @@ def _outside(found: ClosedLoopRun, model: Model) -> float:
 
 def out_of_reach(task: TuningTask) -> Iterator[Objection]:
     """References that no gains can follow with the least gain of the variations.
-
     Tuning on them minimises the loss at the limit of the command.
     """
     (plant, *_), start = task.plants, task.start
