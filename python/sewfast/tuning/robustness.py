@@ -119,9 +119,11 @@ def _of(
             tuple((plant, level) for level in about), (plant,), depends=bool(scheduled)
         )
     levels = [*_levels(task), *scheduled] if speed is None else [speed]
-    points, reason = [], None
+    points: list[tuple[Any, float | None]] = []
+    reason: Exception | None = None
+    may_lack = task.constraints.Ms is None
     for level in levels:
-        if time.spent > ends:
+        if time.spent > ends and (points or may_lack):
             time.lose("all looks at the largest sensitivity Ms")
             break
         try:
@@ -131,8 +133,11 @@ def _of(
         except (SettingError, FitError) as error:
             reason = error
     # the core takes every plant at every point of a schedule, also where the plant never is
-    is_paired = bool(scheduled) and speed is None
-    searched = () if is_paired else tuple(point for point, _ in points)
+    if scheduled and speed is None:
+        reason = SettingError("of a gain schedule, give the speed as well: Constraints(speed=...)")
+        searched: tuple[Any, ...] = ()
+    else:
+        searched = tuple(point for point, _ in points)
     return LinearLoops(tuple(points), searched, depends=True, reason=reason)
 
 
