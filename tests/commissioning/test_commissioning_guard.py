@@ -1,0 +1,107 @@
+"""A machine without a device is watched by a device's guard: no run passes the stated speed by far."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from sewfast import Controller, Gains, commission, record, run
+from sewfast.commissioning import SteppedBench
+from sewfast.errors import LinkError
+from sewfast.recording import Recording
+
+STATED = 2000.0
+TS = 1e-3
+
+
+@dataclass
+class Motor:
+    """`gain` RPM/V with a time constant of .1 s; without friction it integrates the command."""
+
+    gain: float = 250.0
+    has_friction: bool = True
+    flips_at: float = math.inf
+    sticks_at: float = math.inf
+    t: float = 0.0
+    speed_rpm: float = 0.0
+    angle: float = 0.0
+    speeds: list[float] = field(default_factory=list)
+    commands: list[float] = field(default_factory=list)
+
+    @property
+    def counts(self) -> float:
+        return math.floor(4096 * self.angle)
+
+    def reset(self) -> None:
+        self.speed_rpm = self.angle = self.t = 0.0
+
+    def step(self, u: float) -> None:
+        self.commands.append(u)
+        u = -u if self.t >= self.flips_at else u
+        u = 10.0 if self.t >= self.sticks_at else u
+        for _ in range(10):
+            drag = self.speed_rpm if self.has_friction else 0.0
+            self.speed_rpm += 1e-4 / 0.1 * (self.gain * u - drag)
+            self.angle += 1e-4 * self.speed_rpm / 60.0
+        self.t += TS
+        self.speeds.append(abs(self.speed_rpm))
+
+    def judge(self, most: float) -> None:
+        """The command is 0 within 20 ms of the stated speed, which is not passed by far."""
+        passed = int(np.argmax(np.array(self.speeds) > STATED))
+        assert max(self.speeds) > STATED
+        assert max(self.speeds) <= most * STATED
+        assert not any(self.commands[passed + round(0.02 / TS) :])
+
+
+def bench(motor: Motor) -> SteppedBench:
+    return SteppedBench(motor, Ts=TS, counts_per_rev=4096, volt=10.0, speed=STATED, name="rig")
+
+
+@pytest.mark.parametrize(
+    ("motor", "most"),
+    [
+        (Motor(has_friction=False), 1.25),
+        (Motor(gain=400.0), 1.25),
+        (Motor(gain=15_000.0), 2.0),
+    ],
+    ids=["integrates", "too strong", "60 times the gain"],
+)
+def test_a_motor_that_passes_its_speed_is_commanded_to_rest(motor: Motor, most: float) -> None:
+    with pytest.raises(LinkError, match=r"rig, step: expected at most 2000 RPM") as stop:
+        record(bench(motor), np.full(3000, 8.0), name="step")
+    motor.judge(most)
+    assert isinstance(stop.value.recording, Recording)
+    assert "raise" not in str(stop.value)
+    rests = "it stands now" if motor.has_friction else "it still turns 5 s after that"
+    assert rests in str(stop.value)
+
+
+@pytest.mark.parametrize("fault", ["flips_at", "sticks_at"])
+def test_a_loop_that_runs_away_is_ended(fault: str) -> None:
+    motor = Motor(gain=400.0, **{fault: 0.5})
+    pid = Controller(
+        Gains.standard(0.01, 0.1, u_unit="V", y_unit="RPM"), u_min=-10.0, u_max=10.0,
+        filter_samples=8, counts_per_rev=4096,
+    )  # fmt: skip
+    with pytest.raises(LinkError, match="expected at most 2000 RPM"):
+        run(pid, bench(motor), np.full(3000, 1000.0), name="level")
+    # a stage that is stuck has its own will: its command of rest comes as fast
+    motor.judge(1.25 if fault == "flips_at" else math.inf)
+
+
+def test_commissioning_ends_on_a_machine_that_integrates() -> None:
+    motor = Motor(gain=2000.0 * 0.1, has_friction=False)
+    with pytest.raises(LinkError, match="expected at most 2000 RPM"):
+        commission(bench(motor), speed=1500, members=2, evaluations=60)
+    motor.judge(1.25)
+
+
+def test_a_machine_within_its_speed_is_left_alone() -> None:
+    motor = Motor()
+    found = record(bench(motor), np.full(1000, 7.0), name="step")
+    assert len(found) == 1000
+    assert max(motor.speeds) > 0.8 * STATED
