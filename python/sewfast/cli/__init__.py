@@ -20,16 +20,8 @@ from .parser import build_parser
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
-
-    Parameters
-    ----------
-    argv : sequence of str or None
-        Arguments after the program's name; None takes the process's own.
-
-    Returns
-    -------
-    int
-        0 done, 1 a fault in sewfast, 2 refused, 130 interrupted.
+    `argv` are the arguments after the program's name; None takes the process's own. Return 0 if it
+    is done, 1 for a fault in sewfast, 2 if it is refused, 130 if it is interrupted.
     """
     try:
         args, found = _parsed(argv)
@@ -132,11 +124,7 @@ _WRITTEN = {
 
 def require_apart(args: argparse.Namespace) -> None:
     """Refuse to write over a file that the same command reads, or over its own other output.
-
-    Raises
-    ------
-    SettingError
-        If two of its files are the same.
+    Raises `SettingError` if two of its files are the same.
     """
     others = [place for place in _read(args) if _is_file(place)]
     for option, path in _written(args):

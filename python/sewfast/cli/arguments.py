@@ -120,9 +120,8 @@ def add_output(
 
 
 def add_named_output(parser: argparse.ArgumentParser, what: str, source: str, help: str) -> None:
-    """An output named after the first file of an argument: `run.csv` -> `run-WHAT.json`.
-
-    It is in the working folder, wherever that file is. The ending `-model` of a model is dropped.
+    """An output named after the first file of an argument: `run.csv` -> `run-WHAT.json`. It is in
+    the working folder, wherever that file is. The ending `-model` of a model is dropped.
     """
 
     def named(args: argparse.Namespace) -> Path:
@@ -159,11 +158,7 @@ def require_plot(path: Path | None) -> None:
 
 def require_place(path: Path | None, suffixes: tuple[str, ...], *, option: str = "-o") -> None:
     """Refuse an output file that cannot be written, before the work.
-
-    Raises
-    ------
-    SettingError
-        For an extension without a format, or a folder that does not exist.
+    Raises `SettingError` for an extension without a format, or a folder that does not exist.
     """
     if path is None:
         return

@@ -131,12 +131,8 @@ def run_command(args: argparse.Namespace) -> int | None:
 
 def _settle_plant(args: argparse.Namespace) -> None:
     """Put the plant into `args.on` and the controller into `args.controller`.
-
-    Raises
-    ------
-    SettingError
-        For no plant or two, and for a drive without a reference or without --on: a slip must not
-        move a motor.
+    Raises `SettingError` for no plant or two, and for a drive without a reference or without --on:
+    a slip must not move a motor.
     """
     from .. import storage
     from ..control.controller import FORMAT
@@ -206,12 +202,8 @@ def _wanted(args: argparse.Namespace, controller: SampledController) -> Any:
 
 
 def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
-    """The name of a reference, or the samples of a file with columns t, r.
-
-    Raises
-    ------
-    SettingError, DataError
-        For any other text, and a file without r or with another sample time or unit.
+    """The name of a reference, or the samples of a file with columns t, r. Raises `SettingError` or
+    `DataError` for any other text, and a file without r or with another sample time or unit.
     """
     from ..readers import read_columns
     from ..signals import REFERENCES
@@ -266,11 +258,7 @@ def add_host_loop(parser: argparse.ArgumentParser) -> None:
 
 def at_loops_period(args: argparse.Namespace, controller: Controller) -> Controller:
     """The controller at the requested sample time; other arguments are checked too.
-
-    Raises
-    ------
-    SettingError
-        Before anything moves, for options that do not go together.
+    Raises `SettingError`, before anything moves, for options that do not go together.
     """
     from ..link import at_period
     from ..recordfile.writer import require_free
@@ -293,12 +281,8 @@ def at_loops_period(args: argparse.Namespace, controller: Controller) -> Control
 def run_host_loop(
     args: argparse.Namespace, controller: Controller, reference: str | FloatArray
 ) -> int | None:
-    """Run the loop, write its files, and print its outcome.
-
-    Returns
-    -------
-    int or None
-        2 if the run did not complete, 130 if it was interrupted; the files are written even then.
+    """Run the loop, write its files, and print its outcome. Return 2 if the run did not complete,
+    130 if it was interrupted; the files are written even then.
     """
     from ..link import run_on_host
 

@@ -158,11 +158,8 @@ def _sample_time(given: float | None, table: Table, model: Model) -> float | Non
 
 def split(data: Dataset, train: str | None, held_out: str | None) -> tuple[Dataset, Dataset | None]:
     """Training data and held-out data; without `train` the former is all but the latter.
-
-    Raises
-    ------
-    SettingError, DataError
-        For a range that is invalid or outside a file, and for two that overlap.
+    Raises `SettingError` or `DataError` for a range that is invalid or outside a file, and for two
+    that overlap.
     """
     held = None if held_out is None else data.slice(held_out)
     if train is None:
@@ -259,13 +256,8 @@ def prepared(
     data: Dataset, args: argparse.Namespace, *, like: Dataset | None = None, cut: bool = False
 ) -> Dataset:
     """The data after all preparing options; notes on them go to standard error.
-
-    Parameters
-    ----------
-    like : Dataset or None
-        Training data: the same mean is removed as from these.
-    cut : bool
-        Whether the data were cut from masked files: then they are not masked again.
+    `like` are training data: the same mean is removed as from these. `cut` says that the data were
+    cut from masked files: then they are not masked again.
     """
     data = data if cut else masked(data, args)
     data = held(data, args)

@@ -184,12 +184,8 @@ def is_port(text: str) -> bool:
 
 
 def machine_of(text: str) -> VirtualMachine | Machine:
-    """The machine that `--on` names: `virtual[:SEED]`, a motor's twin, or an FMU.
-
-    Raises
-    ------
-    SettingError, ModelFileError
-        For any other text, and for a file that cannot be used.
+    """The machine that `--on` names: `virtual[:SEED]`, a motor's twin, or an FMU. Raises
+    `SettingError` or `ModelFileError` for any other text, and for a file that cannot be used.
     """
     from ..commissioning.fmu import fmu_of, is_fmu
     from ..machine import VirtualMachine
@@ -214,12 +210,8 @@ def _named(machine: str) -> str:
 
 
 def require_no_drive_options(args: argparse.Namespace) -> None:
-    """Refuse a drive's options for another machine: a user could rely on limits that do not apply.
-
-    Raises
-    ------
-    SettingError
-        If one of them was given.
+    """Refuse (`SettingError`) a drive's options for another machine: a user could rely on limits
+    that do not apply.
     """
     given = {
         "--limits": args.limits is not None,
@@ -284,11 +276,7 @@ def _require_untripped(port: str, drive: Drive) -> None:
 
 def _limits(text: str) -> dict[str, float]:
     """Parse `volt=10,speed=3500,...`.
-
-    Raises
-    ------
-    SettingError
-        If a limit is missing, unknown, repeated or not a number.
+    Raises `SettingError` if a limit is missing, unknown, repeated or not a number.
     """
     parts = [part.partition("=") for part in text.split(",")]
     names = [name.strip() for name, _, _ in parts]
@@ -305,11 +293,8 @@ def _limits(text: str) -> dict[str, float]:
 
 def recording_place(out: Path | None, *, overwrite: bool) -> Path:
     """The file of a drive's recording: the output itself, or `.mcap` in the same folder.
-
-    Raises
-    ------
-    SettingError
-        Without an output, and for an existing recording of a drive, as neither can be made again.
+    Raises `SettingError` without an output, and for an existing recording of a drive, as neither
+    can be made again.
     """
     from ..recordfile.writer import require_free, require_replaceable
 

@@ -141,14 +141,8 @@ def _speeds(text: str) -> float | list[float]:
 
 def _require_place_of_model(path: Path | None) -> None:
     """Refuse to replace an identified model, or a file that is no model.
-
     In other commands `--model`, or the first argument, names a model to read: given here by
-    mistake, it would be lost.
-
-    Raises
-    ------
-    SettingError
-        As `require_place`, and for such a file.
+    mistake, it would be lost. Raises `SettingError` as `require_place`, and for such a file.
     """
     from ..models import load_model
 
@@ -247,13 +241,7 @@ def _over_speeds(
 
 
 def _propose(args: argparse.Namespace, fit: ShaftFit | None, controller: Any) -> None:
-    """Write a controller and print its loop.
-
-    Raises
-    ------
-    SettingError
-        Without a fitted machine.
-    """
+    """Write a controller and print its loop. Raises `SettingError` without a fitted machine."""
     from ..frequency import propose
 
     if fit is None:

@@ -108,20 +108,9 @@ def write_columns(
     written: Path | None = None,
 ) -> None:
     """Write columns to `out` and print the result; without `out` print the columns as CSV.
-
-    Parameters
-    ----------
-    out : Path or None
-    columns, units
-        As for `write_table`.
-    summary : mapping
-        The result as JSON values.
-    lines : sequence of str
-        The result as text.
-    header : Header or None
-        Header of an `.mcap` file.
-    written : Path or None
-        A file that contains the columns already: the recording of a drive.
+    `columns` and `units` are as for `write_table`; `summary` is the result as JSON values, and
+    `lines` are the result as text. `header` is for an `.mcap` file. `written` is a file that
+    contains the columns already: the recording of a drive.
     """
     if out is not None:
         if out != written:

@@ -60,7 +60,6 @@ exit codes:
 
 class Parser(argparse.ArgumentParser):
     """A parser that suggests the nearest name for a typo; without a command it shows its help.
-
     argparse uses the same class for the parsers of the commands.
     """
 

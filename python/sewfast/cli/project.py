@@ -38,21 +38,10 @@ _TOP = ("port", "columns", "units", "limits")
 @dataclass(frozen=True)
 class Project:
     """The content of a project file; a field without a setting is empty.
-
-    Attributes
-    ----------
-    path : Path or None
-        The file; None if there is none.
-    port : str or None
-        Serial port or socket of the drive.
-    columns : mapping
-        `input` (a list), `output`, `time`, `counts`, `counts_per_rev`, `ts`, `weights`.
-    units : mapping of str to str
-        Units of columns whose file states none.
-    limits : mapping of str to float
-        Limits enforced by the drive: volt, speed, acceleration, current; all four or none.
-    command : mapping of str to float
-        `u_min` and `u_max`, the range of a controller's command.
+    `columns` has the keys `input` (a list), `output`, `time`, `counts`, `counts_per_rev`, `ts`,
+    `weights`; `units` are those of columns whose file states none. `limits` are enforced by the
+    drive: volt, speed, acceleration, current; all four or none. `command` holds `u_min` and
+    `u_max`, the range of a controller's command.
     """
 
     path: Path | None = None
@@ -116,11 +105,7 @@ class Project:
 
 def find(folder: Path | None = None) -> Project:
     """The project that a folder belongs to: its own file's, or that of the next folder above.
-
-    Raises
-    ------
-    SettingError
-        If the file cannot be read or has invalid content.
+    Raises `SettingError` if the file cannot be read or has invalid content.
     """
     try:
         folder = Path.cwd() if folder is None else folder
@@ -146,10 +131,7 @@ def _is_trusted(path: Path) -> bool:
 
 def load(path: Path) -> Project:
     """The project that a file describes.
-
-    Raises
-    ------
-    SettingError
+    Raises `SettingError` if the file cannot be read or has invalid content.
     """
     found = _parsed(path)
     _require_known(path, "", found, _TOP)
@@ -260,11 +242,7 @@ def _number(path: Path, where: str, value: Any) -> float:
 
 def with_units(table: Table, args: argparse.Namespace) -> Table:
     """A table with the project's units for columns whose file states none.
-
-    Raises
-    ------
-    SettingError
-        If the file states another unit: one of the two is wrong.
+    Raises `SettingError` if the file states another unit: one of the two is wrong.
     """
     units: dict[str, str] = getattr(args, "units", {})
     known = {name: unit for name, unit in units.items() if name in table}
@@ -398,11 +376,7 @@ def init_command(args: argparse.Namespace) -> None:
 
 def _described(recording: str) -> tuple[str, str]:
     """The lines on columns and units of a recording.
-
-    Raises
-    ------
-    SettingError
-        If its columns do not show which is the input and which the output.
+    Raises `SettingError` if its columns do not show which is the input and which the output.
     """
     from ..readers import read_table, roles
 

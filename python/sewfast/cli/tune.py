@@ -272,11 +272,7 @@ def _on_response(
     args: argparse.Namespace, constraints: Constraints, models: list[Any]
 ) -> Constraints:
     """Ms about a speed, and on the bands of a response.
-
-    Raises
-    ------
-    SettingError
-        For a response without a linear model.
+    Raises `SettingError` for a response without a linear model.
     """
     if args.speed is not None:
         constraints = replace(constraints, speed=args.speed)
@@ -308,11 +304,7 @@ def _started(args: argparse.Namespace, models: list[Any]) -> dict[str, Any]:
 
 def _pid(start: SampledController, option: str) -> Controller:
     """The start as a PID, for an option that needs one.
-
-    Raises
-    ------
-    SettingError
-        For another kind of controller.
+    Raises `SettingError` for another kind of controller.
     """
     from ..control.controller import Controller
 
@@ -326,11 +318,7 @@ def _pid(start: SampledController, option: str) -> Controller:
 
 def _first(args: argparse.Namespace) -> dict[str, Any]:
     """The controller to start with, or limits, encoder and filter of the first one.
-
-    Raises
-    ------
-    SettingError
-        For both.
+    Raises `SettingError` for both.
     """
     if args.start is None:
         return _loop(args)
@@ -562,11 +550,7 @@ def _known(pairs: dict[str, float], option: str, names: tuple[str, ...]) -> dict
 
 def variables(text: str | None) -> list[Wanted] | None:
     """`Kp,Ti=0.02:0.5` as names and (name, low, high).
-
-    Raises
-    ------
-    SettingError
-        For bounds that are not two numbers.
+    Raises `SettingError` for bounds that are not two numbers.
     """
     if text is None:
         return None
@@ -587,12 +571,8 @@ def variables(text: str | None) -> list[Wanted] | None:
 
 
 def command_limits(args: argparse.Namespace) -> tuple[float | None, float | None]:
-    """Least and largest command [V]: as given, else a recording's volt limit, else None.
-
-    Raises
-    ------
-    SettingError, DataError
-        For a recording without a volt limit, or one that cannot be read.
+    """Least and largest command [V]: as given, else a recording's volt limit, else None. Raises
+    `SettingError` or `DataError` for a recording without a volt limit, or one that cannot be read.
     """
     if args.limits_of is None:
         return args.u_min, args.u_max
@@ -618,13 +598,7 @@ def _volt_limit(path: str) -> float:
 
 
 def notches(given: list[str] | None) -> list[Biquad]:
-    """Notches of every --notch.
-
-    Raises
-    ------
-    SettingError
-        For anything but HZ[:DEPTH[:WIDTH]].
-    """
+    """Notches of every --notch. Raises `SettingError` for anything but HZ[:DEPTH[:WIDTH]]."""
     from ..control.biquad import Biquad
 
     found = []

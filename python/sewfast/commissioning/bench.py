@@ -49,14 +49,8 @@ ABORTED = "_aborted"
 
 
 class Aborted(Refusal):
-    """A run that was ended early.
-
-    Attributes
-    ----------
-    recording : Recording
-        The recording until then.
-    frequency : float or None
-        Frequency of a command that swung from limit to limit [Hz].
+    """A run that was ended early. `recording` is what was recorded until then; `frequency` [Hz] is
+    that of a command that swung from limit to limit.
     """
 
     def __init__(
@@ -97,18 +91,9 @@ _SEEN = {
 
 
 class Guard:
-    """Ends a run that is too fast, whose motor or encoder has failed, or that swings.
-
-    It is a device's own guard (docs/PROTOCOL.md, 9 and 12). Under feedback, a lost encoder means a
-    motor at full speed until the end of the reference.
-
-    Parameters
-    ----------
-    controller : Controller or StateFeedback
-    name : str
-        Name of the run.
-    counts_per_rev, speed : float
-        Speed above which it ends the run [RPM].
+    """Ends a run that is faster than `speed` [RPM], whose motor or encoder has failed, or whose
+    command swings from limit to limit: a device's own guard (docs/PROTOCOL.md, 9 and 12). Under
+    feedback, a lost encoder means a motor at full speed until the end of the reference.
     """
 
     def __init__(
@@ -130,10 +115,7 @@ class Guard:
 
     def __call__(self, first: int, u: FloatArray, counts: FloatArray) -> None:
         """Check samples `first`, `first + 1`, ...
-
-        Raises
-        ------
-        Aborted
+        Raises `Aborted`.
         """
         self._u.append(u.copy())
         self._counts.append(counts.copy())
@@ -191,15 +173,9 @@ class MachineWrapper:
 
 @dataclass
 class DriveBench(MachineWrapper):
-    """A drive behind a port with its limits set, which returns complete runs only.
-
-    If the link has lost samples of a run that ended well, the run is repeated once: every run
-    starts from rest, and lost samples do not endanger the machine.
-
-    Attributes
-    ----------
-    cancel : threading.Event or None
-        Set it to end a run as Ctrl-C does.
+    """A drive behind a port with its limits set, which returns complete runs only. If the link has
+    lost samples of a run that ended well, the run is repeated once: every run starts from rest, and
+    lost samples do not endanger the machine. Setting `cancel` ends a run as Ctrl-C does.
     """
 
     cancel: threading.Event | None = field(default=None, kw_only=True)
@@ -242,7 +218,6 @@ class DriveBench(MachineWrapper):
 @dataclass
 class RecordedBench(MachineWrapper):
     """A machine that hands every recording to `note`, together with the run of a closed loop.
-
     A recording that an earlier attempt made under the same name with exactly the same command, or
     the same controller and reference, is not made again: `kept` finds it by its key.
     """
@@ -305,14 +280,8 @@ class RecordedBench(MachineWrapper):
 
 
 def require_record(machine: Machine, name: str, samples: int, found: object) -> None:
-    """Refuse an unusable recording of a user's own machine.
-
-    Raises
-    ------
-    SettingError
-        For anything but a recording.
-    DataError
-        For another number of samples than asked for, or values that are not finite.
+    """Refuse an unusable recording of a user's own machine. Raises `SettingError` for anything but
+    a recording, `DataError` for a wrong number of samples or values that are not finite.
     """
     if not isinstance(found, Recording):
         raise SettingError(
@@ -373,12 +342,8 @@ def description_of(bench: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
 def bench_of(
     on: object, u_max: float | None, cancel: threading.Event | None = None
 ) -> Iterator[Machine]:
-    """The machine to commission; for a drive, with a volt limit of at most `u_max` meanwhile.
-
-    Raises
-    ------
-    SettingError
-        For anything but a machine.
+    """The machine to commission; for a drive, with a limit of at most `u_max` [V] meanwhile.
+    Raises `SettingError` for anything but a machine.
     """
     machine = machine_of(on)
     if not is_streaming(machine):

@@ -41,16 +41,9 @@ _MARK = "commissioning"
 @dataclass
 class Checkpoint:
     """Saves each recording, so that a killed process or a power failure loses none.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the commissioning; the files lie in its subfolder `unfinished` until
-        `Commissioning.save` replaces them by tables.
-    device, conditions : mapping
-        Device and settings of the recordings.
-    resume : bool
-        Whether to reuse the recordings that an earlier attempt left there.
+    The files lie in the subfolder `unfinished` of the commissioning's `folder` until
+    `Commissioning.save` replaces them by tables; with `resume` those that an earlier attempt left
+    there are reused. `device` and `conditions` are stored with the recordings.
     """
 
     folder: Path
@@ -61,11 +54,7 @@ class Checkpoint:
 
     def begin(self) -> None:
         """Create the folder, and delete the files of an earlier commissioning unless it resumes.
-
-        Raises
-        ------
-        DataError
-            If either fails.
+        Raises `DataError` if either fails.
         """
         try:
             if not self.resume:
@@ -82,7 +71,6 @@ class Checkpoint:
         self, stage: str, name: str, key: str, recording: Recording, run: ClosedLoopRun | None
     ) -> None:
         """Write a recording; it replaces an earlier one of that name, which was not good enough.
-
         If a file cannot be written, there is one warning: the recordings are also in memory.
         """
         columns = recording.columns()
@@ -150,13 +138,7 @@ class Checkpoint:
 
 
 def prepare(folder: Path) -> None:
-    """Create the folder, before the machine moves.
-
-    Raises
-    ------
-    DataError
-        If it cannot be created.
-    """
+    """Create the folder, before the machine moves. Raises `DataError` if it cannot be created."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -178,12 +160,7 @@ def clear(folder: Path) -> None:
 
 
 def require_repeatable(folder: Path) -> None:
-    """Refuse a folder with files other than recordings of a virtual machine.
-
-    Raises
-    ------
-    SettingError
-    """
+    """Refuse (`SettingError`) a folder with files other than recordings of a virtual machine."""
     for file in _inside(folder / FOLDER):
         if not _is_own(file):
             raise SettingError(

@@ -73,7 +73,6 @@ class Demands:
         ones.
     members, evaluations : int
         Models in the ensemble; controllers that the search tries.
-    seed, threads : int
     load : float or None
         Size of the load step in command [V]; None for a share of `u_max`, 0 for no such
         requirement.
@@ -117,11 +116,7 @@ def demands(
     time_budget: float | None = None,
 ) -> Demands:
     """The demands, checked against the machine's limits.
-
-    Raises
-    ------
-    SettingError
-        For a value outside its range or beyond a limit.
+    Raises `SettingError` for a value outside its range or beyond a limit.
     """
     _require_machine(machine)
     volt = machine.volt if u_max is None else real("u_max", u_max)

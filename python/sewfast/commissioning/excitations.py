@@ -35,13 +35,7 @@ STALLS, STALLING = 3, 0.2
 @dataclass(frozen=True)
 class Motion:
     """Speed is about `gain (u - threshold)`.
-
-    Attributes
-    ----------
-    gain : float
-        [RPM/V]
-    threshold : float
-        Command that friction uses up [V].
+    `gain` is in [RPM/V]; `threshold` is the command that friction uses up [V].
     """
 
     gain: float
@@ -54,12 +48,8 @@ class Motion:
 
 def first_motion(machine: Machine, demands: Demands) -> Motion:
     """Try commands from small to large until the machine turns at a fair speed.
-
-    Raises
-    ------
-    Refusal
-        If nothing moves, the machine turns the wrong way or gets stuck, or its largest command
-        does not reach a fair speed.
+    Raises `Refusal` if nothing moves, the machine turns the wrong way or gets stuck, or its largest
+    command does not reach a fair speed.
     """
     levels: list[tuple[float, float]] = []
     stalls = 0
@@ -145,11 +135,7 @@ LEAST_FIT = 80.0
 
 def step_response(machine: Machine, demands: Demands, motion: Motion) -> Fopdt:
     """Record steps until one settles, and fit it.
-
-    Raises
-    ------
-    Refusal
-        If none settles, the fit is poor, or the command cannot reach the top speed.
+    Raises `Refusal` if none settles, the fit is poor, or the command cannot reach the top speed.
     """
     u = min(motion.command(SHARE * demands.speed), demands.u_max)
     reason: Exception | None = None
@@ -224,7 +210,6 @@ def acceleration(fopdt: Fopdt, demands: Demands) -> float:
 
 def acceleration_shown(recording: Recording, demands: Demands) -> float:
     """Measured acceleration under the largest commands [RPM/s]; inf without such commands.
-
     It is the ninth decile of the changes of speed. Braking does not count: friction helps there as
     much as it hinders here.
     """
@@ -239,7 +224,6 @@ def acceleration_shown(recording: Recording, demands: Demands) -> float:
 
 def acceleration_from_rest(machine: Machine, fastest: float, demands: Demands) -> float:
     """The same from single pulses of the largest command [RPM/s], until one reaches a fair speed.
-
     Each is twice as long as the one before. Pulses between speeds do not help if they are planned
     with far more acceleration than a drive's current limit allows: they last only milliseconds.
     """
@@ -307,7 +291,6 @@ def levels(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int)
 
 def pulses(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int) -> FloatArray:
     """Short commands near the largest, between speeds of the working range [V].
-
     There a drive limits its current: fast loops reach that limit, gentle ones do not. Pulses
     planned with a larger acceleration than the machine's stay below the planned speeds.
     """
@@ -347,17 +330,10 @@ def pace_of(fastest: float, demands: Demands) -> float:
 
 def standard(fastest: float, demands: Demands, Ts: float, *, short: bool) -> dict[str, FloatArray]:
     """Trapezoid, chirps of shrinking and of growing amplitude, random levels [RPM].
-
     At 2,000 RPM and for a fast machine: 0 to 2,000 RPM in .4 s; .1 to 3 Hz in 20 s up to 2,000 RPM
     and up to 600; random levels of 200 to 2,000 RPM, 10 s. They are scaled to other top speeds, and
-    stretched for a machine that is too slow.
-
-    Parameters
-    ----------
-    fastest : float
-        Acceleration of the machine at the limit of its command [RPM/s].
-    short : bool
-        Whether they are for tuning: shorter sweeps, other random levels.
+    stretched if `fastest`, the acceleration at the command's limit [RPM/s], is too small. With
+    `short`, for tuning, sweeps are shorter and random levels differ.
     """
     pace = pace_of(fastest, demands)
     size = demands.speed / 2000.0

@@ -296,11 +296,7 @@ def is_fmu(text: str) -> bool:
 
 def fmu_of(text: str) -> SteppedBench:
     """The machine of `FILE.fmu?volt=24&input=u&speed=w`, the arguments of `fmu_bench` by name.
-
-    Raises
-    ------
-    ModelFileError, SettingError
-        As `fmu_bench`, and for unknown arguments.
+    Raises as `fmu_bench`, and `SettingError` for unknown arguments.
     """
     path, _, query = text.partition("?")
     given: dict[str, Any] = {}

@@ -31,24 +31,11 @@ _FAREWELL = 5.0
 
 
 class FmuProcess:
-    """An FMU in a separate process, advanced by requests.
-
-    Parameters
-    ----------
-    path : path
-        The FMU, for messages.
-    folder : path
-        The folder of the unpacked FMU.
-    input : int
-        Reference of the variable that takes the command.
-    measured : sequence of int or None
-        References of three variables to read after every step; None reads as NaN.
-    start : mapping
-        Initial values of further variables, by reference.
-    Ts : float
-        Sample time [s].
-    timeout : float
-        Longest time of a call [s].
+    """An FMU, unpacked in `folder`, in a separate process, advanced by requests.
+    `path` is for messages. `input` is the reference of the variable that takes the command,
+    `measured` those of three variables to read after every step (None reads as NaN), and `start`
+    holds initial values of further variables by reference. `Ts` is in seconds, and so is `timeout`,
+    the longest time of a call.
     """
 
     def __init__(
@@ -78,11 +65,7 @@ class FmuProcess:
 
     def begin(self) -> tuple[float, ...]:
         """Begin a run; return the variables at its beginning.
-
-        Raises
-        ------
-        SettingError
-            If the FMU refuses, crashes, or does not answer in time.
+        Raises `SettingError` if the FMU refuses, crashes, or does not answer in time.
         """
         return self._ask(b"r", 0.0, "an instance that begins")
 

@@ -55,7 +55,6 @@ def first_gains(
     fopdt: Fopdt, machine: Machine, demands: Demands, small: SmallSignal | None = None
 ) -> Controller:
     """Gains by Eq. 12 with a limit of Ms; the feedback filter's delay counts as dead time.
-
     With a model of the small signals, the gains are lowered until its Ms is within the limit, too;
     if it has a resonance, with a notch there.
     """
@@ -82,7 +81,6 @@ def first_gains(
 
 def notched(controller: Controller, plant: Model, resonance: Resonance, Ms: float) -> Controller:
     """The controller lowered to this Ms, with the notch that allows the largest gains.
-
     They are compared by the integral gain, which rejects disturbances. A notch that gains too
     little is left out, as it costs phase.
     """
@@ -111,13 +109,8 @@ def _integral(controller: Controller) -> float:
 
 def lowered(controller: Controller, plant: Model, Ms: float) -> Controller:
     """The controller with its gains lowered until the loop with `plant` has this Ms.
-
-    It lowers Kp alone first; if that is not enough, it also lengthens Ti by the same factor.
-
-    Raises
-    ------
-    Refusal
-        If no gains reach this Ms.
+    It lowers Kp alone first; if that is not enough, it also lengthens Ti by the same factor. Raises
+    `Refusal` if no gains reach this Ms.
     """
     shares = LOWER ** np.arange(STEPS)
     # at the same Ti, a lower Kp costs phase on a plant slower than Ti; at the same Kp Ti not
@@ -150,7 +143,6 @@ def stretched(controller: Controller, share: float) -> Controller:
 
 def ruled(fopdt: Fopdt, like: Controller) -> Controller:
     """Eq. 12's gains with an Ms of at most 1.8, and all other settings of another controller.
-
     Without that limit, the short dead time of small signals leads to gains that move the command by
     volts for every count of the encoder.
     """
@@ -163,7 +155,6 @@ def ruled(fopdt: Fopdt, like: Controller) -> Controller:
 
 def _rule(fopdt: Fopdt, late: float, Ms: float) -> Rule:
     """Eq. 12 for a feedback that is `late` [s]; SIMC's PI above the largest L/T of Eq. 12.
-
     Below the smallest L/T of Eq. 12 that ratio is used, a longer dead time than the plant's:
     conservative.
     """
@@ -181,7 +172,6 @@ def start_of(
     threads: int,
 ) -> Controller:
     """The start of the search: the rule's gains, with alpha and beta of least cost on a grid.
-
     The rule's own alpha and beta are for a step of the reference; slow references need others.
     """
     tried = [replace(rule, alpha=a, beta=b) for a, b in product(ALPHAS, BETAS)]
@@ -191,7 +181,6 @@ def start_of(
 
 def cost_of(references: Mapping[str, FloatArray], Ts: float, demands: Demands) -> Cost:
     """Weights of tracking, chatter and overshoot: the virtual machine's, scaled.
-
     A cost is a mean over all references; the overshoot's weight is scaled to make it the mean over
     the references with an edge.
     """
@@ -228,15 +217,8 @@ def search(
     rival: Model | None = None,
 ) -> TuningResult:
     """The gains of least cost over all members, each with the usual gain spread and delay.
-
-    A `rival` gives a second opinion on them.
-
-    Raises
-    ------
-    Refusal
-        If every loop tried diverges, or none meets the requirements.
-    Interrupted
-        On Ctrl-C; its `best` is the best controller so far.
+    A `rival` gives a second opinion on them. Raises `Refusal` if every loop tried diverges, or none
+    meets the requirements, and `Interrupted` on Ctrl-C; its `best` is the best controller so far.
     """
     asked = requirements or Requirements()
     try:
@@ -286,14 +268,8 @@ AS_IT_IS = ((1.0, 0),)
 @dataclass(frozen=True)
 class Requirements:
     """A largest Ms, and a load step with a recovery no slower than under the rule's gains.
-
-    Attributes
-    ----------
-    loads : tuple of LoadStep
-        Empty if none is required.
-    rival : Controller or None
-        The rule's gains; None if a member diverges under them.
-    constraints : Constraints
+    `loads` is empty if none is required; `rival` has the rule's gains, and is None if a member
+    diverges under them.
     """
 
     loads: tuple[LoadStep, ...] = ()
@@ -384,7 +360,6 @@ def sensible(
     rule: Controller, ensemble: Ensemble, small: SmallSignal | None, demands: Demands
 ) -> Ensemble:
     """The ensemble without members whose Ms is far above that of the machine's small signals.
-
     All agree on slow references, but a member that is wrong about fast signals would set the limit
     of recovery for all.
     """
@@ -434,16 +409,9 @@ BACK = 0.5
 
 @dataclass(frozen=True)
 class Swing:
-    """An oscillation of a loop that should hold a speed.
-
-    Attributes
-    ----------
-    share : float
-        Share of the gains.
-    frequency : float
-        [Hz]
-    command, railed : float
-        Standard deviation of the command [V], share of samples at a limit.
+    """An oscillation of a loop that should hold a speed, with a `share` of the gains.
+    `frequency` is in [Hz], `command` is the command's standard deviation [V], and `railed` the
+    share of samples at a limit.
     """
 
     share: float
@@ -465,7 +433,6 @@ def swing_of(
     found: ClosedLoopRun, settled: int, share: float = 1.0, expected: float = 0.0
 ) -> Swing | None:
     """The oscillation of the command at a held speed; None for a quiet loop.
-
     `expected` is its standard deviation according to the models [V].
     """
     u, limits = found.u[settled:], found.controller
@@ -494,14 +461,9 @@ def cautious(
     thinning: Thinning | None = None,
 ) -> tuple[Controller, Swing | None]:
     """The largest share of the gains that holds a speed quietly, and the oscillation met, if any.
-
     The `models` predict how far the encoder's counts alone move the command; they run at the
-    samples that `thinning` leaves.
-
-    Raises
-    ------
-    Refusal
-        If the loop oscillates even with a quarter of the gains.
+    samples that `thinning` leaves. Raises `Refusal` if the loop oscillates even with a quarter of
+    the gains.
     """
     r, settled = held(demands, fastest, machine.Ts)
     for share in SHARES:

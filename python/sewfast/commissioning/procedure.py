@@ -381,11 +381,7 @@ def _carry_out(
 
 def _instead(rival: Rival | None, judge: Recording, refusal: Refusal, journal: Journal) -> Trained:
     """The linear rival in place of networks that failed.
-
-    Raises
-    ------
-    Refusal
-        That of the networks, if the rival does not predict well enough either.
+    Raises the networks' `refusal` if the rival does not predict well enough either.
     """
     if rival is None or not rival.is_fit:
         raise refusal
@@ -395,7 +391,6 @@ def _instead(rival: Rival | None, judge: Recording, refusal: Refusal, journal: J
 
 def _pulses(machine: Machine, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Recording]]:
     """The acceleration at the command's limit [RPM/s], and recordings of pulses.
-
     The first pulses are planned without a current limit. With one, they fall short of the planned
     speeds; then more are planned with the acceleration just measured.
     """
@@ -475,7 +470,6 @@ def _references(
     fastest: float, asked: Demands, machine: Machine
 ) -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
     """References for the verification, and for tuning.
-
     Gains are tuned on plants with down to .8 of the gain, which accelerate less. At the pace of the
     verification these would reach the current limit, where no gains help, and the search would
     minimise windup instead (drive `weak`, seed 5: 13.7 RPM on the machine; 4.96 with slower ones).
@@ -538,14 +532,7 @@ Progress: TypeAlias = Callable[[int, int, str], object]
 
 class Journal:
     """Collects the results; `result` makes a `Commissioning` of them at any time.
-
-    Parameters
-    ----------
-    machine : str
-    progress : callable or None
-    cancel : threading.Event or None
-    between : callable or None
-        See `commission`.
+    The callbacks and `cancel` are those of `commission`.
     """
 
     def __init__(

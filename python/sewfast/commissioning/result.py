@@ -327,11 +327,8 @@ _SHORT = 5.0
 
 
 def require_own(folder: Path, *, overwrite: bool) -> None:
-    """Refuse a folder with files that a commissioning of a virtual machine cannot repeat.
-
-    Raises
-    ------
-    SettingError
+    """Refuse (`SettingError`) a folder with files that a commissioning of a virtual machine cannot
+    repeat.
     """
     if not overwrite:
         require_repeatable(folder)
@@ -376,7 +373,6 @@ def numbers_in(file: Path) -> dict[str, Any]:
 
 def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
     """Replace the artefacts of an earlier commissioning; then write the page.
-
     The report refuses a folder without `commissioning.json`, so an interruption in between leaves
     no mixture that looks complete. The checkpoint's recordings stay there until then.
     """
@@ -408,13 +404,8 @@ def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
 
 def _artefacts(found: Commissioning, folder: Path) -> None:
     """Write controllers and models first, a few kB: the tables can fill the disk.
-
-    All tables are tried, even if one does not fit.
-
-    Raises
-    ------
-    DataError
-        For the first table that could not be written, once all others are.
+    All tables are tried, even if one does not fit; then the `DataError` of the first that could not
+    be written is raised.
     """
     for name, controller in (("tuned", found.controller), ("first", found.first)):
         if controller is not None:

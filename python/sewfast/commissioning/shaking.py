@@ -237,11 +237,10 @@ UNBOUNDED = 1e6
 def margins_at_work(
     machine: Machine, controller: Controller, plant: Any, speed: float, seed: int
 ) -> tuple[dict[str, Any], FrequencyResponse] | None:
-    """Margins of a loop, predicted by a linear plant and measured on the machine at a speed.
-
-    The reference is varied by a multisine for half a minute. Returns the margins and the measured
-    response; None if the response is too small, the command reaches its limits even at a small
-    amplitude, or the machine cannot be excited at that speed.
+    """Margins of a loop, predicted by a linear plant and measured on the machine at a speed, with
+    the measured response. The reference is varied by a multisine for half a minute. None if the
+    response is too small, the command reaches its limits even at a small amplitude, or the machine
+    cannot be excited at that speed.
     """
     share = 1.0
     while share >= LEAST_SHAKEN:
@@ -402,12 +401,8 @@ def _in_open_loop(
 
 
 def _kept(error: LinkError, lead: int, plan: _Plan, *, is_whole: bool) -> Recording:
-    """The recording of an aborted run up to its first gap, if that is a period or more.
-
-    Raises
-    ------
-    LinkError
-        The given error, if it is less.
+    """The recording of an aborted run up to its first gap.
+    Raises the given `error` if that is less than a period.
     """
     found = getattr(error.recording, "recording", error.recording)
     if is_whole or not isinstance(found, Recording):
@@ -527,7 +522,6 @@ def _response(
 
 def _working_point(machine: Machine, speed: float) -> tuple[float, int, float]:
     """The command that holds the speed [V], the samples until it does, the time constant [s].
-
     It is found by the secant method, as a machine is not linear.
     """
     tried: list[tuple[float, float]] = [(0.0, 0.0)]
@@ -559,15 +553,8 @@ def _working_point(machine: Machine, speed: float) -> tuple[float, int, float]:
 @dataclass(frozen=True)
 class _Held:
     """The response to a steady command.
-
-    Attributes
-    ----------
-    speed : float
-        Mean of the last quarter [RPM].
-    settled : bool
-        Whether the mean of the quarter before was the same.
-    time : float
-        Time until 63 % of the speed were reached [s].
+    `speed` is the mean of the last quarter [RPM], `settled` says whether the mean of the quarter
+    before was the same, and `time` is the time until 63 % of the speed were reached [s].
     """
 
     speed: float

@@ -49,14 +49,9 @@ REFINED = 15
 
 @dataclass(frozen=True, eq=False)
 class TurnLoad:
-    """A command [V] over the angle: `sum_k a_k cos(k theta) + b_k sin(k theta)`.
-
-    Attributes
-    ----------
-    cosine, sine : array, shape (HARMONICS,)
-        Coefficients [V].
-    ratio : float
-        Turns of the load per turn of the encoder's shaft: below 1 behind a gear.
+    """A command [V] over the angle: `sum_k a_k cos(k theta) + b_k sin(k theta)`. `cosine` and
+    `sine` (HARMONICS,) are its coefficients [V]; `ratio` is the turns of the load per turn of the
+    encoder's shaft, below 1 behind a gear.
     """
 
     cosine: FloatArray
@@ -92,17 +87,9 @@ def turn_load(
     k: int = 1,
 ) -> TurnLoad | None:
     """The load over the turn, if it also shows in a recording not used for the fit.
-
-    Parameters
-    ----------
-    ensemble : Ensemble
-        The load explains the residual of the median of its free runs.
-    plant : Model
-        Response from command to speed about a working speed.
-    learned, judge : Recordings
-        Recordings for the fit, and the one to judge it by.
-    k : int
-        Samples of the recordings per sample of the models.
+    It explains the residual of the median of the ensemble's free runs. `plant` is the response from
+    command to speed about a working speed, `learned` are the recordings for the fit and `judge` the
+    one to judge it by; `k` is the number of their samples per sample of the models.
     """
     try:
         known = [_Unexplained.of(ensemble, r, k) for r in learned]
@@ -135,11 +122,7 @@ class _Unexplained:
     @classmethod
     def of(cls, ensemble: Ensemble, whole: Recording, k: int) -> _Unexplained:
         """The residual of the median of the members' free runs.
-
-        Raises
-        ------
-        FitError
-            If a member diverges.
+        Raises `FitError` if a member diverges.
         """
         thinning = Thinning(k)
         recording = thinning.recording(whole)
@@ -148,10 +131,8 @@ class _Unexplained:
         return cls(recording.y - np.median(runs, axis=0), turns, recording.Ts, thinning)
 
     def span(self, ratio: float) -> float:
-        """Span of the moving mean to remove [s].
-
-        It removes slow changes such as friction that varies with temperature, but keeps the load of
-        a slow output shaft.
+        """Span of the moving mean to remove [s]. It removes slow changes such as friction that
+        varies with temperature, but keeps the load of a slow output shaft.
         """
         rate = float(self.turns[-1]) / (len(self.rest) * self.Ts)
         return max(SLOW, SLOW_TURNS / max(ratio * rate, 1e-9)) if ratio < 1.0 else SLOW
@@ -171,7 +152,6 @@ class _Unexplained:
 
 def _robust(rows: FloatArray, rest: FloatArray) -> FloatArray:
     """Least squares with Tukey's biweight (Huber and Ronchetti, Robust Statistics, 2009, ch. 4).
-
     The error of a model at a current limit is many times the effect of the load, and not a wave
     over the angle. With equal weights, the linear model of drive `weak` gave 9.3 V of load instead
     of .12; with the biweight it gives .18. On nine drives, the residual on the random levels falls
@@ -188,7 +168,6 @@ def _robust(rows: FloatArray, rest: FloatArray) -> FloatArray:
 
 def _behind_a_gear(plant: Model, known: Sequence[_Unexplained]) -> list[float]:
     """Turns of a load per turn of the encoder's shaft, if a line shows one: a list of one at most.
-
     The line is searched in the spectrum over the angle of the longest recording, and its place is
     refined by the residual that the load would leave: over hundreds of turns, a ratio that is off
     by a thousandth gets out of phase.
@@ -208,7 +187,6 @@ def _behind_a_gear(plant: Model, known: Sequence[_Unexplained]) -> list[float]:
 
 def _lines(turns: FloatArray, rest: FloatArray, total: float) -> FloatArray:
     """Power of waves with 0, 1, 2, .. periods in twice the total of turns.
-
     This is one Fourier transform of sums over cells of angle; sums over all samples for each of
     thousands of ratios took four seconds of a slow drive's commissioning.
     """
@@ -254,13 +232,7 @@ filters more than its N."""
 
 @dataclass(frozen=True)
 class Thinning:
-    """Every k-th sample.
-
-    Attributes
-    ----------
-    k : int
-        1 leaves everything as it is.
-    """
+    """Every k-th sample; a `k` of 1 leaves everything as it is."""
 
     k: int = 1
 
@@ -278,7 +250,6 @@ class Thinning:
 
     def recording(self, r: Recording) -> Recording:
         """The mean command over k samples, and the speed from every k-th count.
-
         The command is averaged and not picked, as in a closed loop it changes at every sample.
         """
         if self.k == 1:
@@ -295,10 +266,8 @@ class Thinning:
     def pushes(
         self, load: TurnLoad | None, references: Mapping[str, FloatArray], Ts: float
     ) -> list[FloatArray] | None:
-        """The load's command along references at the machine's sample time, thinned.
-
-        At high speeds its harmonics lie above half the coarse sample rate: averaging keeps them
-        from aliasing.
+        """The load's command along references at the machine's sample time, thinned. At high speeds
+        its harmonics lie above half the coarse sample rate: averaging keeps them from aliasing.
         """
         if load is None:
             return None
@@ -314,10 +283,8 @@ class Thinning:
         return means
 
     def coarse(self, c: Controller) -> Controller:
-        """The controller for simulations at the coarse sample time.
-
-        Its moving average is k times shorter, as a difference of counts over k samples is already
-        the mean of k speeds.
+        """The controller for simulations at the coarse sample time. Its moving average is k times
+        shorter, as a difference of counts over k samples is already the mean of k speeds.
         """
         if self.k == 1:
             return c
@@ -330,7 +297,6 @@ class Thinning:
 
     def fine(self, c: Controller) -> Controller:
         """The controller for the machine at its own sample time.
-
         A coarse sample time itself filters the derivative: a change is divided by the sum of Td / N
         and the sample time. At the machine's sample time, the same `N` would give k times the
         command for every count of the encoder.
@@ -347,7 +313,6 @@ class Thinning:
 
     def plant(self, fopdt: Fopdt, Ts: float) -> Fopdt:
         """First order with dead time in a loop at coarse samples; `Ts` [s] is the machine's.
-
         Holding the command and averaging the speed over k samples instead of one each add half of
         (k - 1) Ts to the dead time.
         """
@@ -355,14 +320,12 @@ class Thinning:
 
     def variations(self) -> Sequence[tuple[float, int]] | None:
         """Gain and delay of the plants for tuning; None for the usual ones.
-
         The coarse sample time alone is more delay than the usual ones add.
         """
         return None if self.k == 1 else ((1.0, 0), (0.8, 0), (1.25, 0))
 
     def cost(self, cost: Cost) -> Cost:
         """The same cost for simulations.
-
         A command that follows the encoder's counts changes more from one coarse sample to the next
         than between the machine's samples: by the square root of k, as a random signal does. The
         measured ratio of fine to coarse change was .55 to .72 at k = 2, .19 to .34 at k = 10.

@@ -65,14 +65,8 @@ LEAST_FIT = 90.0
 
 @dataclass(frozen=True)
 class Resonance:
-    """A pair of lightly damped poles.
-
-    Attributes
-    ----------
-    frequency : float
-        Undamped frequency [Hz].
-    damping : float
-        Damping ratio.
+    """A pair of lightly damped poles; `frequency` is the undamped one [Hz], `damping` their damping
+    ratio.
     """
 
     frequency: float
@@ -84,16 +78,9 @@ class Resonance:
 
 @dataclass(frozen=True, eq=False)
 class SmallSignal:
-    """The machine about a working speed.
-
-    Attributes
-    ----------
-    model : Model
-        Command [V] to speed [RPM], of the simplest order that explains the record.
-    resonance : Resonance or None
-        The one with the highest peak.
-    fopdt : Fopdt or None
-        The model's step response as first order with dead time; None if that does not fit.
+    """The machine about a working speed. `model`, from command [V] to speed [RPM], has the simplest
+    order that explains the record; `resonance` is the one with the highest peak; `fopdt` is the
+    model's step response as first order with dead time, None if that does not fit.
     """
 
     model: Model
@@ -105,7 +92,6 @@ def small_signal(
     machine: Machine, demands: Demands, motion: Motion, fopdt: Fopdt
 ) -> SmallSignal | None:
     """Excite the machine about half its top speed; None if the record shows no dynamics.
-
     If a pair of poles is lightly damped, or a line stands out from the residual of a first order,
     the machine is also excited at a higher speed. A frequency that has moved in proportion with the
     speed is a load over the turn and not a resonance: it is removed.
@@ -132,17 +118,8 @@ def small_signal(
 
 @dataclass(frozen=True, eq=False)
 class Shaken:
-    """The random part of a record.
-
-    Attributes
-    ----------
-    u, speed : array, shape (N,)
-        Command [V], and speed by differences of counts [RPM].
-    turns : array, shape (N,)
-        Angle of the encoder's shaft [turns].
-    Ts : float
-        [s]
-    name : str
+    """The random part of a record: (N,) arrays of the command `u` [V], the `speed` by differences
+    of counts [RPM] and the angle `turns` of the encoder's shaft [turns]; `Ts` is in seconds.
     """
 
     u: FloatArray
@@ -176,7 +153,6 @@ class Shaken:
 
     def without(self, ratios: Sequence[float]) -> Shaken:
         """With the waves of these frequencies per turn removed from both command and speed.
-
         A linear machine answers a sine with a sine of the same frequency, so the rest of the speed
         is still the response to the rest of the command.
         """
@@ -291,7 +267,6 @@ def _swinging(model: Model, shaken: Shaken) -> list[float]:
 
 def turns_of(frequency: float, slow: Shaken, fast: Shaken) -> float | None:
     """Periods per turn of a load that was seen at a frequency [Hz] at the slow speed.
-
     None if the frequency is the same at the fast speed, or if nothing there has moved with the
     speed: the slow record alone does not prove a load.
     """

@@ -36,19 +36,9 @@ DRAWN = 2
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """An ensemble with its errors.
-
-    Attributes
-    ----------
-    ensemble : Ensemble
-    rmse : tuple of float
-        Error of each member in free run on the held-out recording [RPM].
-    fit_percent : float
-        Fit of the best one.
-    dropped : int
-        Number of members left out.
-    card : ReportCard
-        Report card of the best one on that recording.
+    """An ensemble with its errors: the `rmse` of each member in free run on the held-out recording
+    [RPM], and for the best one its `fit_percent` and its report `card` on that recording. `dropped`
+    is the number of members left out.
     """
 
     ensemble: Ensemble
@@ -70,13 +60,8 @@ def train(
     progress: Callable[[int, int], object],
 ) -> Trained:
     """Train members with different seeds; keep those that predict held-out data.
-
-    Raises
-    ------
-    Refusal
-        If no network can be trained, or the best one does not predict well enough.
-    Interrupted
-        On Ctrl-C.
+    Raises `Refusal` if no network can be trained, or the best one does not predict well enough, and
+    `Interrupted` on Ctrl-C.
     """
     data = thinned(Dataset.concat([r.dataset() for r in recordings]), MOST_SAMPLES)
     members = _members(data, demands, progress)
@@ -120,10 +105,8 @@ def validate_member(model: Model, data: Dataset) -> tuple[float, float]:
 def _members(
     data: Dataset, demands: Demands, progress: Callable[[int, int], object]
 ) -> list[Model]:
-    """Networks by seed, trained in parallel; Ctrl-C ends all of them.
-
-    Twice as many are trained as needed, as some end in a poor minimum; the better half by the error
-    on the training data stays.
+    """Networks by seed, trained in parallel; Ctrl-C ends all of them. Twice as many are trained as
+    needed, as some end in a poor minimum; the better half by the error on the training data stays.
     """
     stopped = threading.Event()
     seeds = [demands.seed + i for i in range(DRAWN * demands.members)]
@@ -222,23 +205,9 @@ def linear_rival(
     demands: Demands,
     orders: Sequence[int] = ORDERS,
 ) -> Rival | None:
-    """The simplest linear model of the stretches in which the drive is linear.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    judge : Recording
-        The held-out recording.
-    fopdt : Fopdt
-        Gives the command that holds a speed.
-    demands : Demands
-    orders : sequence of int
-        Orders to try.
-
-    Returns
-    -------
-    Rival or None
-        None if none can be fitted.
+    """The simplest linear model of the stretches in which the drive is linear; None if none can be
+    fitted. `judge` is the held-out recording, `fopdt` gives the command that holds a speed, and the
+    order is one of `orders`.
     """
     found = [part for r in recordings for part in _stretches(r, fopdt, LINEAR * demands.u_max)]
     if not found:

@@ -36,11 +36,7 @@ def agreeing(
     controller: Controller, ensemble: Ensemble, references: Mapping[str, FloatArray]
 ) -> Ensemble:
     """The ensemble without members that deviate from the others, for instance in a false rest.
-
-    Raises
-    ------
-    Disagreement
-        If less than half of the members agree.
+    Raises `Disagreement` if less than half of the members agree.
     """
     members = list(ensemble.members)
     apart = np.zeros(len(members))
@@ -134,16 +130,8 @@ def predict(
     pushes: Sequence[FloatArray] | None = None,
 ) -> tuple[Comparison, ...]:
     """The ensemble's predictions for every reference.
-
-    Parameters
-    ----------
-    pushes : sequence of array, optional
-        For each reference, a command added after the limiter: the load over the turn.
-
-    Raises
-    ------
-    Refusal
-        If members disagree or diverge.
+    `pushes` are commands added after the limiter, one for each reference: the load over the turn.
+    Raises `Refusal` if members disagree or diverge.
     """
     found = []
     for i, (name, r) in enumerate(references.items()):
@@ -182,13 +170,8 @@ def measure(
     keep: Callable[[tuple[Comparison, ...]], object],
 ) -> tuple[Comparison, ...]:
     """Run the references on the machine, the shortest first, and compare each as it ends.
-
-    If the machine allows it, a run is also watched on the way.
-
-    Raises
-    ------
-    Refusal
-        As `require_alike`, before the next reference runs; and if `Watching` ends a run.
+    If the machine allows it, a run is also watched on the way. Raises `Refusal` as `require_alike`,
+    before the next reference runs, and if `Watching` ends a run.
     """
     found = dict(enumerate(predicted))
     for i in sorted(found, key=lambda i: len(found[i].predicted.r)):
@@ -212,18 +195,10 @@ SURE = 1.1
 
 class Watching:
     """Ends a run that is going wrong, instead of judging it afterwards.
-
     It ends a run if the command chatters `TIMES` as much as predicted, as in an oscillating loop,
     or if the machine is so far from the prediction, or has been at a limit for so long, that the
-    run will be refused in any case.
-
-    Parameters
-    ----------
-    predicted : ClosedLoopRun
-        At the machine's samples, or for a slow drive at every k-th of them.
-    controller : Controller
-        The machine's controller.
-    counts_per_rev : float
+    run will be refused in any case. `predicted` has the machine's samples, or for a slow drive
+    every k-th of them; `controller` is the machine's.
     """
 
     def __init__(
@@ -242,13 +217,7 @@ class Watching:
         )
 
     def __call__(self, first: int, u: FloatArray, counts: FloatArray) -> None:
-        """Check samples `first`, `first + 1`, ...
-
-        Raises
-        ------
-        Aborted
-            If the run is going wrong.
-        """
+        """Check samples `first`, `first + 1`, ... Raises `Aborted` if the run is going wrong."""
         end = min(first + len(u), len(self._u))
         if end <= first:
             return
@@ -276,7 +245,6 @@ class Watching:
 
     def _parts(self, end: int) -> None:
         """End a run too far off or too long at a limit.
-
         Speeds are means over blocks of samples, to average the encoder's noise.
         """
         p, c = self._predicted, self._controller
@@ -311,7 +279,6 @@ class Watching:
 
 def judged(predicted: tuple[Comparison, ...], ensemble: Ensemble) -> Judgement:
     """Verdicts on the loops: of the first member on every reference, of all on the shortest.
-
     That all members agree on all references has been checked before.
     """
     shortest = min(predicted, key=lambda c: len(c.predicted.r))

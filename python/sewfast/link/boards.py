@@ -300,7 +300,6 @@ class PolledBoard(Unique, ABC):
 
     def _recording(self, run: _Samples, name: str) -> Recording | None:
         """The run at even times, those at which the commands were sent.
-
         Positions are interpolated between the times of the answers, so that neither the host's
         jitter nor the transmission time of a command appears in the speed.
         """
@@ -405,11 +404,7 @@ class PolledBoard(Unique, ABC):
 
     def _discard(self) -> bool:
         """Discard received bytes: answers to an earlier program or an aborted exchange.
-
-        Returns
-        -------
-        bool
-            Whether the line became quiet; with telemetry on, it never does.
+        Return whether the line became quiet; with telemetry on, it never does.
         """
         self._waiting = b""
         deadline = self._clock.monotonic() + QUIET_WITHIN

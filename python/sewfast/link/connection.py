@@ -43,26 +43,11 @@ class Loan:
 
 
 class Connection(Unique):
-    """A session with the device behind a port; one thread uses it.
-
-    Everything happens in `turn`: it reads once, hands on what arrived and sends what is due. A
-    failure of the port is raised by the next turn, so that sending never raises.
-
-    Parameters
-    ----------
-    port : Port
-        Open; the connection closes it.
-    watchdog : float or None
-        Time that the device runs on without a frame from this host [s]; None for the default.
-    patience : float
-        How long to wait for the first answer [s]; many boards restart when their port opens.
-    resume : float
-        How long to try to reopen a vanished port during a run [s].
-
-    Raises
-    ------
-    LinkError
-        If nothing answers, or not in this protocol.
+    """A session with the device behind an open port, which it closes; one thread uses it.
+    Everything happens in `turn`; the next turn raises a failure of the port, so sending never
+    raises. Times are in [s]: the device runs on for `watchdog` without a frame from this host, the
+    first answer may take `patience` (many boards restart when their port opens), and a port lost
+    during a run is tried again for `resume`. Raises `LinkError` without an answer in this protocol.
     """
 
     def __init__(
@@ -114,16 +99,8 @@ class Connection(Unique):
 
     def turn(self, wait: float = SILENCE) -> bool:
         """Read once, waiting at most `wait` seconds, hand on what arrived, send what is due.
-
-        Returns
-        -------
-        bool
-            Whether anything arrived.
-
-        Raises
-        ------
-        LinkError
-            If the port is lost for good, the device was reset, or a command is not answered.
+        Return whether anything arrived. Raises `LinkError` if the port is lost for good, the device
+        was reset, or a command is not answered.
         """
         came = False
         try:
@@ -195,11 +172,7 @@ class Connection(Unique):
     @contextmanager
     def owned(self) -> Iterator[None]:
         """Use the connection from this thread alone; a second thread is refused, not queued.
-
-        Raises
-        ------
-        SettingError
-            If another thread uses it: their frames and replies would mix.
+        Raises `SettingError` if another thread uses it: their frames and replies would mix.
         """
         if not self._owner.acquire(blocking=False):
             raise SettingError(
@@ -215,13 +188,8 @@ class Connection(Unique):
 
     def request(self, kind: Kind, body: bytes = b"") -> Reply:
         """Send a command and take turns until it is answered.
-
-        Raises
-        ------
-        LinkError
-            If no answer arrives or the port fails; a refusal is a reply.
-        SettingError
-            If another thread uses the connection.
+        Raises `LinkError` if no answer arrives or the port fails (a refusal is a reply), and
+        `SettingError` if another thread uses the connection.
         """
         with self.owned():
             return self._request(kind, body)
@@ -241,11 +209,7 @@ class Connection(Unique):
 
     def ask(self, kind: Kind, body: bytes = b"") -> bytes:
         """The body of a command's reply.
-
-        Raises
-        ------
-        LinkError
-            As `request`, and if the device refuses.
+        Raises `LinkError` as `request`, and if the device refuses.
         """
         return self.request(kind, body).checked()
 
@@ -254,17 +218,10 @@ class Connection(Unique):
         return wire.status(self.request(Kind.STATUS))
 
     def stop(self) -> None:
-        """Send STOP at once; return when the device has confirmed it.
-
-        Called from another thread, it ends that thread's run, which sends STOP itself, and waits
-        for it.
-
-        Raises
-        ------
-        LinkError
-            If it was not confirmed: then the device's watchdog stops the motor.
-        SettingError
-            If a loop on the host uses the connection; Ctrl-C ends that one.
+        """Send STOP at once; return when the device has confirmed it. Called from another thread,
+        it ends that thread's run, which sends STOP itself, and waits for it. Raises `LinkError` if
+        STOP was not confirmed: then the device's watchdog stops the motor. Raises `SettingError` if
+        a loop on the host uses the connection; Ctrl-C ends that one.
         """
         self._halt()
         with self.owned():
@@ -482,11 +439,9 @@ class ClockBounds:
 
 
 class Clock:
-    """Collects exchanges (sent, device's time, received).
-
-    The device's time lies between the two host times, so the line `host(device)` passes above
-    `sent` and below `received` there. Only the convex hulls of the two sets matter, so memory stays
-    small in a session of any length.
+    """Collects exchanges (sent, device's time, received). The device's time lies between the two
+    host times, so the line `host(device)` passes above `sent` and below `received` there. Only the
+    convex hulls of the two sets matter, so memory stays small in a session of any length.
     """
 
     def __init__(self) -> None:
@@ -550,7 +505,6 @@ def _slopes(low: _Points, high: _Points) -> tuple[float, float]:
 
 def _offsets(low: _Points, high: _Points, slopes: tuple[float, float]) -> tuple[float, float]:
     """Least and greatest value at 0 of such a line.
-
     They are reached at the least or greatest slope, or at the slope of an edge of a hull.
     """
     at = [np.clip(s, *slopes) for s in (*slopes, *_edges(low), *_edges(high))]

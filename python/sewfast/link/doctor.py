@@ -111,13 +111,7 @@ MEASURABLE = 20e-6
 
 
 class Metered(Port):
-    """A port that counts what is written to it.
-
-    Parameters
-    ----------
-    port : Port
-        Open.
-    """
+    """A port around an open one, which counts what is written to it."""
 
     def __init__(self, port: Port) -> None:
         self._port = port
@@ -155,11 +149,7 @@ class Metered(Port):
 
 def checkup(port: Metered, echoes: int) -> Iterator[Finding]:
     """Check the device behind an open port, one finding after the other.
-
-    Raises
-    ------
-    LinkError
-        If no device answers, or it stops answering.
+    Raises `LinkError` if no device answers, or it stops answering.
     """
     link = Connection(port, watchdog=0.05, patience=PATIENCE, resume=0.0)
     drive = Drive(link)
@@ -514,19 +504,9 @@ PROC = Path("/proc")
 
 @dataclass(frozen=True)
 class Access:
-    """Who may open a port.
-
-    Parameters
-    ----------
-    allowed : bool
-        Whether this user may read and write it.
-    group : str or None
-        The group that may open it, where the port's mode grants that.
-    owner : str
-    mode : str
-        In the notation of ``ls``.
-    member : bool
-        Whether this process is in the group; a user who has just joined must log in again.
+    """Who may open a port. `allowed` is whether this user may read and write it, `group` the group
+    that may open it, where the port's mode grants that, and `mode` is in the notation of ``ls``.
+    `member` is whether this process is in the group; a user who has just joined must log in again.
     """
 
     allowed: bool
@@ -537,17 +517,8 @@ class Access:
 
 
 def access(path: str, user: int | None = None, groups: frozenset[int] | None = None) -> Access:
-    """Who may open the port at `path`.
-
-    Parameters
-    ----------
-    user, groups : int, frozenset of int, optional
-        Ids to check; by default those of this process.
-
-    Raises
-    ------
-    OSError
-        If there is no such port.
+    """Who may open the port at `path`. `user` and `groups` are ids to check, by default those of
+    this process. Raises `OSError` if there is no such port.
     """
     user = os.geteuid() if user is None else user
     groups = frozenset((os.getegid(), *os.getgroups())) if groups is None else groups
@@ -610,7 +581,6 @@ def permission_remedy(found: Access, vid: int | None = None, pid: int | None = N
 
 def holders(path: str, proc: Path = PROC) -> list[tuple[int, str]]:
     """Number and name of the other processes that hold a port open, as far as this user can see.
-
     Empty on a system without /proc.
     """
     wanted = os.path.realpath(path)
@@ -646,7 +616,6 @@ def _command(folder: Path) -> str:
 
 def latency_timer(path: str, root: Path = SYS) -> tuple[int, Path] | None:
     """Milliseconds for which an FTDI adapter holds bytes back, and the file to change them in.
-
     None for an adapter without such a timer, and on a system that does not show it.
     """
     file = root / Path(os.path.realpath(path)).name / "device" / "latency_timer"

@@ -269,11 +269,8 @@ def _memory(path: Path) -> mmap.mmap:
 
 def _examined(firmware: Path) -> tuple[str, int, int]:
     """The board, and bytes of code and constants and of static memory, from an ELF file's headers.
-
-    Raises
-    ------
-    SettingError
-        For anything but a 32-bit little-endian ELF file for ARM, and for another board.
+    Raises `SettingError` for anything but a 32-bit little-endian ELF file for ARM, and for another
+    board.
     """
     remedy = "build one by `make firmware` in a source checkout"
     try:

@@ -168,12 +168,8 @@ class Layout:
 
 
 def require_capable(plan: Plan, identity: Identity) -> None:
-    """Refuse a plan that the device cannot run.
-
-    Raises
-    ------
-    SettingError
-        For a mode that it does not offer, or a controller with another sample time.
+    """Refuse (`SettingError`) a plan that the device cannot run: a mode that it does not offer, or
+    a controller with another sample time.
     """
     if not identity.capabilities & _CAPABILITIES[plan.mode]:
         raise SettingError(
@@ -191,16 +187,8 @@ def require_capable(plan: Plan, identity: Identity) -> None:
 
 def layout(plan: Plan, channels: Sequence[Channel], identity: Identity, baud: float) -> Layout:
     """Channels and batch that the link carries with a tenth to spare.
-
-    Parameters
-    ----------
-    baud : float
-        Bits per second; inf where nothing limits them.
-
-    Raises
-    ------
-    SettingError
-        If the columns asked for are unknown or too many; the message names those to leave out.
+    `baud` is in bits per second, inf where nothing limits them. Raises `SettingError` if the
+    columns asked for are unknown or too many; the message names those to leave out.
     """
     names = {c.name: c for c in channels}
     wanted = DEFAULTS[plan.mode] if plan.columns is None else tuple(plan.columns)
@@ -263,11 +251,7 @@ def _too_much(plan: Plan, out: Sequence[Channel], identity: Identity, baud: floa
 
 def channels(link: Connection) -> tuple[Channel, ...]:
     """The device's description of its channels.
-
-    Raises
-    ------
-    LinkError
-        If it does not match the device's schema hash.
+    Raises `LinkError` if it does not match the device's schema hash.
     """
     identity = link.identity
     bodies = [link.ask(Kind.DESCRIBE, bytes([k])) for k in range(identity.channels)]
@@ -288,11 +272,7 @@ def channels(link: Connection) -> tuple[Channel, ...]:
 
 def limit(name: str, value: float | None, present: float, ceiling: float) -> float:
     """The limit to set: the one asked for, the one in force, or the device's ceiling.
-
-    Raises
-    ------
-    SettingError
-        For a limit that is not above 0 or is above the ceiling.
+    Raises `SettingError` for a limit that is not above 0 or is above the ceiling.
     """
     if value is None:
         return present if present else ceiling
@@ -305,12 +285,8 @@ def limit(name: str, value: float | None, present: float, ceiling: float) -> flo
 
 
 def require_units(controller: SampledController, streamed: Sequence[Channel]) -> None:
-    """Refuse a controller with other units than the device's.
-
-    Raises
-    ------
-    SettingError
-        If command or output have another unit.
+    """Refuse (`SettingError`) a controller whose command or output has another unit than the
+    device's.
     """
     units = {c.name: c.unit for c in streamed}
     _require_units(controller.u_unit, units.get("u", ""), "command")
@@ -327,11 +303,7 @@ def other_kind(
     controller: SampledController, streamed: Sequence[Channel], identity: Identity
 ) -> bytes:
     """Body of CONTROLLER for any controller but a PID, with the encoder of the device.
-
-    Raises
-    ------
-    SettingError
-        If it has other units than the device, or the firmware does not know it.
+    Raises `SettingError` if it has other units than the device, or the firmware does not know it.
     """
     require_units(controller, streamed)
     if not identity.capabilities & wire.KINDS:
@@ -348,12 +320,8 @@ def other_kind(
 
 
 def gains(controller: Controller, streamed: Sequence[Channel], identity: Identity) -> bytes:
-    """Body of GAINS for a controller, with the encoder of the device.
-
-    Raises
-    ------
-    SettingError
-        If its gains have other units than the device, or the firmware does not support its parts.
+    """Body of GAINS for a controller, with the encoder of the device. Raises `SettingError` if its
+    gains have other units than the device, or the firmware does not support its parts.
     """
     g, c = fitting(controller, streamed), controller
     named = ("observer_time", bool(c.observer_time)), ("r_rate", c.r_rate != math.inf)

@@ -109,18 +109,10 @@ CONNECT_TIMEOUT = 5.0
 
 
 class Port(Unique, ABC):
-    """Bytes in and out; every failure is a `LinkError`.
-
-    A transport defines the form of its addresses (`form`) and whether they are devices of this
-    computer (`is_local`), opens, reads, writes and closes, and explains its failures (`opening`,
-    `losing`).
-
-    Parameters
-    ----------
-    url : str
-        The address as given, for messages.
-    baud : int
-        Bits per second; a socket only stores the number.
+    """Bytes in and out; every failure is a `LinkError`. A transport defines the form of its
+    addresses (`form`) and whether they are devices of this computer (`is_local`), opens, reads,
+    writes and closes, and explains its failures (`opening`, `losing`). `url` is the address as
+    given, for messages; `baud` is in bits per second, and a socket only stores the number.
     """
 
     form: ClassVar[str]
@@ -138,31 +130,19 @@ class Port(Unique, ABC):
     @abstractmethod
     def read(self, timeout: float) -> bytes:
         """The bytes received, as soon as there are any; empty after `timeout` seconds without one.
-
-        Raises
-        ------
-        LinkError
-            If the port vanished, the other side closed it, or it is closed.
+        Raises `LinkError` if the port vanished, the other side closed it, or it is closed.
         """
 
     @abstractmethod
     def write(self, data: bytes) -> None:
         """Write all of `data`.
-
-        Raises
-        ------
-        LinkError
-            If the port vanished or takes no bytes for a second.
+        Raises `LinkError` if the port vanished or takes no bytes for a second.
         """
 
     @abstractmethod
     def fileno(self) -> int:
         """Its descriptor, for code that reads and writes outside the interpreter.
-
-        Raises
-        ------
-        LinkError
-            If it is closed.
+        Raises `LinkError` if the port is closed.
         """
 
     @abstractmethod
@@ -181,13 +161,7 @@ class Port(Unique, ABC):
     @staticmethod
     def opening(url: str, number: int | None, error: BaseException) -> Texts:
         """Expected, received and remedy for a port that does not open.
-
-        Parameters
-        ----------
-        url : str
-        number : int or None
-            The operating system's number of the error.
-        error : BaseException
+        `number` is the operating system's number of the error.
         """
         return "a port that opens", "one that does not", "`sewfast ports` lists what is connected"
 
@@ -203,17 +177,8 @@ class Port(Unique, ABC):
         return "an open port", "one that vanished", "check cable and supply, then connect again"
 
     def reopen(self, timeout: float = CONNECT_TIMEOUT) -> None:
-        """Close the port and open it again.
-
-        Parameters
-        ----------
-        timeout : float
-            Longest wait for the other side of a socket [s], for each of its addresses.
-
-        Raises
-        ------
-        LinkError
-            If it is not there (yet).
+        """Close the port and open it again. `timeout` is the longest wait for the other side of a
+        socket [s], for each of its addresses. Raises `LinkError` if it is not there (yet).
         """
         self.close()
         self._patience = timeout
@@ -396,7 +361,6 @@ DATAGRAM = 1200
 
 class UdpPort(NetworkPort):
     """Datagrams to and from one address; those from other addresses are ignored.
-
     Each holds whole frames, so that losing one damages no frame of another. The frames' sequence
     numbers show what the network loses, repeats or delivers late, as on any port.
     """

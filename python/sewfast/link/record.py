@@ -33,21 +33,10 @@ _OF_A_RUN = ("started", "gap")
 
 
 class Recorder:
-    """The sink of `Drive.stream`.
-
-    Parameters
-    ----------
-    columns : mapping of name to unit
-        The streamed columns.
-    n : int
-        Samples of the run.
-    writer : RecordWriter, optional
-        A lazy file, which is created when the run has begun. With it, the samples are not kept in
-        memory.
-    feed : Feed, optional
-        Of a live view.
-    watch : Watch, optional
-        Called with the samples; an exception from it ends the run.
+    """The sink of `Drive.stream` for a run of `n` samples; `columns` maps streamed names to units.
+    `writer` is a lazy file, created when the run has begun; with it, the samples are not kept in
+    memory. `feed` is that of a live view. `watch` is called with the samples; an exception from it
+    ends the run.
     """
 
     def __init__(
@@ -70,11 +59,7 @@ class Recorder:
 
     def samples(self, first: int, columns: Mapping[str, FloatArray]) -> None:
         """Take a batch of samples; called by the thread that owns the link.
-
-        Raises
-        ------
-        DataError
-            If the file cannot be written.
+        Raises `DataError` if the file cannot be written.
         """
         self._begin()
         if self._file is not None:
@@ -116,19 +101,8 @@ class Recorder:
         return {name: values[: self._end] for name, values in self._kept.items()}
 
     def close(self, outcome: str, taken: int | None) -> None:
-        """Flush and close the file.
-
-        Parameters
-        ----------
-        outcome : str
-            How the run ended.
-        taken : int or None
-            Samples that the device took; None if unknown.
-
-        Raises
-        ------
-        DataError
-            If the file could not be completed.
+        """Flush and close the file. `outcome` says how the run ended, `taken` how many samples the
+        device took; None if unknown. Raises `DataError` if the file could not be completed.
         """
         if self._file is not None:
             self._file.close(outcome, taken=taken)
@@ -151,17 +125,9 @@ def describe(kind: str, index: int | None, detail: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """The samples of a run and its outcome.
-
-    Attributes
-    ----------
-    columns : dict of name to array, shape (N,)
-        Row k is sample k of the run; NaN if the link lost it. N is the number that the device took,
-        the planned one after a complete run.
-    outcome : Outcome
-        How it ended.
-    file : Path or None
-        The recording; None without a file, and if the run never began.
+    """The samples of a run and its outcome. Row k of the `columns`, (N,) each, is sample k of the
+    run, NaN if the link lost it; N is the number that the device took, the planned one after a
+    complete run. `file` is the recording; None without a file, and if the run never began.
     """
 
     columns: dict[str, FloatArray]
@@ -202,36 +168,11 @@ def run_plan(
     watch: Watch | None = None,
     cancel: threading.Event | None = None,
 ) -> RunResult:
-    """Run a plan and keep its samples.
-
-    Parameters
-    ----------
-    drive : Drive
-    plan : Plan
-    name : str
-        Of the excitation or reference.
-    file : path, optional
-        An MCAP recording, written as the samples arrive; without it they are only in memory. It is
-        created when the device has accepted the start: a refused run leaves no file, and an
-        existing one unchanged.
-    live : str or ViewKind
-        See `sewfast.live.open_view`.
-    overwrite : bool
-        Whether to replace a recording of a drive; one of a virtual machine is replaced anyway.
-    settings : mapping, optional
-        Further settings of the run for the file.
-    watch : Watch, optional
-        Called with the samples as they arrive; an exception from it ends the run.
-    cancel : threading.Event, optional
-        Set it in another thread to end the run as Ctrl-C does.
-
-    Raises
-    ------
-    Stopped
-        If a trip, port, device, disk or Ctrl-C ended it; the motor has been stopped and the file
-        closed.
-    SettingError, DataError
-        Before anything moves.
+    """Run a plan and keep its samples, in memory or in an MCAP `file` written as they arrive. It is
+    created when the device accepts the start, so a refused run leaves an existing file unchanged;
+    `overwrite` matters only for a drive's recording. `live` is as in `sewfast.live.open_view`; an
+    exception from `watch`, or setting `cancel` in another thread, ends the run. Raises `Stopped` if
+    a trip, port, device, disk or Ctrl-C ended it; the motor has been stopped and the file closed.
     """
     if file is not None:
         require_replaceable(require_ending(file), overwrite=overwrite)

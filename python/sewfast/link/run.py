@@ -20,26 +20,14 @@ from .wire import Channel, Event, Kind, Limits, Reply, Status
 
 
 def commands(values: NDArray[np.float64], u: Channel, limits: Limits) -> LinkUpload:
-    """Commands rounded to the device's steps.
-
-    Raises
-    ------
-    SettingError
-        If one is beyond the volt limit.
-    """
+    """Commands rounded to the device's steps. Raises `SettingError` beyond the volt limit."""
     limit = min(limits.volt, 32_767 / u.steps_per_unit)
     _require_within("commands", values, limit, u.unit)
     return LinkUpload.commands(values, u.steps_per_unit, limit)
 
 
 def references(values: NDArray[np.float64], limits: Limits) -> LinkUpload:
-    """References as the device stores them.
-
-    Raises
-    ------
-    SettingError
-        If one is beyond the speed limit.
-    """
+    """References as the device stores them. Raises `SettingError` beyond the speed limit."""
     limit = min(limits.speed_rpm, wire.LARGEST)
     _require_within("references", values, limit, "RPM")
     return LinkUpload.references(values, limit)
@@ -121,14 +109,9 @@ def halted(link: Connection) -> LinkError:
 
 def arm_at_rest(link: Connection) -> None:
     """Repeat ARM until the device finds its motor at rest.
-
     The device decides, as it sees every count. The host sees only a STATUS every 20 ms: a motor
-    that creeps, or swings about an edge of the encoder, can move just before ARM.
-
-    Raises
-    ------
-    LinkError
-        If it still moves after 10 s, and if the device refuses for another reason.
+    that creeps, or swings about an edge of the encoder, can move just before ARM. Raises
+    `LinkError` if it still moves after 10 s, and if the device refuses for another reason.
     """
     body = wire.arm(link.watchdog_us, link.identity.key)
     until = time.monotonic() + ARMS_WITHIN
@@ -140,16 +123,8 @@ def arm_at_rest(link: Connection) -> None:
 
 
 class Run:
-    """One run: `upload`, `begin`, `pump`, `finish` in this order, or `abort` at any time.
-
-    Parameters
-    ----------
-    link : Connection
-    plan : Plan
-    layout : Layout
-    profile : LinkUpload or None
-        None in mode "direct".
-    sink : Sink
+    """One run: `upload`, `begin`, `pump`, `finish` in this order, or `abort` at any time. The
+    `profile` is None in mode "direct".
     """
 
     def __init__(
@@ -265,7 +240,6 @@ class Run:
 
     def _is_deaf(self, now: float) -> bool:
         """Whether the device has been silent for too long.
-
         Then heartbeats stop, so that its watchdog stops the motor that nobody sees.
         """
         after = self._deaf_after
@@ -436,11 +410,7 @@ class Run:
 
     def finish(self, reason: str | None = None) -> Outcome:
         """Ask the device how many samples it took, and list those that did not arrive.
-
-        Parameters
-        ----------
-        reason : str or None
-            Why the host ended it; None if the device did.
+        `reason` is why the host ended it; None if the device did.
         """
         status = self.link.status()
         if self.start_us is not None:
@@ -457,11 +427,7 @@ class Run:
 
     def abort(self, error: BaseException | None) -> Outcome:
         """Stop the motor before anything else, then collect the samples that arrived.
-
-        Parameters
-        ----------
-        error : BaseException or None
-            Why; None if the run was cancelled.
+        `error` is why; None if the run was cancelled.
         """
         link, resume = self.link, self.link.resume
         link.each_turn = None

@@ -257,14 +257,8 @@ def _require_switches(**values: object) -> None:
 
 
 def _require_place(name: str, place: object) -> None:
-    """Refuse a file that cannot be created, before creating anything.
-
-    Raises
-    ------
-    SettingError
-        For anything but a file name.
-    LinkError
-        If its folder does not exist.
+    """Refuse a file that cannot be created, before creating anything. Raises `SettingError` for
+    anything but a file name, and `LinkError` if its folder does not exist.
     """
     if place is None:
         return
@@ -279,7 +273,6 @@ def _require_place(name: str, place: object) -> None:
 
 def _require_free(link: Path) -> None:
     """Refuse a link to something that exists: the pty of another device, or a user's file.
-
     A dangling link was left over by a killed device, and is replaced.
     """
     if link.is_symlink() and link.exists():

@@ -213,11 +213,7 @@ class Reply:
 
     def checked(self) -> bytes:
         """The body.
-
-        Raises
-        ------
-        LinkError
-            If the device refused the command; the message says why and what to do.
+        Raises `LinkError` if the device refused the command; the message says why and what to do.
         """
         if self.result:
             raise refusal(self.kind, self.result, self.detail)

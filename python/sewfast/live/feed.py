@@ -29,15 +29,9 @@ _COUNTERS = 4
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """A ring of samples.
-
-    Attributes
-    ----------
-    counters : array of int64, shape (4,)
-        Claimed, end, received, gaps.
-    holds : array of int64, shape (size,)
-        Number of the sample in each place, so that writing after a gap costs nothing; -1 for none.
-    rows : array, shape (columns, size)
+    """A ring of samples. `counters` (4,) are claimed, end, received and gaps; `holds` (size,) is
+    the number of the sample in each place, -1 for none, so that writing after a gap costs nothing;
+    `rows` is (columns, size).
     """
 
     counters: NDArray[np.int64]
@@ -81,24 +75,10 @@ def _anonymous_file() -> int:
 
 
 def speed_over_window(counts: FloatArray, lag: int, Ts: float, counts_per_rev: float) -> FloatArray:
-    """Mean speed [RPM] over the `lag` samples before each one.
-
-    Parameters
-    ----------
-    counts : array, shape (N,)
-        Accumulated counts; NaN where a sample is missing.
-    lag : int
-        Samples in the window, at least 1; one count over it is `60 / (lag Ts counts_per_rev)` RPM.
-    Ts : float
-        Sample time [s].
-    counts_per_rev : float
-        Counts per revolution.
-
-    Returns
-    -------
-    array, shape (N - lag,)
-        From sample `lag` on; NaN if a sample of the window is missing, because a device that was
-        reset in the gap counts from another origin.
+    """Mean speed [RPM] over the `lag` samples before each one, (N - lag,) from sample `lag` on.
+    `counts` (N,) are accumulated, NaN where a sample is missing; `Ts` is in seconds; one count over
+    the window is `60 / (lag Ts counts_per_rev)` RPM. The speed is NaN if a sample of the window is
+    missing, because a device that was reset in the gap counts from another origin.
     """
     missing = np.concatenate(([0], np.cumsum(np.isnan(counts))))
     whole = missing[lag + 1 :] == missing[: len(counts) - lag]

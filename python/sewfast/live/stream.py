@@ -72,19 +72,8 @@ def _is_local(address: str) -> bool:
 
 
 class Gate:
-    """Listens, reads the heads of requests and forwards those that pass.
-
-    Parameters
-    ----------
-    host, port
-        Address to listen on; port 0 takes any free one.
-    behind : pair of text and int
-        Address of the server to forward to.
-
-    Raises
-    ------
-    OSError
-        If the port is taken.
+    """Listens, reads the heads of requests and forwards those that pass to the server `behind`.
+    Port 0 takes any free one. Raises `OSError` if the port is taken.
     """
 
     def __init__(self, host: str, port: int, behind: tuple[str, int]) -> None:
@@ -187,12 +176,7 @@ fewer. Samples not sent in one second can be made up for in the next."""
 
 class Tail:
     """The samples of a feed since the last read.
-
-    Parameters
-    ----------
-    feed : Feed
-    now : callable
-        The wall clock [s], from which the time stamps of the samples start.
+    Their time stamps start from the wall clock `now` [s].
     """
 
     def __init__(self, feed: Feed, now: Callable[[], float] = time.time) -> None:
@@ -269,18 +253,8 @@ _INFO = 2
 
 class FoxgloveView:
     """Topics `/drive` (one message a sample) and `/log` (the lines of status).
-
-    Parameters
-    ----------
-    host, port
-        Address to listen on; port 0 takes any free one.
-    name : str
-        Name shown to clients.
-
-    Raises
-    ------
-    SettingError
-        Without the package foxglove-sdk, or for a port that is taken.
+    It listens on `host` and `port`; clients see `name`. Raises `SettingError` without the package
+    foxglove-sdk, or for a port that is taken.
     """
 
     def __init__(self, host: str, port: int, name: str) -> None:
@@ -362,20 +336,10 @@ TIMESTAMP = "timestamp"
 
 
 class PlotJugglerView:
-    """One datagram a sample: PlotJuggler takes one time per message, and reads 2,048 bytes.
-
-    A message that is not JSON makes it stop listening, and one without the time makes it use its
-    own clock from then on. So a missing value is left out, and the time is always included.
-
-    Parameters
-    ----------
-    host, port
-        Address that PlotJuggler listens on.
-
-    Raises
-    ------
-    SettingError
-        For a host that has no address.
+    """One datagram a sample: PlotJuggler takes one time per message, and reads 2,048 bytes. A
+    message that is not JSON makes it stop listening, and one without the time makes it use its own
+    clock from then on. So a missing value is left out, and the time is always included. `host` and
+    `port` are where PlotJuggler listens. Raises `SettingError` for a host that has no address.
     """
 
     def __init__(self, host: str, port: int) -> None:

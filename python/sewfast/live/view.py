@@ -35,16 +35,9 @@ LOCAL = "127.0.0.1"
 
 @dataclass(frozen=True)
 class ViewKind:
-    """A view by name; streams have an address.
-
-    Attributes
-    ----------
-    name : str
-        `auto`, `terminal`, `none`, `plotjuggler` or `foxglove`.
-    host : str
-        Address of PlotJuggler, or of the Foxglove server.
-    port : int
-        Port of the stream; 0 for views without one, and for a Foxglove server on any free port.
+    """A view by name: `auto`, `terminal`, `none`, `plotjuggler` or `foxglove`. Streams have an
+    address, `host` and `port`: that of PlotJuggler, or of the Foxglove server. The port is 0 for
+    views without one, and for a Foxglove server on any free port.
     """
 
     name: str
@@ -53,12 +46,8 @@ class ViewKind:
 
     @classmethod
     def parse(cls, text: str) -> ViewKind:
-        """The view named by a text such as `plotjuggler:HOST:PORT`; see `KINDS`.
-
-        Raises
-        ------
-        SettingError
-            For any other text, or a port outside 1 to 65535 (Foxglove: 0 to 65535).
+        """The view named by a text such as `plotjuggler:HOST:PORT`; see `KINDS`. Raises
+        `SettingError` for any other text, or a port outside 1 to 65535 (Foxglove: 0 to 65535).
         """
         if not isinstance(text, str):
             raise _refusal(text)
@@ -104,7 +93,6 @@ _NICE = 5
 
 def main() -> None:
     """Show a feed until the pipe on standard input ends.
-
     The arguments are the descriptor of the memory, the feed and the kind as JSON. The answer on
     standard output is a line of JSON: the view's port, or why there is none.
     """
@@ -146,13 +134,7 @@ _PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.live.view import ma
 
 @dataclass(frozen=True)
 class Shown:
-    """A running view.
-
-    Attributes
-    ----------
-    port : int
-        Port of its server; 0 without one.
-    """
+    """A running view; `port` is that of its server, 0 without one."""
 
     port: int
 
@@ -316,11 +298,7 @@ class View(Protocol):
 
 def resolve(kind: ViewKind) -> ViewKind:
     """Replace `auto` by `terminal` or `none`.
-
-    Raises
-    ------
-    SettingError
-        For `terminal` if standard error is not a terminal.
+    Raises `SettingError` for `terminal` if standard error is not a terminal.
     """
     terminal = sys.stderr is not None and sys.stderr.isatty()
     if kind.name == "auto":
@@ -334,12 +312,8 @@ def resolve(kind: ViewKind) -> ViewKind:
 
 
 def make(kind: ViewKind, feed: Feed) -> View | None:
-    """The view of a kind; None for `none`.
-
-    Raises
-    ------
-    SettingError
-        As `resolve`; for a host without an address, a port that is taken, a missing package.
+    """The view of a kind; None for `none`. Raises `SettingError` as `resolve`, and for a host
+    without an address, a port that is taken or a missing package.
     """
     kind = resolve(kind)
     if kind.name == "terminal":
@@ -366,16 +340,9 @@ _SLICE_S = 0.05
 
 
 class Tty:
-    """The terminal behind a text stream.
-
-    It is opened a second time if the system allows: only then can writes be non-blocking without
-    making the terminal non-blocking for all who share it. Otherwise a write waits as long as the
-    terminal is blocked.
-
-    Parameters
-    ----------
-    stream : text stream
-        Standard error, which must be a terminal.
+    """The terminal behind a text stream, standard error. It is opened a second time if the system
+    allows: only then can writes be non-blocking without making the terminal non-blocking for all
+    who share it. Otherwise a write waits as long as the terminal is blocked.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -477,15 +444,9 @@ _PATIENCE_S = 0.2
 
 
 class TerminalView:
-    """A status line, with the feed's notes written above it.
-
+    """A status line on a terminal, with the feed's notes written above it.
     It moves the cursor only by carriage returns, which every terminal knows, and changes no mode:
     however the program ends, nothing has to be restored.
-
-    Parameters
-    ----------
-    stream : text stream
-        A terminal.
     """
 
     def __init__(self, stream: TextIO) -> None:

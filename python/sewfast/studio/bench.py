@@ -91,12 +91,8 @@ class _Both:
 
 class Bench:
     """The state of the process: the drive, whether it is armed, the last answer of the page.
-
-    Parameters
-    ----------
-    send : callable(message, curves=None)
-        Sends a message to the server. It can block, so while the motor turns only the thread that
-        shows samples calls it.
+    `send(message, curves=None)` sends a message to the server. It can block, so while the motor
+    turns only the thread that shows samples calls it.
     """
 
     def __init__(self, send: Send) -> None:

@@ -34,16 +34,8 @@ SOCKET = "drive.port"
 @dataclass(frozen=True)
 class Place:
     """The connection of a drive, which a copy opens first.
-
-    Parameters
-    ----------
-    port : str
-        The page's address: a serial port, ``socket://HOST:PORT``, or ``virtual[:SEED]``.
-    baud : int
-    watchdog : float or None
-        [s]
-    limits : mapping
-        By their names in Python; infinite for no limit.
+    `port` is the page's address: a serial port, ``socket://HOST:PORT``, or ``virtual[:SEED]``.
+    `watchdog` is in [s]; `limits` go by their names in Python, infinite for no limit.
     """
 
     port: str
@@ -171,12 +163,7 @@ def copies(kind: str, place: Place, asked: dict[str, Any]) -> dict[str, str]:
 
 
 def checked_recording(file: Any) -> str:
-    """The plain name of a recording to write, without a folder.
-
-    Raises
-    ------
-    SettingError
-    """
+    """The plain name of a recording to write, without a folder; others raise `SettingError`."""
     fits = isinstance(file, str) and re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,60}\.mcap", file)
     if not fits:
         raise SettingError(

@@ -51,14 +51,8 @@ _PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.studio.jobs import 
 
 
 class Jobs:
-    """At most one long step at a time.
-
-    Parameters
-    ----------
-    folder : Path
-        The project.
-    tell : callable(event)
-        Takes progress and results; called in its own thread.
+    """At most one long step at a time, on the project in `folder`.
+    `tell(event)` takes progress and results; it is called in its own thread.
     """
 
     def __init__(self, folder: Path, tell: Callable[[dict[str, Any]], None]) -> None:
@@ -72,23 +66,9 @@ class Jobs:
         self, event: str, step: str, *arguments: Any,
         finish: Callable[[Any], dict[str, Any]] | None = None,
     ) -> None:  # fmt: skip
-        """Start one of the `STEPS`; its result becomes an event.
-
-        Parameters
-        ----------
-        event : str
-            Name of the event with the result.
-        step : str
-            Name of the function.
-        *arguments
-            Arguments of the function after the project and the report.
-        finish : callable, optional
-            Converts the function's result for the pages.
-
-        Raises
-        ------
-        SettingError
-            If another step is running.
+        """Start the function `step` of the `STEPS`; its result becomes the event named `event`.
+        `arguments` follow the project and the report; `finish` converts the result for the pages.
+        Raises `SettingError` if another step is running.
         """
         with self._lock:
             if self._ear is not None and self._ear.is_alive():
@@ -183,14 +163,7 @@ class Jobs:
 
 
 class Report:
-    """Progress of a step, in its process.
-
-    Parameters
-    ----------
-    send : callable(kind, value)
-    event : str
-        Name of the step.
-    """
+    """Progress of a step, in its process. `send(kind, value)` takes it; `event` names the step."""
 
     def __init__(self, send: Callable[[str, Any], None], event: str) -> None:
         self._send, self._event = send, event
@@ -325,14 +298,7 @@ Curves = Mapping[str, "FloatArray"]
 
 
 class Steps:
-    """Carries out the steps on a project.
-
-    Parameters
-    ----------
-    project : Project
-    jobs : Jobs
-        Runs the long steps.
-    """
+    """Carries out the steps on a project; `jobs` runs the long ones."""
 
     def __init__(self, project: Project, jobs: Jobs) -> None:
         self.project, self.jobs = project, jobs
@@ -341,11 +307,7 @@ class Steps:
 
     def do(self, name: str, fields: dict[str, Any]) -> Any:
         """Carry out a checked message; return JSON values, or these and curves.
-
-        Raises
-        ------
-        SewfastError
-            For a refusal.
+        Raises `SewfastError` for a refusal.
         """
         if name.startswith("tune") or name == "loop":
             return self._tune(name, fields)

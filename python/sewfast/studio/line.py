@@ -37,14 +37,8 @@ _PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.studio.bench import
 
 
 class Line:
-    """A drive in the process that owns its port.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the recordings.
-    tell : callable(event)
-        Takes the events of the process; called in its own thread.
+    """A drive in the process that owns its port; its recordings are in `folder`.
+    `tell(event)` takes the events of the process; it is called in its own thread.
     """
 
     def __init__(self, folder: Path, tell: Callable[[dict[str, Any]], None]) -> None:
@@ -249,11 +243,7 @@ class Line:
 
     def work(self, kind: str, **asked: Any) -> None:
         """Start a record, run or commissioning; its end is the event ``driven``.
-
-        Raises
-        ------
-        SettingError
-            If the drive is not armed, or busy.
+        Raises `SettingError` if the drive is not armed, or busy.
         """
         with self._lock:
             if not self.is_connected:
@@ -270,12 +260,8 @@ class Line:
         self._write({"do": "work", "id": next(self._numbers), **place, **asked})
 
     def live(self, seconds: float, columns: int) -> tuple[dict[str, Any], dict[str, FloatArray]]:
-        """The newest samples to draw: lowest and highest of each of `columns` pieces.
-
-        Returns
-        -------
-        head, curves
-            For each column ``NAME_low`` and ``NAME_high``, and the times ``t`` [s].
+        """The newest samples to draw: lowest and highest of each of `columns` pieces. Return a head
+        and the curves, ``NAME_low`` and ``NAME_high`` for each column, with the times ``t`` [s].
         """
         feed = self._feed
         if feed is None:

@@ -79,11 +79,7 @@ def shown_loop(
     tuning: Tuning, values: Mapping[str, Any], response: FrequencyResponse | None
 ) -> tuple[dict[str, Any], Curves]:
     """Plant, L, S and T of the loop with these values, with marked margins and a measured response.
-
-    Raises
-    ------
-    SettingError
-        For a response with another sample time or other units.
+    Raises `SettingError` for a response with another sample time or other units.
     """
     from ..analysis.points import loop_bodes
 

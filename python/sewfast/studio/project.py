@@ -389,12 +389,7 @@ def _files(place: Path) -> list[Path]:
 
 
 def checked_name(file: Any) -> str:
-    """The plain name of a controller file to write, without a folder.
-
-    Raises
-    ------
-    SettingError
-    """
+    """The plain name of a controller to write, without a folder; others raise `SettingError`."""
     fits = isinstance(file, str) and re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,60}\.json", file)
     require(bool(fits), "file", "a name such as controller.json", file)
     return str(file)
@@ -409,19 +404,8 @@ LONGEST_NAME = 100
 
 class Upload:
     """A file that arrives in pieces; it appears under its name when it is complete.
-
-    Parameters
-    ----------
-    folder : Path
-    file : str
-        A new, plain name without a folder.
-    size : int
-        Announced number of bytes.
-
-    Raises
-    ------
-    SettingError
-        For a name that is taken or not a recording's, or a size out of range.
+    `file` is a new, plain name without a folder, `size` the announced number of bytes. Raises
+    `SettingError` for a name that is taken or not a recording's, or a size out of range.
     """
 
     def __init__(self, folder: Path, file: str, size: int) -> None:
@@ -444,12 +428,8 @@ class Upload:
             )
 
     def add(self, piece: bytes) -> int:
-        """Write the next piece; return the bytes received so far.
-
-        Raises
-        ------
-        SettingError
-            For more bytes than announced, or if it cannot be written; then the file is deleted.
+        """Write the next piece; return the bytes received so far. Raises `SettingError` for more
+        bytes than announced, or if it cannot be written; then the file is deleted.
         """
         self.received += len(piece)
         if self.received > self.size:
@@ -466,12 +446,8 @@ class Upload:
 
     def finish(self) -> str:
         """Give the complete file its name, and return the name.
-
-        Raises
-        ------
-        SettingError
-            For fewer bytes than announced, a name taken meanwhile, or a model, a controller or
-            another file that states its format; then the file is deleted.
+        Raises `SettingError` for fewer bytes than announced, a name taken meanwhile, or a model, a
+        controller or another file that states its format; then the file is deleted.
         """
         from .. import storage
 
@@ -514,12 +490,7 @@ class Upload:
 
 
 def checked_recording_name(file: Any) -> str:
-    """The plain name of an uploaded recording, without a folder.
-
-    Raises
-    ------
-    SettingError
-    """
+    """The plain name of an uploaded recording, without a folder; others raise `SettingError`."""
     fits = (
         isinstance(file, str)
         and file.isprintable()

@@ -131,16 +131,8 @@ def script(
     step: Step, name: str, columns: dict[str, Any], reference: str | None, segment: int | None
 ) -> str:
     """Python that repeats a step, to run in the project folder.
-
-    Parameters
-    ----------
-    step : Step
-    name : str
-        ``look``, ``identify``, ``validate`` or ``bode``.
-    columns : dict
-        Arguments of `sewfast.read`.
-    reference, segment
-        For ``bode``.
+    `name` is ``look``, ``identify``, ``validate`` or ``bode``; `columns` are arguments of
+    `sewfast.read`; `reference` and `segment` are for ``bode``.
     """
     read = ", ".join([repr(step.file), *(f"{k}={v!r}" for k, v in columns.items())])
     lines = ["import sewfast", "", f"data = sewfast.read({read})"]
@@ -264,13 +256,8 @@ def carry_out(
     writing: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> dict[str, Any]:
     """Commission a machine or a drive into the folder `commissioned`; return its result.
-
-    Raises
-    ------
-    Refusal
-        If the evidence is not good enough.
-    SettingError
-        For a folder of that name with other files.
+    Raises `Refusal` if the evidence is not good enough, and `SettingError` for a folder of that
+    name with other files.
     """
     from ..commissioning import commission
     from ..commissioning.result import require_own
@@ -328,19 +315,8 @@ def require_writable(folder: Path) -> None:
 
 def envelope(values: FloatArray, Ts: float, columns: int = COLUMNS) -> dict[str, Any]:
     """A curve to draw: every sample, or the lowest and the highest of each of `columns` pieces.
-
-    Parameters
-    ----------
-    values : (N,) array
-        NaN is a gap.
-    Ts : float
-        Sample time [s].
-    columns : int
-
-    Returns
-    -------
-    dict
-        ``Ts``, ``n`` and ``low``, ``high``: lists of equal length over the whole time.
+    `values` (N,) have NaN for a gap; `Ts` is in seconds. Return ``Ts``, ``n`` and ``low``,
+    ``high``: lists of equal length over the whole time.
     """
     n = len(values)
     if n <= 2 * columns:

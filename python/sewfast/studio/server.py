@@ -178,10 +178,8 @@ class Studio:
     # --- Access -----------------------------------------------------------------------------------
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """A page, a refusal, or None to open the socket.
-
-        The check of the host keeps out foreign names bound to this address, the check of the origin
-        foreign pages in the same browser.
+        """A page, a refusal, or None to open the socket. The check of the host keeps out foreign
+        names bound to this address, the check of the origin foreign pages in the same browser.
         """
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         known = {f"http://{host}" for host in self._hosts}

@@ -35,7 +35,6 @@ MOST_WAITING = 200
 
 class Session:
     """A page that has given its token.
-
     Sending to the page and answering its requests have a thread each, so that a page that no longer
     reads holds up nobody, and a long request of a page does not delay its STOP.
     """
@@ -113,7 +112,6 @@ class Session:
 
 def packed(head: dict[str, Any], curves: Mapping[str, FloatArray]) -> bytes:
     """A message with curves: length of the head, head as JSON, then every curve in float32.
-
     The head's `curves` are names and lengths in order; it is padded so that a browser can map an
     array onto the rest.
     """
@@ -282,11 +280,7 @@ _KINDS: dict[str, type | tuple[type, ...]] = {
 
 def checked(asked: dict[str, Any]) -> dict[str, Any]:
     """The fields of a message, checked against its schema.
-
-    Raises
-    ------
-    SettingError
-        Names the field, the expected and the received value.
+    Raises `SettingError`, which names the field, the expected and the received value.
     """
     name = asked.get("do")
     schema = SCHEMAS.get(name) if isinstance(name, str) else None

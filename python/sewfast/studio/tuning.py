@@ -34,14 +34,7 @@ READABLE_DB = -60.0
 @dataclass(frozen=True)
 class Knob:
     """A setting of the controller with its range.
-
-    Parameters
-    ----------
-    name, unit : str
-    value, low, high : float
-    log : bool
-        Whether the scale is logarithmic.
-    whole : bool
+    `log` says that the scale is logarithmic, `whole` that the value is a whole number.
     """
 
     name: str
@@ -459,18 +452,10 @@ def _word(text: str) -> str:
 
 @dataclass(frozen=True)
 class Search:
-    """How to search for a controller, and what is a good one.
-
-    Parameters
-    ----------
-    evaluations, seed : int
-        As for `sewfast.tune`.
-    seconds : float or None
-        Its `time_budget`; when a search ends by time, its copy is the controller that it found.
-    weights : mapping
-        Fields of `sewfast.Cost` by name.
-    constraints : mapping
-        ``Ms``, ``overshoot`` [%] and ``u`` of `sewfast.Constraints`.
+    """How to search for a controller, and what is a good one. `evaluations` and `seed` are as for
+    `sewfast.tune`, `seconds` is its `time_budget`; when a search ends by time, its copy is the
+    controller that it found. `weights` are fields of `sewfast.Cost` by name; `constraints` are
+    ``Ms``, ``overshoot`` [%] and ``u`` of `sewfast.Constraints`.
     """
 
     evaluations: int
@@ -480,23 +465,13 @@ class Search:
     constraints: Mapping[str, float] = field(default_factory=dict)
 
     def cost(self) -> Cost:
-        """The weights; those that are not given are the defaults.
-
-        Raises
-        ------
-        SettingError
-        """
+        """The weights; those that are not given are the defaults."""
         from ..tuning import Cost
 
         return Cost(**self.weights)
 
     def limits(self) -> Constraints:
-        """The constraints.
-
-        Raises
-        ------
-        SettingError
-        """
+        """The constraints."""
         from ..tuning import Constraints
 
         return Constraints(**self.constraints)
