@@ -1,4 +1,4 @@
-"""A machine without a device is watched by a device's guard: no run passes the stated speed by far."""
+"""A machine without a device is watched by a device's guard and passes no stated speed by far."""
 
 from __future__ import annotations
 

@@ -114,15 +114,13 @@ class Guard:
         self._counts: list[FloatArray] = []
 
     def __call__(self, first: int, u: FloatArray, counts: FloatArray) -> None:
-        """Check samples `first`, `first + 1`, ...
-        Raises `Aborted`.
-        """
+        """Check samples `first`, `first + 1`, ...; raises `Aborted`."""
         self._u.append(u.copy())
         self._counts.append(counts.copy())
         found = self._guard.watch(u, counts)
         if found is None:
             return
-        (after, (reason, value)) = found
+        after, (reason, value) = found
         end = sum(map(len, self._u[:-1])) + after + 1
         all_u, all_counts = (np.concatenate(x)[:end] for x in (self._u, self._counts))
         raise Aborted.after(
