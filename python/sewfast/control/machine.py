@@ -506,9 +506,7 @@ class SteppedBench:
         self, name: str, k: int, speed: float, u: float, rests: bool,
         recording: Callable[[int], Recording],
     ) -> LinkError:  # fmt: skip
-        after = (
-            "it stands now" if rests else f"it still turns {COAST:g} s after the command of rest"
-        )
+        after = "it stands now" if rests else f"it still turns {COAST:g} s after that"
         error = LinkError(
             name=f"{self.name}, {name}", expected=f"at most {self.speed:g} RPM",
             received=f"{speed:.4g} RPM after {k * self.Ts:.3g} s, under {u:.3g} V; rest was "

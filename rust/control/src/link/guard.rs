@@ -38,6 +38,11 @@ const PATIENCE: u64 = 250_000;
 /// Fewest samples of a large command without motion, or between two ways that are not in a row, at long periods.
 const LEAST: u64 = 10;
 
+/// Shorter spans over which a host sees a speed [samples], ...
+const SHORT: [usize; 3] = [4, 2, 1];
+/// ... where it is that far above its limit: a sample that comes a fifth too late is no speed.
+const FAR: f32 = 1.25;
+
 /// Why a run must end, with the value that passed its limit.
 pub type Trip = (Reason, f32);
 
@@ -66,7 +71,16 @@ impl Watch {
     /// The limit that the motion passes.
     pub fn take(&mut self, counts: i32) -> Result<(), Trip> {
         self.guard.take(counts);
-        self.guard.check(&self.limits, f32::NAN)
+        self.guard.check(&self.limits, f32::NAN)?;
+        // A motor that is far too fast is seen before the mean of 8 samples shows it.
+        for span in SHORT {
+            let surely = self.guard.moved(0, span).saturating_abs().saturating_sub(1);
+            let speed = surely as f32 * self.guard.rpm * (WINDOW / span) as f32;
+            if speed > FAR * self.limits.speed {
+                return Err((Reason::Speed, speed));
+            }
+        }
+        Ok(())
     }
 
     /// Takes the command of the sample.
@@ -332,6 +346,11 @@ mod tests {
         let fast = (0..20).position(|k| turning.take(turned(k)).is_err());
         assert_eq!(fast, Some(8));
         assert_eq!(turning.take(turned(9)), Err((Reason::Speed, 1040.0)));
+        // 60 counts in a millisecond are more than 1.25 times that, whatever the steps of the encoder
+        let mut leaping = watch();
+        let leapt =
+            (0..20).position(|k| leaping.take(if k < 5 { 0 } else { 60 * (k - 4) }).is_err());
+        assert_eq!(leapt, Some(5));
         let mut lost = watch();
         let stuck = (0..1000).position(|_| lost.take(7).and_then(|()| lost.sent(15.0)).is_err());
         assert_eq!(stuck, Some(250));
