@@ -351,3 +351,34 @@ def test_the_command_prints_and_writes(tmp_path: Path) -> None:
     assert values["loops"][0]["plants"][0]["margins"]["stable"] is True
     assert all((tmp_path / name).is_file() for name in values["files"])
     assert "none.json" in command(tmp_path, "analyse", "controller.json", "none.json", done=2).err
+
+
+# --- The recorded range, and the limits of tune ---------------------------------------------------
+
+
+def recorded(low: float, high: float) -> LinearOE:
+    core = drive().core
+    record = {"input_range": [[-20.0, 20.0]], "output_range": [low, high]}
+    return LinearOE(core, 0.001, ("u",), "y", ("V",), "RPM", ("counts", 1572.0), record)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "level", "step"),
+    [(-309.0, 300.0, -150.0, 15.45), (0.0, 3000.0, 1500.0, 150.0), (1000.0, 3000.0, 2000.0, 150.0)],
+)
+def test_steps_suit_the_recorded_range(low: float, high: float, level: float, step: float) -> None:
+    found = analyse(QUIET, recorded(low, high), references=["trapezoid"], threads=1)
+    tracked = found.responses[0]
+    assert (tracked.level, tracked.size) == (level, pytest.approx(step))
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(1.0, "ok"), (6.0, "warn"), (30.0, "fail")])
+def test_margins_are_judged_by_the_limits_of_tune(share: float, verdict: str) -> None:
+    gains = replace(QUIET.gains, Kp=share * QUIET.gains.Kp)
+    found = analyse(replace(QUIET, gains=gains), recorded(0.0, 3000.0), references=["trapezoid"])
+    assert found.judgement is not None
+    line = found.judgement.line("margins")
+    assert line.verdict == verdict
+    assert (found.Ms > 2.0) is (verdict != "ok")
+    if verdict == "warn":
+        assert "close to instability" in line.meaning

@@ -141,7 +141,8 @@ def terms(run: ClosedLoopRun) -> dict[str, float]:
 LARGEST_MS = 1.8
 """Limit of Ms if none is given: a gain margin of 2.25 and a phase margin of 32 degrees for sure.
 Without one the search goes as close to instability as calm references allow: to 2.6 to 3.7 with
-seeds 0 to 2 on the linear model of docs/reading-margins.md."""
+seeds 0 to 2 on the linear model of docs/reading-margins.md. Commissioned with it, the virtual
+machine costs 5.72 RPM; with 2 it costs 5.71."""
 
 
 @dataclass(frozen=True)

@@ -115,9 +115,8 @@ class Verdict:
 
     def __str__(self) -> str:
         graded = f"the model is graded {self.model}" if self.model not in ("", "good") else ""
-        return f"{self.grade}: " * bool(graded or self.reasons) + (
-            "; ".join(filter(None, (*self.reasons, graded))) or self.grade
-        )
+        said = "; ".join(filter(None, (*self.reasons, graded)))
+        return f"{self.grade}: {said}" if said else self.grade
 
 
 def model_grade(plants: Sequence[Any]) -> str:
