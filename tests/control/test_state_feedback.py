@@ -106,7 +106,7 @@ def test_a_run_is_the_step_by_step_and_reaches_the_reference(
 ) -> None:
     ideal = replace(controller, counts_per_rev=None)
     r = np.full(3000, 1000.0)
-    found = sewfast.run(ideal, model, r)
+    found = sewfast.run(ideal, model, r, noise=0.0)
     assert abs(found.y[-1] - 1000.0) < 1.0
     core, single = ideal.core(), ideal.core().single()
     u = [core.step(float(x), float(y)) for x, y in zip(found.r, found.y, strict=True)]

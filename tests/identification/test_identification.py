@@ -67,7 +67,7 @@ def test_networks_that_share_their_linear_start_are_those_of_identify() -> None:
         )
         network = train(seed)
         np.testing.assert_array_equal(network.core.theta, alone.core.theta)
-        evidence = {"region", "uncertainty", "information", "verdict", "rest"}
+        evidence = {"region", "uncertainty", "information", "verdict", "rest", "noise"}
         assert set(alone.training) - set(network.training) <= evidence
         assert network.training["cost"] == alone.training["cost"]
         thetas.append(network.core.theta)

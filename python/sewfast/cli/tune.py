@@ -469,7 +469,7 @@ def _show_gains(args: argparse.Namespace, controller: SampledController) -> None
         )
     if controller.counts_per_rev is None and args.start is None:
         print(
-            "feedback: free of noise and of an encoder's steps, as the model knows of none; "
+            "feedback: with the noise that the model's record shows, without an encoder's steps; "
             "--counts-per-rev puts an encoder in the loop"
         )
     if args.plot is not None:
