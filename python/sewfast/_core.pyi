@@ -1004,15 +1004,16 @@ def host_loop(
 
 # --- guard.rs ---------------------------------------------------------------------------------------------
 
+@final
 class Guard:
     """The device's guard for a run on a machine without one: speed [RPM], a motor that stands under a large command of up to
     ``volt``, and a command that swings between the limits ``between`` of a loop. What it sees is a reason (Speed, NoMotion,
     Swinging) with the value that passed its limit [RPM, V, Hz].
     """
 
-    def __init__(
-        self, *, Ts: float, counts_per_rev: float, volt: float, speed: float, between: tuple[float, float] | None = None
-    ) -> None: ...
+    def __new__(
+        cls, *, Ts: float, counts_per_rev: float, volt: float, speed: float, between: tuple[float, float] | None = None
+    ) -> Guard: ...
     def take(self, counts: float) -> tuple[str, float] | None:
         """Takes the counts of a sample, before its command acts."""
 
