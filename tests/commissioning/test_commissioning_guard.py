@@ -1,4 +1,4 @@
-"""A machine without a device is watched by a device's guard and passes no stated speed by far."""
+"""A machine that is not as thought: too fast for its stated speed, or short of what was asked."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ import pytest
 
 from sewfast import Controller, Gains, commission, record, run
 from sewfast.commissioning import SteppedBench
+from sewfast.commissioning.verification import Comparison, unreached
+from sewfast.control.loop import ClosedLoopRun
+from sewfast.dataset import FloatArray
 from sewfast.errors import LinkError
 from sewfast.recording import Recording
 
@@ -106,3 +109,23 @@ def test_a_machine_within_its_speed_is_left_alone() -> None:
     found = record(bench(motor), np.full(1000, 7.0), name="step")
     assert len(found) == 1000
     assert max(motor.speeds) > 0.8 * STATED
+
+
+def run_at(y: FloatArray, u: float = 3.0) -> ClosedLoopRun:
+    pid = Controller(Gains.standard(0.01, 0.1), Ts=TS, u_min=-10.0, u_max=10.0)
+    r = np.concatenate([np.linspace(0.0, 1500.0, 400), np.full(1600, 1500.0)])
+    t = TS * np.arange(len(r))
+    return ClosedLoopRun(t, r, np.full(len(r), u), y, y, pid, "rig", "trapezoid")
+
+
+def test_what_was_predicted_and_missed_is_no_verification() -> None:
+    good = run_at(np.interp(np.arange(2000), [0, 450], [0.0, 1500.0]))
+    short = run_at(np.interp(np.arange(2000), [0, 350], [0.0, 1200.0]))
+    railed = run_at(good.y, u=10.0)
+    assert unreached([Comparison("trapezoid", good, good, ())]) == ""
+    # as predicted, and yet 300 RPM off
+    text = unreached([Comparison("trapezoid", short, short, ())])
+    assert text == "1200 of 1500 RPM on 'trapezoid'"
+    assert "at a limit for 100 %" in unreached([Comparison("trapezoid", good, railed, ())])
+    assert unreached([Comparison("trapezoid", railed, railed, ())]) == ""
+    assert unreached([Comparison("trapezoid", short, None, ())]) == ""

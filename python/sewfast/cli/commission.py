@@ -135,7 +135,7 @@ def _kept(args: argparse.Namespace) -> int | None:
         print_json({"folder": str(args.out), **found.numbers()})
     else:
         print(f"{found}\nlook at {page}")
-    return None
+    return None if found.is_verified else 2
 
 
 def _commissioned(args: argparse.Namespace) -> Commissioning:

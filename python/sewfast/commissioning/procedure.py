@@ -46,12 +46,20 @@ from .gains import (
     sensible,
     start_of,
 )
-from .result import VERIFIED, VERIFIED_POORLY, Commissioning, require_own
+from .result import UNREACHED, VERIFIED, VERIFIED_POORLY, Commissioning, require_own
 from .shaking import margins_at_work
 from .slow import Thinning, turn_load
 from .small_signal import SHAKEN_AT, SmallSignal, small_signal
 from .training import ORDERS, THINNED, Rival, Trained, linear_rival, train
-from .verification import Disagreement, agreeing, judged, measure, predict, require_unsaturated
+from .verification import (
+    Disagreement,
+    agreeing,
+    judged,
+    measure,
+    predict,
+    require_unsaturated,
+    unreached,
+)
 
 __all__ = ["STAGES", "commission"]
 
@@ -163,8 +171,8 @@ def commission(
     Returns
     -------
     Commissioning
-        Its `verdict` is ``verified``, or ``verified, prediction poor`` if the measured cost is
-        more than twice the predicted one.
+        Its `verdict` is ``verified``, ``verified, prediction poor`` if the measured cost is more
+        than twice the predicted one, or ``predicted, target not reached``.
 
     Raises
     ------
@@ -375,6 +383,8 @@ def _carry_out(
         else:
             journal.say(f"the margins could not be measured at {speed:g} RPM")
     journal.finish()
+    if missed := unreached(journal.result(VERIFIED).comparisons):
+        return journal.result(UNREACHED, missed)
     found = journal.result(VERIFIED)
     return replace(found, verdict=VERIFIED_POORLY) if found.is_predicted_poorly else found
 

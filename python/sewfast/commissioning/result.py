@@ -39,6 +39,7 @@ from .training import Rival
 from .verification import Comparison
 
 VERIFIED, VERIFIED_POORLY = "verified", "verified, prediction poor"
+UNREACHED = "predicted, target not reached"
 POOR = 2.0
 """Ratio of measured to predicted cost above which the prediction is poor."""
 
@@ -52,7 +53,8 @@ class Commissioning:
     machine : str
     verdict : str
         ``verified``: run on the machine, which behaved as predicted; ``verified, prediction poor``:
-        the speeds agree with the prediction, but the cost is more than twice as high. ``refused``,
+        the speeds agree with the prediction, but the cost is more than twice as high; ``predicted,
+        target not reached``: as predicted, but off a held level, or longer at a limit. ``refused``,
         ``interrupted``: ended at `stage`; it holds the results until then, the rest is None or
         empty.
     stage, reason : str
@@ -136,7 +138,7 @@ class Commissioning:
 
     @property
     def is_verified(self) -> bool:
-        """Whether the machine behaved as predicted."""
+        """Whether the machine behaved as predicted and reached what was asked for."""
         return self.verdict in (VERIFIED, VERIFIED_POORLY)
 
     @property

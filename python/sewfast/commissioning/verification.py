@@ -277,6 +277,39 @@ class Watching:
         )  # fmt: skip
 
 
+def unreached(comparisons: Sequence[Comparison]) -> str:
+    """What the machine did not reach although it did what was predicted; empty if nothing.
+
+    A level that a reference holds for a tenth of its length must be met, in the mean over the
+    second half of the hold, within `APART` of the reference's span, and the command must be at a
+    limit no longer than predicted.
+    """
+    said = []
+    for c in comparisons:
+        alike = c.alike
+        if alike is None:
+            continue
+        for level, hold in _holds(c.predicted.r):
+            mean = float(np.nanmean(alike.y[hold]))
+            if abs(mean - level) > APART * c.span:
+                said.append(f"{mean:.4g} of {level:.4g} RPM on {c.reference!r}")
+        limits = [(x.metrics()["saturated"] or 0.0) for x in (c.predicted, alike)]
+        if limits[1] > limits[0] + APART:
+            said.append(
+                f"the command was at a limit for {100 * limits[1]:.0f} % of {c.reference!r}, "
+                f"{100 * limits[0]:.0f} % predicted"
+            )
+    return "; ".join(said)
+
+
+def _holds(r: FloatArray) -> list[tuple[float, slice]]:
+    """Levels held for a tenth of a reference, each with the second half of its hold."""
+    edges = np.flatnonzero(np.diff(r, prepend=np.nan, append=np.nan) != 0.0)
+    pairs = zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+    long = [(a, b) for a, b in pairs if b - a >= max(2.0, 0.1 * len(r))]
+    return [(float(r[a]), slice((a + b) // 2, b)) for a, b in long]
+
+
 def judged(predicted: tuple[Comparison, ...], ensemble: Ensemble) -> Judgement:
     """Verdicts on the loops: of the first member on every reference, of all on the shortest.
     That all members agree on all references has been checked before.
