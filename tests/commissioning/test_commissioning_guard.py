@@ -129,3 +129,29 @@ def test_what_was_predicted_and_missed_is_no_verification() -> None:
     assert "at a limit for 100 %" in unreached([Comparison("trapezoid", good, railed, ())])
     assert unreached([Comparison("trapezoid", railed, railed, ())]) == ""
     assert unreached([Comparison("trapezoid", short, None, ())]) == ""
+
+
+@pytest.mark.parametrize(
+    ("per_turn", "scale"),
+    [(6.0, 1.0), (1.0, 0.0), (2.0 * math.pi, 0.0)],
+    ids=["hall", "turns", "rad"],
+)
+def test_coarse_steps_and_counts_that_are_none_trip_nothing(per_turn: float, scale: float) -> None:
+    class Sensor(Motor):
+        @property
+        def counts(self) -> float:
+            counted = per_turn * self.angle
+            return math.floor(counted) if scale else counted
+
+    motor = Sensor()
+    rig = SteppedBench(motor, Ts=TS, counts_per_rev=per_turn, volt=10.0, speed=STATED)
+    found = record(rig, np.full(1500, 6.0), name="step")
+    assert len(found) == 1500
+    assert max(motor.speeds) > 0.7 * STATED
+
+
+def test_a_machine_that_states_just_what_training_needs_is_not_tripped() -> None:
+    motor = Motor(gain=300.0)
+    rig = SteppedBench(motor, Ts=TS, counts_per_rev=4096, volt=10.0, speed=1250.0)
+    commission(rig, speed=1000, members=1, evaluations=60)
+    assert max(motor.speeds) < 1250.0

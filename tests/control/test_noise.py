@@ -15,6 +15,7 @@ from sewfast.control.controller import Controller
 from sewfast.control.loop import run
 from sewfast.errors import ModelFileError, SettingError
 from sewfast.models import Ensemble
+from sewfast.trust import judge
 from sewfast.tuning import tune
 
 TS = 0.01
@@ -111,3 +112,8 @@ def test_noise_below_zero_is_refused(tmp_path: Path) -> None:
         run(pid(), noisy(1.0), np.ones(10), noise=-1.0)
     with pytest.raises(SettingError, match="noise"):
         run(pid(), VirtualMachine(), np.ones(10), noise=1.0)
+
+
+def test_noise_is_no_oscillation() -> None:
+    found = judge(pid(), noisy(5.0))
+    assert [line.verdict for line in found.lines if line.name == "limit cycle"] == ["ok"]

@@ -217,3 +217,20 @@ def test_the_command_refuses_unfit_gains_unless_it_is_forced(tmp_path: Path) -> 
     free = sewfast(tmp_path, *usual, "--constraint", "Ms=inf", "-o", "free.json").out
     assert "Ms not limited" in free
     assert "within    Ms <= 1.8" in sewfast(tmp_path, *usual, "-o", "usual.json").out
+
+
+@pytest.mark.parametrize("level", [30.0, 80.0, 90.0])
+def test_full_power_on_the_way_to_a_step_is_no_limit_without_need(level: float) -> None:
+    pole = math.exp(-10.0 / 1000.0)
+    heater = LinearOE.from_tf([0.0, 100.0 * (1.0 - pole)], [1.0, -pole], 10.0)
+    pid = Controller(Gains.standard(0.2, 400.0), Ts=10.0, u_min=0.0, u_max=1.0)
+    found = run(pid, heater, np.full(600, level))
+    assert abs(found.y[-1] - level) < 0.1
+    assert _at_limit(found, heater) < 0.1
+
+
+def test_gains_are_no_better_than_an_ensemble() -> None:
+    members = [LinearOE.from_tf([0.0, 0.5], [1.0, pole], 0.01) for pole in (-0.95, -0.94)]
+    known = {"input_range": [[-3.0, 3.0]], "output_range": [-20.0, 20.0]}
+    poor = Ensemble.of(members, training={**known, "verdict": {"grade": "poor"}})
+    assert tune(poor, evaluations=30, threads=1).verdict.grade == "poor"

@@ -135,8 +135,8 @@ def _speeds(plants: Sequence[Plant]) -> list[float]:
         levels = [rest + 0.5 * ways[0], *levels] if len(shares) > 1 else levels
     else:
         levels = [low + share * (high - low) for share in shares]
-    # two digits are enough for a default
-    return [float(f"{level:.2g}") for level in levels]
+    # two digits of the way from rest are enough for a default
+    return [rest + float(f"{level - rest:.2g}") for level in levels]
 
 
 def recorded_way(plants: Sequence[Plant]) -> float | None:

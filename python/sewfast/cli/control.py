@@ -113,7 +113,10 @@ def run_command(args: argparse.Namespace) -> int | None:
             return None
         plant = plant_of(args.on)
         reference = _wanted(args, controller)
-        _show_run(args, run(controller, plant, reference, name=name), None, plant)
+        found = run(controller, plant, reference, name=name)
+        # noise is no oscillation, so that a run without it is judged
+        calm = run(controller, plant, reference, noise=0.0, name=name)
+        _show_run(args, found, None, plant, calm)
         return None
     place = recording_place(args.out, overwrite=args.overwrite)
     reference = _wanted(args, controller)
@@ -158,14 +161,15 @@ def _settle_plant(args: argparse.Namespace) -> None:
 
 
 def _show_run(
-    args: argparse.Namespace, found: ClosedLoopRun, place: Path | None, plant: Plant | None = None
-) -> None:
+    args: argparse.Namespace, found: ClosedLoopRun, place: Path | None,
+    plant: Plant | None = None, calm: ClosedLoopRun | None = None,
+) -> None:  # fmt: skip
     """Write the columns, unless `place` already has those of a drive, and print a summary."""
     from ..models import Model
     from ..trust import judge
 
     # a model knows the region that it was trained in
-    warnings = judge(found, plant if isinstance(plant, Model) else None).warnings
+    warnings = judge(calm or found, plant if isinstance(plant, Model) else None).warnings
     summary: dict[str, Any] = {"plant": found.plant, "reference": found.reference}
     summary |= {"unit": found.units["y"], "n": len(found.t), "Ts": found.Ts, **found.metrics()}
     summary["warnings"] = [line.to_json() for line in warnings]

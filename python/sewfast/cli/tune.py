@@ -242,7 +242,11 @@ def tune_command(args: argparse.Namespace) -> int | None:
             _show_front(args, front)
     except Interrupted as e:
         getattr(e.best, "picked", e.best).save(args.out)
-        print(f"interrupted; kept the best so far in {args.out}", file=sys.stderr)
+        print(
+            f"interrupted; kept the best so far in {args.out}, which nobody has judged: look at "
+            f"its margins first ({suggested('analyse', args.out, args.model[0])})",
+            file=sys.stderr,
+        )
         return 130
     return None
 

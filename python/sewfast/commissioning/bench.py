@@ -230,7 +230,7 @@ class RecordedBench(MachineWrapper):
         if recording is None:
             recording = self.inner.excite(u, name)
             require_record(self.inner, name, len(u), recording)
-            self._require_speed(name, recording)
+            self._require_speed(name, key, recording)
         self.note(name, key, recording, None)
         return recording
 
@@ -249,11 +249,14 @@ class RecordedBench(MachineWrapper):
 
             try:
                 found = super().follow(controller, r, name, watch=both)
-            except Aborted as stop:
+            except (Aborted, LinkError) as stop:
                 # under another name, so that a resumed commissioning repeats the run
-                self.note(f"{name}{ABORTED}", key, stop.recording, None)
+                if isinstance(stop.recording, Recording):
+                    self.note(f"{name}{ABORTED}", key, stop.recording, None)
                 raise
             _require_run(self.inner, name, len(r), found)
+            # nobody has watched a machine without a watch, nor the last samples of another
+            self._require_speed(name, key, found.recording)
         self.note(name, key, found.recording, found)
         return found
 
@@ -262,19 +265,22 @@ class RecordedBench(MachineWrapper):
         """The speed that the machine must not pass [RPM]; a drive's device watches its own."""
         return math.inf if isinstance(self.inner, DriveBench) else self.inner.speed
 
-    def _require_speed(self, name: str, recording: Recording) -> None:
-        """Refuse an excitation, which nobody could interrupt, that was faster than stated."""
+    def _require_speed(self, name: str, key: str, recording: Recording) -> None:
+        """Refuse a run that was faster than stated."""
         guard = _core.Guard(
             Ts=self.Ts, counts_per_rev=self.counts_per_rev, volt=math.inf, speed=self._stated
         )
         found = guard.watch(recording.u, recording.counts)
-        if found is not None:
-            k, (reason, value) = found
-            raise Aborted(
-                f"{name!r}, {k * self.Ts:.3g} s after its start: "
-                + _SEEN[reason].format(limit=self._stated, value=value),
-                replace(recording, name=f"{name}{ABORTED}"),
-            )
+        if found is None:
+            return
+        k, (reason, value) = found
+        aborted = replace(recording, name=f"{name}{ABORTED}")
+        self.note(aborted.name, key, aborted, None)
+        raise Aborted(
+            f"{name!r}, {k * self.Ts:.3g} s after its start: "
+            + _SEEN[reason].format(limit=self._stated, value=value),
+            aborted,
+        )
 
 
 def require_record(machine: Machine, name: str, samples: int, found: object) -> None:

@@ -534,9 +534,11 @@ def each_reference(references: Any, default: Sequence[str]) -> list[Any]:
 def trial(
     controller: SampledController, plant: Plant, reference: Any, title: str, seed: int = 0
 ) -> ClosedLoopRun:
-    """A run under the plant's title. If the loop diverges, the `FitError` names the plant."""
+    """A run without noise, which is no oscillation, under the plant's title. If the loop diverges,
+    the `FitError` names the plant.
+    """
     try:
-        return replace(run(controller, plant, reference, seed=seed), plant=title)
+        return replace(run(controller, plant, reference, noise=0.0, seed=seed), plant=title)
     except FitError as e:
         named = reference if isinstance(reference, str) else "reference"
         raise FitError(

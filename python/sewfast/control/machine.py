@@ -365,7 +365,7 @@ COAST = 5.0
 """Longest wait for rest after a machine has been too fast [s]."""
 TOO_FAST = (
     "look for a load that drives it, a turned sign of command or encoder, a gain larger than "
-    "recorded, wrong counts_per_rev"
+    "recorded, wrong counts_per_rev, a counter that wraps"
 )
 """What to do about a machine that is faster than stated: never a higher limit."""
 

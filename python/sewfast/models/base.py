@@ -241,7 +241,7 @@ COMBINATIONS: tuple[Combine, ...] = ("median", "mean")
 MOST_MEMBERS = 1000
 LEAST_SHARE = 0.5
 """Part of the members that must not diverge for the ensemble to have a run."""
-_OF_ALL_MEMBERS = ("input_range", "output_range", "region", "rest", "noise")
+_OF_ALL_MEMBERS = ("input_range", "output_range", "region", "rest", "noise", "verdict")
 """Entries that a file stores once for all members."""
 
 

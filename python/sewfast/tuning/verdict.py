@@ -139,7 +139,10 @@ def verdict_of(
     `others` are the objections known otherwise.
     """
     found = [*others, *_of_loops(task, controller, limit)]
-    if not time.over("the runs for the verdict"):
+    if time.over("the runs for the verdict"):
+        text = "the time budget left no time to run the references on the models"
+        found.append(Objection("fair", text, "give more time, or run them (sewfast run)"))
+    else:
         found += _of_runs(task, controller)
     found.sort(key=lambda o: GRADES.index(o.grade))
     return Verdict(tuple(found), model_grade(task.plants))
@@ -220,6 +223,7 @@ def _of_runs(task: TuningTask, controller: SampledController) -> list[Objection]
 
 def _at_limit(found: ClosedLoopRun, model: Model) -> float:
     """Share of samples at a limit among those at which the reference needs no limit.
+
     0 if these are less than half of the reference, or if it is not known what it needs.
     """
     c = found.controller
@@ -237,16 +241,21 @@ def _at_limit(found: ClosedLoopRun, model: Model) -> float:
 
 
 def command_for(model: Model, r: FloatArray, u_min: float, u_max: float) -> FloatArray:
-    """The command with which a first-order model of the step response follows a reference [u]:
-    `(r + T dr/dt - offset)/K` without the dead time; for a model that integrates, the same of the
-    reference's rate. Raises `FitError` or `SettingError` if no step of the model settles.
+    """The command [u] with which a first-order model of the step response follows `r` [y], as fast
+    as the limits allow, from rest and without the dead time; for a model that integrates, the same
+    of the reference's rate. Raises `FitError` or `SettingError` if no step of the model settles.
     """
     moving = rate_step(model, u_min, u_max)
     step = drive_step(model, u_min, u_max) if moving is None else moving
-    followed = r if moving is None else np.diff(r, append=r[-1:]) / model.Ts
-    slope = np.diff(followed, append=followed[-1:]) / model.Ts
-    fopdt = step.fopdt
-    needed: FloatArray = (followed + fopdt.T * slope - fopdt.offset) / fopdt.K
+    fopdt, Ts = step.fopdt, model.Ts
+    followed = r if moving is None else np.diff(r, append=r[-1:]) / Ts
+    stays = math.exp(-Ts / fopdt.T) if fopdt.T > 0.0 else 0.0
+    needed = np.empty(len(followed))
+    y = model.rest.y if moving is None else 0.0
+    for k, wanted in enumerate(followed.tolist()):
+        level = (wanted - stays * y) / (1.0 - stays)
+        needed[k] = u = min(max((level - fopdt.offset) / fopdt.K, u_min), u_max)
+        y = stays * y + (1.0 - stays) * (fopdt.K * u + fopdt.offset)
     return needed
 
 

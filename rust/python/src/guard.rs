@@ -10,6 +10,10 @@ use crate::seam::slice;
 #[pyclass(module = "sewfast._core")]
 pub struct Guard {
     watch: Watch,
+    /// A power of two.
+    scale: f64,
+    /// All counts so far were whole: they are those of an encoder with steps.
+    whole: bool,
 }
 
 /// The name of a reason, and the value that passed its limit.
@@ -19,9 +23,16 @@ fn seen((reason, value): Trip) -> Seen {
     (format!("{reason:?}"), value.into())
 }
 
-/// As a counter of 32 bits that wraps, like a device's.
-fn counter(counts: f64) -> i32 {
-    counts as i64 as i32
+/// Counts that a turn has at least: what counts turns or radians is no counter of whole steps.
+const FINE: f64 = 4096.0;
+
+impl Guard {
+    /// As a counter of 32 bits that wraps, like a device's, with its step.
+    fn counter(&mut self, counts: f64) -> (i32, u32) {
+        self.whole &= counts.fract() == 0.0;
+        let step = if self.whole { self.scale } else { 1.0 };
+        ((counts * self.scale).floor() as i64 as i32, step as u32)
+    }
 }
 
 #[pymethods]
@@ -43,13 +54,18 @@ impl Guard {
             current: f32::INFINITY,
         };
         let between = between.map(|(low, high)| (low as f32, high as f32));
+        let scale = (FINE / counts_per_rev).log2().ceil().max(0.0).exp2();
+        let counts_per_rev = scale * counts_per_rev;
         Self {
             watch: Watch::new(Ts as f32, counts_per_rev as f32, limits, between),
+            scale,
+            whole: true,
         }
     }
 
     fn take(&mut self, counts: f64) -> Option<Seen> {
-        self.watch.take(counter(counts)).err().map(seen)
+        let (counts, step) = self.counter(counts);
+        self.watch.take_on_time(counts, step).err().map(seen)
     }
 
     fn watch(
@@ -61,11 +77,13 @@ impl Guard {
         for (k, (u, counts)) in u.iter().zip(counts).enumerate() {
             // a sample that a link has lost
             if !(u.is_finite() && counts.is_finite()) {
+                self.watch.forget();
                 continue;
             }
+            let (counts, step) = self.counter(*counts);
             let passed = self
                 .watch
-                .take(counter(*counts))
+                .take(counts, step)
                 .and_then(|()| self.watch.sent(*u as f32));
             if let Err(trip) = passed {
                 return Ok(Some((k, seen(trip))));

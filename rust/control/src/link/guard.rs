@@ -35,12 +35,12 @@ const HISTORY: usize = 32;
 const STANDSTILL: u64 = 100_000;
 /// A large command may stay without motion for this long \[us\].
 const PATIENCE: u64 = 250_000;
-/// Fewest samples of a large command without motion, or between two ways that are not in a row, at long periods.
+/// Fewest samples, for a host, of a large command without motion, or between two ways that are not in a row.
 const LEAST: u64 = 10;
 
 /// Shorter spans over which a host sees a speed [samples], ...
 const SHORT: [usize; 3] = [4, 2, 1];
-/// ... where it is that far above its limit: a sample that comes a fifth too late is no speed.
+/// ... where it is that far above its limit.
 const FAR: f32 = 1.25;
 
 /// Why a run must end, with the value that passed its limit.
@@ -58,29 +58,49 @@ impl Watch {
     /// A guard for a sample time \[s\]; `between` are the limits of a loop's command, which must not swing from one to the other.
     pub fn new(ts: f32, counts_per_rev: f32, limits: Limits, between: Option<(f32, f32)>) -> Self {
         let period = (ts * 1e6) as u32;
+        let mut guard = Guard::new(period, ts, counts_per_rev);
+        guard.least = LEAST.saturating_mul(guard.period);
         Self {
-            guard: Guard::new(period, ts, counts_per_rev),
+            guard,
             limits,
             between,
         }
     }
 
-    /// Takes the counts of a sample, read before its command acts; a counter may wrap.
+    /// Takes the counts of a sample, read before its command acts, which are wrong by less than `step`; a counter may wrap.
     ///
     /// # Errors
-    /// The limit that the motion passes.
-    pub fn take(&mut self, counts: i32) -> Result<(), Trip> {
+    /// A mean speed over 8 samples that is above its limit whatever the steps of the encoder.
+    pub fn take(&mut self, counts: i32, step: u32) -> Result<(), Trip> {
         self.guard.take(counts);
-        self.guard.check(&self.limits, f32::NAN)?;
-        // A motor that is far too fast is seen before the mean of 8 samples shows it.
-        for span in SHORT {
-            let surely = self.guard.moved(0, span).saturating_abs().saturating_sub(1);
-            let speed = surely as f32 * self.guard.rpm * (WINDOW / span) as f32;
-            if speed > FAR * self.limits.speed {
-                return Err((Reason::Speed, speed));
-            }
+        self.is_within(WINDOW, step, self.limits.speed)
+    }
+
+    /// The same of a machine whose samples come on time to the bit: one that is far too fast is seen within a sample or two.
+    ///
+    /// # Errors
+    /// As [`take`](Self::take), and a speed over 4, 2 or 1 samples that is far above its limit.
+    pub fn take_on_time(&mut self, counts: i32, step: u32) -> Result<(), Trip> {
+        self.take(counts, step)?;
+        let far = FAR * self.limits.speed;
+        SHORT
+            .iter()
+            .try_for_each(|&span| self.is_within(span, step, far))
+    }
+
+    fn is_within(&self, span: usize, step: u32, limit: f32) -> Result<(), Trip> {
+        let moved = self.guard.moved(0, span).saturating_abs();
+        let surely = moved.saturating_sub(step.into());
+        let speed = surely as f32 * self.guard.rpm * (WINDOW / span) as f32;
+        if speed > limit {
+            return Err((Reason::Speed, speed));
         }
         Ok(())
+    }
+
+    /// The next counts are the first ones, as after lost samples.
+    pub fn forget(&mut self) {
+        self.guard.forget();
     }
 
     /// Takes the command of the sample.
@@ -125,6 +145,8 @@ pub(super) struct Guard {
     /// Samples since the last of them, and since the first.
     since: u32,
     swinging: u32,
+    /// Shortest patience of a host \[us\]; 0 on a device.
+    least: u64,
 }
 
 impl Guard {
@@ -143,6 +165,7 @@ impl Guard {
             swings: 0,
             since: 0,
             swinging: 0,
+            least: 0,
         }
     }
 
@@ -274,7 +297,7 @@ impl Guard {
         }
         let first = self.side == 0;
         self.side = side;
-        let in_row = u64::from(self.since).saturating_mul(self.period) <= self.at_least(SWING);
+        let in_row = u64::from(self.since).saturating_mul(self.period) <= SWING.max(self.least);
         if first || !in_row || self.swings == 0 {
             (self.swings, self.swinging) = (u32::from(!first), 0);
         } else {
@@ -298,15 +321,10 @@ impl Guard {
         } else {
             0
         };
-        if u64::from(self.stuck).saturating_mul(self.period) > self.at_least(PATIENCE) {
+        if u64::from(self.stuck).saturating_mul(self.period) > PATIENCE.max(self.least) {
             return Err((Reason::NoMotion, u));
         }
         Ok(())
-    }
-
-    /// A time \[us\], or that of the fewest samples.
-    fn at_least(&self, time: u64) -> u64 {
-        time.max(LEAST.saturating_mul(self.period))
     }
 }
 
@@ -340,26 +358,33 @@ mod tests {
             ..FREE
         };
         let watch = || Watch::new(1e-3, 1500.0, limits, Some((-20.0, 20.0)));
-        // 25 counts a millisecond are 1000 RPM, and a counter may wrap
+        // 25 counts a millisecond are 1000 RPM, of 200 counts one is the encoder's step, and a counter may wrap
         let mut turning = watch();
         let turned = |k: i32| (i32::MAX - 200).wrapping_add(26 * k);
-        let fast = (0..20).position(|k| turning.take(turned(k)).is_err());
+        let fast = (0..20).position(|k| turning.take(turned(k), 1).is_err());
         assert_eq!(fast, Some(8));
-        let said = turning.take(turned(9)).err();
-        assert!(said.is_some_and(|(why, rpm)| why == Reason::Speed && (rpm - 1040.0).abs() < 0.01));
-        // 60 counts in a millisecond are more than 1.25 times that, whatever the steps of the encoder
-        let mut leaping = watch();
-        let leapt =
-            (0..20).position(|k| leaping.take(if k < 5 { 0 } else { 60 * (k - 4) }).is_err());
-        assert_eq!(leapt, Some(5));
+        let said = turning.take(turned(9), 1).err();
+        assert!(said.is_some_and(|(why, rpm)| why == Reason::Speed && (rpm - 1035.0).abs() < 0.01));
+        // 60 counts in a millisecond are far more, which exact samples show at once, and others in their mean
+        let leaps = |k: i32| if k < 5 { 0 } else { 60 * (k - 4) };
+        let (mut exact, mut late) = (watch(), watch());
+        let position = (0..20).position(|k| exact.take_on_time(leaps(k), 1).is_err());
+        assert_eq!(position, Some(5));
+        let position = (0..20).position(|k| late.take(leaps(k), 1).is_err());
+        assert_eq!(position, Some(8));
+        late.forget();
+        assert_eq!(late.take(9000, 1), Ok(()));
+        // one step of a sensor with 6 steps a turn is 1,250 RPM in 8 samples of a millisecond
+        let mut coarse = Watch::new(1e-3, 6.0, limits, None);
+        assert!((0..2000).all(|k| coarse.take(k / 12, 1).is_ok()));
         let mut lost = watch();
-        let stuck = (0..1000).position(|_| lost.take(7).and_then(|()| lost.sent(15.0)).is_err());
+        let stuck = (0..1000).position(|_| lost.take(7, 1).and_then(|()| lost.sent(15.0)).is_err());
         assert_eq!(stuck, Some(250));
         assert!(lost.at_rest());
         let mut swings = watch();
         let ended = (0..1000).find_map(|k| {
             let seen = swings
-                .take(k)
+                .take(k, 1)
                 .and_then(|()| swings.sent(if k % 40 < 20 { 20.0 } else { -20.0 }));
             seen.err()
         });
@@ -367,7 +392,7 @@ mod tests {
         assert!(ended.is_some_and(|(_, hertz)| (hertz - 25.0).abs() < 1.0));
         // at a period of a second ten samples pass before a motor is said to stand
         let mut slow = Watch::new(1.0, 1500.0, limits, None);
-        let stuck = (0..100).position(|_| slow.take(7).and_then(|()| slow.sent(15.0)).is_err());
+        let stuck = (0..100).position(|_| slow.take(7, 1).and_then(|()| slow.sent(15.0)).is_err());
         assert_eq!(stuck, Some(10));
     }
 
