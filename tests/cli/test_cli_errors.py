@@ -432,7 +432,7 @@ def _start_up(folder: Path) -> float:
 def _wait_until_busy(process: subprocess.Popen[str], start_up: float) -> None:
     """Wait until it has had far more of the processor than start-up takes."""
     began = time.monotonic()
-    while _used(process, began) < 2.0 * start_up + 0.5:
+    while _used(process, began) < 4.0 * start_up + 1.0:
         time.sleep(0.1)
         assert process.poll() is None, process.communicate()
 
