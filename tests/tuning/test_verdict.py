@@ -21,6 +21,8 @@ from sewfast.machine import VirtualMachine
 from sewfast.models import Ensemble, LinearOE, Model
 from sewfast.tuning import tune
 from sewfast.tuning.objective import LARGEST_MS, Constraints
+from sewfast.tuning.robustness import _levels
+from sewfast.tuning.task import TuningTask
 from sewfast.tuning.verdict import GRADES, Objection, Verdict, _at_limit, command_for
 
 SHORT = signals.reference("trapezoid")[:900]
@@ -234,3 +236,12 @@ def test_gains_are_no_better_than_an_ensemble() -> None:
     known = {"input_range": [[-3.0, 3.0]], "output_range": [-20.0, 20.0]}
     poor = Ensemble.of(members, training={**known, "verdict": {"grade": "poor"}})
     assert tune(poor, evaluations=30, threads=1).verdict.grade == "poor"
+
+
+def test_levels_of_both_directions_leave_out_the_standstill() -> None:
+    task = TuningTask.of(
+        drive(), [np.array([-1000.0, 1500.0])], start=QUIET, first={}, cost=None,
+        aggregate="mean", constraints=None, variations=None,
+    )  # fmt: skip
+    assert _levels(task) == [750.0, -500.0]
+    assert _levels(replace(task, references=[np.array([400.0, 1000.0])])) == [700.0, 500.0, 200.0]

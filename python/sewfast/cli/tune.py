@@ -157,8 +157,8 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--speed", type=float, metavar="Y",
-        help="output about which models are linearised for Ms (middle of the references, half way "
-        "to their ends)",
+        help="output about which models are linearised for Ms (half way from rest to the ends of "
+        "the references)",
     )  # fmt: skip
     parser.add_argument(
         "--load", action="append", metavar="LEVEL:COMMAND",

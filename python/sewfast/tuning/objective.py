@@ -174,8 +174,8 @@ class Constraints:
         one of these counts with its bands: Ms is the largest that they allow. By default the models
         used for tuning.
     speed : float, optional
-        Output at which nonlinear models are linearised [y]; by default the middle of the references
-        and half way to their ends.
+        Output at which nonlinear models are linearised [y]; by default half way from rest to the
+        ends of the references.
 
     Raises
     ------

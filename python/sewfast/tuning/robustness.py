@@ -20,6 +20,10 @@ HAIR = 1.001
 """Share above which an Ms exceeds a limit: rounding in the search for its frequency."""
 
 
+ROUNDING = 1e-6
+"""Distance from 1 of the pole of an integrator."""
+
+
 @dataclass(frozen=True, eq=False)
 class LinearLoops:
     """The linear plants of a search.
@@ -76,10 +80,10 @@ class LinearLoops:
 
 def linear_loops(task: TuningTask, time: Budget) -> LinearLoops:
     """The linear plants of a task, from the plants of its constraints or else its models.
-    A nonlinear model is linearised in the middle of the references and half way to their ends, as a
-    motor stands in its dry friction in the middle of references of both signs; with a gain schedule
-    also at its points; with a speed in the constraints only there. Levels at which a model has no
-    steady state are left out. Raises `SettingError` for measured responses without a linear plant.
+    A nonlinear model is linearised half way from rest to the ends of the references; with a gain
+    schedule also at its points; with a speed in the constraints only there. Levels at which a model
+    has no stable steady state are left out: the plant stands there, one network of many does not.
+    Raises `SettingError` for measured responses without a linear plant.
     """
     controller, given = task.start, task.constraints.plant
     if not isinstance(controller, Controller):
@@ -128,6 +132,8 @@ def _of(
             break
         try:
             point = operating_point(plant, level)
+            if max(abs(point.poles), default=0.0) > 1.0 + ROUNDING:
+                continue
             margins(controller, point, speed=level)  # refuses a standstill, where nothing answers
             points.append((point, level))
         except (SettingError, FitError) as error:
@@ -142,12 +148,14 @@ def _of(
 
 
 def _levels(task: TuningTask) -> list[float]:
-    """The middle of the references, and half way from rest to their ends [y]."""
+    """Half way from rest to the ends of the references [y]; their middle, too, unless rest is among
+    them: about rest a motor stands in its dry friction, and a loop there tells nothing.
+    """
     low = min(float(r.min()) for r in task.references)
     high = max(float(r.max()) for r in task.references)
     rest = task.rest.y
     halves = [rest + 0.5 * (end - rest) for end in (high, low) if end != rest]
-    return list(dict.fromkeys([0.5 * (low + high), *halves]))
+    return halves if low <= rest <= high else list(dict.fromkeys([0.5 * (low + high), *halves]))
 
 
 def within_default(task: TuningTask) -> Iterator[TuningTask]:
