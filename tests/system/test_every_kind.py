@@ -31,18 +31,16 @@ CONTROLLER = Controller(
 )  # fmt: skip
 REFERENCE = np.repeat([0.0, 2.0, 4.0, 1.0], 60)
 every_kind = pytest.mark.parametrize("name", CASES)
+BY_DAY = [
+    "oe",
+    "hammerstein_wiener",
+    "grey_box",
+    "neural_oe",
+    "neural_ss, two inputs",
+    "ensemble of mixed kinds",
+]
 one_of_each = pytest.mark.nightly(
-    "the same for every kind",
-    by_day=[
-        "oe",
-        "hammerstein_wiener",
-        "grey_box",
-        "neural_oe",
-        "neural_ss, integrator",
-        "neural_ss, two inputs",
-        "ensemble of mixed kinds",
-        "ensemble, no delay",
-    ],
+    "the same for every kind", by_day=[*BY_DAY, "neural_ss, integrator", "ensemble, no delay"]
 )
 
 
@@ -58,18 +56,7 @@ def refusal(model: Model) -> str | None:
     return late if any(m.orders["nk"] == 0 for m in singles(model)) else None
 
 
-@pytest.mark.nightly(
-    "the same for every kind",
-    by_day=[
-        "oe",
-        "hammerstein_wiener",
-        "grey_box",
-        "neural_oe",
-        "neural_ss, two inputs",
-        "ensemble of mixed kinds",
-        "oe without evidence",
-    ],
-)
+@pytest.mark.nightly("the same for every kind", by_day=[*BY_DAY, "oe without evidence"])
 @every_kind
 def test_check_gives_a_card(name: str) -> None:
     model = model_of(name)

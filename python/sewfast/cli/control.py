@@ -95,7 +95,7 @@ def add(commands: Commands) -> None:
 def run_command(args: argparse.Namespace) -> int | None:
     from ..commissioning.fmu import is_fmu
     from ..control.files import load_controller, load_pid
-    from ..control.loop import run
+    from ..control.loop import noise_in_loop, run
 
     _settle_plant(args)
     require_plot(args.plot)
@@ -114,8 +114,10 @@ def run_command(args: argparse.Namespace) -> int | None:
         plant = plant_of(args.on)
         reference = _wanted(args, controller)
         found = run(controller, plant, reference, name=name)
-        # noise is no oscillation, so that a run without it is judged
-        calm = run(controller, plant, reference, noise=0.0, name=name)
+        calm = None
+        if noise_in_loop(controller, plant) > 0.0:
+            # noise is no oscillation, so that a run without it is judged
+            calm = run(controller, plant, reference, noise=0.0, name=name)
         _show_run(args, found, None, plant, calm)
         return None
     place = recording_place(args.out, overwrite=args.overwrite)

@@ -295,13 +295,18 @@ def unreached(comparisons: Sequence[Comparison]) -> str:
                 said.append(f"{mean:.4g} of {level:.4g} RPM on {c.reference!r}")
         # the median of the members' commands is at a limit only where most of them are
         runs = (alike, c.predicted, *c.members)
-        limit, *expected = ((x.metrics()["saturated"] or 0.0) for x in runs)
+        limit, *expected = map(_at_limit, runs)
         if limit > max(expected) + APART:
             said.append(
                 f"the command was at a limit for {100 * limit:.0f} % of {c.reference!r}, "
                 f"{100 * max(expected):.0f} % predicted"
             )
     return "; ".join(said)
+
+
+def _at_limit(found: ClosedLoopRun) -> float:
+    """Share of samples at a limit of the command."""
+    return found.metrics()["saturated"] or 0.0
 
 
 def _holds(r: FloatArray) -> list[tuple[float, slice]]:
@@ -337,7 +342,7 @@ def require_alike(c: Comparison) -> None:
 
 def require_unsaturated(found: ClosedLoopRun) -> None:
     """Raise `Refusal` for a loop that is at the limit of its command for too long."""
-    saturated = found.metrics()["saturated"] or 0.0
+    saturated = _at_limit(found)
     require(
         saturated <= SATURATED,
         f"expected the command within its limits most of the time on {found.reference!r}, it was "

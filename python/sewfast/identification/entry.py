@@ -27,9 +27,8 @@ from ..progress import shown_in_notebooks
 from ..threads import Workers, available, require_workers
 from . import choice, further, grey_box, lagged, linear
 from .folds import TEXTS, UNSEEN_DATA, Split, thinned, unstable_verdict, verdict
-from .noise import with_noise
 from .outputs import OUTPUTS
-from .rest import with_rest
+from .rest import for_loops
 from .task import Clock, Progress, Provenance, Task, with_provenance
 from .training import Structure
 
@@ -240,7 +239,7 @@ def identify(
             clock.lose("evidence")
         else:
             found = with_training_evidence(found, excerpt)
-        return with_noise(with_rest(_with_losses(found, clock), excerpt), excerpt)
+        return for_loops(_with_losses(found, clock), excerpt)
     except KeyboardInterrupt:
         raise Interrupted(found) from None
 

@@ -1,7 +1,8 @@
-"""The rest of a plant: from standing samples of its records, else an equilibrium of the model."""
+"""What loops on a model take from its record: the level at rest, and the noise of its output."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,23 +11,30 @@ from typing import TypeVar, cast
 import numpy as np
 
 from ..dataset import Dataset, FloatArray
+from ..dataset.outliers import quantum
 from ..dataset.standing import Standing, standing
 from ..equilibrium import linearise
-from ..errors import SettingError
+from ..errors import FitError, SettingError
 from ..evidence.region import stored_region
 from ..evidence.residuals import representative
 from ..models import Model
 from ..models.rest import Rest
+from ..validation import noise_of
 from .task import free_run_rmse, with_provenance
 
 M = TypeVar("M", bound=Model)
 
 
-def with_rest(model: M, data: Dataset) -> M:
-    """The model with its rest in `training`, and so its alternatives; unchanged if that is zero."""
+def for_loops(model: M, data: Dataset) -> M:
+    """The model, and so its alternatives, with its rest and the noise of its output in `training`:
+    none of them if it is zero.
+    """
     found = _standing(data)
-    others = tuple(_rested(m, data, found) for m in model.alternatives)
-    return replace(_rested(model, data, found), alternatives=others)
+
+    def each(m: Model) -> Model:
+        return _noisy(_rested(m, data, found), data)
+
+    return cast("M", replace(each(model), alternatives=tuple(map(each, model.alternatives))))
 
 
 def _rested(model: M, data: Dataset, found: Rest | None) -> M:
@@ -76,3 +84,20 @@ def _level(model: Model, u: FloatArray) -> float | None:
     if not (found.settled and math.isfinite(found.y)):
         return None
     return found.y if region is None or region.holds(u, found.y) else None
+
+
+def _noisy(model: M, data: Dataset) -> M:
+    """Third differences show white noise, and fast motion beside it that a free run explains.
+    What is rounded to a grid has at least the noise of rounding (Widrow, Kollar and Liu 1996). An
+    output that was computed from counts has none: a loop then has the encoder itself.
+    """
+    if model.counts is not None:
+        return model
+    outputs = [e.y for e in data.experiments]
+    found = [noise_of(outputs)]
+    with contextlib.suppress(FitError):  # a free run that diverges explains nothing
+        found.append(noise_of([y - f for y, f in zip(outputs, model.simulate(data), strict=True)]))
+    white = min((n for n in found if math.isfinite(n)), default=0.0)
+    rounded = min((quantum(y) or 0.0 for y in outputs), default=0.0) / math.sqrt(12.0)
+    noise = max(white, rounded)
+    return cast("M", with_provenance(model, {"noise": noise})) if noise > 0.0 else model

@@ -90,7 +90,7 @@ class ParetoFront(Plotted):
     @property
     def warning(self) -> str | None:
         """As `TuningResult.warning`."""
-        return "; ".join(self.verdict.reasons) or None
+        return self.verdict.warning
 
     @property
     def cut(self) -> str | None:

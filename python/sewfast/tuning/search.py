@@ -113,7 +113,7 @@ class TuningResult:
     @property
     def warning(self) -> str | None:
         """The reasons of the verdict, with what to do; None if there are none."""
-        return "; ".join(self.verdict.reasons) or None
+        return self.verdict.warning
 
     @property
     def cut(self) -> str | None:

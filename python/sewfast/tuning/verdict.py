@@ -90,6 +90,11 @@ class Verdict:
         return tuple(str(o) for o in self.objections)
 
     @property
+    def warning(self) -> str | None:
+        """All reasons in one text; None if there are none."""
+        return "; ".join(self.reasons) or None
+
+    @property
     def unfit(self) -> tuple[Objection, ...]:
         """The objections for which the gains must not be used."""
         return tuple(o for o in self.objections if o.grade == "unfit")

@@ -38,7 +38,7 @@ const PATIENCE: u64 = 250_000;
 /// Fewest samples, for a host, of a large command without motion, or between two ways that are not in a row.
 const LEAST: u64 = 10;
 
-/// Shorter spans over which a host sees a speed [samples], ...
+/// Shorter spans over which a host sees a speed \[samples\], ...
 const SHORT: [usize; 3] = [4, 2, 1];
 /// ... where it is that far above its limit.
 const FAR: f32 = 1.25;
@@ -76,7 +76,7 @@ impl Watch {
         self.is_within(WINDOW, step, self.limits.speed)
     }
 
-    /// The same of a machine whose samples come on time to the bit: one that is far too fast is seen within a sample or two.
+    /// The same of a machine whose samples come on time: one that is far too fast is seen within a sample or two.
     ///
     /// # Errors
     /// As [`take`](Self::take), and a speed over 4, 2 or 1 samples that is far above its limit.
