@@ -500,6 +500,9 @@ def fit_neural_ss(
     has little power, so that a search on pieces leaves it out and applies it to whole records.
     """
 
+def convex_weights(residuals: _F, weights: _F) -> _F:
+    """Weights w >= 0 of sum 1, (models,), with the least sum of weights (residuals w)^2; residuals are (rows, models)."""
+
 def guard(
     model: LinearModel | NeuralOE | NeuralSS, experiments: _Experiments, *, linear: Sequence[LinearModel] = ...,
 ) -> str:

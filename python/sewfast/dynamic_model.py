@@ -525,21 +525,31 @@ def _table(
 
 
 def _row(c: Mapping[str, Any], choice: Mapping[str, Any]) -> tuple[str, ...]:
-    """Model, output function, weight decay, error, mark."""
-    error = _number(c.get("free_run_rmse"), "runs away")
+    """Model, output function, weight decay, error, mark: chosen, or its weight among several."""
+    error, weight = _number(c.get("free_run_rmse"), "runs away"), c.get("weight")
+    mark = ""
+    if isinstance(weight, (int, float)):
+        mark = "chosen" if weight == 1.0 else f"{100.0 * weight:.0f} %"
     if c.get("kind") == "oe":
-        return f"oe, na = {c.get('na')}, nb = {c.get('nb')}, nk = {c.get('nk')}", "", "", error, ""
+        return (
+            f"oe, na = {c.get('na')}, nb = {c.get('nb')}, nk = {c.get('nk')}",
+            "",
+            "",
+            error,
+            mark,
+        )
     if c.get("kind") == "grey_box":
         beside = f", {c['hidden']} tanh" if c.get("hidden") else ""
         is_chosen = choice.get("chosen") == "grey_box"
-        return f"grey_box, a motor{beside}", "", "", error, "chosen" if is_chosen else ""
+        own = mark or ("chosen" if is_chosen else "")
+        return f"grey_box, a motor{beside}", "", "", error, own
     orders = ", ".join(f"{k} = {c[k]}" for k in ("nx", "na", "nb") if k in c)
     size = f"{c.get('kind')}, {orders}, {c.get('hidden')} tanh, nk = {c.get('nk')}"
     size += ", integrator" if c.get("integrator") else ""
     decay = f"decay {_number(c.get('weight_decay'), '?')}"
     chosen = choice.get("chosen_structure")
     is_chosen = isinstance(chosen, Mapping) and all(c.get(k) == v for k, v in chosen.items())
-    return size, str(c.get("output")), decay, error, "chosen" if is_chosen else ""
+    return size, str(c.get("output")), decay, error, mark or ("chosen" if is_chosen else "")
 
 
 def _number(value: Any, otherwise: str) -> str:

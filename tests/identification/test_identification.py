@@ -94,7 +94,7 @@ def test_auto_takes_the_network_where_it_helps_and_says_why() -> None:
     rmse = choice["free_run_rmse"]
     assert rmse["neural_ss"] < 0.9 * rmse["oe"]
     assert "free-run error" in choice["reason"]
-    assert [d["range"] for d in choice["held_out"]] == ["640:800"]
+    assert [d["range"] for d in choice["held_out"]] == ["0:200", "200:400", "400:600", "600:800"]
     assert model.training["samples"] == 800
     kinds = {c["kind"] for c in choice["candidates"]}
     assert kinds == {"oe", "neural_ss"}

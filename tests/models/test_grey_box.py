@@ -239,7 +239,7 @@ def test_a_search_in_a_hurry_and_one_interrupted_keep_the_motor(
     def stopped(self: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sewfast.identification.search.Search.screen", stopped)
+    monkeypatch.setattr("sewfast.identification.table.Table._screened", stopped)
     with pytest.raises(sewfast.Interrupted) as e:
         sewfast.identify(_plant(3000, 1))
     assert e.value.best.kind == "grey_box"
@@ -261,7 +261,7 @@ def test_a_motor_is_tried_before_any_larger_linear_model(monkeypatch: pytest.Mon
 
     monkeypatch.setattr("sewfast.identification.grey_box.Motors.candidate", motor)
     monkeypatch.setattr("sewfast.identification.linear.LinearTable.search", linear)
-    monkeypatch.setattr("sewfast.identification.search.Search.screen", ends)
+    monkeypatch.setattr("sewfast.identification.table.Table._screened", ends)
     with pytest.raises(sewfast.Interrupted):
         sewfast.identify(_plant(1000, 1))
     assert order == ["motor", "linear after 1"]

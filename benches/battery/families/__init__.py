@@ -10,9 +10,11 @@ nothing is decided on them. Each half has a motor with friction, an integrator (
 of blocks, a linear truth, small records and large ones.
 
     RULES  first_order_encoder, prbs_drift, dead_time, motor_friction, drive_limit, angle,
-           position_periodic, hammerstein, wiener_hammerstein, tanks, duffing, backlash, two_inputs
+           position_periodic, hammerstein, wiener_hammerstein, tanks, duffing, backlash, two_inputs,
+           short_lags, short_hammerstein, short_tank, short_motor
     HELD   second_order_encoder, two_mass, three_inputs, motor_loop, slow_drive, position, wiener,
-           hammerstein_wiener, bouc_wen, bilinear, gain_scheduled
+           hammerstein_wiener, bouc_wen, bilinear, gain_scheduled,
+           short_oscillator, short_wiener, short_scheduled, short_loop
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import zlib
 import numpy as np
 
 from ..simulators import FloatArray
-from . import blocks, linear, motors, plants, positions
+from . import blocks, linear, motors, plants, positions, short
 from .system import FAMILIES, Case, Family, Levels, Record, System, Truth, rms
 
 __all__ = [
@@ -38,7 +40,7 @@ __all__ = [
     "rms",
 ]
 
-CHAPTERS = (linear, motors, positions, blocks, plants)
+CHAPTERS = (linear, motors, positions, blocks, plants, short)
 NAMES = tuple(name for chapter in CHAPTERS for name in vars(chapter) if name in FAMILIES)
 """Of all families, in the order of the chapters."""
 RULES = tuple(name for name in NAMES if FAMILIES[name].split == "rules")

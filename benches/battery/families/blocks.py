@@ -26,7 +26,7 @@ def second_order(rng: Rng) -> tuple[FloatArray, FloatArray, float]:
     return *sim.oscillator(1.0, period, rng.uniform(0.25, 0.8)), period / 4
 
 
-def _input_curve(rng: Rng) -> tuple[Callable[..., FloatArray], FloatArray]:
+def input_curve(rng: Rng) -> tuple[Callable[..., FloatArray], FloatArray]:
     """A static function of an input within +-1 and its parameters."""
     which = int(rng.integers(0, 4))
     if which == 0:
@@ -47,7 +47,7 @@ def _input_curve(rng: Rng) -> tuple[Callable[..., FloatArray], FloatArray]:
     )
 
 
-def _output_curve(rng: Rng) -> tuple[Callable[..., FloatArray], FloatArray]:
+def output_curve(rng: Rng) -> tuple[Callable[..., FloatArray], FloatArray]:
     """A static function that rises, for a signal of size 1."""
     which = int(rng.integers(0, 3))
     if which == 0:
@@ -63,7 +63,7 @@ def _output_curve(rng: Rng) -> tuple[Callable[..., FloatArray], FloatArray]:
 def hammerstein(rng: Rng) -> System:
     """A static curve (tanh, cubic, dead zone, bent at 0), then second order and a delay of 0 to 3;
     25 to 45 dB; 1,000 to 6,000 samples; multisine, steps or levels."""
-    curve, p = _input_curve(rng)
+    curve, p = input_curve(rng)
     b, a, tau = second_order(rng)
     delay = int(rng.integers(0, 4))
     scale = log_uniform(rng, 1, 24)
@@ -85,7 +85,7 @@ def hammerstein(rng: Rng) -> System:
 def wiener(rng: Rng) -> System:
     """Second order and a delay of 0 to 2, then a saturation on one side, on both, or an
     exponential; 25 to 45 dB; 600 to 3,000 samples; multisine, steps or levels."""
-    curve, p = _output_curve(rng)
+    curve, p = output_curve(rng)
     b, a, tau = second_order(rng)
     delay = int(rng.integers(0, 3))
     scale, gain = log_uniform(rng, 1, 24), log_uniform(rng, 0.1, 100)
@@ -154,8 +154,8 @@ def wiener_hammerstein(rng: Rng) -> System:
 def hammerstein_wiener(rng: Rng) -> System:
     """A static curve, order 2 to 4, a static curve that rises; 30 to 50 dB; 10,000 to 60,000
     samples; multisine or steps."""
-    first, p = _input_curve(rng)
-    last, q = _output_curve(rng)
+    first, p = input_curve(rng)
+    last, q = output_curve(rng)
     b, a, tau = second_order(rng)
     extra = int(rng.integers(0, 3))
     c, d = sim.lags(1.0, *(tau * rng.uniform(0.15, 0.7) for _ in range(extra))) if extra else (

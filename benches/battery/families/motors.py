@@ -45,7 +45,7 @@ class _Motor:
         return Truth(run, self.theta)
 
 
-def _motor(
+def motor_of(
     rng: Rng, tau: float, coulomb: tuple[float, float], dead: tuple[float, float],
     limit: tuple[float, float] | None = None,
 ) -> _Motor:  # fmt: skip
@@ -76,7 +76,7 @@ def _motor(
 def motor_friction(rng: Rng) -> System:
     """Motor with Stribeck friction (Coulomb 2 to 10 % of the voltage) and a dead zone of 1 to 8 %,
     tau 20 to 120; 30 to 45 dB; 2,000 to 10,000 samples; steps or a multisine."""
-    m = _motor(rng, log_uniform(rng, 20, 120), (0.02, 0.1), (0.01, 0.08))
+    m = motor_of(rng, log_uniform(rng, 20, 120), (0.02, 0.1), (0.01, 0.08))
     signal = Excitation(str(rng.choice(["steps", "multisine"])), -m.top, m.top, m.tau)
     N = samples(rng, 2000, 10000)
     train, test = records(rng, m.truth(), signal, N, min(N, 4000), rng.uniform(30, 45))
@@ -88,7 +88,7 @@ def drive_limit(rng: Rng) -> System:
     """Motor whose current is limited at 15 to 50 % of the stall current, tau 20 to 80, little
     friction; 30 to 50 dB; twice 5,000 to 20,000 samples: a slow chirp in one direction, pulses in
     both. Test: random steps up to 80 % of the pulses."""
-    m = _motor(rng, log_uniform(rng, 20, 80), (0.005, 0.03), (0.002, 0.01), (0.15, 0.5))
+    m = motor_of(rng, log_uniform(rng, 20, 80), (0.005, 0.03), (0.002, 0.01), (0.15, 0.5))
     truth, N = m.truth(), samples(rng, 5000, 20000)
     slow = 0.4 * m.top * (1 + sim.chirp(N, 0.02 / m.tau, 0.6 / m.tau))
     pulses = sim.steps(rng, N, -m.top, m.top, m.tau, 6 * m.tau)
@@ -104,7 +104,7 @@ def motor_loop(rng: Rng) -> System:
     """Motor with friction of 1 to 6 % recorded under a speed PI controller that sees the noise, tau
     20 to 100; 25 to 40 dB; 3,000 to 10,000 samples; reference in steps. Test: other references,
     no noise in the loop."""
-    m = _motor(rng, log_uniform(rng, 20, 100), (0.01, 0.06), (0.005, 0.03))
+    m = motor_of(rng, log_uniform(rng, 20, 100), (0.01, 0.06), (0.005, 0.03))
     truth, gain = m.truth(), m.speed / m.top
     Kp, Ti = rng.uniform(0.8, 2.5) / gain, m.tau * rng.uniform(0.6, 1.5)
 
@@ -130,7 +130,7 @@ def motor_loop(rng: Rng) -> System:
 def slow_drive(rng: Rng) -> System:
     """A slow drive (tau 30 to 120) with friction of 2 to 8 %, recorded in 8 to 12 long steps with
     rests between; 30 to 45 dB; 800 to 7,000 samples. Test: random steps."""
-    m = _motor(rng, log_uniform(rng, 30, 120), (0.02, 0.08), (0.005, 0.03))
+    m = motor_of(rng, log_uniform(rng, 30, 120), (0.02, 0.08), (0.005, 0.03))
     truth, count = m.truth(), int(rng.integers(8, 13))
     shares = rng.permutation(np.linspace(0.25, 1, count)) * rng.choice([-1, 1], count)
     shares[:2] = 1, -1
@@ -146,7 +146,7 @@ def slow_drive(rng: Rng) -> System:
 def two_inputs(rng: Rng) -> System:
     """Motor with friction of 1 to 5 % and a brake torque as second input, tau 20 to 80; 30 to 45
     dB; 3,000 to 12,000 samples; steps on both."""
-    m = _motor(rng, log_uniform(rng, 20, 80), (0.01, 0.05), (0.005, 0.03))
+    m = motor_of(rng, log_uniform(rng, 20, 80), (0.01, 0.05), (0.005, 0.03))
     truth = m.truth(load=True)
 
     def inputs(N: int, inside: float) -> FloatArray:

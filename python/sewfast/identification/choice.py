@@ -10,59 +10,50 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from .. import _core
-from ..dataset import Dataset
-from ..dataset.experiment import mean_square, weights_of
+from ..dataset import Diagnosis
 from ..errors import FitError, Interrupted
-from ..models import Ensemble, LinearOE, Model, NeuralOE, NeuralSS
+from ..models import LinearOE, Model
 from ..models.grey_box import GreyBox
+from .closing import MOST_MEMBERS, WORTH_IT, as_one, closed, cost_of, linear_alternative
 from .finals import (
     ALONE,
     ENOUGH_TO_CHOOSE_BY,
-    WORTH_IT,
     WORTH_LOOKING,
     Finals,
 )
 from .folds import (
     LEAST_HELD_OUT,
     SHARE,
-    TEXTS,
     compared,
     errors_of,
     folds,
     free_runs,
-    verdict,
-    what_to_record,
 )
 from .linear import HELD_OUT, LEAST_GAIN, LinearCandidate, LinearTable, linear_provenance, short
 from .search import CLIMB_ITERATIONS, Search
-from .task import Pool, Provenance, Stopped, Task, arrays, finite, with_provenance, wrap
-from .training import Network, Request, Structure
+from .table import MOST_SAMPLES, tabled
+from .task import Pool, Provenance, Stopped, Task, arrays, finite, with_provenance
+from .training import Network, Request, Structure, counting
 from .trials import (
+    DIAGNOSIS,
+    REFIT_LOST,
     SHARE_OF_FINAL,
     SHARE_OF_REFIT,
     SHARE_OF_VERIFYING,
     STILL_WORTH_A_FEEDTHROUGH,
     Candidate,
-    counting,
     median_of,
 )
 
 WORTH_AN_INTEGRATOR = 0.7
-ABOUT_EQUAL = 0.02
-"""On little data, an error larger by this factor counts as equal: fewer parameters are safer."""
-MOST_MEMBERS = 15
-"""Members of an ensemble: a controller is tuned on each, and a median of more is hardly better."""
 MOST_ALTERNATIVES = 2
 LIKELY = 1.5
 """Linear models with an error on the newest part within this factor are tested on earlier ones."""
-_FINALISTS, _REFIT = "training of the finalists to the end", "the fit to all samples"
-_DIAGNOSIS = "the diagnosis of the record"
-"""Work that a time budget can cut short, in words."""
+_FINALISTS = "training of the finalists to the end"
+"""What a time budget can cut short, in words."""
 TOGETHER = 1.25
-"""On little data, or in little time, the median includes all finalists within this factor."""
+"""In little time, the median includes all finalists within this factor."""
 
 
 def searched(task: Task, *, wants_network: bool = False) -> Model:
@@ -78,6 +69,10 @@ def searched(task: Task, *, wants_network: bool = False) -> Model:
         if wants_network:
             raise FitError(f"{task.data.source}: {reason}; record longer, or give validation data")
         return short(task, reason)
+    if len(task.data) <= MOST_SAMPLES:
+        found = tabled(task, wants_network=wants_network)
+        if found is not None:
+            return found
     pool = Pool(task.threads, task.clock, task.progress)
     choice = Choice(Search(task, parts, pool, wants_network))
     try:
@@ -139,7 +134,7 @@ class Choice(Finals):
         best = able[0]
         for c in sorted(able, key=lambda c: c.structure.parameters(self.search.inputs)):
             ratio, deviation = compared(c.errors, best.errors)
-            if ratio <= min(deviation, ABOUT_EQUAL if self.search.is_small else LEAST_GAIN):
+            if ratio <= min(deviation, LEAST_GAIN):
                 best = c
                 break
         return [best, *self._joining(best, able)]
@@ -150,13 +145,13 @@ class Choice(Finals):
         return motor is None or c.error < WORTH_IT * motor.rmse
 
     def _joining(self, best: Candidate, able: Sequence[Candidate]) -> list[Candidate]:
-        """Others that reduce the median's error; on little data all that are about as good.
+        """Others that reduce the median's error; in little time all that are about as good.
         On few held-out samples, a structure that leads narrowly can do far worse elsewhere, and
         other structures fail at other places: any gain is accepted.
         """
         group = [best]
         worth = 1.0 if self.split.scored < ENOUGH_TO_CHOOSE_BY else ALONE
-        is_unsure = self.search.is_small or (self.is_hurried and not self.search.is_large)
+        is_unsure = self.is_hurried and not self.search.is_large
         if best.structure.integrator and self.search.repeats:
             # the held-out data repeat the training data and cannot rank them: take all small ones
             return [c for c in able if c is not best and c.structure.integrator]
@@ -204,15 +199,14 @@ class Choice(Finals):
 
     def _refitted(self, c: Candidate, most: int) -> list[Network]:
         """A few iterations on all data, including the held-out part, if the model stays sound.
-        There are none if a budget has cut the training short, except on little data: models that
-        have not reached their minimum do worse after some steps towards another one.
+        There are none if a budget has cut the training short: models that have not reached their
+        minimum do worse after some steps towards another one.
         """
         search, models = self.search, c.models[:most]
-        is_early = self.is_hurried and not search.is_small
         if self.split.is_given or self.is_interrupted:
             return models
-        if is_early or self.clock.over(SHARE_OF_REFIT, _REFIT):
-            self.clock.lose(_REFIT)
+        if self.is_hurried or self.clock.over(SHARE_OF_REFIT, REFIT_LOST):
+            self.clock.lose(REFIT_LOST)
             return models
         linear = search.start(c.structure.nx, c.structure.nk, c.structure.output)
         request = Request(
@@ -220,7 +214,7 @@ class Choice(Finals):
             linear if c.structure.kind == "neural_oe" else None, initial=models,
         )  # fmt: skip
         until = self.clock.until(SHARE_OF_REFIT)
-        (found,) = search.guarded(search.train([request], until, 1.0, _REFIT))
+        (found,) = search.guarded(search.train([request], until, 1.0, REFIT_LOST))
         kept = [s.model for s in counting(found) if s.is_sound]
         return kept if len(kept) >= min(len(models), 3) else models
 
@@ -251,14 +245,7 @@ class Choice(Finals):
     def _of(self, models: Sequence[Network], s: Structure) -> Model:
         """One model unchanged, several as an ensemble, in the data's names and units."""
         known: Provenance = {"weight_decay": s.decay, "samples_fitted": len(self.task.data)}
-        members = [
-            with_provenance(
-                wrap(NeuralOE if isinstance(m, _core.NeuralOE) else NeuralSS, m, self.task.data),
-                known,
-            )
-            for m in models
-        ]
-        return members[0] if len(members) == 1 else Ensemble.of(members)
+        return as_one([(m, known) for m in models], self.task)
 
     def _alternative(self, c: Candidate) -> Model:
         model = self._of(c.models[:MOST_MEMBERS], c.structure)
@@ -280,11 +267,7 @@ class Choice(Finals):
         if not self.search.linear.eligible:
             return []
         chosen = self.search.linear.choice
-        core = chosen.models[0]
-        choice: Provenance = {"chosen": "oe", "reason": "the linear alternative"}
-        choice |= {"free_run_rmse": {"oe": finite(chosen.rmse)}}
-        extra: Provenance = {"initial_state": "estimated", "choice": choice}
-        return [self.task.model(LinearOE, core, extra)]
+        return [linear_alternative(chosen, chosen.rmse, self.task)]
 
     def _is_motor(self) -> bool:
         """Whether a motor's equations beat linear models, on the newest part and the one before."""
@@ -318,7 +301,7 @@ class Choice(Finals):
         part = self.split.shortened(len(task.data), HELD_OUT)
         fits = self.search.pool.map(
             lambda c, look: motors.refitted(c, task.data, part, look),
-            jobs, until=until, share=1.0, what=_REFIT,
+            jobs, until=until, share=1.0, what=REFIT_LOST,
         )  # fmt: skip
         core = next((c for c in fits if c is not None), found.core)
         provenance: Provenance = {
@@ -346,7 +329,7 @@ class Choice(Finals):
         options = task.fit_options(na=chosen.order, nb=chosen.order + 1, nk=chosen.nk)
         (fit,) = self.search.pool.map(
             lambda data, look: _core.fit_oe(data, **{**options, "progress": look}),
-            [arrays(task.data)], until=until, share=1.0, what=_REFIT,
+            [arrays(task.data)], until=until, share=1.0, what=REFIT_LOST,
         )  # fmt: skip
         if fit is None:
             # no time to fit all samples: keep the model of the excerpt
@@ -387,32 +370,16 @@ class Choice(Finals):
 
     def _closed(self, model: Model, error: float, alternatives: Sequence[Model]) -> Model:
         """The model with its alternatives, notes and verdict."""
-        notes = list(model.training.get("notes", []))
         linear = self.linear
-        if self.wants_network and linear is not None and error >= WORTH_IT * linear.rmse:
-            notes.append(
-                f"free-run error on data not trained on: {100 * error / linear.rmse:.1f} % of the "
-                "best linear model's; consider model oe"
-            )
-        if self.task.nk is None and any(m.orders["nk"] == 0 for m in model.members or (model,)):
-            notes.append(
-                "the output depends on the input of the same sample (nk = 0), so that no loop can "
-                "be closed around the model; for a controller identify with nk = 1"
-            )
-        extra: Provenance = {"notes": notes} if notes else {}
-        found = verdict(model, self.task.data, self.split, error)
-        is_known = self.search.is_diagnosed or not self.clock.over(SHARE_OF_REFIT, _DIAGNOSIS)
-        if found["grade"] == "good" and is_known and self.search.repeats:
-            found["grade"] = "fair"
-            repeated = "good on repetitions of this record"
-            found["text"] = found["text"].replace(TEXTS["good"], repeated)
-            found["next"] += what_to_record(self.task.data)
-        if self.clock.truncated and found["grade"] != "good":
-            found["next"].insert(0, "give a longer time budget, or none")
-        if is_known:
-            found["next"] += [f"{f.text}: {f.remedy}" for f in self.search.diagnosis.findings]
-        extra["verdict"] = found
-        return replace(with_provenance(model, extra), alternatives=tuple(alternatives))
+        found = closed(
+            model, self.task, self.split, error, linear=None if linear is None else linear.rmse,
+            wants_network=self.wants_network, diagnosed=self._diagnosed,
+        )  # fmt: skip
+        return replace(found, alternatives=tuple(alternatives))
+
+    def _diagnosed(self) -> Diagnosis | None:
+        is_known = self.search.is_diagnosed or not self.clock.over(SHARE_OF_REFIT, DIAGNOSIS)
+        return self.search.diagnosis if is_known else None
 
     def _choice(self, kind: str, error: float) -> Provenance:
         linear = self.linear
@@ -446,11 +413,3 @@ class Choice(Finals):
             raise KeyboardInterrupt from stopped
         provenance = {"termination": "interrupted", "initial_state": "estimated"}
         return self.task.model(LinearOE, linear.models[0], provenance)
-
-
-def cost_of(model: Model, data: Dataset) -> float:
-    """J of the free run, in the output's unit squared."""
-    runs = zip(model.simulate(data), data.experiments, strict=True)
-    pairs = [((e.y - run) ** 2, weights_of(e)) for run, e in runs]
-    squares, weights = (np.concatenate(column) for column in zip(*pairs, strict=True))
-    return mean_square(squares, weights) / 2.0

@@ -99,7 +99,7 @@ def identify(
         units if they are credibly better on held-out data). `neural_oe`: the lagged network,
         trained in free run from the linear output-error model. `neural_ss`: the state-space
         network. `auto`: one of `oe`, `neural_ss`, `neural_oe` and, for speeds, `grey_box`, by the
-        free-run error on held-out data; on little data the median of several networks, an
+        free-run error on held-out data; on little data the median of several models, an
         `Ensemble`. A kind requested by name is always returned. A model is trained further on
         these data, in its own structure.
     preset : "paper" or None
@@ -126,8 +126,8 @@ def identify(
     iterations : int or None
         At most this many per start; None: by the amount of data, 100 for a lagged model.
     validation : Dataset or None
-        Data for selection only, not for fitting. None holds out the last fifth of every
-        experiment (two of eight blocks for `neural_oe`).
+        Data for selection only, not for fitting. None holds out four blocks in turn, with more than
+        3,750 samples the last fifth of every experiment (two of eight blocks for `neural_oe`).
     threads : int or None
         None uses every core, or as many as the environment variable SEWFAST_THREADS allows.
     workers : executor or None

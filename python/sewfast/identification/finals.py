@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from .closing import WORTH_IT
 from .folds import Split, compared, errors_of, free_runs
 from .linear import LinearCandidate, LinearTable
 from .search import STILL_NEAR, Search, decayed
@@ -22,8 +23,6 @@ from .trials import (
     median_of,
 )
 
-WORTH_IT = 0.9
-"""A network must bring the error below this part of the best linear model's, and of a motor's."""
 WORTH_LOOKING = 0.97
 """If the median of the starts does not even reach this ratio, no further tests are made."""
 VERIFIED = 4
@@ -251,7 +250,7 @@ class Finals:
                 for c, starts, r in zip(going, found, requests, strict=True)
             ]
             alive = [c for c in alive if c.converged] + following
-            if not search.is_small and not (search.repeats and alive[0].structure.integrator):
+            if not (search.repeats and alive[0].structure.integrator):
                 best = min(c.error for c in alive)
                 behind = BEHIND_LARGE if search.is_large else BEHIND
                 alive = [c for c in alive if c.error <= behind * best]
@@ -260,7 +259,7 @@ class Finals:
     def _with_more_starts(self, finalists: Sequence[Candidate], budget: float) -> list[Candidate]:
         search, requests = self.search, []
         for c in finalists:
-            many = 16 if search.is_small else 12 if c.structure.integrator else 6
+            many = 12 if c.structure.integrator else 6
             many = 4 if len(self.task.data) >= 25_000 and not c.structure.integrator else many
             wanted = many if self.task.starts is None else self.task.starts
             request = search.request(c.structure, 60, starts=1, first=20)

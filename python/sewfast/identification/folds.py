@@ -124,10 +124,10 @@ def folds(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]
     if sum(int((np.diff(e.u, axis=0) != 0.0).any(axis=1).sum()) for e in data.experiments) < 2:
         return ()
     found = (split(data, skipped=i * SHARE) for i in range(FOLDS))
-    return tuple(f for f in found if f is not None and f.scored and _moves(f.fitted))
+    return tuple(f for f in found if f is not None and f.scored and is_moving(f.fitted))
 
 
-def _moves(data: Dataset) -> bool:
+def is_moving(data: Dataset) -> bool:
     """Whether there is motion to learn from: a step near the end can be entirely held out."""
     try:
         data.require_excited()

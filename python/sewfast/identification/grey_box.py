@@ -84,7 +84,7 @@ def grey_box(task: Task) -> Model:
         core = found.core
     known: Provenance = {
         "initial_state": "estimated",
-        "cost": _cost(core, task.data),
+        "cost": cost_of(core, task.data),
         "cost_horizon": "free run",
         "cost_unit": "output unit squared",
         "structure": {"hidden": hidden},
@@ -135,7 +135,7 @@ class MotorCandidate:
         """What a choice between both records."""
         return {"hidden": self.hidden, "held_out_rmse": finite(self.rmse)}
 
-    def row(self) -> Provenance:
+    def to_json(self) -> Provenance:
         """The candidate's row of the table."""
         return {"kind": "grey_box", "hidden": self.hidden, "free_run_rmse": finite(self.rmse)}
 
@@ -171,7 +171,7 @@ class Motors:
         except (DataError, SettingError):
             return None
         plain = pool.map(
-            lambda part, look: _or_none(lambda: self.alone(part, look)),
+            lambda part, look: or_none(lambda: self.alone(part, look)),
             [part], until=until, what="the equations of a motor",
         )[0]  # fmt: skip
         if plain is None:
@@ -184,7 +184,7 @@ class Motors:
     ) -> float | None:
         """The error of the same candidate fitted to another part; None if there is none."""
         plain = pool.map(
-            lambda part, look: _or_none(lambda: self.alone(part, look)),
+            lambda part, look: or_none(lambda: self.alone(part, look)),
             [part], until=until, what=EARLIER,
         )[0]  # fmt: skip
         if plain is None or not found.hidden:
@@ -196,7 +196,7 @@ class Motors:
         self, motor: MotorCandidate, part: Split, pool: Pool, until: float | None
     ) -> MotorCandidate | None:
         return pool.map(
-            lambda part, look: _or_none(lambda: self.beside(motor, part, look)),
+            lambda part, look: or_none(lambda: self.beside(motor, part, look)),
             [part], until=until, what="a network beside the motor",
         )[0]  # fmt: skip
 
@@ -204,7 +204,7 @@ class Motors:
         self, found: MotorCandidate, data: Dataset, part: Split, look: Look
     ) -> _core.GreyBox:
         """The candidate fitted to all data, unless that is worse on the part that chose it."""
-        own = _or_none(lambda: self.fitted(thinned(data, MOST_FITTED), found.hidden, look))
+        own = or_none(lambda: self.fitted(thinned(data, MOST_FITTED), found.hidden, look))
         if own is None:
             return found.core
         ratio, deviation = compared(errors_of(free_runs(own, part), part), found.errors)
@@ -229,7 +229,7 @@ class Motors:
                 # cut short, it fits this part and nothing else: as it began, it has no effect
                 one = _changed(core, theta=start)
             begun.append(one)
-        best = min(begun, key=lambda c: _cost(c, part))
+        best = min(begun, key=lambda c: cost_of(c, part))
         if part is data:
             return best
         with contextlib.suppress(TimeUp):
@@ -237,7 +237,7 @@ class Motors:
         return best
 
 
-def _or_none(found: Callable[[], R]) -> R | None:
+def or_none(found: Callable[[], R]) -> R | None:
     """What is found; None if the fit fails because the data are not those of a motor."""
     try:
         return found()
@@ -348,7 +348,7 @@ def trained_from(
     bounds = (low, np.full(len(start), np.inf))
     found = minimised(normal, cost, start, bounds, count, enough=ENOUGH, iterations=iterations)
     best = _changed(core, theta=found.x)
-    residual = 2.0 * _cost(best, data)
+    residual = 2.0 * cost_of(best, data)
     return _changed(best, residual_variance=max(residual, 1e-300))
 
 
@@ -369,7 +369,7 @@ def _runs(
         yield e, run, e.y - run, state
 
 
-def _cost(core: _core.GreyBox, data: Dataset) -> float:
+def cost_of(core: _core.GreyBox, data: Dataset) -> float:
     """J of the free run [output unit squared]; infinite if it diverges."""
     try:
         pairs = [(_weights(e), error) for e, _, error, _ in _runs(core, data)]

@@ -162,6 +162,12 @@ PATIENCE = 2
 """Number of orders without gain after which larger ones are skipped."""
 MISLED = 1.2
 """A model whose error exceeds a smaller one's by this factor is no start for a network."""
+ROUNDING = 1e-11
+"""Error of a linear model, relative to the largest output, that is only rounding."""
+INTEGRATING_POLE = 0.9995
+"""Real pole of the linear models above which an integrator is tried."""
+ENDLESS_GAIN = 5.0
+"""Steady gain times the input's range, in widths of the output's range, of an integrating plant."""
 SPARE_POLES = (0.6, 0.8, 0.4, 0.9, 0.7, 0.5, 0.3)
 LEAST_GAIN = math.log(1.005)
 """Differences in error below half a per cent count as zero, however significant."""
@@ -282,9 +288,9 @@ class LinearTable:
             self.candidates[order, nk] = LinearCandidate(order, nk, models, errors)
 
     def error(self, order: int, nk: int) -> float:
-        """Error on the newest fold; infinite if there is no such model."""
+        """Error on all folds; infinite if there is no such model."""
         found = self.candidates.get((order, nk))
-        return math.inf if found is None else found.rmse
+        return math.inf if found is None else joined(found.errors).rmse
 
     @property
     def eligible(self) -> list[LinearCandidate]:
@@ -322,24 +328,56 @@ class LinearTable:
             return c.errors[0]
         return Errors(np.concatenate(squares), np.concatenate(counts))
 
-    def start(self, order: int, nk: int) -> _core.LinearModel | None:
+    def start(self, order: int, nk: int, fold: int = 0) -> _core.LinearModel | None:
         """A model of that order as a network's start.
         If the fit of that order is misled (it has found a spurious slow pole), it is the smaller
         one with additional fast poles.
         """
         fitted_ = self.candidates.get((order, nk))
-        smaller = [c for (o, k), c in self.candidates.items() if o < order and k == nk]
+        own = None if fitted_ is None else fitted_.models[fold]
+        smaller = [
+            c for (o, k), c in self.candidates.items()
+            if o < order and k == nk and c.models[fold] is not None
+        ]  # fmt: skip
         if not smaller:
-            return None if fitted_ is None else fitted_.models[0]
-        best = min(smaller, key=lambda c: c.rmse)
-        own, model = None if fitted_ is None else fitted_.models[0], best.models[0]
-        if own is None or model is None:
-            return own if model is None else raised(model, order)
-        return raised(model, order) if is_misled(own, model, self._excerpts[0]) else own
+            return own
+        model = min(smaller, key=lambda c: c.errors[fold].rmse).models[fold]
+        assert model is not None
+        if own is None:
+            return raised(model, order)
+        return raised(model, order) if is_misled(own, model, self._excerpts[fold]) else own
+
+    def is_exact(self, data: Dataset) -> bool:
+        """Whether the least error is only rounding, so that nothing else can help."""
+        if not self.eligible:
+            return False
+        largest = max(abs(v) for v in data.output_range)
+        return min(joined(c.errors).rmse for c in self.eligible) <= ROUNDING * largest
+
+    def integrates(self, data: Dataset) -> bool:
+        """Whether the best models have a pole at 1 and an unbounded steady gain.
+        Friction or limits also lead larger orders to a pole near 1, but these do worse on held-out
+        data: only the best models count.
+        """
+        low, high = data.output_range
+        swing = np.ptp(np.concatenate([e.u for e in data.experiments]), axis=0)
+        asked = [c.models[0] for c in (self.choice, self.best)]
+        return all(
+            m is not None
+            and slowest_pole(m) > INTEGRATING_POLE
+            and float(np.abs(m.dc_gain() * swing).max()) > ENDLESS_GAIN * (high - low)
+            for m in asked
+        )
 
     def rows(self) -> Iterator[Provenance]:
         """For the table of candidates."""
         yield from (c.to_json() for _, c in sorted(self.candidates.items()))
+
+
+def joined(errors: Sequence[Errors]) -> Errors:
+    """The errors on all folds together."""
+    squares = np.concatenate([e.squares for e in errors])
+    return Errors(squares, np.concatenate([e.counts for e in errors]))
 
 
 def simplest(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,7 @@ SHARPNESS = 4.0
 """Least density of a pile relative to its surroundings."""
 MEMORIES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)
 """Poles of the low-pass filters whose sign is the first guess of the output's."""
+WORTH_A_RECTIFIER = 0.8
 FIRST_ROUNDS, ROUNDS = 2, 12
 """Iterations of all first guesses; of the better two."""
 SIGN_SAMPLES = 2_000
@@ -117,6 +119,16 @@ def _may_be_rectified(y: FloatArray) -> bool:
     if top <= 0.0 or float(y.min()) < -BELOW_ZERO * top:
         return False
     return bool(np.mean(y <= NEAR_ZERO * top) > 0.005)
+
+
+def is_rectified(
+    behind: _core.LinearModel | None, pairs: Pairs, plain: Sequence[_core.LinearModel | None]
+) -> bool:
+    """Whether a linear model behind a rectifier is better than all plain ones."""
+    if behind is None:
+        return False
+    bound = min((rms_error(m, pairs) for m in plain if m is not None), default=math.inf)
+    return rms_error(behind, pairs, np.abs) < WORTH_A_RECTIFIER * bound
 
 
 # --- a linear start behind a rectifier ----------------------------------------------------------

@@ -13,8 +13,8 @@ from .. import _core
 from ..dataset import Diagnosis, diagnose
 from . import grey_box
 from .folds import Split, compared
-from .linear import HELD_OUT, MISLED, slowest_pole
-from .outputs import ABS, LINEAR, Output, named, rms_error, suggested
+from .linear import HELD_OUT, MISLED
+from .outputs import ABS, LINEAR, Output, is_rectified, named, suggested
 from .task import arrays
 from .training import Request, Structure
 from .trials import (
@@ -33,13 +33,10 @@ DECAY_MATTERS = 6_000
 """Samples from which on only the finalists, not the climb, try another weight decay."""
 HOPELESS = 0.98
 """The search ends if the best of the second halving exceeds this part of the linear error."""
-ROUNDING = 1e-11
-"""Error of a linear model, relative to the largest output, that is only rounding."""
 WORTH_A_STEP = 0.97
 """A step of the climb must reduce the error to below this part."""
 LEAST_STEP = 0.01
 """Relative gain of a step that suffices if the gain is significant."""
-WORTH_A_RECTIFIER = 0.8
 FAR_BEHIND = 2.0
 """A kind of network whose best is worse than the other's by this factor climbs no further."""
 STILL_NEAR = 3.0
@@ -50,10 +47,6 @@ ROUNDS = 6
 MOST_STARTS, SHARE_OF_STARTS = 8, 0.1
 """Fresh starts of a structure at a time, and the part of the operations for all of them."""
 SCREEN_ITERATIONS, HALVING_ITERATIONS, CLIMB_ITERATIONS = 20, (25, 40), 40
-INTEGRATING_POLE = 0.9995
-"""Real pole of the linear models above which an integrator is tried."""
-ENDLESS_GAIN = 5.0
-"""Steady gain times the input's range, in widths of the output's range, of an integrating plant."""
 SAYS_LITTLE = 0.5
 """Error of the best linear model, in deviations of the output, above which poles are ignored."""
 INTEGRATING_ITERATIONS, INTEGRATING_STARTS = 60, 8
@@ -109,10 +102,7 @@ class Search(Trials):
         """Whether the linear model's error is only rounding, so that a network cannot help.
         A network requested by name is trained in any case.
         """
-        if self.wants_network or not self.linear.eligible:
-            return False
-        size = max(abs(v) for v in self.task.data.output_range)
-        return self.linear.best.rmse <= ROUNDING * size
+        return not self.wants_network and self.linear.is_exact(self.task.data)
 
     @property
     def is_hopeless(self) -> bool:
@@ -165,7 +155,7 @@ class Search(Trials):
         """Number of starts of each structure."""
         samples = len(self.trials[0].fitted)
         round_ = SCREEN_ITERATIONS * sum(s.operations(self.inputs, samples) for s in likely)
-        return self._cheap_starts(round_, 4 if self.is_small else 3)
+        return self._cheap_starts(round_, 3)
 
     def _cheap_starts(self, operations: float, least: int) -> int:
         """Number of starts that are cheap at this cost for one: the best start judges a size."""
@@ -181,11 +171,11 @@ class Search(Trials):
         near = [c for c in alive if c.error <= STILL_NEAR * alive[0].error]
         firsts = best_of_each_size(near) if iterations == HALVING_ITERATIONS[0] else []
         kept = half + [c for c in firsts if c not in half]
-        samples, least = len(self.trials[0].fitted), 2 if self.is_small else 1
+        samples = len(self.trials[0].fitted)
         costs = [
             (c.iterations + iterations) * c.structure.operations(self.inputs, samples) for c in kept
         ]
-        fresh = [self._cheap_starts(len(kept) * cost, least) for cost in costs]
+        fresh = [self._cheap_starts(len(kept) * cost, 1) for cost in costs]
         return sorted(self.continued(kept, iterations, fresh), key=lambda c: c.error)
 
     def climb(self) -> None:
@@ -271,13 +261,8 @@ class Search(Trials):
 
     def _is_rectified(self) -> bool:
         """Whether a linear model with a rectified output is better than any without."""
-        behind = self.start(2, self.nk, ABS)
-        if behind is None:
-            return False
-        pairs = arrays(self.trials[0].fitted)
         plain = [c.models[0] for c in self.linear.eligible if c.order <= 2]
-        bound = min((rms_error(m, pairs) for m in plain if m is not None), default=math.inf)
-        return rms_error(behind, pairs, np.abs) < WORTH_A_RECTIFIER * bound
+        return is_rectified(self.start(2, self.nk, ABS), arrays(self.trials[0].fitted), plain)
 
     def _integrating(self) -> list[Structure]:
         """Small networks followed by an integrator, if a linear pole is nearly 1."""
@@ -322,31 +307,16 @@ class Search(Trials):
         return self.diagnosis.find("repeats") is not None
 
     def _integrates(self) -> bool:
-        """Whether the best linear models have a pole at 1 and an unbounded steady gain.
-        Friction or limits also lead larger orders to a pole near 1, but these do worse on held-out
-        data: only the best models count.
-        """
-        if self.diagnosis.find("integrator") is not None:
-            return True
-        data = self.task.data
-        low, high = data.output_range
-        swing = np.ptp(np.concatenate([e.u for e in data.experiments]), axis=0)
-        asked = [c.models[0] for c in (self.linear.choice, self.linear.best)]
-        return all(
-            m is not None
-            and slowest_pole(m) > INTEGRATING_POLE
-            and float(np.abs(m.dc_gain() * swing).max()) > ENDLESS_GAIN * (high - low)
-            for m in asked
-        )
+        """Whether the record or the best linear models show an integrator."""
+        is_seen = self.diagnosis.find("integrator") is not None
+        return is_seen or self.linear.integrates(self.task.data)
 
     def _lagged(self) -> list[Structure]:
         """The lagged network of second order; its weight decay has a different meaning."""
         task = self.task
         if task.nx is not None or task.output not in (None, "linear"):
             return []
-        s = Structure(
-            2, self.nk, task.hidden or 8, 1e-3 if self.is_small else 1e-4, kind="neural_oe"
-        )
+        s = Structure(2, self.nk, task.hidden or 8, 1e-4, kind="neural_oe")
         return [s] if s.nk >= 1 and self.is_affordable(s) else []
 
     def _moves(self, best: Candidate, is_first: bool) -> list[tuple[str, Structure]]:
@@ -365,11 +335,8 @@ class Search(Trials):
             moves.append(("grow", replace(s, nx=s.nx + 1)))
             if wider:
                 moves.append(("grow", replace(s, nx=s.nx + 1, hidden=2 * s.hidden)))
-            if self.is_small:
-                moves.append(("fresh", replace(s, nx=s.nx + 1)))
         if self.samples < DECAY_MATTERS:
-            step = 10.0 if self.is_small else 100.0
-            moves += [("decay", decayed(s, f)) for f in (step, 1.0 / step)]
+            moves += [("decay", decayed(s, f)) for f in (100.0, 0.01)]
         if is_first and task.nk is None and not s.integrator:
             later, at_once = replace(s, nk=s.nk + 1), replace(s, nk=0)
             moves += [("fresh", later)]
@@ -398,7 +365,7 @@ class Search(Trials):
                 iterations.append(best.iterations + 30)
             else:
                 count = 30 if self.is_large else 60
-                starts = self._limited(4 if self.is_small else 2)
+                starts = self._limited(2)
                 requests.append(self.request(s, count, starts=starts))
                 iterations.append(count)
         found = self.trained(requests)
@@ -415,8 +382,7 @@ class Search(Trials):
             return False
         ratio, deviation = compared(found.errors, best.errors)
         if found.error < worth * best.error:
-            # on few held-out samples some of many steps gain by luck, and lead to large networks
-            return not self.is_small or ratio < -deviation
+            return True
         # near the noise even a useful step gains little; on much data ever wider networks would
         # keep gaining in this way
         is_cheap = not self.is_large or found.structure.hidden <= best.structure.hidden

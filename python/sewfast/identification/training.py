@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -24,6 +24,10 @@ from .outputs import LINEAR, Output, scale_of
 from .task import Look, Pairs, Pool, Provenance, Stopped, arrays
 
 HIDDEN_SCALE = 1.0
+WORST = 3.0
+"""Starts whose J exceeds this multiple of the best one's do not count."""
+SHARE_OF_GUARD = 0.95
+"""Part of a time budget by which the guard must be finished."""
 OVERHEAD = 2_000
 """Cost of a sample apart from its sensitivities, in multiplications."""
 
@@ -229,6 +233,36 @@ def train(
     return [[Start(*values) for values in some if values is not None] for some in starts]
 
 
+def guarded(
+    found: Sequence[Sequence[Start]],
+    data: Pairs,
+    bounds: list[_core.LinearModel],
+    pool: Pool,
+) -> list[list[Start]]:
+    """The starts with the guard's findings on whole records.
+    `bounds` are linear models whose memory of the initial state bounds that of networks.
+    """
+    flat = [start for starts in found for start in starts]
+
+    def fault(start: Start, look: Look) -> str:
+        return _core.guard(start.model, data, linear=bounds)
+
+    late = "not asked within the time budget"
+    until = pool.clock.until(SHARE_OF_GUARD)
+    faults = (
+        late if f is None else f
+        for f in pool.map(fault, flat, until=until, what="the guard of networks")
+    )
+    return [[replace(s, fault=next(faults)) for s in starts] for starts in found]
+
+
+def counting(starts: Iterable[Start]) -> list[Start]:
+    """Starts not far worse than the best, sound ones if there are any; best first."""
+    starts = list(starts)
+    able = sorted([s for s in starts if s.is_sound] or starts, key=lambda s: s.cost)
+    return [s for s in able if s.cost <= WORST * able[0].cost]
+
+
 def _spread(workers: Workers, jobs: Sequence[Job]) -> list[tuple[Network, float] | None]:
     """Run state-space networks on the workers, lagged ones (few and quick) in this process."""
     remote = [i for i, job in enumerate(jobs) if "nx" in job.settings]
@@ -259,10 +293,7 @@ def _jobs(request: Request, seed: int, until: float | None) -> list[Job]:
         settings |= {"na": s.nx, "nb": s.nx + 1}
     else:
         settings |= {"nx": s.nx, "integrator": s.integrator, "output": s.output.name}
-        if request.initial:
-            parameters = request.initial[0].settings["output_parameters"]
-        else:
-            parameters = s.output.parameters(*scale_of(request.fitted, s.output))
+        parameters = s.output.parameters(*scale_of(request.fitted, s.output))
         settings |= {"output_parameters": parameters, "hidden_scale": HIDDEN_SCALE}
     common: dict[str, Any] = {
         "experiments": arrays(request.fitted),
@@ -274,10 +305,17 @@ def _jobs(request: Request, seed: int, until: float | None) -> list[Job]:
     }
     if request.initial:
         return [
-            Job(**common, number=request.first + i, initial=_values(model))
-            for i, model in enumerate(request.initial)
+            _onwards(common, model, request.first + i) for i, model in enumerate(request.initial)
         ]
     return [Job(**common, number=request.first + i, initial=None) for i in range(request.starts)]
+
+
+def _onwards(common: dict[str, Any], model: Network, number: int) -> Job:
+    """A job that goes on from a model, in its own scaling."""
+    settings = dict(common["settings"])
+    if "nx" in settings:
+        settings["output_parameters"] = model.settings["output_parameters"]
+    return Job(**{**common, "settings": settings}, number=number, initial=_values(model))
 
 
 def _values(model: Network) -> dict[str, Any]:

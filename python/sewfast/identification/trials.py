@@ -20,16 +20,14 @@ from .grey_box import MotorCandidate
 from .linear import SAMPLES, LinearTable, fitted
 from .outputs import ABS, LINEAR, Output, rectified_start
 from .task import Look, Pool, Provenance, Task, arrays, finite
-from .training import Network, Request, Start, Structure, train
+from .training import Network, Request, Start, Structure, counting, guarded, train
 
-SMALL, LARGE = 3_750, 45_000
-"""Samples up to which a data set is small, and above which it is large."""
+LARGE = 45_000
+"""Samples above which a data set is large."""
 TRIAL_SAMPLES, TRIAL_SAMPLES_LARGE = 20_000, 12_000
 """Fitted samples of a trial. Fewer than 20,000 raise the final error by a factor of up to 3."""
 SEARCH_OPERATIONS, SEARCH_OPERATIONS_LARGE = 1.8e11, 5e11
 """Multiplications after which the search ends; a core does some 1.4e10 per second."""
-WORST = 3.0
-"""Starts whose J exceeds this multiple of the best one's are left out of a candidate."""
 SAMPLES_PER_PARAMETER = 4
 BY_FAR = 0.2
 """Below this part of the linear error on the newest part, a network needs no further evidence."""
@@ -42,7 +40,8 @@ additional states can compensate). nk = 0 is no plant for a loop, and a smoothed
 the input a little."""
 TRAINING = "training of networks"
 """What is lost if a time budget ends before a network is trained, or while one is."""
-SHARE_OF_GUARD = 0.95
+REFIT_LOST, DIAGNOSIS = "the fit to all samples", "the diagnosis of the record"
+"""What is lost if a budget ends before these."""
 SHARE_OF_LINEAR = 0.12
 """Part of a time budget for linear models but the smallest."""
 SHARE_OF_SEARCH, SHARE_OF_SEARCH_VERIFIED = 0.58, 0.45
@@ -91,13 +90,6 @@ class Candidate:
         return row | {"free_run_rmse": finite(self.error)}
 
 
-def counting(starts: Iterable[Start]) -> list[Start]:
-    """Starts not far worse than the best, sound ones if there are any; best first."""
-    starts = list(starts)
-    able = sorted([s for s in starts if s.is_sound] or starts, key=lambda s: s.cost)
-    return [s for s in able if s.cost <= WORST * able[0].cost]
-
-
 def best_of_each_size(ranked: Iterable[Candidate]) -> list[Candidate]:
     """The first one of each kind and number of states."""
     found: dict[tuple[object, ...], Candidate] = {}
@@ -143,11 +135,6 @@ class Trials:
         self._guarded = arrays(self.task.data)
 
     @property
-    def is_small(self) -> bool:
-        """Whether the data are few: variance dominates, and many starts are cheap."""
-        return self.samples <= SMALL
-
-    @property
     def is_large(self) -> bool:
         """Whether the data are many: little variance, and larger networks can pay."""
         return self.samples > LARGE
@@ -155,7 +142,7 @@ class Trials:
     @property
     def decay(self) -> float:
         """Initial weight decay."""
-        return 1e-4 if self.samples < 4_000 else 1e-7 if self.is_large else 1e-5
+        return 1e-7 if self.is_large else 1e-5
 
     @property
     def until(self) -> float | None:
@@ -248,7 +235,7 @@ class Trials:
     def rows(self) -> Iterator[Provenance]:
         """Rows of the table: linear models, then networks in the order of their trials."""
         yield from self.linear.rows()
-        yield from () if self.motor is None else (self.motor.row(),)
+        yield from () if self.motor is None else (self.motor.to_json(),)
         yield from (c.to_json() for c in self.candidates.values())
 
     # --- training -------------------------------------------------------------------------------
@@ -351,19 +338,7 @@ class Trials:
 
     def guarded(self, found: Sequence[Sequence[Start]]) -> list[list[Start]]:
         """The starts with the guard's findings on whole records."""
-        flat = [start for starts in found for start in starts]
-        bounds = self.bounding_models
-
-        def fault(start: Start, look: Look) -> str:
-            return _core.guard(start.model, self._guarded, linear=bounds)
-
-        late = "not asked within the time budget"
-        until = self.pool.clock.until(SHARE_OF_GUARD)
-        faults = (
-            late if f is None else f
-            for f in self.pool.map(fault, flat, until=until, what="the guard of networks")
-        )
-        return [[replace(s, fault=next(faults)) for s in starts] for starts in found]
+        return guarded(found, self._guarded, self.bounding_models, self.pool)
 
     @property
     def bounding_models(self) -> list[_core.LinearModel]:

@@ -39,6 +39,7 @@ pub mod search;
 pub mod signals;
 pub mod simd;
 pub mod speed;
+pub mod stacking;
 mod starts;
 pub mod tune;
 

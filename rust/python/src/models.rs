@@ -10,7 +10,7 @@ use pyo3::types::PyDict;
 use sewfast_core::embedded::{Embedded, Precision};
 use sewfast_core::guard::{Unsound, verdict};
 use sewfast_core::linearised::Linearised;
-use sewfast_core::{Error, Result, model};
+use sewfast_core::{Error, Result, model, stacking};
 
 use crate::seam::{array1, array2, raise, rows, slice, watched};
 use linear::LinearModel;
@@ -96,6 +96,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     neural::register(module)?;
     neural_ss::register(module)?;
     module.add_function(wrap_pyfunction!(guard, module)?)?;
+    module.add_function(wrap_pyfunction!(convex_weights, module)?)?;
     module.add_class::<EmbeddedModel>()?;
     module.add_function(wrap_pyfunction!(tanh_quotients, module)?)
 }
@@ -236,6 +237,18 @@ pub type Values<'py> = PyReadonlyArray1<'py, f64>;
 
 fn released<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send) -> PyResult<T> {
     py.detach(work).map_err(|e| raise(py, e))
+}
+
+#[pyfunction]
+fn convex_weights<'py>(
+    py: Python<'py>,
+    residuals: Rows<'py>,
+    weights: Values<'py>,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    let ((residuals, models), weights) =
+        (rows(&residuals, "residuals")?, slice(&weights, "weights")?);
+    let found = released(py, || stacking::convex_weights(residuals, models, weights))?;
+    Ok(array1(py, found))
 }
 
 #[pyfunction]

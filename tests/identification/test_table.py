@@ -1,0 +1,190 @@
+"""Little data: blocks of the whole record, convex weights, and the table of structures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import sewfast
+from plants import bent_data, linear_data
+from sewfast import Dataset, Ensemble, LinearOE, NeuralSS, _core, identify, validate
+from sewfast.errors import DataError, Interrupted
+from sewfast.identification import table
+from sewfast.identification.blocks import COUNT, Blocks, Row, blocked, combined
+
+F = NDArray[np.float64]
+QUICK: dict[str, Any] = {"nx": 1, "nk": 1, "hidden": 4, "starts": 2, "iterations": 30}
+
+
+# --- blocks ---------------------------------------------------------------------------------------
+
+
+def test_every_sample_is_held_out_once_and_never_fitted_then() -> None:
+    data = Dataset.concat([linear_data(1000, name="a"), linear_data(600, name="b")])
+    folds = blocked(data)
+    assert len(folds) == COUNT
+    ranges = [[(s["name"], s["range"]) for s in f.sources] for f in folds]
+    third = [("a", "800:1000"), ("b", "0:200")]
+    assert ranges == [[("a", "0:400")], [("a", "400:800")], third, [("b", "200:600")]]
+    for fold in folds:
+        assert len(fold.fitted) + sum(s["samples"] for s in fold.sources) == len(data)
+    blocks = Blocks(data, folds)
+    # but for the outputs that give the state where an experiment begins
+    assert len(blocks.weights) == len(data) - 2 * 20
+    assert len(blocks.together.fitted) == len(data)
+
+
+def test_a_part_that_was_not_measured_is_not_held_out() -> None:
+    (e,) = linear_data(800).experiments
+    y = e.y.copy()
+    y[:200] = np.nan
+    folds = blocked(Dataset.from_arrays(e.u, y, 0.01))
+    assert [[s["range"] for s in f.sources] for f in folds] == [
+        ["200:400"],
+        ["400:600"],
+        ["600:800"],
+    ]
+
+
+@pytest.mark.parametrize("samples", [60, 150])
+def test_too_few_samples_have_no_blocks(samples: int) -> None:
+    assert blocked(linear_data(samples)) == ()
+
+
+def test_an_input_that_moves_once_has_no_blocks() -> None:
+    u = np.r_[np.zeros(100), np.ones(900)]
+    assert blocked(Dataset.from_arrays(u, np.cumsum(u), 0.01)) == ()
+
+
+def test_validation_data_are_the_only_block() -> None:
+    (only,) = blocked(linear_data(400), linear_data(300, seed=3))
+    assert only.is_given
+    assert len(only.fitted) == 400
+
+
+# --- weights --------------------------------------------------------------------------------------
+
+
+def rows_of(residuals: F, blocks: Blocks, parameters: list[int]) -> list[Row]:
+    return [
+        Row("oe", p, None, (), r, blocks.errors(r))
+        for r, p in zip(residuals, parameters, strict=True)
+    ]
+
+
+@pytest.fixture(scope="module")
+def blocks() -> Blocks:
+    data = linear_data(1000)
+    return Blocks(data, blocked(data))
+
+
+def drawn(blocks: Blocks, *sizes: float) -> F:
+    return (
+        np.random.default_rng(0).normal(size=(len(sizes), len(blocks.weights)))
+        * np.array(sizes)[:, None]
+    )
+
+
+def test_models_with_independent_errors_share_by_their_variances(blocks: Blocks) -> None:
+    found = combined(rows_of(drawn(blocks, 1.0, 1.0, 2.0), blocks, [3, 3, 3]), blocks)
+    np.testing.assert_allclose(found.weights, [4 / 9, 4 / 9, 1 / 9], atol=0.04)
+    assert found.errors.rmse == pytest.approx(2 / 3, rel=0.1)
+
+
+def test_the_simplest_of_equal_models_is_alone(blocks: Blocks) -> None:
+    (one,) = drawn(blocks, 1.0)
+    rows = rows_of(np.array([1.001 * one, one, 0.999 * one]), blocks, [2, 4, 9])
+    assert combined(rows, blocks).rows == (rows[0],)
+
+
+def test_a_model_that_errs_more_has_no_weight(blocks: Blocks) -> None:
+    good, noise = drawn(blocks, 1.0, 1.0)
+    rows = rows_of(np.array([good + 2.0 * noise, good]), blocks, [2, 9])
+    assert combined(rows, blocks).rows == (rows[1],)
+
+
+def test_a_sample_without_weight_does_not_count() -> None:
+    residuals, weights = np.array([[1.0, 3.0], [5.0, 0.0]]), np.array([1.0, 0.0])
+    assert _core.convex_weights(residuals, weights).tolist() == [1.0, 0.0]
+
+
+def test_a_model_that_runs_away_is_refused() -> None:
+    with pytest.raises(DataError, match="leave out models that run away"):
+        _core.convex_weights(np.array([[1.0, np.inf]]), np.ones(1))
+
+
+# --- the model ------------------------------------------------------------------------------------
+
+
+def test_a_bent_plant_gets_networks_and_their_weights_are_told() -> None:
+    model = identify(bent_data(600, noise=0.02), **QUICK)
+    choice = model.training["choice"]
+    weights = [c["weight"] for c in choice["candidates"] if "weight" in c]
+    assert sum(weights) == pytest.approx(1.0, abs=0.01)
+    assert [d["range"] for d in choice["held_out"]] == ["0:150", "150:300", "300:450", "450:600"]
+    assert " %" in str(model)
+    verdict = model.training["verdict"]
+    assert verdict["grade"] == "good"
+    assert len(verdict["blocks"]) == COUNT
+    assert min(verdict["blocks"]) <= verdict["fit_percent"] <= max(verdict["blocks"])
+    assert "block by block" in verdict["text"]
+
+
+def test_one_start_is_one_network() -> None:
+    model = identify(bent_data(600), model="neural_ss", **{**QUICK, "starts": 1})
+    assert isinstance(model, NeuralSS)
+
+
+def test_the_first_member_is_of_the_structure_with_most_weight() -> None:
+    model = identify(bent_data(500, noise=0.05), nk=1, starts=2, iterations=20)
+    assert isinstance(model, Ensemble)
+    assert len(model.members) <= table.MOST_MEMBERS
+    listed = [c for c in model.training["choice"]["candidates"] if "weight" in c]
+    heaviest = max(listed, key=lambda c: c["weight"])
+    assert model.members[0].kind == heaviest["kind"]
+    assert model.members[0].orders["nk"] == 1
+
+
+def test_shifting_the_levels_changes_nothing_but_them() -> None:
+    (e,) = bent_data(600, noise=0.02).experiments
+    one, other = (
+        identify(Dataset.from_arrays(e.u + du, e.y + dy, 0.01), **QUICK)
+        for du, dy in ((0.0, 0.0), (24.5, 293.15))
+    )
+    scale = float(np.std(e.y))
+    (a,), (b,) = (
+        one.simulate(Dataset.from_arrays(e.u, e.y, 0.01)),
+        other.simulate(Dataset.from_arrays(e.u + 24.5, e.y + 293.15, 0.01)),
+    )
+    assert np.max(np.abs(b - a - 293.15)) < 0.02 * scale
+
+
+def test_an_outlier_among_the_starts_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = bent_data(600, noise=0.02)
+    plain = identify(data, model="neural_ss", **{**QUICK, "starts": 4})
+    assert isinstance(plain, Ensemble)
+    wild = [replace(m, core=_scaled(m)) if i == 1 else m for i, m in enumerate(plain.members)]
+    test = bent_data(400, seed=7)
+    errors = [validate(Ensemble.of(m), test).simulation.rmse for m in (plain.members, wild)]
+    assert errors[1] < 2.0 * errors[0]
+
+
+def _scaled(model: sewfast.Model) -> Any:
+    return _core.NeuralSS(**model.core.settings, theta=3.0 * model.core.theta)
+
+
+def test_a_stop_before_the_networks_keeps_what_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stopped(self: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(table.Table, "_screened", stopped)
+    with pytest.raises(Interrupted) as e:
+        identify(bent_data(600, noise=0.02))
+    best = e.value.best
+    assert isinstance(best, (LinearOE, Ensemble))
+    assert best.training["termination"] == "interrupted"
+    assert validate(best, bent_data(400, seed=5)).simulation.rmse < np.inf
