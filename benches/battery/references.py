@@ -28,6 +28,8 @@ from .families import Case, rms
 from .simulators import FloatArray
 
 ORDERS = (1, 2, 3, 4)
+SHORT = 800
+"""Samples of a short record."""
 HELD_OUT = 0.2
 STEP = 1e-5
 """Of the finite differences, as a share of each parameter."""
@@ -52,6 +54,8 @@ class References:
         The same between the ends of the recorded input, as the record itself shows it.
     oracle_gain_error, oe_gain_error : float or None
         Relative errors of it.
+    hindsight : float or None
+        Least test error of output error with 2, 3 and 4 past outputs and inputs, of short records.
     """
 
     digest: str
@@ -63,6 +67,7 @@ class References:
     range_gain: float | None = None
     oracle_gain_error: float | None = None
     oe_gain_error: float | None = None
+    hindsight: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -80,9 +85,18 @@ def references(case: Case) -> References:
         own = _gain(case.truth.run(theta, case.gain_probe), case.gain_probe)
         found["oracle_gain_error"] = abs(own / gain - 1)
         found["oe_gain_error"] = gain_error(case, linear, gain, case.gain_probe)
+    if case.samples <= SHORT:
+        found["hindsight"] = min(_in_hindsight(case, order) for order in (2, 3, 4))
     return References(
         digest(case), case.noise, oracle_error(case, theta), score(case, linear), order, **found
     )  # fmt: skip
+
+
+def _in_hindsight(case: Case, order: int) -> float:
+    try:
+        return score(case, identify(case.training, model="oe", na=order, nb=order))
+    except FitError:
+        return math.inf
 
 
 def digest(case: Case) -> str:

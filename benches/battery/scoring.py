@@ -6,6 +6,7 @@ What is reported of the test error e of a run (o: the oracle's, s: rms of the tr
     as_measured    sqrt(e^2 + s^2) / sqrt(o^2 + s^2): the same ratio on a test record that has the
                    training's noise, as every real one has
     over_oe        e / output error's
+    over_hindsight e / the least of output error's with 2, 3 and 4 past values (short records)
     over_noise     e / s
     spread         worst over median of the runs of one case, which differ in the seed only
 """
@@ -100,6 +101,11 @@ class Outcome:
     def over_oe_measured(self) -> list[float]:
         s = self.references.noise
         return [math.hypot(r.error, s) / math.hypot(self.references.oe, s) for r in self.runs]
+
+    def over_hindsight(self) -> list[float]:
+        """Empty for longer records."""
+        least = self.references.hindsight
+        return [r.error / least for r in self.runs] if least else []
 
     def over_noise(self) -> list[float]:
         return [r.error / self.references.noise for r in self.runs]
@@ -244,6 +250,9 @@ def _summary(outcomes: Sequence[Outcome]) -> dict[str, float | int | None]:
         "over_noise_median": _quantile([x for o in outcomes for x in o.over_noise()], 0.5),
         "worse_than_oe": _share(worse),
         "worse_than_oe_measured": _share(visibly),
+        "over_hindsight_median": _quantile([x for o in outcomes for x in o.over_hindsight()], 0.5),
+        "over_hindsight_90": _quantile([x for o in outcomes for x in o.over_hindsight()], 0.9),
+        "over_hindsight_worst": _quantile([x for o in outcomes for x in o.over_hindsight()], 1.0),
         "spread_95": _quantile(repeated, 0.95),
         "networks_for_linear_truth": _share(linear),
         "gain_error_median": _quantile(gains, 0.5),
@@ -277,6 +286,9 @@ _WORDS = {
     "over_noise_median": "error over the noise, median",
     "worse_than_oe": f"share over {WORSE} x output error",
     "worse_than_oe_measured": "the same with the training's noise",
+    "over_hindsight_median": "short records: error over output error's in hindsight, median",
+    "over_hindsight_90": "the same, 90 % quantile",
+    "over_hindsight_worst": "the same, worst",
     "spread_95": "worst over median seed, 95 % quantile",
     "networks_for_linear_truth": "share of networks for a linear truth",
     "gain_error_median": "steady gain of motors, median error",

@@ -54,12 +54,12 @@ DECAYS = (1e-4, 1e-2)
 """Weight decays in the beginning. With the smaller one only, the geometric mean of test errors is
 .569 of output error's, with both .417 (families `short_*` of the battery's rules)."""
 STARTS = 4
-FIRST, HALVINGS, FURTHER = 30, (60, 120), 60
+FIRST, HALVINGS, FURTHER = 30, (60, 120), 90
 """Iterations of all networks, further ones of the better halves, and of each step of the climb."""
-CLIMBERS = 2
-"""Models of each fold from which larger networks grow."""
-ROUNDS, WORTH_A_STEP = 4, 0.98
-"""Steps of the climb, and the part of the error below which one must bring it."""
+CLIMBED = 5e9
+"""Multiplications of one structure in a step of the climb, which limit the models of each fold that
+take part: training to the end pays on few samples, where it costs little."""
+ROUNDS = 4
 REFIT = 15
 """Iterations on all data of a network that was trained without a block."""
 LAGGED_DECAY = 1e-3
@@ -336,7 +336,7 @@ class Table:
                 return
             found = [row for s in self._moves(best.found) if (row := self._moved(best, s))]
             nearest = min(found, key=lambda r: r.rmse, default=None)
-            best = nearest if nearest and nearest.rmse < WORTH_A_STEP * best.rmse else None
+            best = nearest if nearest and nearest.rmse < best.rmse else None
 
     def _moves(self, s: Structure) -> list[Structure]:
         task = self.task
@@ -350,7 +350,9 @@ class Table:
     def _moved(self, best: Row, s: Structure) -> Row | None:
         """The row of a structure that starts at the models of a smaller one or another decay."""
         size = best.found.nx, best.found.hidden
-        models = [f[:CLIMBERS] for f in best.models]
+        each = FURTHER * s.operations(self.task.data.n_inputs, len(self.task.data))
+        able = max(1, int(CLIMBED / (len(self.folds) * each)))
+        models = [f[:able] for f in best.models]
         if size == (s.nx, s.hidden):
             return self._trained(s, FURTHER, best, models)
         grown = [tuple(m.grown(s.nx, s.hidden, self.task.seed) for m in f) for f in models]
