@@ -432,7 +432,7 @@ def test_a_kind_by_name_gets_a_verdict_too(kind: Any) -> None:
 def test_a_network_by_name_is_trained_where_the_linear_fits_took_the_search_s_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(table, "SHARE_OF_SEARCH", 1e-9)
+    monkeypatch.setattr(table, "SHARE_OF_NETWORKS", 1e-9)
     data = bent_data(600)
     model = identify(data, model="neural_ss", time_budget=600.0)
     assert {m.kind for m in model.members or (model,)} == {"neural_ss"}

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 import sewfast
 from plants import bent_data, linear_data
-from sewfast import Dataset, Ensemble, LinearOE, NeuralSS, _core, identify, validate
+from sewfast import Dataset, Ensemble, Experiment, LinearOE, NeuralSS, _core, identify, validate
 from sewfast.errors import DataError, Interrupted
 from sewfast.identification import table
 from sewfast.identification.blocks import COUNT, Blocks, Row, blocked, combined
+from sewfast.identification.closing import MOST_MEMBERS
 
 F = NDArray[np.float64]
 QUICK: dict[str, Any] = {"nx": 1, "nk": 1, "hidden": 4, "starts": 2, "iterations": 30}
@@ -83,10 +84,9 @@ def blocks() -> Blocks:
 
 
 def drawn(blocks: Blocks, *sizes: float) -> F:
-    return (
-        np.random.default_rng(0).normal(size=(len(sizes), len(blocks.weights)))
-        * np.array(sizes)[:, None]
-    )
+    found = np.random.default_rng(0).normal(size=(len(sizes), len(blocks.weights)))
+    found *= np.array(sizes)[:, None]
+    return found
 
 
 def test_models_with_independent_errors_share_by_their_variances(blocks: Blocks) -> None:
@@ -142,7 +142,7 @@ def test_one_start_is_one_network() -> None:
 def test_the_first_member_is_of_the_structure_with_most_weight() -> None:
     model = identify(bent_data(500, noise=0.05), nk=1, starts=2, iterations=20)
     assert isinstance(model, Ensemble)
-    assert len(model.members) <= table.MOST_MEMBERS
+    assert len(model.members) <= MOST_MEMBERS
     listed = [c for c in model.training["choice"]["candidates"] if "weight" in c]
     heaviest = max(listed, key=lambda c: c["weight"])
     assert model.members[0].kind == heaviest["kind"]
@@ -163,7 +163,7 @@ def test_shifting_the_levels_changes_nothing_but_them() -> None:
     assert np.max(np.abs(b - a - 293.15)) < 0.02 * scale
 
 
-def test_an_outlier_among_the_starts_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_outlier_among_the_starts_is_ignored() -> None:
     data = bent_data(600, noise=0.02)
     plain = identify(data, model="neural_ss", **{**QUICK, "starts": 4})
     assert isinstance(plain, Ensemble)
@@ -188,3 +188,50 @@ def test_a_stop_before_the_networks_keeps_what_there_is(monkeypatch: pytest.Monk
     assert isinstance(best, (LinearOE, Ensemble))
     assert best.training["termination"] == "interrupted"
     assert validate(best, bent_data(400, seed=5)).simulation.rmse < np.inf
+
+
+def test_a_linear_model_is_kept_when_the_motor_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stopped(self: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(table.Table, "_try_motor", stopped)
+    with pytest.raises(Interrupted) as e:
+        identify(bent_data(600, noise=0.02))
+    assert isinstance(e.value.best, LinearOE)
+
+
+def test_a_curve_without_memory_gets_a_network() -> None:
+    # linear fits without some of the blocks end at a trend, from which no network can start
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 20), 15)
+    y = np.tanh(2.0 * u) + 0.02 * rng.normal(size=len(u))
+    model = identify(Dataset.from_arrays(u, y, 0.01), starts=2, iterations=20)
+    assert {m.kind for m in model.members or (model,)} & {"neural_ss", "neural_oe"}
+    assert model.training["verdict"]["fit_percent"] > 80.0
+
+
+def test_a_rectified_output_is_no_question_of_a_delay() -> None:
+    rng = np.random.default_rng(0)
+    rng.normal(size=600)
+    u = np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, 21), 15)[:300]
+    x = np.zeros(300)
+    for k in range(1, 300):
+        x[k] = 0.9 * x[k - 1] + 0.1 * np.tanh(2.0 * u[k - 1])
+    y = np.abs(x) + 0.005 * rng.normal(size=300)
+    model = identify(Dataset.from_arrays(u, y, 0.01), starts=2, iterations=20)
+    assert "abs" in {c.get("output") for c in model.training["choice"]["candidates"]}
+    only = identify(
+        Dataset.from_arrays(u, y, 0.01), model="neural_ss", output="abs", nx=1, starts=2
+    )
+    assert {m.kind for m in only.members or (only,)} == {"neural_ss"}
+
+
+def test_weights_of_samples_count_in_the_fit_of_a_block() -> None:
+    (e,) = bent_data(600, noise=0.02).experiments
+    y, w = e.y.copy(), np.ones(600)
+    y[320:330] += 20.0
+    w[320:330] = 0.0
+    spoilt = Experiment(e.u, y, {}, "spoilt", 0, weights=w)
+    data = replace(Dataset.from_arrays(e.u, y, 0.01), experiments=(spoilt,))
+    verdict = identify(data, **QUICK).training["verdict"]
+    assert min(verdict["blocks"]) > 80.0

@@ -15,6 +15,7 @@ from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.experiment import weights_of
 from ..dynamic_model import INIT, Core
 from .folds import ERROR_BLOCKS, Errors, Split, compared, free_runs, is_moving, with_run_up
+from .linear import LEAST_GAIN
 from .task import Provenance, finite, sources
 
 COUNT = 4
@@ -25,6 +26,10 @@ LEAST = 2 * INIT
 AS_GOOD, AT_LEAST = 0.05, 0.02
 """Fewer structures suffice if their error is larger by less than a standard error, within these
 bounds: the best of dozens of structures leads by a per cent or two by luck."""
+
+
+FAR = 100.0
+"""Errors of this many times the least are those of runaways, and have no part in any weights."""
 
 
 def blocked(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]:
@@ -144,7 +149,6 @@ class Row:
     models: tuple[tuple[Any, ...], ...]
     residual: FloatArray
     errors: Errors
-    iterations: int = 0
 
     @property
     def rmse(self) -> float:
@@ -176,14 +180,17 @@ class Mixture:
 
 
 def combined(rows: Sequence[Row], blocks: Blocks) -> Mixture:
-    """The fewest rows that do as well as all of them within a standard error.
+    """The fewest rows that do as well as all of them, within a standard error or two per cent.
     One row if there is one, the simplest such; else those that are left when one after another is
     dropped without which the error grows least.
     """
+    least = min(r.rmse for r in rows)
+    rows = [r for r in rows if r.rmse <= FAR * least]
     everything = Mixture.of(rows, blocks)
     for row in sorted(rows, key=lambda r: (r.parameters, r.rmse)):
         if _is_as_good(row.errors, everything.errors):
-            return Mixture.of([row], blocks)
+            linear = [r for r in rows if r.kind == "oe"]
+            return Mixture.of([simplest(linear) if row in linear else row], blocks)
     pairs = zip(rows, everything.weights, strict=True)
     best = Mixture.of([r for r, w in pairs if w > 0.0], blocks)
     while len(best.rows) > 1:
@@ -197,6 +204,13 @@ def combined(rows: Sequence[Row], blocks: Blocks) -> Mixture:
     return best
 
 
-def _is_as_good(one: Errors, other: Errors) -> bool:
+def simplest(rows: Sequence[Row]) -> Row:
+    """The simplest linear model that does as well as the best of them, which is hardly luck."""
+    best = min(rows, key=lambda r: r.rmse)
+    ranked = sorted(rows, key=lambda r: (r.parameters, r.rmse))
+    return next(r for r in ranked if _is_as_good(r.errors, best.errors, LEAST_GAIN))
+
+
+def _is_as_good(one: Errors, other: Errors, least: float = AT_LEAST) -> bool:
     ratio, deviation = compared(one, other)
-    return ratio <= min(max(deviation, AT_LEAST), AS_GOOD)
+    return ratio <= min(max(deviation, least), AS_GOOD)

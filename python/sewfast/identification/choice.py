@@ -60,6 +60,10 @@ def searched(task: Task, *, wants_network: bool = False) -> Model:
     """The network if it is credibly better, else linear output error.
     If one is wanted, it is the state-space network, even if that is not better.
     """
+    if len(task.data) <= MOST_SAMPLES:
+        found = tabled(task, wants_network=wants_network)
+        if found is not None:
+            return found
     parts = folds(task.data, task.validation)
     if not parts:
         reason = (
@@ -69,10 +73,6 @@ def searched(task: Task, *, wants_network: bool = False) -> Model:
         if wants_network:
             raise FitError(f"{task.data.source}: {reason}; record longer, or give validation data")
         return short(task, reason)
-    if len(task.data) <= MOST_SAMPLES:
-        found = tabled(task, wants_network=wants_network)
-        if found is not None:
-            return found
     pool = Pool(task.threads, task.clock, task.progress)
     choice = Choice(Search(task, parts, pool, wants_network))
     try:

@@ -27,8 +27,8 @@ from .task import Provenance, sources
 SHARE = 0.2
 """Part of every experiment that is held out, at its end.
 
-Blocks inside a record lie where the drive was before and after, and favour a network that memorises
-the record; a later part is the honest test.
+Short blocks inside a record lie where the drive was before and after, and favour a network that
+memorises the record; a later part is the honest test if there are many data.
 """
 FOLDS = 3
 """Number of later parts on which models are judged, each trained on the data before the part."""

@@ -21,7 +21,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from .. import _core
-from ..dataset import Diagnosis, diagnose
+from ..dataset import Diagnosis, FloatArray, diagnose
 from ..errors import FitError, Interrupted
 from ..models import Model
 from ..models.base import EnsembleCore
@@ -29,7 +29,7 @@ from . import grey_box
 from .blocks import Blocks, Mixture, Row, blocked, combined
 from .closing import MOST_MEMBERS, as_one, closed, cost_of, linear_alternative
 from .grey_box import or_none
-from .linear import LinearTable, joined, linear_provenance, raised
+from .linear import MISLED, ROUNDING, LinearTable, joined, linear_provenance, raised, time_constant
 from .outputs import ABS, LINEAR, Output, is_rectified, named, rectified_start, suggested
 from .task import Pool, Provenance, Stopped, Task, arrays, finite, with_provenance
 from .training import Request, Start, Structure, counting, guarded, train
@@ -40,7 +40,6 @@ from .trials import (
     SHARE_OF_FINAL,
     SHARE_OF_LINEAR,
     SHARE_OF_REFIT,
-    SHARE_OF_SEARCH,
     TRAINING,
     WORTH_A_FEEDTHROUGH,
 )
@@ -62,6 +61,8 @@ take part: training to the end pays on few samples, where it costs little."""
 ROUNDS = 4
 REFIT = 15
 """Iterations on all data of a network that was trained without a block."""
+SHARE_OF_NETWORKS = 0.85
+"""Part of a time budget by which networks must be finished."""
 LAGGED_DECAY = 1e-3
 """Weight decay of the lagged network, where it has another meaning."""
 Models: TypeAlias = Sequence[Sequence[Any]]
@@ -101,12 +102,11 @@ class Table:
         self.clock, self.folds = self.pool.clock, self.blocks.folds
         self.linear = LinearTable(self.task.nk, self.folds, self.pool)
         self.motors = grey_box.Motors(self.task.seed, self.task.iterations_or_usual)
-        self.outputs: list[Output] = [LINEAR]
         # a network that failed the guard, for one asked for by name
         self._unsound: tuple[Structure, tuple[tuple[Start, ...], ...]] | None = None
         self._pairs = arrays(self.task.data)
         # part of a time budget by which networks must be finished
-        self._share = SHARE_OF_SEARCH
+        self._share = SHARE_OF_NETWORKS
 
     # --- the schedule -----------------------------------------------------------------------------
 
@@ -134,6 +134,10 @@ class Table:
         """Whether the linear model's error is only rounding, so that a network cannot help."""
         return not self.wants_network and self.linear.is_exact(self.task.data)
 
+    @property
+    def _rounding(self) -> float:
+        return ROUNDING * max(abs(v) for v in self.task.data.output_range)
+
     def _try_motor(self) -> None:
         """Fit the equations of a motor, unless another kind was requested."""
         task = self.task
@@ -155,14 +159,7 @@ class Table:
             if all(m is not None for m in c.models):
                 self._enter("oe", c.parameters, c, [(m,) for m in c.models])
 
-    def _enter(
-        self,
-        kind: str,
-        parameters: int,
-        found: Any,
-        models: Sequence[Sequence[Any]],
-        after: int = 0,
-    ) -> Row | None:
+    def _enter(self, kind: str, parameters: int, found: Any, models: Models) -> Row | None:
         """A row of these models of each fold, unless one runs away on its block."""
         cores = [m[0] if len(m) == 1 else EnsembleCore(tuple(m), "median") for m in models]
         residual = self.blocks.residual(cores)
@@ -170,7 +167,7 @@ class Table:
             return None
         row = Row(
             kind, parameters, found, tuple(map(tuple, models)), residual,
-            self.blocks.errors(residual), after,
+            self.blocks.errors(residual),
         )  # fmt: skip
         self.rows[found] = row
         self.pool.best = min(self.pool.best, row.rmse)
@@ -180,10 +177,9 @@ class Table:
 
     def _screened(self) -> list[Row]:
         """All likely networks, trained briefly."""
-        self.outputs = self._outputs()
         found: list[Row] = []
         at_once: list[Row] = []
-        for s in self._likely():
+        for s in self._likely(self._outputs()):
             row = self._trained(s, FIRST)
             (at_once if s.nk == 0 and self.task.nk is None else found).extend([row] if row else [])
         # no loop can be closed around a model that needs the input of the same sample
@@ -207,10 +203,13 @@ class Table:
 
     @cached_property
     def _behind_rectifier(self) -> _core.LinearModel | None:
-        """The linear model behind a rectifier, of all data: each fold trains from it."""
-        until = self.clock.until(SHARE_OF_SEARCH)
+        """The linear model behind a rectifier, of all data: each fold trains from it.
+        A delay that was found without the rectifier says nothing.
+        """
+        order = min(2, self.task.nx or 2)
+        until = self.clock.until(self._share)
         (found,) = self.pool.map(
-            lambda data, look: or_none(lambda: rectified_start(data, 2, self._nk, look)),
+            lambda data, look: or_none(lambda: rectified_start(data, order, self.linear.nk, look)),
             [self.task.data], until=until, what="linear starts of networks",
         )  # fmt: skip
         return found
@@ -219,7 +218,7 @@ class Table:
     def _nk(self) -> int:
         return self.linear.choice.nk if self.linear.eligible else self.linear.nk
 
-    def _likely(self) -> list[Structure]:
+    def _likely(self, outputs: Sequence[Output]) -> list[Structure]:
         """Sizes near those of the best linear models, the likeliest first."""
         task, linear = self.task, self.linear
         orders, nk = list(ORDERS), self._nk
@@ -232,18 +231,21 @@ class Table:
         hidden = task.hidden or HIDDEN
         found = [
             Structure(nx, k, hidden, decay, output)
-            for output in self.outputs
+            for output in outputs
             for nx in orders
             for decay in DECAYS
             for k in dict.fromkeys((linear.nk, nk))
-            if output != ABS or nx > 1
+            if output != ABS or (k == linear.nk and (nx > 1 or task.nx == 1))
         ]
-        if task.nk is None and linear.nk == nk == 1 and task.data.counts is None:
+        if task.nk is None and task.data.counts is None:
             # further states can replace the missing sample of a slow input, at great cost
-            found += [replace(s, nk=0) for s in found if (s.nx, s.output) == (orders[0], LINEAR)]
+            least = min((linear.error(o, linear.nk) for o in orders), default=math.inf)
+            able = [o for o in orders if linear.error(o, linear.nk) <= MISLED * least]
+            like = (min(able), linear.nk, LINEAR)
+            found += [replace(s, nk=0) for s in found if (s.nx, s.nk, s.output) == like]
         if not self.wants_network and task.nx is None and task.output in (None, "linear"):
-            lagged = Structure(2, max(nk, 1), hidden, LAGGED_DECAY, kind="neural_oe")
-            found.insert(min(2, len(found)), lagged)
+            lagged = Structure(2, nk, hidden, LAGGED_DECAY, kind="neural_oe")
+            found[2:2] = [lagged] if nk >= 1 else []
         if task.nx is None and task.output in (None, "linear") and self._integrates():
             found += [
                 Structure(nx, linear.nk, h, DECAYS[0], integrator=True)
@@ -279,20 +281,25 @@ class Table:
         if s.output == ABS:
             behind = self._behind_rectifier
             return None if behind is None else raised(behind, s.nx)
-        self.linear.add([(s.nx, s.nk)], self.clock.until(SHARE_OF_SEARCH))
-        return self.linear.start(s.nx, s.nk, fold)
+        self.linear.add([(s.nx, s.nk)], self.clock.until(self._share))
+        others = (i for i in range(len(self.folds)) if i != fold)
+        found = [self.linear.start(s.nx, s.nk, i) for i in (fold, *others)]
+        # without a block, a fit can end at a trend: that of another fold is nearer to the plant
+        longest = max(len(e) for e in self.task.data.experiments)
+        able = (m for m in found if m is not None and time_constant(m) <= longest)
+        return next(able, found[0])
 
     def _trained(
-        self, s: Structure, iterations: int, from_: Row | None = None, models: Models | None = None
+        self, s: Structure, iterations: int, models: Models | None = None, starts: int = STARTS
     ) -> Row | None:
         """The row of a structure after further iterations from models of each fold, else of its
-        starts; None if no start is sound in each fold, or no time is left.
+        starts; None if no start is sound, a fold has none, or no time is left.
         """
         if self.clock.over(self._share, TRAINING):
             return None
         task, until = self.task, self.clock.until(self._share)
         most = iterations if task.iterations is None else min(iterations, task.iterations)
-        starts = STARTS if task.starts is None else task.starts
+        starts = starts if task.starts is None else task.starts
         requests = []
         for i, part in enumerate(self.folds):
             given = () if models is None else models[i]
@@ -300,18 +307,30 @@ class Table:
             count = 0 if given else starts
             requests.append(Request(s, part.fitted, None, most, linear, count, 0, given))
         share = max(self.pool.share, min(0.8, self.pool.share + 0.02))
-        found = train(
+        found = self._started(requests, until, share)
+        # a linear fit that ends at a trend is no start: random ones are
+        again = [i for i, f in enumerate(found) if not f and s.kind == "neural_ss"]
+        afresh = [replace(requests[i], linear=None) for i in again if models is None]
+        for i, starts_ in zip(again, self._started(afresh, until, share), strict=False):
+            found[i] = starts_
+        judged = [counting(f) for f in guarded(found, self._pairs, self._bounds, self.pool)]
+        if not all(judged):
+            return None
+        if not any(f[0].is_sound for f in judged):
+            if self._unsound is None:
+                self._unsound = s, tuple(tuple(f) for f in judged)
+            return None
+        parameters = s.parameters(task.data.n_inputs)
+        return self._enter(s.kind, parameters, s, [[x.model for x in f] for f in judged])
+
+    def _started(
+        self, requests: Sequence[Request], until: float | None, share: float
+    ) -> list[list[Start]]:
+        task = self.task
+        return train(
             requests, self.pool, task.seed, workers=task.workers, until=until, share=share,
             what=TRAINING,
         )  # fmt: skip
-        judged = [counting(f) for f in guarded(found, self._pairs, self._bounds, self.pool)]
-        if not all(f and f[0].is_sound for f in judged):
-            if all(judged) and self._unsound is None:
-                self._unsound = s, tuple(tuple(f) for f in judged)
-            return None
-        after = iterations if from_ is None else from_.iterations + iterations
-        parameters = s.parameters(task.data.n_inputs)
-        return self._enter(s.kind, parameters, s, [[x.model for x in f] for f in judged], after)
 
     @property
     def _bounds(self) -> list[_core.LinearModel]:
@@ -321,7 +340,7 @@ class Table:
 
     def _further(self, row: Row, iterations: int) -> Row:
         """The row trained further; unchanged if that is not better on the blocks."""
-        new = self._trained(row.found, iterations, row, row.models)
+        new = self._trained(row.found, iterations, row.models)
         if new is not None and new.rmse < row.rmse:
             return new
         self.rows[row.found] = row
@@ -354,9 +373,9 @@ class Table:
         able = max(1, int(CLIMBED / (len(self.folds) * each)))
         models = [f[:able] for f in best.models]
         if size == (s.nx, s.hidden):
-            return self._trained(s, FURTHER, best, models)
+            return self._trained(s, FURTHER, models)
         grown = [tuple(m.grown(s.nx, s.hidden, self.task.seed) for m in f) for f in models]
-        return self._trained(s, FURTHER, best, grown)
+        return self._trained(s, FURTHER, grown)
 
     # --- the model --------------------------------------------------------------------------------
 
@@ -364,31 +383,26 @@ class Table:
         """The rows combined, those with weight trained on everything."""
         rows = [r for r in self.rows.values() if r.kind == "neural_ss" or not self.wants_network]
         reasons = ["interrupted: the best so far"] if is_interrupted else []
-        if self.is_exact:
-            reasons.append("the linear model's error is at rounding: no network was asked")
-        if not rows:
-            rows = [self._late_row() or self._unsound_row()]
-            is_late = rows[0].found in self.rows
+        if rows:
+            # at rounding, errors say no more
+            exact = [r for r in rows if self.is_exact and r.rmse <= self._rounding]
+            simplest = sorted(exact, key=lambda r: r.parameters)[:1]
+            mixture = combined(simplest or rows, self.blocks)
+            reasons += [*self._missing(rows, is_interrupted), self._reason(mixture, len(rows))]
+        else:
+            late = self._late_row()
+            row = late or self._unsound_row()
+            mixture = Mixture((row,), np.ones(1), row.residual, row.errors)
             reasons.append(
                 "there was time for one network only"
-                if is_late
+                if late is not None
                 else "no network passed the guard; the best of them is used"
             )
-        elif not any(isinstance(r.found, Structure) for r in rows):
-            reasons.append(
-                "the time budget left no time for a network"
-                if TRAINING in self.clock.lost
-                else "no network could be trained: too few samples, or none passed the guard"
-            )
-        mixture = combined(rows, self.blocks)
-        reasons.append(self._reason(mixture, len(rows)))
-        shares = np.diff(np.round(MOST_MEMBERS * np.cumsum(mixture.weights)), prepend=0.0)
+        shares = self._shares(mixture)
         cores: list[tuple[Any, Provenance]] = []
         # the first member is the plant of a loop: the best of the row with most weight
         for i in np.argsort(-mixture.weights, kind="stable").tolist():
-            row, share = mixture.rows[i], int(shares[i])
-            most = self._fewest(row) if share == MOST_MEMBERS else share
-            cores += self._members(row, most, is_interrupted)
+            cores += self._members(mixture.rows[i], int(shares[i]), is_interrupted)
         model = as_one(cores, self.task)
         provenance: Provenance = {
             "initial_state": "estimated",
@@ -408,15 +422,22 @@ class Table:
             diagnosed=self._diagnosed,
         )  # fmt: skip
         model = self._with_blocks(model, mixture)
-        return replace(model, alternatives=tuple(self._alternatives(mixture)))
+        return replace(model, alternatives=tuple(self._alternatives(model)))
 
     def _with_blocks(self, model: Model, mixture: Mixture) -> Model:
         """The verdict with the fit of each block, which shows how far the figure can be trusted."""
         spread, sizes = self.blocks.together.spread, self.blocks.sizes
         if len(sizes) < 2 or not spread > 0.0:
             return model
-        parts = np.split(mixture.residual**2, np.cumsum(sizes)[:-1])
-        fits = [100.0 * (1.0 - math.sqrt(float(p.mean())) / spread) for p in parts]
+        if not np.isfinite(mixture.residual).all():
+            return model
+        ends = np.cumsum(sizes)[:-1]
+        squares = np.split(self.blocks.weights * mixture.residual**2, ends)
+        counts = np.split(self.blocks.weights, ends)
+        fits = [
+            100.0 * (1.0 - math.sqrt(float(p.sum() / w.sum())) / spread)
+            for p, w in zip(squares, counts, strict=True)
+        ]
         own = dict(model.training["verdict"])
         own["blocks"] = fits
         own["text"] += f"; block by block {min(fits):.1f} to {max(fits):.1f} %"
@@ -424,17 +445,37 @@ class Table:
 
     def best_so_far(self, stopped: BaseException) -> Model:
         """The result on Ctrl-C: of the rows so far, as they are."""
+        self._enter_linear()
         able = [r for r in self.rows.values() if r.kind == "neural_ss" or not self.wants_network]
         if not able:
             # a kind requested by name is not replaced by another
             raise KeyboardInterrupt from stopped
         return with_provenance(self.model(is_interrupted=True), {"termination": "interrupted"})
 
-    def _fewest(self, row: Row) -> int:
-        """Members of a row that is alone: a linear model or a motor needs no others beside it."""
-        if row.kind in ("oe", "grey_box"):
-            return 1
-        return min(MOST_MEMBERS, self.task.starts or MOST_MEMBERS)
+    def _missing(self, rows: Sequence[Row], is_interrupted: bool) -> list[str]:
+        """Why there is no network among the rows."""
+        if self.is_exact:
+            return ["the linear model's error is at rounding: no network was asked"]
+        if is_interrupted or any(isinstance(r.found, Structure) for r in rows):
+            return []
+        if TRAINING in self.clock.lost:
+            return ["the time budget left no time for a network"]
+        return ["no network could be trained: too few samples, or none passed the guard"]
+
+    def _shares(self, mixture: Mixture) -> FloatArray:
+        """Members of each row in proportion to its weight, as many as the scarcest row allows."""
+        if len(mixture.rows) == 1:
+            (row,) = mixture.rows
+            # a linear model or a motor needs no others beside it
+            alone = row.kind in ("oe", "grey_box")
+            return np.array([1 if alone else min(MOST_MEMBERS, self.task.starts or MOST_MEMBERS)])
+        pairs = zip(mixture.rows, mixture.weights, strict=True)
+        whole = 0 if self.folds[0].is_given else 1
+        able = min(
+            (sum(map(len, r.models)) + whole * (r.kind in ("oe", "grey_box"))) / w for r, w in pairs
+        )
+        most = min(MOST_MEMBERS, max(1, int(able)))
+        return np.diff(np.round(most * np.cumsum(mixture.weights)), prepend=0.0)
 
     def _members(self, row: Row, most: int, is_interrupted: bool) -> list[tuple[Any, Provenance]]:
         """At most so many models of the row, each with its provenance.
@@ -442,13 +483,18 @@ class Table:
         a block, if they stay sound. A linear model or a motor is fitted to everything; if there are
         to be several, those without a block follow.
         """
-        of_folds = [
-            m[i] for i in range(max(map(len, row.models))) for m in row.models if i < len(m)
-        ]
-        plain: Provenance = {"samples_fitted": len(self.task.data)}
+        fitted = [len(f.fitted) for f in self.folds]
+        known: Provenance = {}
         if isinstance(row.found, Structure):
-            plain["weight_decay"] = row.found.decay
-        given = [(m, plain) for m in of_folds][:most]
+            known["weight_decay"] = row.found.decay
+        plain = known | {"samples_fitted": len(self.task.data)}
+        of_folds = [
+            (m[i], known | {"samples_fitted": n})
+            for i in range(max(map(len, row.models)))
+            for m, n in zip(row.models, fitted, strict=True)
+            if i < len(m)
+        ]
+        given = of_folds[:most]
         if not most or is_interrupted or self.folds[0].is_given:
             return given
         if self.clock.over(SHARE_OF_REFIT, REFIT_LOST):
@@ -471,53 +517,56 @@ class Table:
                 [self.task.data], until=until, share=1.0, what=REFIT_LOST,
             )  # fmt: skip
             # on everything it must not fit worse than the best that was fitted to less
-            able = [c for c in (core, *of_folds) if c is not None]
-            able.sort(key=lambda c: grey_box.cost_of(c, self.task.data))
-            return [(c, plain) for c in able[:most]]
+            able = ([] if core is None else [(core, plain)]) + of_folds
+            able.sort(key=lambda pair: grey_box.cost_of(pair[0], self.task.data))
+            return able[:most]
         linear = self._start(row.found, 0) if row.kind == "neural_oe" else None
         request = Request(
-            row.found, self.task.data, None, REFIT, linear, initial=[m for m, _ in given]
+            row.found, self.task.data, None, min(REFIT, self.task.iterations or REFIT), linear,
+            initial=[m for m, _ in given],
         )  # fmt: skip
         found = train(
             [request], self.pool, self.task.seed, workers=self.task.workers, until=until, share=1.0,
             what=REFIT_LOST,
         )  # fmt: skip
         (starts,) = guarded(found, self._pairs, self._bounds, self.pool)
-        sound = [(s.model, plain) for s in counting(starts) if s.is_sound]
-        return sound or given
+        return [(s.model, plain) for s in counting(starts) if s.is_sound] or given
 
     def _late_row(self) -> Row | None:
         """A network that was asked for by name, in the time that is left after slow linear fits."""
-        self._share = SHARE_OF_FINAL
-        likely = self._likely()[:1] if self.wants_network and self._unsound is None else []
-        found = [self._trained(s, FURTHER) for s in likely]
-        return found[0] if found else None
+        self._share = SHARE_OF_REFIT
+        if not self.wants_network or self._unsound is not None:
+            return None
+        likely = self._likely(self._outputs())
+        return self._trained(likely[0], FIRST, starts=1) if likely else None
 
     def _unsound_row(self) -> Row:
         """The best network that failed the guard, if a network was asked for by name."""
         if self._unsound is not None:
             structure, starts = self._unsound
             models = tuple(tuple(s.model for s in f) for f in starts)
-            # what it leaves unexplained can be without bounds
-            residual = np.full(len(self.blocks.weights), self.blocks.together.spread)
-            errors = self.blocks.errors(residual)
+            cores = [EnsembleCore(m, "median") for m in models]
+            residual = self.blocks.residual(cores)
+            if residual is None:
+                residual = np.full(len(self.blocks.weights), np.inf)
             parameters = structure.parameters(self.task.data.n_inputs)
+            errors = self.blocks.errors(residual)
             return Row("neural_ss", parameters, structure, models, residual, errors)
         remedy = "give more time" if self.clock.truncated else "record longer"
         raise FitError(
             f"{self.task.data.source}: expected a model with a finite free run on data not trained "
-            f"on, found none; {remedy}, give nx and hidden, or ask for model oe"
+            f"on, found none; {remedy}, give other sizes (nx, hidden), or ask for model oe"
         )
 
     def _linear_error(self) -> float | None:
         errors = [joined(c.errors).rmse for c in self.linear.eligible]
         return min(errors, default=None)
 
-    def _alternatives(self, mixture: Mixture) -> list[Model]:
+    def _alternatives(self, model: Model) -> list[Model]:
         """The best network alone, if the model has none, and the linear model."""
-        found = []
-        networks = [r for r in self.rows.values() if r.kind in ("neural_ss", "neural_oe")]
-        if networks and not any(r in mixture.rows for r in networks):
+        found, kinds = [], {m.kind for m in model.members or (model,)}
+        networks = [r for r in self.rows.values() if isinstance(r.found, Structure)]
+        if networks and not kinds & {"neural_ss", "neural_oe"}:
             best = min(networks, key=lambda r: r.rmse)
             choice: Provenance = {
                 "chosen": best.kind, "reason": "an alternative to the choice",
@@ -526,7 +575,7 @@ class Table:
             members = self._members(best, MOST_MEMBERS, True)
             extra: Provenance = {"initial_state": "estimated", "choice": choice}
             found.append(self.task.documented(as_one(members, self.task), extra))
-        if self.linear.eligible and not all(r.kind == "oe" for r in mixture.rows):
+        if self.linear.eligible and kinds != {"oe"}:
             chosen = self.linear.choice
             found.append(linear_alternative(chosen, joined(chosen.errors).rmse, self.task))
         return found
@@ -539,7 +588,8 @@ class Table:
                 "the simplest structure that does as well as all together within a standard error"
             )
         else:
-            listed = ", ".join(f"{100 * w:.0f} %" for w in sorted(mixture.weights, reverse=True))
+            weights = sorted(np.round(mixture.weights, 3), reverse=True)
+            listed = ", ".join(f"{100 * w:.0f} %" for w in weights)
             what = f"{len(mixture.rows)} structures with weights of {listed}"
         reason = f"{what}; {count} were judged on {where}"
         linear = self._linear_error()

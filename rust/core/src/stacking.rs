@@ -11,7 +11,7 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::{Error, Result};
 
-/// Of the mean square of the columns, added to the diagonal of `R'R`: equal columns share their weight.
+/// Part by which the diagonal of `R'R` is raised: equal columns share their weight.
 const RIDGE: f64 = 1e-10;
 /// Relative decrease of `|R w|^2` below which no corner is added.
 const TOLERANCE: f64 = 1e-9;
@@ -37,6 +37,11 @@ pub fn convex_weights(residuals: &[f64], models: usize, weights: &[f64]) -> Resu
         ));
     }
     let gram = products(residuals, models, weights);
+    if !gram.iter().all(|v| v.is_finite()) {
+        return Err(Error::data(
+            "residuals: expected values whose squares are finite; leave out models that run away",
+        ));
+    }
     let mut point = vec![0.0; models];
     let mut corners = vec![nearest(gram.diagonal().iter().copied())];
     point[corners[0]] = 1.0;
@@ -105,7 +110,7 @@ fn affine(gram: &DMatrix<f64>, corners: &[usize]) -> DVector<f64> {
     found / sum
 }
 
-/// `R'WR`, scaled to a mean diagonal of 1, with a ridge.
+/// `R'WR`, scaled to a least diagonal of 1, with a ridge in proportion to each diagonal.
 fn products(residuals: &[f64], models: usize, weights: &[f64]) -> DMatrix<f64> {
     let mut gram = DMatrix::zeros(models, models);
     for (row, &w) in residuals.chunks_exact(models).zip(weights) {
@@ -116,12 +121,17 @@ fn products(residuals: &[f64], models: usize, weights: &[f64]) -> DMatrix<f64> {
         }
     }
     gram.fill_upper_triangle_with_lower_triangle();
-    let mean = gram.trace() / models as f64;
-    if mean > 0.0 {
-        gram /= mean;
+    let squares = gram.diagonal();
+    let least = squares
+        .iter()
+        .copied()
+        .filter(|&s| s > 0.0)
+        .fold(f64::INFINITY, f64::min);
+    if least.is_finite() {
+        gram /= least;
     }
     for i in 0..models {
-        gram[(i, i)] += RIDGE;
+        gram[(i, i)] += RIDGE * gram[(i, i)].max(1.0);
     }
     gram
 }
@@ -166,6 +176,16 @@ mod tests {
             convex_weights(&residuals, 2, &[1.0; 3]).unwrap(),
             [1.0, 0.0]
         );
+    }
+
+    #[test]
+    fn a_model_that_is_far_off_changes_nothing_for_the_others() {
+        for far in [1.0, 1e6, 1e9] {
+            let residuals = [1.0, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 10.0 * far];
+            let w = convex_weights(&residuals, 3, &[1.0; 3]).unwrap();
+            assert!((w[0] / w[1] - 9.0).abs() < 1e-6 && w[2] < 0.01, "{w:?}");
+        }
+        assert!(convex_weights(&[1.0, 1e200], 2, &[1.0]).is_err());
     }
 
     #[test]
