@@ -31,8 +31,8 @@ from .folds import (
     free_runs,
 )
 from .linear import HELD_OUT, LEAST_GAIN, LinearCandidate, LinearTable, linear_provenance, short
+from .mixture import MOST_SAMPLES, tabled
 from .search import CLIMB_ITERATIONS, Search
-from .table import MOST_SAMPLES, tabled
 from .task import Pool, Provenance, Stopped, Task, arrays, finite, with_provenance
 from .training import Network, Request, Structure, counting
 from .trials import (
