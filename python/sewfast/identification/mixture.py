@@ -24,6 +24,7 @@ from .blocks import Blocks, Mixture, Row, blocked, combined
 from .closing import MOST_MEMBERS, as_one, closed, cost_of, linear_alternative
 from .grey_box import or_none
 from .linear import joined, linear_provenance
+from .outputs import ABS, suggested
 from .table import Table
 from .task import Pool, Provenance, Stopped, Task, finite, with_provenance
 from .training import Request, Structure, counting, guarded, train
@@ -41,11 +42,13 @@ REFIT = 15
 
 
 def tabled(task: Task, *, wants_network: bool = False) -> Model | None:
-    """The structures that describe the data best, as one model; None if there are too few blocks.
+    """The structures that describe the data best, as one model; None if there are too few blocks,
+    or if the output looks rectified.
     If a network is wanted, it is of state-space networks, even if these are not better.
     """
     folds = blocked(task.data, task.validation)
-    if not folds:
+    # behind a rectifier starts differ too much for four of them: longer records' search has more
+    if not folds or (task.output in (None, "abs") and ABS in suggested(task.data)):
         return None
     pool = Pool(task.threads, task.clock, task.progress)
     table = Table(task, Blocks(task.data, folds), pool, wants_network)
