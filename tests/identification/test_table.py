@@ -72,7 +72,7 @@ def test_validation_data_are_the_only_block() -> None:
 
 def rows_of(residuals: F, blocks: Blocks, parameters: list[int]) -> list[Row]:
     return [
-        Row("oe", p, None, (), r, blocks.errors(r))
+        Row("oe", p, None, (), (), r, blocks.errors(r))
         for r, p in zip(residuals, parameters, strict=True)
     ]
 

@@ -13,7 +13,7 @@ import numpy as np
 from .. import simulators as sim
 from ..simulators import Excitation, FloatArray
 from .blocks import input_curve, output_curve, second_order
-from .drawing import log_uniform, records, sample_time, samples
+from .drawing import log_uniform, records, sample_time, samples, transfer_function
 from .motors import motor_of
 from .system import Record, Rng, System, Truth, family
 
@@ -52,28 +52,16 @@ def _recorded(
     return System(truth, train, test, sample_time(rng))
 
 
-def _linear(
-    b: FloatArray, a: FloatArray
-) -> tuple[Callable[[FloatArray, FloatArray], FloatArray], FloatArray]:
-    delay = int(np.flatnonzero(b)[0])
-    nb = len(b) - delay
-
-    def run(theta: FloatArray, u: FloatArray) -> FloatArray:
-        return sim.filtered(np.concatenate([np.zeros(delay), theta[:nb]]), theta[nb:], u)
-
-    return run, np.concatenate([b[delay:], a])
-
-
 @family("rules", linear=True, quick=True)
 def short_lags(rng: Rng) -> System:
     """One to three lags, dead time of 0 to 4 samples; 15 to 40 dB; PRBS, steps or multisine."""
     tau = log_uniform(rng, 4, 25)
     taus = [tau, *(tau * rng.uniform(0.15, 0.7) for _ in range(int(rng.integers(0, 3))))]
-    run, theta = _linear(
+    truth = transfer_function(
         *sim.lags(log_uniform(rng, 0.1, 100), *taus, delay=int(rng.integers(0, 5)))
     )
     kind = str(rng.choice(["prbs", "prbs", "steps", "multisine"]))
-    return _recorded(rng, run, theta, Excitation(kind, -1.0, 1.0, tau), (15, 40))
+    return _recorded(rng, truth.run, truth.theta, Excitation(kind, -1.0, 1.0, tau), (15, 40))
 
 
 @family("rules", quick=True)
@@ -127,9 +115,10 @@ def short_oscillator(rng: Rng) -> System:
     if rng.random() < 0.5:
         c, d = sim.lags(1.0, period * rng.uniform(0.1, 0.5))
         b, a = np.convolve(b, c), np.convolve(np.r_[1.0, a], np.r_[1.0, d])[1:]
-    run, theta = _linear(b, a)
+    truth = transfer_function(b, a)
     kind = str(rng.choice(["prbs", "prbs", "steps", "levels"]))
-    return _recorded(rng, run, theta, Excitation(kind, -1.0, 1.0, period / 4), (15, 40))
+    signal = Excitation(kind, -1.0, 1.0, period / 4)
+    return _recorded(rng, truth.run, truth.theta, signal, (15, 40))
 
 
 @family("held", quick=True)

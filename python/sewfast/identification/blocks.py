@@ -14,7 +14,18 @@ from .. import _core
 from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.experiment import weights_of
 from ..dynamic_model import INIT, Core
-from .folds import ERROR_BLOCKS, Errors, Split, compared, free_runs, is_moving, with_run_up
+from .folds import (
+    ERROR_BLOCKS,
+    Errors,
+    Split,
+    compared,
+    free_runs,
+    given,
+    is_moving,
+    measured,
+    moves_once,
+    with_run_up,
+)
 from .linear import LEAST_GAIN
 from .task import Provenance, finite, sources
 
@@ -26,8 +37,6 @@ LEAST = 2 * INIT
 AS_GOOD, AT_LEAST = 0.05, 0.02
 """Fewer structures suffice if their error is larger by less than a standard error, within these
 bounds: the best of dozens of structures leads by a per cent or two by luck."""
-
-
 FAR = 100.0
 """Errors of this many times the least are those of runaways, and have no part in any weights."""
 
@@ -39,8 +48,8 @@ def blocked(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ..
     the fitted part as in the held one. Validation data, if given, are the only fold.
     """
     if validation is not None:
-        return (Split(data, validation, is_given=True, sources=tuple(sources(validation))),)
-    if sum(int((np.diff(e.u, axis=0) != 0.0).any(axis=1).sum()) for e in data.experiments) < 2:
+        return given(data, validation)
+    if moves_once(data):
         return ()
     edges = [round(i * len(data) / COUNT) for i in range(COUNT + 1)]
     found = (_without(data, low, high) for low, high in itertools.pairwise(edges))
@@ -57,22 +66,18 @@ def _without(data: Dataset, low: int, high: int) -> Split | None:
     for e in data.experiments:
         start, stop = max(low - first, 0), min(high - first, len(e))
         first += len(e)
-        if stop - start < LEAST or _measured(e, start, stop) < LEAST:
+        if stop - start < LEAST or measured(e.y[start:stop]) < LEAST:
             fitted.append(e)
             continue
         held.append(with_run_up(e, start, stop))
         parts.append(e.cut(start, stop))
         around = ((0, start), (stop, len(e)))
-        fitted += [e.cut(a, b) for a, b in around if _measured(e, a, b) >= LEAST]
+        fitted += [e.cut(a, b) for a, b in around if measured(e.y[a:b]) >= LEAST]
     if not (held and fitted):
         return None
     pieces = (replace(data, experiments=tuple(p)) for p in (fitted, held, parts))
     of, judged, scored = pieces
     return Split(of, judged, sources=tuple(sources(scored)))
-
-
-def _measured(e: Experiment, start: int, stop: int) -> int:
-    return int(np.isfinite(e.y[start:stop]).sum())
 
 
 @dataclass(frozen=True)
@@ -140,13 +145,15 @@ class Blocks:
 @dataclass(frozen=True, eq=False)
 class Row:
     """A structure, its models of each fold, and what these leave unexplained on the blocks.
-    `found` is what the row was made of; `models` are those of each fold, the best first.
+    `found` is what the row was made of; `models` are those of each fold, the best first; `sound`
+    says of each fold whether they passed the guard.
     """
 
     kind: str
     parameters: int
     found: Any
     models: tuple[tuple[Any, ...], ...]
+    sound: tuple[bool, ...]
     residual: FloatArray
     errors: Errors
 

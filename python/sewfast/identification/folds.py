@@ -88,7 +88,7 @@ def split(data: Dataset, skipped: float = 0.0) -> Split | None:
         if stop - at < LEAST_HELD_OUT or at < LEAST_HELD_OUT:
             fitted.append(e)
             continue
-        if min(_measured(e.y[:at]), _measured(e.y[at:stop])) < LEAST_HELD_OUT:
+        if min(measured(e.y[:at]), measured(e.y[at:stop])) < LEAST_HELD_OUT:
             # a long gap leaves too little on one side for a split
             fitted.append(e.cut(0, stop))
             continue
@@ -107,7 +107,7 @@ def split(data: Dataset, skipped: float = 0.0) -> Split | None:
 
 def _whole(data: Dataset, skipped: float) -> tuple[list[Experiment], list[Experiment]]:
     """Many short experiments split into those before the last fifth, and that fifth."""
-    able = [e for e in data.experiments if _measured(e.y) >= LEAST_HELD_OUT]
+    able = [e for e in data.experiments if measured(e.y) >= LEAST_HELD_OUT]
     stop = round((1.0 - skipped) * len(able))
     at = stop - round(SHARE * len(able))
     return able[:at], able[at:stop] if at > 0 else []
@@ -120,11 +120,22 @@ def folds(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]
     Validation data, if given, are the only fold.
     """
     if validation is not None:
-        return (Split(data, validation, is_given=True, sources=tuple(sources(validation))),)
-    if sum(int((np.diff(e.u, axis=0) != 0.0).any(axis=1).sum()) for e in data.experiments) < 2:
+        return given(data, validation)
+    if moves_once(data):
         return ()
     found = (split(data, skipped=i * SHARE) for i in range(FOLDS))
     return tuple(f for f in found if f is not None and f.scored and is_moving(f.fitted))
+
+
+def given(data: Dataset, validation: Dataset) -> tuple[Split, ...]:
+    """Validation data as the only fold."""
+    return (Split(data, validation, is_given=True, sources=tuple(sources(validation))),)
+
+
+def moves_once(data: Dataset) -> bool:
+    """Whether the inputs move less than twice."""
+    moves = ((np.diff(e.u, axis=0) != 0.0).any(axis=1).sum() for e in data.experiments)
+    return sum(map(int, moves)) < 2
 
 
 def is_moving(data: Dataset) -> bool:
@@ -136,7 +147,8 @@ def is_moving(data: Dataset) -> bool:
     return True
 
 
-def _measured(y: FloatArray) -> int:
+def measured(y: FloatArray) -> int:
+    """Number of outputs that are known."""
     return int(np.isfinite(y).sum())
 
 

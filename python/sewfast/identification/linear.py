@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .. import _core
-from ..dataset import Dataset
+from ..dataset import Dataset, Diagnosis
 from ..dataset.experiment import mean_square, weights_of
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted
@@ -354,11 +354,16 @@ class LinearTable:
         largest = max(abs(v) for v in data.output_range)
         return min(joined(c.errors).rmse for c in self.eligible) <= ROUNDING * largest
 
-    def integrates(self, data: Dataset) -> bool:
-        """Whether the best models have a pole at 1 and an unbounded steady gain.
+    def integrates(self, data: Dataset, diagnosis: Diagnosis) -> bool:
+        """Whether the record shows an integrator, or the best models do: a pole at 1 and an
+        unbounded steady gain.
         Friction or limits also lead larger orders to a pole near 1, but these do worse on held-out
         data: only the best models count.
         """
+        if diagnosis.find("integrator") is not None:
+            return True
+        if not self.eligible:
+            return False
         low, high = data.output_range
         swing = np.ptp(np.concatenate([e.u for e in data.experiments]), axis=0)
         asked = [c.models[0] for c in (self.choice, self.best)]

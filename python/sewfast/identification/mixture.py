@@ -181,13 +181,15 @@ class Ending:
         if isinstance(row.found, Structure):
             known["weight_decay"] = row.found.decay
         plain = known | {"samples_fitted": len(self.task.data)}
+        # not every fold of a row need have a sound network
+        asked = row.sound if any(row.sound) else (True,) * len(fitted)
         of_folds = [
             (m[i], known | {"samples_fitted": n})
             for i in range(max(map(len, row.models)))
-            for m, n in zip(row.models, fitted, strict=True)
-            if i < len(m)
+            for m, n, is_asked in zip(row.models, fitted, asked, strict=True)
+            if is_asked and i < len(m)
         ]
-        given = self._sound(of_folds)[:most]
+        given = of_folds[:most]
         if not most or is_interrupted or self.table.folds[0].is_given:
             return given
         if self.clock.over(SHARE_OF_REFIT, REFIT_LOST):
@@ -225,16 +227,6 @@ class Ending:
         (starts,) = guarded(found, self.table.pairs, self.table.bounds, self.pool)
         return [(s.model, plain) for s in counting(starts) if s.is_sound] or given
 
-    def _sound(self, cores: list[tuple[Any, Provenance]]) -> list[tuple[Any, Provenance]]:
-        """Those that pass the guard, as not every fold of a row need have one; all if none does."""
-        networks = (_core.NeuralSS, _core.NeuralOE)
-        return [
-            pair
-            for pair in cores
-            if not isinstance(pair[0], networks)
-            or not _core.guard(pair[0], self.table.pairs, linear=self.table.bounds)
-        ] or cores
-
     def _unsound_row(self) -> Row:
         """The best network that failed the guard, if a network was asked for by name."""
         if self.table.unsound is not None:
@@ -246,7 +238,8 @@ class Ending:
                 residual = np.full(len(self.table.blocks.weights), np.inf)
             parameters = structure.parameters(self.task.data.n_inputs)
             errors = self.table.blocks.errors(residual)
-            return Row("neural_ss", parameters, structure, models, residual, errors)
+            sound = (False,) * len(models)
+            return Row("neural_ss", parameters, structure, models, sound, residual, errors)
         remedy = "give more time" if self.clock.truncated else "record longer"
         raise FitError(
             f"{self.task.data.source}: expected a model with a finite free run on data not trained "
@@ -254,8 +247,8 @@ class Ending:
         )
 
     def _linear_error(self) -> float | None:
-        errors = [joined(c.errors).rmse for c in self.table.linear.eligible]
-        return min(errors, default=None)
+        table = self.table.linear
+        return min((table.error(c.order, c.nk) for c in table.eligible), default=None)
 
     def _alternatives(self, model: Model) -> list[Model]:
         """The best network alone, if the model has none, and the linear model."""

@@ -272,7 +272,7 @@ class Search(Trials):
             return []
         orders: tuple[int, ...] = (2, 3)
         likely: tuple[int, ...] = (1, 2) if self.repeats else (1, 2, 4, 8)
-        if not self._integrates():
+        if not self.linear.integrates(self.task.data, self.diagnosis):
             # linear models miss the integrator of a drive that friction holds most of the time
             if self.linear.best.rmse < SAYS_LITTLE * self._deviation:
                 return []
@@ -305,11 +305,6 @@ class Search(Trials):
     def repeats(self) -> bool:
         """Whether the record repeats one trajectory, so that held-out data were seen before."""
         return self.diagnosis.find("repeats") is not None
-
-    def _integrates(self) -> bool:
-        """Whether the record or the best linear models show an integrator."""
-        is_seen = self.diagnosis.find("integrator") is not None
-        return is_seen or self.linear.integrates(self.task.data)
 
     def _lagged(self) -> list[Structure]:
         """The lagged network of second order; its weight decay has a different meaning."""

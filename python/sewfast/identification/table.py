@@ -23,7 +23,7 @@ from . import grey_box
 from .blocks import Blocks, Row
 from .grey_box import or_none
 from .linear import MISLED, ROUNDING, LinearTable, raised, time_constant
-from .outputs import ABS, LINEAR, Output, is_rectified, named, rectified_start, suggested
+from .outputs import ABS, LINEAR, Output, named, rectified_start, suggested
 from .task import Pool, Task, arrays
 from .training import Request, Start, Structure, counting, guarded, train
 from .trials import (
@@ -58,7 +58,7 @@ Models: TypeAlias = Sequence[Sequence[Any]]
 
 @dataclass
 class Table:
-    """The structures of one identification, and the model that is made of them.
+    """The structures of one identification.
     `rows` are those with a finite free run on every block, by what they were made of.
     """
 
@@ -129,21 +129,24 @@ class Table:
         self._enter("grey_box", len(largest.core.theta), largest, [(c.core,) for c in found])
 
     def enter_linear(self) -> None:
+        """Rows of all linear models so far that every fold has."""
         if self.wants_network:
             return
         for c in self.linear.candidates.values():
             if all(m is not None for m in c.models):
                 self._enter("oe", c.parameters, c, [(m,) for m in c.models])
 
-    def _enter(self, kind: str, parameters: int, found: Any, models: Models) -> Row | None:
+    def _enter(
+        self, kind: str, parameters: int, found: Any, models: Models, sound: Sequence[bool] = ()
+    ) -> Row | None:
         """A row of these models of each fold, unless one runs away on its block."""
         cores = [m[0] if len(m) == 1 else EnsembleCore(tuple(m), "median") for m in models]
         residual = self.blocks.residual(cores)
         if residual is None:
             return None
         row = Row(
-            kind, parameters, found, tuple(map(tuple, models)), residual,
-            self.blocks.errors(residual),
+            kind, parameters, found, tuple(map(tuple, models)),
+            tuple(sound) or (True,) * len(self.folds), residual, self.blocks.errors(residual),
         )  # fmt: skip
         self.rows[found] = row
         self.pool.best = min(self.pool.best, row.rmse)
@@ -168,14 +171,8 @@ class Table:
         return found
 
     def _outputs(self) -> list[Output]:
-        data = self.task.data
-        if self.task.output is not None:
-            return [named(self.task.output, data)]
-        return [o for o in suggested(data) if o != ABS or self._is_rectified()]
-
-    def _is_rectified(self) -> bool:
-        plain = [c.models[0] for c in self.linear.eligible if c.order <= 2]
-        return is_rectified(self._behind_rectifier, self.pairs, plain)
+        output, data = self.task.output, self.task.data
+        return suggested(data) if output is None else [named(output, data)]
 
     @cached_property
     def _behind_rectifier(self) -> _core.LinearModel | None:
@@ -219,21 +216,17 @@ class Table:
             able = [o for o in orders if linear.error(o, linear.nk) <= MISLED * least]
             like = (min(able), linear.nk, LINEAR)
             found += [replace(s, nk=0) for s in found if (s.nx, s.nk, s.output) == like]
-        if not self.wants_network and task.nx is None and task.output in (None, "linear"):
+        is_free = task.nx is None and task.output in (None, "linear")
+        if is_free and not self.wants_network:
             lagged = Structure(2, nk, hidden, LAGGED_DECAY, kind="neural_oe")
             found[2:2] = [lagged] if nk >= 1 else []
-        if task.nx is None and task.output in (None, "linear") and self._integrates():
+        if is_free and linear.integrates(task.data, self.diagnosis):
             found += [
                 Structure(nx, linear.nk, h, DECAYS[0], integrator=True)
                 for nx in (2, 3)
                 for h in ((2, HIDDEN) if task.hidden is None else (task.hidden,))
             ]
         return [s for s in found if self._is_affordable(s)]
-
-    def _integrates(self) -> bool:
-        linear = self.linear
-        is_seen = self.diagnosis.find("integrator") is not None
-        return is_seen or (bool(linear.eligible) and linear.integrates(self.task.data))
 
     @cached_property
     def diagnosis(self) -> Diagnosis:
@@ -297,7 +290,8 @@ class Table:
                 self.unsound = s, tuple(tuple(f) for f in judged)
             return None
         parameters = s.parameters(task.data.n_inputs)
-        return self._enter(s.kind, parameters, s, [[x.model for x in f] for f in judged])
+        trained = [[x.model for x in f] for f in judged]
+        return self._enter(s.kind, parameters, s, trained, [f[0].is_sound for f in judged])
 
     def _started(
         self, requests: Sequence[Request], until: float | None, share: float
