@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ import sewfast
 from effort import FULL
 from plants import bent_data, linear_data
 from sewfast import Dataset, Ensemble, LinearOE, NeuralOE, NeuralSS, _core, identify, validate
+from sewfast.dataset import diagnose
 from sewfast.errors import DataError, FitError, Interrupted, SettingError
 from sewfast.identification import table
 from sewfast.identification.folds import (
@@ -26,10 +26,8 @@ from sewfast.identification.folds import (
     free_runs,
 )
 from sewfast.identification.linear import DELAYS, LinearTable, raised
-from sewfast.identification.search import HALVING_ITERATIONS, STILL_NEAR, Search
 from sewfast.identification.task import Clock, Pool, Stopped, Task
-from sewfast.identification.training import Start, Structure
-from sewfast.identification.trials import Candidate, best_of_each_size, counting
+from sewfast.identification.training import Start, counting
 
 F = NDArray[np.float64]
 SEEDS = range(3 if FULL else 1)
@@ -221,23 +219,6 @@ def test_sound_starts_count_first_and_far_worse_ones_not_at_all() -> None:
     assert counting([]) == []
 
 
-def test_direct_feedthrough_has_to_be_worth_it() -> None:
-    data = bent_data()
-    search = Search(task(data), folds(data), pool())
-
-    def candidate(nk: int, error: float) -> Candidate:
-        return Candidate(
-            Structure(1, nk, 4, 1e-4), (start(1.0),), errors(np.full(12, 100 * error**2)), 1
-        )
-
-    delayed, at_once = candidate(1, 1.0), candidate(0, 0.6)
-    search.candidates = {c.structure: c for c in (delayed, at_once)}
-    assert search.best is delayed
-    better = candidate(0, 0.4)
-    search.candidates[better.structure] = better
-    assert search.best is better
-
-
 @pytest.mark.nightly("a default search for each seed")
 @pytest.mark.parametrize("nk", [0, 1])
 def test_feedthrough_is_found_before_further_states_make_up_for_it(nk: int) -> None:
@@ -251,13 +232,8 @@ def test_feedthrough_is_found_before_further_states_make_up_for_it(nk: int) -> N
         y[k] = 1.6 * y[k - 1] - 0.8 * y[k - 2] - 0.02 * y[k - 1] ** 3 + 0.2 * u[k - nk]
     y += 0.002 * rng.normal(size=len(u))
     data = Dataset.from_arrays(u, y, 0.01)
-    search = Search(task(data), folds(data), pool())
-    search.linear.search(None)
-    kept = search.screen()
-    assert search.feeds_through == (nk == 0)
-    assert any(c.structure.nk == 0 for c in kept) == (nk == 0)
-    assert search.best is not None
-    assert search.best.structure.nk == nk
+    model = identify(data, threads=2)
+    assert {m.orders["nk"] for m in model.members or (model,)} == {nk}
 
 
 def test_a_model_without_a_delay_says_that_no_loop_can_be_closed_around_it() -> None:
@@ -273,37 +249,13 @@ def test_a_model_without_a_delay_says_that_no_loop_can_be_closed_around_it() -> 
     assert not any("nk = 1" in note for note in asked.training.get("notes", []))
 
 
-def test_the_best_of_every_number_of_states_is_trained_beyond_the_screening() -> None:
-    data = bent_data(1000, noise=0.1)
-    search = Search(task(data, starts=1), folds(data), pool())
-    search.linear.search(None)
-    alive = search.screen()
-    assert len({c.structure.nx for c in alive}) > 1
-    near = {c.structure.size for c in alive if c.error <= STILL_NEAR * alive[0].error}
-    kept = search.halve(alive, HALVING_ITERATIONS[0])
-    assert near <= {c.structure.size for c in kept}
-    firsts = best_of_each_size(sorted(alive, key=lambda c: c.error))
-    assert len({c.structure.size for c in firsts}) == len(firsts)
-
-
-@pytest.mark.parametrize(("samples", "hidden"), [(4_000, 16), (46_000, 8)])
-def test_on_much_data_the_smaller_of_equal_networks_goes_on(samples: int, hidden: int) -> None:
-    data = bent_data(samples, noise=0.1)
-    search = Search(task(data), folds(data), pool())
-    held = Errors(np.ones(50), np.ones(50))
-    least, close, worse = (replace(held, squares=held.squares * f**2) for f in (1.0, 1.01, 1.03))
-    sizes = {16: least, 8: close, 4: worse}
-    found = [Candidate(Structure(2, 1, h, 1e-7), (), e, 60) for h, e in sizes.items()]
-    assert search.simplest(found).structure.hidden == hidden
-
-
 def test_a_repeated_trajectory_is_seen_and_a_random_one_is_not() -> None:
     rng = np.random.default_rng(2)
     once = np.repeat(rng.uniform(-1, 1, 20), 30)
     for u, repeats in ((np.tile(once, 4), True), (np.repeat(rng.uniform(-1, 1, 80), 30), False)):
         y = np.cumsum(u + 0.01 * rng.normal(size=len(u)))
         data = Dataset.from_arrays(u, y, 0.01)
-        assert Search(task(data), folds(data), pool()).repeats == repeats
+        assert (diagnose(data).find("repeats") is not None) == repeats
 
 
 # --- the pool -------------------------------------------------------------------------------------
@@ -432,7 +384,7 @@ def test_a_kind_by_name_gets_a_verdict_too(kind: Any) -> None:
 def test_a_network_by_name_is_trained_where_the_linear_fits_took_the_search_s_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(table, "SHARE_OF_NETWORKS", 1e-9)
+    monkeypatch.setattr(table, "SHARE_OF_SEARCH", 1e-9)
     data = bent_data(600)
     model = identify(data, model="neural_ss", time_budget=600.0)
     assert {m.kind for m in model.members or (model,)} == {"neural_ss"}

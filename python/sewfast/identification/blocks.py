@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,47 +33,53 @@ from .task import Provenance, finite, sources
 COUNT = 4
 """Blocks. Eight take twice the time and gain nothing: geometric mean of test errors .384 of output
 error's, against .349 with four (families `short_*` of the battery's rules, systems 0 to 4)."""
+ENOUGH = 3_000
+"""Samples to judge by: with more data, fewer blocks are held out, each made of stretches that are
+spread over the record."""
 LEAST = 2 * INIT
 """Samples of a block of one experiment."""
-AS_GOOD, AT_LEAST = 0.05, 0.02
-"""Fewer structures suffice if their error is larger by less than a standard error, within these
-bounds: the best of dozens of structures leads by a per cent or two by luck."""
-FAR = 100.0
-"""Errors of this many times the least are those of runaways, and have no part in any weights."""
+AS_GOOD, BY_LUCK = 0.05, 10.0
+"""Fewer structures suffice if their error is larger by at most a standard error, or by this number
+over that of samples, up to the first bound: the best of dozens of structures leads by luck."""
+FAR = 2.0
+"""A structure with an error of more than this many times the least has no part in any weights: the
+errors of bad models can cancel on some blocks, but a median of members does not cancel them."""
 
 
 def blocked(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]:
-    """The experiments one after another in contiguous blocks, each held out once, in order.
-    What is left of an experiment before and after its block is fitted. There are none if the data
-    are too short, or if the inputs move only once: what follows a single step is its response, in
-    the fitted part as in the held one. Validation data, if given, are the only fold.
+    """The experiments one after another in blocks, each held out once, in order.
+    What is left of an experiment around its blocks is fitted. On many data only the first folds
+    are given, those that are enough to judge by. There are none if the data are too short, or if
+    the inputs move only once: what follows a single step is its response, in the fitted part as in
+    the held one. Validation data, if given, are the only fold.
     """
     if validation is not None:
         return given(data, validation)
     if moves_once(data):
         return ()
-    edges = [round(i * len(data) / COUNT) for i in range(COUNT + 1)]
-    found = (_without(data, low, high) for low, high in itertools.pairwise(edges))
+    count = min(COUNT, math.ceil(COUNT * ENOUGH / len(data)))
+    edges = np.linspace(0, len(data), COUNT * math.ceil(COUNT / count) + 1).round().astype(int)
+    stretches = list(itertools.pairwise(edges.tolist()))
+    found = (_without(data, stretches[i::COUNT]) for i in range(count))
     parts = tuple(f for f in found if f is not None and f.scored and is_moving(f.fitted))
-    return parts if len(parts) > 1 else ()
+    return parts if len(parts) > 1 or count == 1 else ()
 
 
-def _without(data: Dataset, low: int, high: int) -> Split | None:
-    """Samples `low` to `high` of all experiments held out; None if they are too few."""
+def _without(data: Dataset, stretches: Sequence[tuple[int, int]]) -> Split | None:
+    """These ranges of the samples of all experiments held out; None if they are too short."""
     fitted: list[Experiment] = []
     held: list[Experiment] = []
     parts: list[Experiment] = []
     first = 0
     for e in data.experiments:
-        start, stop = max(low - first, 0), min(high - first, len(e))
+        within = [(max(low - first, 0), min(high - first, len(e))) for low, high in stretches]
+        able = [(a, b) for a, b in within if b - a >= LEAST and measured(e.y[a:b]) >= LEAST]
         first += len(e)
-        if stop - start < LEAST or measured(e.y[start:stop]) < LEAST:
-            fitted.append(e)
-            continue
-        held.append(with_run_up(e, start, stop))
-        parts.append(e.cut(start, stop))
-        around = ((0, start), (stop, len(e)))
-        fitted += [e.cut(a, b) for a, b in around if measured(e.y[a:b]) >= LEAST]
+        held += [with_run_up(e, a, b) for a, b in able]
+        parts += [e.cut(a, b) for a, b in able]
+        edges = [0, *itertools.chain(*able), len(e)]
+        around = zip(edges[::2], edges[1::2], strict=True)
+        fitted += [e.cut(a, b) for a, b in around if not able or measured(e.y[a:b]) >= LEAST]
     if not (held and fitted):
         return None
     pieces = (replace(data, experiments=tuple(p)) for p in (fitted, held, parts))
@@ -120,6 +127,11 @@ class Blocks:
             sum(int(np.isfinite(e.y[e.initial_samples(INIT) :]).sum()) for e in f.held.experiments)
             for f in self.folds
         ]
+
+    @property
+    def luck(self) -> float:
+        """Logarithm of the ratio of errors by which the best of dozens of structures may lead."""
+        return BY_LUCK / len(self.weights)
 
     def residual(self, cores: Sequence[Core]) -> FloatArray | None:
         """Scored outputs minus the free runs of one model per fold; None if a run diverges."""
@@ -191,11 +203,10 @@ def combined(rows: Sequence[Row], blocks: Blocks) -> Mixture:
     One row if there is one, the simplest such; else those that are left when one after another is
     dropped without which the error grows least.
     """
-    least = min(r.rmse for r in rows)
-    rows = [r for r in rows if r.rmse <= FAR * least]
+    rows, luck = able(rows), blocks.luck
     everything = Mixture.of(rows, blocks)
     for row in sorted(rows, key=lambda r: (r.parameters, r.rmse)):
-        if _is_as_good(row.errors, everything.errors):
+        if is_as_good(row.errors, everything.errors, luck):
             linear = [r for r in rows if r.kind == "oe"]
             return Mixture.of([simplest(linear) if row in linear else row], blocks)
     pairs = zip(rows, everything.weights, strict=True)
@@ -204,20 +215,27 @@ def combined(rows: Sequence[Row], blocks: Blocks) -> Mixture:
         fewer = [
             Mixture.of([r for r in best.rows if r is not dropped], blocks) for dropped in best.rows
         ]
-        able = [m for m in fewer if _is_as_good(m.errors, everything.errors)]
-        if not able:
+        enough = [m for m in fewer if is_as_good(m.errors, everything.errors, luck)]
+        if not enough:
             break
-        best = min(able, key=lambda m: m.errors.rmse)
+        best = min(enough, key=lambda m: m.errors.rmse)
     return best
+
+
+def able(rows: Sequence[Row]) -> list[Row]:
+    """Those that do not run away."""
+    least = min(r.rmse for r in rows)
+    return [r for r in rows if r.rmse <= FAR * least]
 
 
 def simplest(rows: Sequence[Row]) -> Row:
     """The simplest linear model that does as well as the best of them, which is hardly luck."""
     best = min(rows, key=lambda r: r.rmse)
     ranked = sorted(rows, key=lambda r: (r.parameters, r.rmse))
-    return next(r for r in ranked if _is_as_good(r.errors, best.errors, LEAST_GAIN))
+    return next(r for r in ranked if is_as_good(r.errors, best.errors, LEAST_GAIN))
 
 
-def _is_as_good(one: Errors, other: Errors, least: float = AT_LEAST) -> bool:
+def is_as_good(one: Errors, other: Errors, least: float) -> bool:
+    """Whether the first errors are larger by at most a standard error, or by `least`."""
     ratio, deviation = compared(one, other)
     return ratio <= min(max(deviation, least), AS_GOOD)

@@ -25,7 +25,7 @@ from ..models.files import STRUCTURED
 from ..models.linear import LinearDifference
 from ..progress import shown_in_notebooks
 from ..threads import Workers, available, require_workers
-from . import choice, further, grey_box, lagged, linear
+from . import further, grey_box, lagged, linear, mixture
 from .folds import TEXTS, UNSEEN_DATA, Split, thinned, unstable_verdict, verdict
 from .outputs import OUTPUTS
 from .rest import for_loops
@@ -33,13 +33,13 @@ from .task import Clock, Progress, Provenance, Task, with_provenance
 from .training import Structure
 
 _KINDS: dict[str, Callable[[Task], Model]] = {
-    "auto": choice.searched,
+    "auto": mixture.searched,
     "arx": linear.arx,
     "iv": linear.iv,
     "oe": linear.oe,
     "grey_box": grey_box.grey_box,
     "neural_oe": lagged.neural_oe,
-    "neural_ss": partial(choice.searched, wants_network=True),
+    "neural_ss": partial(mixture.searched, wants_network=True),
     "paper": lagged.paper,
     **{cls.kind: lagged.identified_as(cls) for cls in STRUCTURED},
 }
@@ -126,8 +126,8 @@ def identify(
     iterations : int or None
         At most this many per start; None: by the amount of data, 100 for a lagged model.
     validation : Dataset or None
-        Data for selection only, not for fitting. None holds out four blocks in turn, with more than
-        3,750 samples the last fifth of every experiment (two of eight blocks for `neural_oe`).
+        Data for selection only, not for fitting. None holds out blocks in turn (of
+        `neural_oe` two of eight).
     threads : int or None
         None uses every core, or as many as the environment variable SEWFAST_THREADS allows.
     workers : executor or None

@@ -41,9 +41,9 @@ RUN_UP = 10 * INIT
 @dataclass(frozen=True)
 class Split:
     """Data to fit to and data to choose by.
-    `held` begins in the fitted data, where only the first `INIT` outputs are known. If `is_given`,
-    it is the user's own validation data, which are never trained on. `sources` are the scored
-    ranges, as JSON values.
+    Parts of `held` begin in the fitted data, which give their state. If `is_given`, it is the
+    user's own validation data, which are never trained on. `sources` are the scored ranges, as
+    JSON values.
     """
 
     fitted: Dataset
@@ -54,7 +54,7 @@ class Split:
     @property
     def scored(self) -> int:
         """Number of samples by which models are chosen."""
-        return sum(int(np.isfinite(e.y[INIT:]).sum()) for e in self.held.experiments)
+        return sum(measured(e.y[e.initial_samples(INIT) :]) for e in self.held.experiments)
 
     @property
     def spread(self) -> float:
@@ -152,12 +152,27 @@ def measured(y: FloatArray) -> int:
     return int(np.isfinite(y).sum())
 
 
-def with_run_up(e: Experiment, at: int, stop: int) -> Experiment:
+@dataclass(frozen=True, eq=False, repr=False)
+class HeldOut(Experiment):
+    """A held-out part; its first `run_up` samples are fitted ones, which only give its state."""
+
+    run_up: int = 0
+
+    def initial_samples(self, init: int) -> int:
+        """Number of first samples that give the state, at least `init` measured ones."""
+        return max(self.run_up, super().initial_samples(init))
+
+    def cut(self, start: int, stop: int) -> HeldOut:
+        """Samples `start` to `stop`, with what is left of the run-up."""
+        e = super().cut(start, stop)
+        left = max(0, self.run_up - start)
+        return HeldOut(e.u, e.y, {}, e.name, e.start, weights=e.weights, run_up=left)
+
+
+def with_run_up(e: Experiment, at: int, stop: int) -> HeldOut:
     begin = max(0, at - RUN_UP)
-    y = e.y[begin:stop].copy()
-    y[e.cut(begin, stop).initial_samples(INIT) : at - begin] = np.nan
-    weights = None if e.weights is None else e.weights[begin:stop]
-    return Experiment(e.u[begin:stop], y, {}, e.name, e.start + begin, weights=weights)
+    part = e.cut(begin, stop)
+    return HeldOut(part.u, part.y, {}, e.name, part.start, weights=part.weights, run_up=at - begin)
 
 
 def _shortened(data: Dataset, samples: int) -> Dataset:

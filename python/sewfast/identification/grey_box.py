@@ -34,8 +34,6 @@ EXCERPT, POLISHING = 8_000, 10
 """Samples on which the starts are trained, and iterations of the best one on all samples."""
 SEARCHED, MOST_FITTED = 10_000, 100_000
 """Samples to which a motor is fitted during a search of structures, and at its end."""
-EARLIER = "the motor on an earlier part"
-"""What is lost if a time budget ends before a motor is fitted to a second part."""
 ENOUGH = 1.0
 """Squared distance to the minimum in standard errors at which the descent ends."""
 ARGUMENTS, OUTPUTS = 3.0, 0.1
@@ -149,6 +147,7 @@ class Motors:
 
     def fitted(self, data: Dataset, hidden: int, look: Look | None = None) -> _core.GreyBox:
         """A motor's parameters, a network of `hidden` units beside it, and the process noise."""
+        data = thinned(data, MOST_FITTED)
         core = _motor(data, look)
         return _with_noise(self._with_network(core, data, hidden, look) if hidden else core, data)
 
@@ -179,19 +178,6 @@ class Motors:
         fuller = self._beside(plain, part, pool, until)
         return fuller if fuller is not None and _is_better(fuller, plain) else plain
 
-    def again(
-        self, found: MotorCandidate, part: Split, pool: Pool, until: float | None
-    ) -> float | None:
-        """The error of the same candidate fitted to another part; None if there is none."""
-        plain = pool.map(
-            lambda part, look: or_none(lambda: self.alone(part, look)),
-            [part], until=until, what=EARLIER,
-        )[0]  # fmt: skip
-        if plain is None or not found.hidden:
-            return None if plain is None else plain.rmse
-        fuller = self._beside(plain, part, pool, until)
-        return None if fuller is None else fuller.rmse
-
     def _beside(
         self, motor: MotorCandidate, part: Split, pool: Pool, until: float | None
     ) -> MotorCandidate | None:
@@ -199,16 +185,6 @@ class Motors:
             lambda part, look: or_none(lambda: self.beside(motor, part, look)),
             [part], until=until, what="a network beside the motor",
         )[0]  # fmt: skip
-
-    def refitted(
-        self, found: MotorCandidate, data: Dataset, part: Split, look: Look
-    ) -> _core.GreyBox:
-        """The candidate fitted to all data, unless that is worse on the part that chose it."""
-        own = or_none(lambda: self.fitted(thinned(data, MOST_FITTED), found.hidden, look))
-        if own is None:
-            return found.core
-        ratio, deviation = compared(errors_of(free_runs(own, part), part), found.errors)
-        return found.core if ratio > deviation else own
 
     def _with_network(
         self, core: _core.GreyBox, data: Dataset, hidden: int, look: Look | None

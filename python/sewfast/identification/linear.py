@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -184,8 +184,9 @@ class LinearCandidate:
 
     @property
     def rmse(self) -> float:
-        """Error on the newest fold."""
-        return self.errors[0].rmse
+        """Error on all folds together."""
+        squares = np.concatenate([e.squares for e in self.errors])
+        return Errors(squares, np.concatenate([e.counts for e in self.errors])).rmse
 
     @property
     def parameters(self) -> int:
@@ -201,8 +202,8 @@ class LinearCandidate:
 @dataclass
 class LinearTable:
     """Linear models fitted for a decision.
-    The newest of the `folds` comes first; models are fitted to thinned excerpts of their training
-    data. `given_nk` is None if the delay is not given.
+    Models are fitted to thinned excerpts of each fold's training data. `given_nk` is None if the
+    delay is not given.
     """
 
     given_nk: int | None
@@ -290,7 +291,7 @@ class LinearTable:
     def error(self, order: int, nk: int) -> float:
         """Error on all folds; infinite if there is no such model."""
         found = self.candidates.get((order, nk))
-        return math.inf if found is None else joined(found.errors).rmse
+        return math.inf if found is None else found.rmse
 
     @property
     def eligible(self) -> list[LinearCandidate]:
@@ -305,7 +306,7 @@ class LinearTable:
 
     @property
     def best(self) -> LinearCandidate:
-        """The model with the lowest error on the newest fold."""
+        """The model with the lowest error."""
         return min(self.eligible, key=lambda c: c.rmse)
 
     @property
@@ -352,7 +353,7 @@ class LinearTable:
         if not self.eligible:
             return False
         largest = max(abs(v) for v in data.output_range)
-        return min(joined(c.errors).rmse for c in self.eligible) <= ROUNDING * largest
+        return self.best.rmse <= ROUNDING * largest
 
     def integrates(self, data: Dataset, diagnosis: Diagnosis) -> bool:
         """Whether the record shows an integrator, or the best models do: a pole at 1 and an
@@ -373,16 +374,6 @@ class LinearTable:
             and float(np.abs(m.dc_gain() * swing).max()) > ENDLESS_GAIN * (high - low)
             for m in asked
         )
-
-    def rows(self) -> Iterator[Provenance]:
-        """For the table of candidates."""
-        yield from (c.to_json() for _, c in sorted(self.candidates.items()))
-
-
-def joined(errors: Sequence[Errors]) -> Errors:
-    """The errors on all folds together."""
-    squares = np.concatenate([e.squares for e in errors])
-    return Errors(squares, np.concatenate([e.counts for e in errors]))
 
 
 def simplest(

@@ -1,55 +1,62 @@
-"""The end of the search on little data: from the table of structures to one model.
+"""The end of the search: from the table of structures to one model.
 
 Structures with weight are trained on everything; of several the model is the median of members in
-proportion to their weights: on few data a start can go astray on a new input, and a median ignores
-it where a weighted mean is lost with it.
+proportion to their weights: a start can go astray on a new input, and a median ignores it where a
+weighted mean is lost with it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from .. import _core
-from ..dataset import Diagnosis, FloatArray
+from ..dataset import Dataset, Diagnosis, FloatArray
+from ..dataset.experiment import mean_square, weights_of
 from ..errors import FitError, Interrupted
-from ..models import Model
+from ..models import Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from ..models.base import EnsembleCore
+from ..models.grey_box import GreyBox
 from . import grey_box
-from .blocks import Blocks, Mixture, Row, blocked, combined
-from .closing import MOST_MEMBERS, as_one, closed, cost_of, linear_alternative
+from .blocks import LEAST, Blocks, Mixture, Row, blocked, combined
+from .folds import TEXTS, Split, verdict, what_to_record
 from .grey_box import or_none
-from .linear import joined, linear_provenance
-from .outputs import ABS, suggested
-from .table import Table
-from .task import Pool, Provenance, Stopped, Task, finite, with_provenance
+from .linear import LinearCandidate, linear_provenance, short
+from .table import SHARE_OF_REFIT, TRAINING, Table
+from .task import Pool, Provenance, Stopped, Task, finite, with_provenance, wrap
 from .training import Request, Structure, counting, guarded, train
-from .trials import (
-    DIAGNOSIS,
-    REFIT_LOST,
-    SHARE_OF_REFIT,
-    TRAINING,
-)
 
-MOST_SAMPLES = 3_750
-"""Samples up to which every structure can be trained without each block."""
+REFIT_LOST, DIAGNOSIS = "the fit to all samples", "the diagnosis of the record"
+"""What is lost if a budget ends before these."""
 REFIT = 15
 """Iterations on all data of a network that was trained without a block."""
+MOST_MEMBERS = 15
+"""Members of an ensemble: a controller is tuned on each, and a median of more is hardly better."""
+WORTH_IT = 0.9
+"""A network must bring the error below this part of the best linear model's, and of a motor's."""
+_CLASSES: dict[type, type[Model]] = {
+    _core.LinearModel: LinearOE, _core.GreyBox: GreyBox, _core.NeuralOE: NeuralOE,
+    _core.NeuralSS: NeuralSS,
+}  # fmt: skip
 
 
-def tabled(task: Task, *, wants_network: bool = False) -> Model | None:
-    """The structures that describe the data best, as one model; None if there are too few blocks,
-    or if the output looks rectified.
+def searched(task: Task, *, wants_network: bool = False) -> Model:
+    """The structures that describe the data best, as one model.
     If a network is wanted, it is of state-space networks, even if these are not better.
     """
     folds = blocked(task.data, task.validation)
-    # behind a rectifier starts differ too much for four of them: longer records' search has more
-    if not folds or (task.output in (None, "abs") and ABS in suggested(task.data)):
-        return None
+    if not folds:
+        reason = (
+            f"the record is too short for blocks of {LEAST} samples, each held out once, to "
+            "compare on; or nothing moves outside them, or only once"
+        )
+        if wants_network:
+            raise FitError(f"{task.data.source}: {reason}; record longer, or give validation data")
+        return short(task, reason)
     pool = Pool(task.threads, task.clock, task.progress)
     table = Table(task, Blocks(task.data, folds), pool, wants_network)
     ending = Ending(table)
@@ -265,16 +272,18 @@ class Ending:
             found.append(self.task.documented(as_one(members, self.task), extra))
         if self.table.linear.eligible and kinds != {"oe"}:
             chosen = self.table.linear.choice
-            found.append(linear_alternative(chosen, joined(chosen.errors).rmse, self.task))
+            found.append(linear_alternative(chosen, self.task))
         return found
 
     def _reason(self, mixture: Mixture, count: int) -> str:
         parts = len(self.table.folds)
-        where = "the validation data" if parts == 1 else f"{parts} blocks, each held out once"
+        where = "a held-out block" if parts == 1 else f"{parts} blocks, each held out once"
+        if self.table.folds[0].is_given:
+            where = "the validation data"
         if len(mixture.rows) == 1:
-            what = (
-                "the simplest structure that does as well as all together within a standard error"
-            )
+            what = "as good as all together within a standard error, and the simplest such"
+            if mixture.rows[0].kind == "grey_box":
+                what = "the equations of a motor: " + what
         else:
             weights = sorted(np.round(mixture.weights, 3), reverse=True)
             listed = ", ".join(f"{100 * w:.0f} %" for w in weights)
@@ -321,3 +330,71 @@ class Ending:
             SHARE_OF_REFIT, DIAGNOSIS
         )
         return self.table.diagnosis if is_known else None
+
+
+# --- Members as one model, its notes and verdict --------------------------------------------------
+
+
+def as_one(cores: Sequence[tuple[Any, Provenance]], task: Task) -> Model:
+    """One model unchanged, several as the median, each with its provenance."""
+    members = [
+        with_provenance(wrap(_CLASSES[type(core)], core, task.data), known) for core, known in cores
+    ]
+    return members[0] if len(members) == 1 else Ensemble.of(members)
+
+
+def linear_alternative(chosen: LinearCandidate, task: Task) -> Model:
+    """The linear model with which others were compared."""
+    choice: Provenance = {"chosen": "oe", "reason": "the linear alternative"}
+    choice |= {"free_run_rmse": {"oe": finite(chosen.rmse)}}
+    extra: Provenance = {"initial_state": "estimated", "choice": choice}
+    return task.model(LinearOE, chosen.models[0], extra)
+
+
+def closed(
+    model: Model,
+    task: Task,
+    part: Split,
+    error: float,
+    *,
+    linear: float | None,
+    wants_network: bool,
+    diagnosed: Callable[[], Diagnosis | None],
+) -> Model:
+    """The model with its notes and verdict, by its error on the part that it was not trained on.
+    `linear` is the error of the best linear model there; `diagnosed` gives the properties of the
+    record, None if a time budget leaves no time for them.
+    """
+    notes = list(model.training.get("notes", []))
+    if wants_network and linear is not None and error >= WORTH_IT * linear:
+        notes.append(
+            f"free-run error on data not trained on: {100 * error / linear:.1f} % of the best "
+            "linear model's; consider model oe"
+        )
+    if task.nk is None and any(m.orders["nk"] == 0 for m in model.members or (model,)):
+        notes.append(
+            "the output depends on the input of the same sample (nk = 0), so that no loop can be "
+            "closed around the model; for a controller identify with nk = 1"
+        )
+    extra: Provenance = {"notes": notes} if notes else {}
+    found = verdict(model, task.data, part, error)
+    diagnosis = diagnosed()
+    if found["grade"] == "good" and diagnosis is not None and diagnosis.find("repeats") is not None:
+        found["grade"] = "fair"
+        repeated = "good on repetitions of this record"
+        found["text"] = found["text"].replace(TEXTS["good"], repeated)
+        found["next"] += what_to_record(task.data)
+    if task.clock.truncated and found["grade"] != "good":
+        found["next"].insert(0, "give a longer time budget, or none")
+    if diagnosis is not None:
+        found["next"] += [f"{f.text}: {f.remedy}" for f in diagnosis.findings]
+    extra["verdict"] = found
+    return with_provenance(model, extra)
+
+
+def cost_of(model: Model, data: Dataset) -> float:
+    """J of the free run, in the output's unit squared."""
+    runs = zip(model.simulate(data), data.experiments, strict=True)
+    pairs = [((e.y - run) ** 2, weights_of(e)) for run, e in runs]
+    squares, weights = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    return mean_square(squares, weights) / 2.0

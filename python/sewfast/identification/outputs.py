@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +25,6 @@ SHARPNESS = 4.0
 """Least density of a pile relative to its surroundings."""
 MEMORIES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)
 """Poles of the low-pass filters whose sign is the first guess of the output's."""
-WORTH_A_RECTIFIER = 0.8
 FIRST_ROUNDS, ROUNDS = 2, 12
 """Iterations of all first guesses; of the better two."""
 SIGN_SAMPLES = 2_000
@@ -121,16 +118,6 @@ def _may_be_rectified(y: FloatArray) -> bool:
     return bool(np.mean(y <= NEAR_ZERO * top) > 0.005)
 
 
-def is_rectified(
-    behind: _core.LinearModel | None, pairs: Pairs, plain: Sequence[_core.LinearModel | None]
-) -> bool:
-    """Whether a linear model behind a rectifier is better than all plain ones."""
-    if behind is None:
-        return False
-    bound = min((rms_error(m, pairs) for m in plain if m is not None), default=math.inf)
-    return rms_error(behind, pairs, np.abs) < WORTH_A_RECTIFIER * bound
-
-
 # --- a linear start behind a rectifier ----------------------------------------------------------
 
 
@@ -213,23 +200,3 @@ def _low_pass(u: FloatArray, memory: float) -> FloatArray:
         last = memory * last + (1.0 - memory) * float(value)
         y[k] = last
     return y
-
-
-def rms_error(
-    model: _core.LinearModel,
-    pairs: Pairs,
-    seen: Callable[[FloatArray], FloatArray] = lambda s: s,
-) -> float:
-    """Root mean square of y - seen(free run), each run from its own estimated state.
-    Behind a rectifying sensor, states of both signs explain the first samples, which are therefore
-    not counted.
-    """
-    squares = []
-    for u, y, *_ in pairs:
-        try:
-            states = [model.estimate_initial_state(u[:INIT], s * y[:INIT]) for s in (1.0, -1.0)]
-            runs = [(y - seen(model.simulate(u, x)))[INIT:] for x in states]
-        except FitError:
-            return float("inf")
-        squares.append(min((run[~np.isnan(run)] ** 2 for run in runs), key=np.sum))
-    return float(np.sqrt(np.mean(np.concatenate(squares))))

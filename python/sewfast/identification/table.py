@@ -1,11 +1,15 @@
-"""The search on little data: a table of structures, judged on blocks of the whole record.
+"""The search for a structure: a table of structures, judged on blocks of the whole record.
 
-On few samples it is luck which structure leads on one held-out part, and which one a vote refuses.
-Here every structure is trained without each block in turn and judged on that block, so that every
-sample is predicted by models that have not seen it. The structures are then combined by convex
-weights of least squares on these free runs (stacking: Wolpert 1992; Breiman 1996; of time series,
-Hansen and Racine 2012), reduced to the fewest that do as well within a standard error
-(`blocks.py`, `mixture.py`).
+It is luck which structure leads on one held-out part, and which one a vote refuses. Here every
+structure is trained without each block in turn and judged on that block, so that every sample is
+predicted by models that have not seen it. The structures are then combined by convex weights of
+least squares on these free runs (stacking: Wolpert 1992; Breiman 1996; of time series, Hansen and
+Racine 2012), reduced to the fewest that do as well within a standard error (`blocks.py`,
+`mixture.py`).
+
+Effort is counted in multiplications, not in seconds, so that a seed gives the same model on every
+machine: a stage has as many starts and iterations as its work allows. On many samples all but the
+last stage train on an excerpt.
 """
 
 from __future__ import annotations
@@ -20,36 +24,51 @@ from .. import _core
 from ..dataset import Diagnosis, diagnose
 from ..models.base import EnsembleCore
 from . import grey_box
-from .blocks import Blocks, Row
+from .blocks import FAR, Blocks, Mixture, Row, able
+from .folds import thinned
 from .grey_box import or_none
-from .linear import MISLED, ROUNDING, LinearTable, raised, time_constant
+from .linear import HELD_OUT, MISLED, ROUNDING, LinearTable, raised, time_constant
 from .outputs import ABS, LINEAR, Output, named, rectified_start, suggested
 from .task import Pool, Task, arrays
 from .training import Request, Start, Structure, counting, guarded, train
-from .trials import (
-    SAMPLES_PER_PARAMETER,
-    SHARE_OF_FINAL,
-    SHARE_OF_LINEAR,
-    SHARE_OF_REFIT,
-    TRAINING,
-    WORTH_A_FEEDTHROUGH,
-)
 
 ORDERS, MOST_NX = (1, 2, 3, 4), 8
 """States of the networks that are tried in any case, beside those of the best linear models."""
-HIDDEN, MOST_HIDDEN = 4, 16
-DECAYS = (1e-4, 1e-2)
-"""Weight decays in the beginning. With the smaller one only, the geometric mean of test errors is
+LIKELY = 2
+"""Numbers of states that are tried with an output function, or another delay."""
+HIDDEN, MOST_HIDDEN = 4, 32
+SAMPLES_PER_PARAMETER = 4
+DECAYS = (0.1, 10.0)
+"""Weight decays in the beginning, times the number of samples: a prior of the weights, which counts
+the less the more data there are. With the smaller one only, the geometric mean of test errors is
 .569 of output error's, with both .417 (families `short_*` of the battery's rules)."""
-STARTS = 4
-FIRST, HALVINGS, FURTHER = 30, (60, 120), 90
+FIRST_STARTS, STARTS = 8, 4
+"""Of each fold: at first, and of those the best."""
+FIRST, FIRST_OF_INTEGRATORS, HALVINGS, FURTHER = 15, 60, (30, 60), 90
 """Iterations of all networks, further ones of the better halves, and of each step of the climb."""
-CLIMBED = 5e9
-"""Multiplications of one structure in a step of the climb, which limit the models of each fold that
-take part: training to the end pays on few samples, where it costs little."""
-ROUNDS = 4
-SHARE_OF_NETWORKS = 0.85
-"""Part of a time budget by which networks must be finished."""
+WORK, CLIMBED = 1e11, 5e9
+"""Multiplications of a stage, and of one structure in a step of the climb; a core does some 1.4e10
+per second. Training to the end pays on few samples, where it costs little."""
+HOPELESS = 3.0
+"""Ratio to the best error above which a network is not trained further."""
+LEAST, LEAST_FURTHER = 15, 40
+"""Iterations of a stage, and of a step of the climb, whatever their work."""
+TRIAL_SAMPLES = 20_000
+"""Samples of a fold to which networks are trained before the last stage."""
+ROUNDS, WORTH_A_STEP = 4, 0.99
+"""Steps of the climb; each has to bring the error below this part."""
+LEADING = 3
+LEGS, LEG, FINISHED = 2, 80, 0.995
+"""Stages on all samples of those that lead, and their iterations; one that does not bring the error
+below the last part is the last one."""
+WORTH_A_FEEDTHROUGH = 0.5
+"""Error ratio required of nk = 0. It is no plant for a loop, and a smoothed speed anticipates the
+input a little."""
+SHARE_OF_LINEAR, SHARE_OF_SEARCH, SHARE_OF_NETWORKS, SHARE_OF_REFIT = 0.12, 0.7, 0.87, 0.94
+"""Parts of a time budget for linear models but the smallest, and by which the search, the training
+to the end, and the fits to everything must be finished."""
+TRAINING = "training of networks"
+"""What is lost if a time budget ends before a network is trained, or while one is."""
 LAGGED_DECAY = 1e-3
 """Weight decay of the lagged network, where it has another meaning."""
 Models: TypeAlias = Sequence[Sequence[Any]]
@@ -75,29 +94,34 @@ class Table:
         # a network that failed the guard, for one asked for by name
         self.unsound: tuple[Structure, tuple[tuple[Start, ...], ...]] | None = None
         self.pairs = arrays(self.task.data)
-        # part of a time budget by which networks must be finished
-        self._share = SHARE_OF_NETWORKS
+        # part of a time budget by which the present stage must be finished
+        self._share = SHARE_OF_SEARCH
+        # the data to which each fold's networks are trained
+        self._fitted = [thinned(f.fitted, TRIAL_SAMPLES) for f in self.folds]
 
     # --- the schedule -----------------------------------------------------------------------------
 
     def search(self) -> None:
-        """Linear models and a motor, then networks: the better half of them further, twice, then
-        larger ones from the best.
+        """Linear models and a motor, then networks: the better half of them further, twice, larger
+        ones from the best, and those that lead to the end.
         The equations of a motor come after the smallest linear model: where they hold, no other
         second of the search gains as much, and a time budget must not end before it.
         """
         self.linear.begin()
         if not self.is_exact:
             self._try_motor()
-        self.linear.search(self.clock.within(SHARE_OF_LINEAR, SHARE_OF_FINAL))
+        self.linear.search(self.clock.within(SHARE_OF_LINEAR, SHARE_OF_SEARCH))
         self.enter_linear()
         if self.is_exact:
             return
         alive = self._screened()
         for iterations in HALVINGS:
-            best = sorted(alive, key=lambda r: r.rmse)[: max(2, (len(alive) + 1) // 2)]
-            alive = [self._further(row, iterations) for row in best]
-        self._climb()
+            half = sorted(alive, key=lambda r: r.rmse)[: max(2, (len(alive) + 1) // 2)]
+            near = [r for r in half if r.rmse <= HOPELESS * half[0].rmse]
+            alive = self._further(near, iterations)
+        if not self.is_hopeless:
+            self._climb()
+            self._finish()
 
     @property
     def is_exact(self) -> bool:
@@ -105,9 +129,27 @@ class Table:
         return not self.wants_network and self.linear.is_exact(self.task.data)
 
     @property
+    def is_hopeless(self) -> bool:
+        """Whether no network is better so far than linear models or a motor's equations."""
+        of = [r.rmse for r in self.rows.values() if isinstance(r.found, Structure)]
+        others = [r.rmse for r in self.rows.values() if not isinstance(r.found, Structure)]
+        return min(of, default=math.inf) >= min(others, default=math.inf)
+
+    @property
     def usable(self) -> list[Row]:
-        """Rows of which the model may consist."""
-        return [r for r in self.rows.values() if r.kind == "neural_ss" or not self.wants_network]
+        """Rows of which the model may consist.
+        Where the plant integrates, networks without an integrator follow the positions of the
+        record only: they count if all with one are far worse.
+        """
+        found = [r for r in self.rows.values() if r.kind == "neural_ss" or not self.wants_network]
+        least = FAR * min((r.rmse for r in found), default=math.inf)
+        if any(is_integrator(r) and r.rmse <= least for r in found) and self._integrates:
+            found = [r for r in found if is_integrator(r) or not isinstance(r.found, Structure)]
+        return found
+
+    @cached_property
+    def _integrates(self) -> bool:
+        return self.linear.integrates(self.task.data, self.diagnosis)
 
     @property
     def rounding(self) -> float:
@@ -119,8 +161,9 @@ class Table:
         task = self.task
         if self.wants_network or {task.nk, task.nx, task.hidden, task.output} != {None}:
             return
-        until, found = self.clock.until(SHARE_OF_FINAL), []
+        until, found = self.clock.until(SHARE_OF_SEARCH), []
         for part in self.folds:
+            part = part.shortened(grey_box.SEARCHED, HELD_OUT)
             one = self.motors.candidate(part, self.pool, until)
             if one is None:
                 return
@@ -156,18 +199,21 @@ class Table:
 
     def _screened(self) -> list[Row]:
         """All likely networks, trained briefly."""
-        found: list[Row] = []
-        at_once: list[Row] = []
-        for s in self._likely(self._outputs()):
-            row = self._trained(s, FIRST)
-            (at_once if s.nk == 0 and self.task.nk is None else found).extend([row] if row else [])
+        likely = self._likely(self._outputs())
+        tried: list[Row | None] = []
+        # an integrator begins without the motion of a linear model, far from its optimum
+        for is_far, iterations in ((False, FIRST), (True, FIRST_OF_INTEGRATORS)):
+            asked = [(s, None) for s in likely if s.integrator == is_far]
+            tried += self._stage(asked, iterations, FIRST_STARTS)
+        found = [r for r in tried if r is not None and (r.found.nk > 0 or self.task.nk == 0)]
         # no loop can be closed around a model that needs the input of the same sample
         least = min((r.rmse for r in found), default=math.inf)
-        for row in at_once:
-            if row.rmse < WORTH_A_FEEDTHROUGH * least:
-                found.append(row)
-            else:
-                del self.rows[row.found]
+        for row in tried:
+            if row is not None and row not in found:
+                if row.rmse < WORTH_A_FEEDTHROUGH * least:
+                    found.append(row)
+                else:
+                    del self.rows[row.found]
         return found
 
     def _outputs(self) -> list[Output]:
@@ -197,18 +243,18 @@ class Table:
         orders, nk = list(ORDERS), self._nk
         if linear.eligible:
             order, best = linear.choice.order, linear.best.order
-            orders = sorted(
-                {*ORDERS, order, order + 1, best, best + 1}, key=lambda o: abs(o - order)
-            )
+            orders = sorted({*ORDERS, order, best}, key=lambda o: abs(o - order))
         orders = [o for o in orders if o <= MOST_NX] if task.nx is None else [task.nx]
         hidden = task.hidden or HIDDEN
+        decays = [float(f"{d / len(task.data):.0e}") for d in DECAYS]
+        widths = (HIDDEN, HIDDEN, 2 * HIDDEN) if task.hidden is None else (hidden,) * 2
         found = [
-            Structure(nx, k, hidden, decay, output)
+            Structure(nx, k, h, decay, output)
             for output in outputs
-            for nx in orders
-            for decay in DECAYS
+            for nx in self._able(orders, output)
+            for h, decay in zip(widths, (*decays, decays[0]), strict=False)
             for k in dict.fromkeys((linear.nk, nk))
-            if output != ABS or (k == linear.nk and (nx > 1 or task.nx == 1))
+            if k == linear.nk or (nx in orders[:LIKELY] and output != ABS)
         ]
         if task.nk is None and task.data.counts is None:
             # further states can replace the missing sample of a slow input, at great cost
@@ -220,13 +266,23 @@ class Table:
         if is_free and not self.wants_network:
             lagged = Structure(2, nk, hidden, LAGGED_DECAY, kind="neural_oe")
             found[2:2] = [lagged] if nk >= 1 else []
-        if is_free and linear.integrates(task.data, self.diagnosis):
+        if is_free:
+            # linear models miss the integrator of a drive that friction holds most of the time
+            sizes = [(2, HIDDEN)]
+            if self._integrates:
+                sizes = [(2, 2), (2, HIDDEN), (3, 2), (3, HIDDEN)]
+            sizes = [(nx, task.hidden or h) for nx, h in sizes]
             found += [
-                Structure(nx, linear.nk, h, DECAYS[0], integrator=True)
-                for nx in (2, 3)
-                for h in ((2, HIDDEN) if task.hidden is None else (task.hidden,))
+                Structure(nx, linear.nk, h, decays[0], integrator=True)
+                for nx, h in dict.fromkeys(sizes)
             ]
         return [s for s in found if self._is_affordable(s)]
+
+    def _able(self, orders: Sequence[int], output: Output) -> Sequence[int]:
+        """Numbers of states to try with an output function; a hidden sign takes two to be told."""
+        if output == LINEAR or self.task.nx is not None:
+            return orders
+        return [nx for nx in orders if output != ABS or nx > 1][:LIKELY]
 
     @cached_property
     def diagnosis(self) -> Diagnosis:
@@ -258,38 +314,72 @@ class Table:
         able = (m for m in found if m is not None and time_constant(m) <= longest)
         return next(able, found[0])
 
-    def _trained(
-        self, s: Structure, iterations: int, models: Models | None = None, starts: int = STARTS
-    ) -> Row | None:
-        """The row of a structure after further iterations from models of each fold, else of its
-        starts; None if no start is sound, a fold has none, or no time is left.
+    def _stage(
+        self,
+        wanted: Sequence[tuple[Structure, Models | None]],
+        iterations: int,
+        starts: int = STARTS,
+        work: float = WORK,
+        least: int = LEAST,
+    ) -> list[Row | None]:
+        """Rows of structures after further iterations from models of each fold, else of fresh
+        starts, as many of both as this work allows.
         """
+        samples = sum(map(len, self._fitted))
+        each = sum(s.operations(self.task.data.n_inputs, samples) for s, _ in wanted)
+        most = int(work / max(each, 1.0))
+        starts = max(1, min(starts, most // iterations))
+        iterations = min(iterations, max(least, most))
+        if self.task.iterations is not None:
+            iterations = min(iterations, self.task.iterations)
+        # as many at a time as keep all threads at work
+        together = max(1, self.pool.threads // len(self.folds))
+        found: list[Row | None] = []
+        for i in range(0, len(wanted), together):
+            found += self._trained(wanted[i : i + together], iterations, starts)
+        return found
+
+    def _trained(
+        self, wanted: Sequence[tuple[Structure, Models | None]], iterations: int, starts: int
+    ) -> list[Row | None]:
+        """One row each; None if no start is sound, a fold has none, or no time is left."""
         if self.clock.over(self._share, TRAINING):
-            return None
+            return [None] * len(wanted)
         task, until = self.task, self.clock.until(self._share)
-        most = iterations if task.iterations is None else min(iterations, task.iterations)
-        starts = starts if task.starts is None else task.starts
-        requests = []
-        for i, part in enumerate(self.folds):
-            given = () if models is None else models[i]
-            linear = self.start_of(s, i) if not given or s.kind == "neural_oe" else None
-            count = 0 if given else starts
-            requests.append(Request(s, part.fitted, None, most, linear, count, 0, given))
+        fresh = starts if task.starts is None else task.starts
+        requests: list[Request] = []
+        for s, models in wanted:
+            for i, fitted in enumerate(self._fitted):
+                given = () if models is None else models[i][:starts]
+                linear = self.start_of(s, i) if not given or s.kind == "neural_oe" else None
+                count = 0 if given else fresh
+                requests.append(Request(s, fitted, None, iterations, linear, count, 0, given))
         share = max(self.pool.share, min(0.8, self.pool.share + 0.02))
         found = self._started(requests, until, share)
         # a linear fit that ends at a trend is no start: random ones are
-        again = [i for i, f in enumerate(found) if not f and s.kind == "neural_ss"]
-        afresh = [replace(requests[i], linear=None) for i in again if models is None]
-        for i, starts_ in zip(again, self._started(afresh, until, share), strict=False):
+        again = [
+            i
+            for i, (f, r) in enumerate(zip(found, requests, strict=True))
+            if not (f or r.initial) and r.structure.kind == "neural_ss"
+        ]
+        afresh = [replace(requests[i], linear=None) for i in again]
+        for i, starts_ in zip(again, self._started(afresh, until, share), strict=True):
             found[i] = starts_
         judged = [counting(f) for f in guarded(found, self.pairs, self.bounds, self.pool)]
+        folds = len(self.folds)
+        return [
+            self._judged(s, judged[i * folds : (i + 1) * folds]) for i, (s, _) in enumerate(wanted)
+        ]
+
+    def _judged(self, s: Structure, judged: Sequence[list[Start]]) -> Row | None:
+        """The row of a structure with these starts of each fold."""
         if not all(judged):
             return None
         if not any(f[0].is_sound for f in judged):
             if self.unsound is None:
                 self.unsound = s, tuple(tuple(f) for f in judged)
             return None
-        parameters = s.parameters(task.data.n_inputs)
+        parameters = s.parameters(self.task.data.n_inputs)
         trained = [[x.model for x in f] for f in judged]
         return self._enter(s.kind, parameters, s, trained, [f[0].is_sound for f in judged])
 
@@ -308,49 +398,73 @@ class Table:
         model = self.linear.choice.models[0] if self.linear.eligible else None
         return [] if model is None else [model]
 
-    def _further(self, row: Row, iterations: int) -> Row:
-        """The row trained further; unchanged if that is not better on the blocks."""
-        new = self._trained(row.found, iterations, row.models)
-        if new is not None and new.rmse < row.rmse:
-            return new
-        self.rows[row.found] = row
-        return row
+    def _further(self, rows: Sequence[Row], iterations: int, work: float = WORK) -> list[Row]:
+        """The rows trained further, each unchanged if that is not better on the blocks."""
+        found = self._stage([(r.found, r.models) for r in rows], iterations, work=work)
+        better = [
+            new if new is not None and new.rmse < row.rmse else row
+            for row, new in zip(rows, found, strict=True)
+        ]
+        self.rows |= {r.found: r for r in better}
+        return better
 
     def late_row(self) -> Row | None:
         """A network that was asked for by name, in the time that is left after slow linear fits."""
         self._share = SHARE_OF_REFIT
         if not self.wants_network or self.unsound is not None:
             return None
-        likely = self._likely(self._outputs())
-        return self._trained(likely[0], FIRST, starts=1) if likely else None
+        likely = self._likely(self._outputs())[:1]
+        return next(iter(self._stage([(s, None) for s in likely], FIRST, starts=1)), None)
 
     def _climb(self) -> None:
         """Larger networks and other weight decays from the best one, while these are better."""
-        networks = [r for r in self.rows.values() if r.kind == "neural_ss"]
+        networks = [r for r in self.usable if r.kind == "neural_ss"]
         best = min(networks, key=lambda r: r.rmse, default=None)
-        for _ in range(ROUNDS):
+        for round_ in range(ROUNDS):
             if best is None:
                 return
-            found = [row for s in self._moves(best.found) if (row := self._moved(best, s))]
-            nearest = min(found, key=lambda r: r.rmse, default=None)
-            best = nearest if nearest and nearest.rmse < best.rmse else None
+            moves = [(s, self._moved(best, s)) for s in self._moves(best.found, round_ == 0)]
+            tried = self._stage(moves, FURTHER, work=CLIMBED * len(moves), least=LEAST_FURTHER)
+            found = [r for r in tried if r is not None and r.rmse < WORTH_A_STEP * best.rmse]
+            best = min(found, key=lambda r: r.rmse, default=None)
 
-    def _moves(self, s: Structure) -> list[Structure]:
+    def _moves(self, s: Structure, is_first: bool) -> list[Structure]:
         task = self.task
-        found = [replace(s, decay=float(f"{s.decay * f:.0e}")) for f in (0.1, 10.0)]
+        factors = (0.1, 10.0) if is_first else ()
+        found = [replace(s, decay=float(f"{s.decay * f:.0e}")) for f in factors]
         if task.hidden is None and 2 * s.hidden <= MOST_HIDDEN:
             found.append(replace(s, hidden=2 * s.hidden))
         if task.nx is None and s.nx < MOST_NX:
             found.append(replace(s, nx=s.nx + 1))
         return [m for m in found if m not in self.rows and self._is_affordable(m)]
 
-    def _moved(self, best: Row, s: Structure) -> Row | None:
-        """The row of a structure that starts at the models of a smaller one or another decay."""
-        size = best.found.nx, best.found.hidden
-        each = FURTHER * s.operations(self.task.data.n_inputs, len(self.task.data))
-        able = max(1, int(CLIMBED / (len(self.folds) * each)))
-        models = [f[:able] for f in best.models]
-        if size == (s.nx, s.hidden):
-            return self._trained(s, FURTHER, models)
-        grown = [tuple(m.grown(s.nx, s.hidden, self.task.seed) for m in f) for f in models]
-        return self._trained(s, FURTHER, grown)
+    def _moved(self, best: Row, s: Structure) -> Models:
+        """Models of each fold from which a larger structure, or another decay, starts."""
+        if (best.found.nx, best.found.hidden) == (s.nx, s.hidden):
+            return best.models
+        return [tuple(m.grown(s.nx, s.hidden, self.task.seed) for m in f) for f in best.models]
+
+    def _finish(self) -> None:
+        """Networks that lead, trained to the end on all samples."""
+        rows = self.usable
+        if not rows:
+            return
+        self._share = SHARE_OF_NETWORKS
+        self._fitted = [f.fitted for f in self.folds]
+        mixture = Mixture.of(able(rows), self.blocks)
+        pairs = sorted(zip(mixture.weights, mixture.rows, strict=True), key=lambda p: -p[0])
+        going = [r for w, r in pairs if w > 0.0 and isinstance(r.found, Structure)][:LEADING]
+        # as much for a sample as in the stages before
+        work = WORK * max(1.0, len(self.task.data) / TRIAL_SAMPLES)
+        for _ in range(LEGS):
+            after = self._further(going, LEG, work)
+            going = [
+                new for new, old in zip(after, going, strict=True) if new.rmse < FINISHED * old.rmse
+            ]
+            if not going:
+                return
+
+
+def is_integrator(row: Row) -> bool:
+    """Whether it is of networks with an integrator."""
+    return isinstance(row.found, Structure) and row.found.integrator
