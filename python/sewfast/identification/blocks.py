@@ -48,8 +48,8 @@ errors of bad models can cancel on some blocks, but a median of members does not
 
 def blocked(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]:
     """The experiments one after another in blocks, each held out once, in order.
-    What is left of an experiment around its blocks is fitted. On many data only the first folds
-    are given, those that are enough to judge by. There are none if the data are too short, or if
+    What is left of an experiment around its blocks is fitted. On many data only the last folds are
+    given, those that are enough to judge by. There are none if the data are too short, or if
     the inputs move only once: what follows a single step is its response, in the fitted part as in
     the held one. Validation data, if given, are the only fold.
     """
@@ -60,7 +60,8 @@ def blocked(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ..
     count = min(COUNT, math.ceil(COUNT * ENOUGH / len(data)))
     edges = np.linspace(0, len(data), COUNT * math.ceil(COUNT / count) + 1).round().astype(int)
     stretches = list(itertools.pairwise(edges.tolist()))
-    found = (_without(data, stretches[i::COUNT]) for i in range(count))
+    # the first of all is the last to be held out: nothing before it gives its state
+    found = (_without(data, stretches[i::COUNT]) for i in range(COUNT - count, COUNT))
     parts = tuple(f for f in found if f is not None and f.scored and is_moving(f.fitted))
     return parts if len(parts) > 1 or count == 1 else ()
 
