@@ -206,11 +206,12 @@ class Table:
             asked = [(s, None) for s in likely if s.integrator == is_far]
             tried += self._stage(asked, iterations, FIRST_STARTS)
         found = [r for r in tried if r is not None and (r.found.nk > 0 or self.task.nk == 0)]
-        # no loop can be closed around a model that needs the input of the same sample
-        least = min((r.rmse for r in found), default=math.inf)
+        # no loop can be closed around a model that needs the input of the same sample; further
+        # states can replace it, so that only those of equal size tell
+        delayed = {replace(r.found, nk=0): r.rmse for r in found if r.found.nk == self.linear.nk}
         for row in tried:
             if row is not None and row not in found:
-                if row.rmse < WORTH_A_FEEDTHROUGH * least:
+                if row.rmse < WORTH_A_FEEDTHROUGH * delayed.get(row.found, math.inf):
                     found.append(row)
                 else:
                     del self.rows[row.found]
