@@ -131,11 +131,6 @@ class Blocks:
             for f in self.folds
         ]
 
-    @property
-    def luck(self) -> float:
-        """Logarithm of the ratio of errors by which the best of dozens of structures may lead."""
-        return BY_LUCK / len(self.weights)
-
     def residual(self, cores: Sequence[Core]) -> FloatArray | None:
         """Scored outputs minus the free runs of one model per fold; None if a run diverges."""
         runs: list[FloatArray] = []
@@ -206,10 +201,10 @@ def combined(rows: Sequence[Row], blocks: Blocks) -> Mixture:
     One row if there is one, the simplest such; else those that are left when one after another is
     dropped without which the error grows least.
     """
-    rows, luck = able(rows), blocks.luck
+    rows, luck = near(rows), BY_LUCK / len(blocks.weights)
     everything = Mixture.of(rows, blocks)
     for row in sorted(rows, key=lambda r: (r.parameters, r.rmse)):
-        if is_as_good(row.errors, everything.errors, luck):
+        if _is_as_good(row.errors, everything.errors, luck):
             linear = [r for r in rows if r.kind == "oe"]
             return Mixture.of([simplest(linear) if row in linear else row], blocks)
     pairs = zip(rows, everything.weights, strict=True)
@@ -218,15 +213,15 @@ def combined(rows: Sequence[Row], blocks: Blocks) -> Mixture:
         fewer = [
             Mixture.of([r for r in best.rows if r is not dropped], blocks) for dropped in best.rows
         ]
-        enough = [m for m in fewer if is_as_good(m.errors, everything.errors, luck)]
+        enough = [m for m in fewer if _is_as_good(m.errors, everything.errors, luck)]
         if not enough:
             break
         best = min(enough, key=lambda m: m.errors.rmse)
     return best
 
 
-def able(rows: Sequence[Row]) -> list[Row]:
-    """Those that do not run away."""
+def near(rows: Sequence[Row]) -> list[Row]:
+    """Those whose error is not far above the least."""
     least = min(r.rmse for r in rows)
     return [r for r in rows if r.rmse <= FAR * least]
 
@@ -235,10 +230,10 @@ def simplest(rows: Sequence[Row]) -> Row:
     """The simplest linear model that does as well as the best of them, which is hardly luck."""
     best = min(rows, key=lambda r: r.rmse)
     ranked = sorted(rows, key=lambda r: (r.parameters, r.rmse))
-    return next(r for r in ranked if is_as_good(r.errors, best.errors, LEAST_GAIN))
+    return next(r for r in ranked if _is_as_good(r.errors, best.errors, LEAST_GAIN))
 
 
-def is_as_good(one: Errors, other: Errors, least: float) -> bool:
+def _is_as_good(one: Errors, other: Errors, least: float) -> bool:
     """Whether the first errors are larger by at most a standard error, or by `least`."""
     ratio, deviation = compared(one, other)
     return ratio <= min(max(deviation, least), AS_GOOD)

@@ -147,7 +147,6 @@ class Motors:
 
     def fitted(self, data: Dataset, hidden: int, look: Look | None = None) -> _core.GreyBox:
         """A motor's parameters, a network of `hidden` units beside it, and the process noise."""
-        data = thinned(data, MOST_FITTED)
         core = _motor(data, look)
         return _with_noise(self._with_network(core, data, hidden, look) if hidden else core, data)
 

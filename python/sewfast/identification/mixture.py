@@ -23,7 +23,7 @@ from ..models.base import EnsembleCore
 from ..models.grey_box import GreyBox
 from . import grey_box
 from .blocks import LEAST, Blocks, Mixture, Row, blocked, combined
-from .folds import TEXTS, Split, verdict, what_to_record
+from .folds import TEXTS, Split, thinned, verdict, what_to_record
 from .grey_box import or_none
 from .linear import LinearCandidate, linear_provenance, short
 from .table import SHARE_OF_REFIT, TRAINING, Table
@@ -37,7 +37,8 @@ REFIT = 15
 MOST_MEMBERS = 15
 """Members of an ensemble: a controller is tuned on each, and a median of more is hardly better."""
 WORTH_IT = 0.9
-"""A network must bring the error below this part of the best linear model's, and of a motor's."""
+"""A network that was asked for says so if its error is not below this part of the best linear
+model's."""
 _CLASSES: dict[type, type[Model]] = {
     _core.LinearModel: LinearOE, _core.GreyBox: GreyBox, _core.NeuralOE: NeuralOE,
     _core.NeuralSS: NeuralSS,
@@ -216,7 +217,8 @@ class Ending:
             hidden = row.found.hidden
             (core,) = self.pool.map(
                 lambda data, look: or_none(lambda: self.table.motors.fitted(data, hidden, look)),
-                [self.task.data], until=until, share=1.0, what=REFIT_LOST,
+                [thinned(self.task.data, grey_box.MOST_FITTED)],
+                until=until, share=1.0, what=REFIT_LOST,
             )  # fmt: skip
             # on everything it must not fit worse than the best that was fitted to less
             able = ([] if core is None else [(core, plain)]) + of_folds
@@ -255,7 +257,7 @@ class Ending:
 
     def _linear_error(self) -> float | None:
         table = self.table.linear
-        return min((table.error(c.order, c.nk) for c in table.eligible), default=None)
+        return table.best.rmse if table.eligible else None
 
     def _alternatives(self, model: Model) -> list[Model]:
         """The best network alone, if the model has none, and the linear model."""

@@ -24,7 +24,7 @@ from .. import _core
 from ..dataset import Diagnosis, diagnose
 from ..models.base import EnsembleCore
 from . import grey_box
-from .blocks import FAR, Blocks, Mixture, Row, able
+from .blocks import FAR, Blocks, Mixture, Row, near
 from .folds import thinned
 from .grey_box import or_none
 from .linear import HELD_OUT, MISLED, ROUNDING, LinearTable, raised, time_constant
@@ -49,7 +49,7 @@ FIRST, FIRST_OF_INTEGRATORS, HALVINGS, FURTHER = 15, 60, (30, 60), 90
 WORK, CLIMBED = 1e11, 5e9
 """Multiplications of a stage, and of one structure in a step of the climb; a core does some 1.4e10
 per second. Training to the end pays on few samples, where it costs little."""
-HOPELESS = 3.0
+FAR_BEHIND = 3.0
 """Ratio to the best error above which a network is not trained further."""
 LEAST, LEAST_FURTHER = 15, 40
 """Iterations of a stage, and of a step of the climb, whatever their work."""
@@ -117,8 +117,8 @@ class Table:
         alive = self._screened()
         for iterations in HALVINGS:
             half = sorted(alive, key=lambda r: r.rmse)[: max(2, (len(alive) + 1) // 2)]
-            near = [r for r in half if r.rmse <= HOPELESS * half[0].rmse]
-            alive = self._further(near, iterations)
+            going = [r for r in half if r.rmse <= FAR_BEHIND * half[0].rmse]
+            alive = self._further(going, iterations)
         if not self.is_hopeless:
             self._climb()
             self._finish()
@@ -131,9 +131,9 @@ class Table:
     @property
     def is_hopeless(self) -> bool:
         """Whether no network is better so far than linear models or a motor's equations."""
-        of = [r.rmse for r in self.rows.values() if isinstance(r.found, Structure)]
+        networks = [r.rmse for r in self.rows.values() if isinstance(r.found, Structure)]
         others = [r.rmse for r in self.rows.values() if not isinstance(r.found, Structure)]
-        return min(of, default=math.inf) >= min(others, default=math.inf)
+        return min(networks, default=math.inf) >= min(others, default=math.inf)
 
     @property
     def usable(self) -> list[Row]:
@@ -252,7 +252,7 @@ class Table:
         found = [
             Structure(nx, k, h, decay, output)
             for output in outputs
-            for nx in self._able(orders, output)
+            for nx in self._orders_of(output, orders)
             for h, decay in zip(widths, (*decays, decays[0]), strict=False)
             for k in dict.fromkeys((linear.nk, nk))
             if k == linear.nk or (nx in orders[:LIKELY] and output != ABS)
@@ -279,7 +279,7 @@ class Table:
             ]
         return [s for s in found if self._is_affordable(s)]
 
-    def _able(self, orders: Sequence[int], output: Output) -> Sequence[int]:
+    def _orders_of(self, output: Output, orders: Sequence[int]) -> Sequence[int]:
         """Numbers of states to try with an output function; a hidden sign takes two to be told."""
         if output == LINEAR or self.task.nx is not None:
             return orders
@@ -335,13 +335,18 @@ class Table:
             iterations = min(iterations, self.task.iterations)
         # as many at a time as keep all threads at work
         together = max(1, self.pool.threads // len(self.folds))
-        found: list[Row | None] = []
+        # the same for all: fits of further linear starts must not change them with the threads
+        bounds, found = self.bounds, list[Row | None]()
         for i in range(0, len(wanted), together):
-            found += self._trained(wanted[i : i + together], iterations, starts)
+            found += self._trained(wanted[i : i + together], iterations, starts, bounds)
         return found
 
     def _trained(
-        self, wanted: Sequence[tuple[Structure, Models | None]], iterations: int, starts: int
+        self,
+        wanted: Sequence[tuple[Structure, Models | None]],
+        iterations: int,
+        starts: int,
+        bounds: list[_core.LinearModel],
     ) -> list[Row | None]:
         """One row each; None if no start is sound, a fold has none, or no time is left."""
         if self.clock.over(self._share, TRAINING):
@@ -366,7 +371,7 @@ class Table:
         afresh = [replace(requests[i], linear=None) for i in again]
         for i, starts_ in zip(again, self._started(afresh, until, share), strict=True):
             found[i] = starts_
-        judged = [counting(f) for f in guarded(found, self.pairs, self.bounds, self.pool)]
+        judged = [counting(f) for f in guarded(found, self.pairs, bounds, self.pool)]
         folds = len(self.folds)
         return [
             self._judged(s, judged[i * folds : (i + 1) * folds]) for i, (s, _) in enumerate(wanted)
@@ -447,12 +452,9 @@ class Table:
 
     def _finish(self) -> None:
         """Networks that lead, trained to the end on all samples."""
-        rows = self.usable
-        if not rows:
-            return
         self._share = SHARE_OF_NETWORKS
         self._fitted = [f.fitted for f in self.folds]
-        mixture = Mixture.of(able(rows), self.blocks)
+        mixture = Mixture.of(near(self.usable), self.blocks)
         pairs = sorted(zip(mixture.weights, mixture.rows, strict=True), key=lambda p: -p[0])
         going = [r for w, r in pairs if w > 0.0 and isinstance(r.found, Structure)][:LEADING]
         # as much for a sample as in the stages before
