@@ -22,7 +22,7 @@ from sewfast.dataset.faults import faults
 from sewfast.errors import DataError, SettingError
 
 SEEDS = range(40 if FULL else 4)
-FAULTS = ("dead_sensor", "no_dynamics", "exchanged", "late_input", "at_once")
+FAULTS = ("dead_sensor", "spike", "wraps", "no_dynamics", "exchanged", "late_input", "at_once")
 Columns = tuple[np.ndarray, np.ndarray]
 
 
@@ -196,6 +196,52 @@ def test_identify_leaves_a_dead_stretch_out(tmp_path: Path) -> None:
     assert "left out" in motor.err
     k_v = motor.json()["parameters"]["k_v"]["value"]
     assert k_v == pytest.approx(30.0 / (100.0 * np.pi), rel=0.01)
+
+
+# --- values that no plant has ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("value", "count"), [(1e12, 1), (-32768.0, 1), (65535.0, 3)])
+def test_identify_leaves_a_spike_out(value: float, count: int) -> None:
+    random = np.random.default_rng(1)
+    u = steps(random, 3000)
+    y = drive(u) + random.normal(size=len(u))
+    y[1234 : 1234 + count] = value
+    assert found(u, y) == ["spike"]
+    model = api.identify(Dataset.from_arrays(u, y, 0.01), model="oe")
+    assert model.training["verdict"]["fit_percent"] > 98.0
+    assert any(f"in samples 1234:{1234 + count}" in note for note in model.training["notes"])
+
+
+def test_what_is_no_spike() -> None:
+    random = np.random.default_rng(2)
+    u = np.zeros(400)
+    u[200] = 1e3
+    blow = drive(u, pole=0.1)
+    assert found(u, blow) == []
+    early = np.full(400, 5.0)
+    early[:2] = 0.0
+    step = drive(early, pole=0.05) + 0.1 * random.normal(size=400)
+    assert found(early, step) == []
+    assert found(early[::-1], step[::-1]) == []
+
+
+def test_an_integer_that_wraps_is_refused_by_name() -> None:
+    random = np.random.default_rng(3)
+    u = 3.0 + steps(random, 4000, -1.0, 1.0)
+    counts = np.floor(np.cumsum(drive(u)))
+    wrapped = (counts + 32768) % 65536 - 32768
+    assert found(u, wrapped) == ["wraps"]
+    with refuses(DataError, received="jumps back by 65536", remedy="np.unwrap"):
+        api.identify(Dataset.from_arrays(u, wrapped, 0.01))
+    assert "wraps" not in found(u, np.unwrap(wrapped, period=65536))
+
+
+def test_a_number_times_an_input_of_two_levels_is_no_plant() -> None:
+    random = np.random.default_rng(4)
+    u = np.repeat(random.choice([-5.0, 5.0], 150), 20)
+    assert found(u, 100.0 * u) == ["no_dynamics"]
+    assert found(np.repeat([0.0, 1.0], 200), np.repeat([0.0, 3.0], 200)) == []
 
 
 # --- columns --------------------------------------------------------------------------------------

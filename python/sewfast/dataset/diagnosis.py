@@ -54,8 +54,8 @@ _REFERENCE = re.compile(
 @dataclass(frozen=True)
 class Finding:
     """One property of a record.
-    `kind` is `dead_sensor`, `no_dynamics`, `exchanged`, `late_input`, `at_once`, `unstable`,
-    `integrator`, `wraps`, `closed_loop`, `repeats`, `two_level_input`, `rests`, `short_record`,
+    `kind` is `dead_sensor`, `spike`, `wraps`, `no_dynamics`, `exchanged`, `late_input`, `at_once`,
+    `unstable`, `integrator`, `closed_loop`, `repeats`, `two_level_input`, `rests`, `short_record`,
     `limited_input` or `coarse_output`. `text`, the finding and its meaning, and `remedy` are
     sentences without a full stop; `evidence` has the figures, in SI units and those of the columns.
     """
@@ -119,13 +119,14 @@ def diagnose(data: Dataset) -> Diagnosis:
 
     ==================  ======================================================================
     `dead_sensor`       the output keeps one value while the rest says that it cannot
+    `spike`             a few samples of the output have more power than all others
+    `wraps`             the output is an angle that jumps back by a turn
     `no_dynamics`       the output is the input times a number: a column was read twice
     `exchanged`         the input answers the output
     `late_input`        the output moves before the input, which was logged late
     `at_once`           the output moves in the sample in which the input does
     `unstable`          an unstable plant, which only a closed loop holds
     `integrator`        the output is a position: it integrates what an input drives
-    `wraps`             the output is an angle that jumps back by a turn
     `closed_loop`       an input was computed from the output, or a reference was recorded
     `repeats`           one trajectory over and over: a held-out part contains nothing new
     `two_level_input`   an input with two levels shows no nonlinearity
@@ -168,12 +169,10 @@ def diagnose(data: Dataset) -> Diagnosis:
     """
     require_dataset(data, "data")
     wrong = [Finding(f.kind, f.text, f.remedy, f.evidence) for f in faults(data)]
-    wrapped = list(_wraps(data))
-    found = None if wrapped else integration(data)
+    found = None if any(f.kind == "wraps" for f in wrong) else integration(data)
     return Diagnosis(
         (
             *wrong,
-            *wrapped,
             *_integrator(data, found),
             *_closed_loop(data),
             *_repeats(data),
@@ -237,45 +236,6 @@ def _short(data: Dataset, found: Integration | None) -> Iterator[Finding]:
                 "standard_errors_restoring": found.restoring,
             },
         )
-
-
-def _wraps(data: Dataset) -> Iterator[Finding]:
-    """Jumps by nearly the whole range, against the motion before and after."""
-    columns = [e.y[np.abs(e.y) < LARGEST] for e in data.experiments]
-    everything = np.concatenate(columns)
-    span = float(np.ptp(everything)) if len(everything) else 0.0
-    if span == 0.0:
-        return
-    back, other, sizes = 0, 0, []
-    for y in columns:
-        change = np.diff(y)
-        # changes of an angle are either small or jumps; noise has changes of all sizes between
-        other += int(np.sum((np.abs(change) > 0.35 * span) & (np.abs(change) <= 0.7 * span)))
-        jumps = np.where(np.abs(change) > 0.7 * span, np.sign(change), 0.0)
-        for k in np.flatnonzero(jumps):
-            if -jumps[k] in jumps[max(k - 5, 0) : k + 6]:
-                # there and back: a spike
-                other += 1
-                continue
-            around = np.concatenate([change[max(k - 5, 0) : k], change[k + 1 : k + 6]])
-            slope = float(np.median(around)) if len(around) else 0.0
-            if slope * change[k] < 0.0 and abs(slope) < 0.2 * span:
-                back += 1
-                sizes.append(abs(float(change[k]) - slope))
-            else:
-                other += 1
-    if back < 2 or back < 4 * other:
-        return
-    period = float(np.median(sizes))
-    turns = (360.0, math.tau, 1.0, *(2.0**b for b in range(8, 33)))
-    period = next((turn for turn in turns if abs(period / turn - 1.0) < 0.02), period)
-    yield Finding(
-        "wraps",
-        f"{_output(data)} jumps back by {period:.6g} at {back} places while it moves on: an angle "
-        "or a counter that wraps, which no model can follow",
-        f"unwrap it before it is read: np.unwrap(y, period={period:.6g})",
-        {"period": period, "jumps": back},
-    )
 
 
 def _coarse(data: Dataset) -> Iterator[Finding]:

@@ -9,6 +9,10 @@ fails on any numbers: columns are compared about their mean, in units of their d
   output is limited to the recorded range, moves; the input has the levels there at which the output
   moves elsewhere, so that friction or a dead zone is no explanation; and a limit of the output was
   not reached by motion, so that a saturation or an end stop is none either.
+- A value that stands out: a few samples, far from those before and after, have more power than the
+  rest of the output.
+- A counter that wraps: the output jumps by its whole range against the way that it moves before and
+  after.
 - No dynamics: in one sample and for the whole record, the output is the input times a number.
 - The order in time: the past of a cause helps to predict its effect beyond the effect's own past,
   and not the other way (Granger 1969).
@@ -200,6 +204,60 @@ def _regressors(u: FloatArray, y: FloatArray) -> FloatArray:
     return np.stack([*past, *inputs, np.ones(len(k))], axis=1)
 
 
+# --- Values that no plant has ---------------------------------------------------------------------
+
+SPIKE = 3
+"""Most samples in a row that are a spike and no motion."""
+SPIKES = 20
+"""Most spikes of an experiment that are looked for."""
+
+
+def spikes(data: Dataset) -> tuple[Dead, ...]:
+    """Short stretches of the output that have most of its power, while no input stands out."""
+    return tuple(
+        Dead(i, e.start + first, e.start + first + count, float(e.y[first]))
+        for i, e in enumerate(data.experiments)
+        for first, count in _spikes_in(_columns(e))
+    )
+
+
+def _spikes_in(columns: FloatArray) -> Iterator[tuple[int, int]]:
+    y = columns[:, -1]
+    for _ in range(SPIKES):
+        if np.isfinite(y).sum() < 4 * PAST or (stretch := _spike(y)) is None:
+            return
+        first, count = stretch
+        # the answer to a blow on the input is no spike
+        near = slice(max(0, first - PAST), first + count)
+        if any(
+            (inside := _spike(u)) and near.start <= inside[0] < near.stop for u in columns.T[:-1]
+        ):
+            return
+        yield first, count
+        y[first : first + count] = np.nan
+
+
+def _spike(column: FloatArray) -> tuple[int, int] | None:
+    """`SPIKE` samples or fewer about the farthest value, if they have most of the power."""
+    if not np.isfinite(column).any():
+        return None
+    apart = np.abs(column - np.nanmedian(column))
+    k = int(np.nanargmax(apart))
+    if apart[k] == 0.0:
+        return None
+    far = apart > 0.5 * apart[k]
+    first = k - int(np.argmin(far[k::-1])) + 1 if not far[: k + 1].all() else 0
+    last = k + int(np.argmin(far[k:])) if not far[k:].all() else len(far)
+    # away and back: a step that settles in a sample begins or ends elsewhere
+    if last - first > SPIKE or first == 0 or last == len(column):
+        return None
+    if not abs(column[first - 1] - column[last]) < 0.5 * apart[k]:
+        return None
+    power = (apart / apart[k]) ** 2
+    inside = float(np.nansum(power[first:last]))
+    return (first, last - first) if inside > float(np.nansum(power)) - inside else None
+
+
 # --- Columns of which one is computed from the other, exchanged, or late --------------------------
 
 
@@ -221,7 +279,9 @@ def copied(data: Dataset) -> Copy | None:
         y = np.concatenate([c[delay:, -1] for c in experiments])
         known = np.isfinite(u) & np.isfinite(y)
         u, y = u[known], y[known]
-        if len(y) < 4 * PAST or len(np.unique(u[:MOST])) < 3:
+        # a few steps between two levels are like those of any plant that settles in a sample
+        is_binary = len(np.unique(u[:MOST])) < 3
+        if len(y) < 4 * PAST or (is_binary and np.count_nonzero(np.diff(u)) < PAST):
             continue
         if _scale([np.column_stack([u, y])]) is None:
             continue
@@ -391,8 +451,65 @@ class Fault:
 def faults(data: Dataset) -> tuple[Fault, ...]:
     """Dead stretches of the output's sensor, columns that are no input and output of a plant, or a
     plant that only a closed loop holds."""
+    if wrap := tuple(_wraps(data)):
+        return wrap
+    if apart := spikes(data):
+        rest = faults(alive(data, apart))
+        return (*(_spike_fault(data, spike) for spike in apart), *rest)
     found = (*(_dead_fault(data, dead) for dead in dead_stretches(data)), *_order_fault(data))
     return found or tuple(_unstable_fault(data))
+
+
+def _wraps(data: Dataset) -> Iterator[Fault]:
+    """Jumps by nearly the whole range, against the motion before and after."""
+    columns = [e.y[np.abs(e.y) < LARGEST_FITTED] for e in data.experiments]
+    everything = np.concatenate(columns)
+    span = float(np.ptp(everything)) if len(everything) else 0.0
+    if span == 0.0:
+        return
+    back, other, sizes = 0, 0, []
+    for y in columns:
+        change = np.diff(y)
+        # changes of an angle are either small or jumps; noise has changes of all sizes between
+        other += int(np.sum((np.abs(change) > 0.35 * span) & (np.abs(change) <= 0.7 * span)))
+        jumps = np.where(np.abs(change) > 0.7 * span, np.sign(change), 0.0)
+        for k in np.flatnonzero(jumps):
+            if -jumps[k] in jumps[max(k - 5, 0) : k + 6]:
+                # there and back: a spike
+                other += 1
+                continue
+            around = np.concatenate([change[max(k - 5, 0) : k], change[k + 1 : k + 6]])
+            slope = float(np.median(around)) if len(around) else 0.0
+            if slope * change[k] < 0.0 and abs(slope) < 0.2 * span:
+                back += 1
+                sizes.append(abs(float(change[k]) - slope))
+            else:
+                other += 1
+    if back < 2 or back < 4 * other:
+        return
+    period = float(np.median(sizes))
+    turns = (360.0, math.tau, 1.0, *(2.0**b for b in range(8, 33)))
+    period = next((turn for turn in turns if abs(period / turn - 1.0) < 0.02), period)
+    yield Fault(
+        "wraps",
+        f"{labelled(data.output_name, data.output_unit)} jumps back by {period:.6g} at {back} "
+        "places while it moves on: an angle or a counter that wraps, which no model can follow",
+        f"unwrap it before it is read: np.unwrap(y, period={period:.6g})",
+        {"period": period, "jumps": float(back)},
+    )
+
+
+def _spike_fault(data: Dataset, spike: Dead) -> Fault:
+    of = "" if len(data.experiments) == 1 else f" of {data.experiments[spike.experiment].name}"
+    span = f"{spike.start}:{spike.stop}"
+    return Fault(
+        "spike",
+        f"{data.output_name} is {spike.value:.6g} in samples {span}{of}, far from the samples "
+        "beside it, and has more power there than in all the rest of the record",
+        f'leave it out, data.mask("{span}") (--mask {span}), and check cable, sensor and log',
+        {"first": float(spike.start), "last": float(spike.stop), "value": spike.value},
+        spike,
+    )
 
 
 def _dead_fault(data: Dataset, dead: Dead) -> Fault:
@@ -479,12 +596,12 @@ def _unstable_fault(data: Dataset) -> Iterator[Fault]:
 
 
 def sound(data: Dataset) -> tuple[Dataset, tuple[Fault, ...]]:
-    """The data without dead stretches, and what was found, for `identify`.
+    """The data without dead stretches and spikes, and what was found, for `identify`.
     Raises `DataError` if the columns are no input and output of a plant: one is computed from the
-    other, or they are exchanged.
+    other, they are exchanged, or a counter wraps.
     """
     found = faults(data)
-    wrong = next((f for f in found if f.kind in ("no_dynamics", "exchanged")), None)
+    wrong = next((f for f in found if f.kind in ("no_dynamics", "exchanged", "wraps")), None)
     if wrong is not None:
         raise DataError(
             name=data.source, expected="an output that answers the input", received=wrong.text,
@@ -501,4 +618,4 @@ def alive(data: Dataset, dead: Sequence[Dead]) -> Dataset:
     for d in dead:
         start = data.experiments[d.experiment].start
         masks[d.experiment][d.start - start : d.stop - start] = True
-    return data.mask(masks, why="of a dead sensor left out")
+    return data.mask(masks, why="that no plant has left out")
