@@ -28,7 +28,7 @@ MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest n
   python-test python-core docs package package-source
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -268,6 +268,9 @@ physics: $(VENV)/bench.stamp ## parameters of motors whose truth is known (docs/
 
 drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONLY="shaft60 lash", SEEDS=)
 	$(BIN)/python benches/drives.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))
+
+faults: $(VENV)/bench.stamp ## commissioning on drives with 30 faults: ended in time, never verified, named (SEEDS=20, ONLY=word)
+	$(BIN)/python benches/faults.py $(if $(ONLY),--only "$(ONLY)") $(if $(SEEDS),--seeds $(SEEDS))
 
 motors: $(DEV) ## commissioning on 20 motors of MuJoCo, compared with an oracle (ONLY="3 7", SEEDS=)
 	$(BIN)/python benches/mujoco_motors.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))

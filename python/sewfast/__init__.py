@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from . import rules, signals, trust
     from ._core import __version__
     from .analysis import Analysis, analyse
+    from .causes import Cause, cause_of
     from .commissioning import Commissioning, bode, commission
     from .comparison import Comparison, compare
     from .control.biquad import Biquad
@@ -62,6 +63,7 @@ __all__ = [
     "IV",
     "Analysis",
     "Biquad",
+    "Cause",
     "ClosedLoopRun",
     "Commissioning",
     "Comparison",
@@ -106,6 +108,7 @@ __all__ = [
     "__version__",
     "analyse",
     "bode",
+    "cause_of",
     "check",
     "commission",
     "compare",
@@ -148,6 +151,7 @@ _HOMES = {
     "commissioning": "Commissioning bode commission",
     "comparison": "Comparison compare",
     "analysis": "Analysis analyse",
+    "causes": "Cause cause_of",
     "control": "Biquad Controller Gains fit_fopdt load_controller paper_controller table_1",
     "control.state_feedback": "StateFeedback",
     "tuning": "Constraints Cost LoadStep ParetoFront TuningResult pareto tune",

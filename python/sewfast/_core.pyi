@@ -1007,6 +1007,17 @@ def host_loop(
 
 # --- guard.rs ---------------------------------------------------------------------------------------------
 
+def causes(
+    u: _F, counts: _F, before: Sequence[tuple[_F, _F]], *, Ts: float, counts_per_rev: float
+) -> dict[str, Any]:
+    """What has changed in a machine, from a run (u, counts) and earlier ones, all from rest.
+
+    ``motor`` (gain [RPM/u], lag and delay [s], friction and bias [u]) is fitted to the earlier runs or, without any, to this
+    one; ``unsure`` is its rms error on the earlier runs over their rms speed, NaN without any, ``backwards`` that
+    of a motor that turns against its command, on this run; ``error`` is the rms error of its speed on this one, ``size`` the rms speed [RPM]. ``findings`` are changes, the
+    best first, each with its value, its time [s], the error with it [RPM] and the motor until then.
+    """
+
 @final
 class Guard:
     """The device's guard for a run on a machine without one: speed [RPM], a motor that stands under a large command of up to

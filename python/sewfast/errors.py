@@ -19,6 +19,8 @@ class SewfastError(Exception):
         Name of the refused item: an argument, a column, a file, a port.
     expected, received, remedy : str or None
         Expected value, received value, what to do.
+    cause : Cause or None
+        What is wrong with the machine, if a run shows it (`sewfast.cause_of`).
 
     Examples
     --------
@@ -33,6 +35,7 @@ class SewfastError(Exception):
     expected: str | None
     received: str | None
     remedy: str | None
+    cause: Any = None
 
     def __init__(
         self,
@@ -53,6 +56,14 @@ class SewfastError(Exception):
             found = _fields(str(message))
         super().__init__(message)
         self.name, self.expected, self.received, self.remedy = found
+
+    def explain(self, cause: Any) -> None:
+        """Put the cause into the message, in place of a remedy for any cause."""
+        message = str(self)
+        if self.remedy and message.endswith(self.remedy):
+            message = message[: -len(self.remedy)].rstrip("; ")
+        self.args = (f"{message}; {cause}",)
+        self.cause, self.remedy = cause, str(cause)
 
 
 def _fields(message: str) -> tuple[str | None, ...]:

@@ -77,24 +77,50 @@ def test_a_motor_that_passes_its_speed_is_commanded_to_rest(motor: Motor, most: 
     with pytest.raises(LinkError, match=r"rig, step: expected at most 2000 RPM") as stop:
         record(bench(motor), np.full(3000, 8.0), name="step")
     motor.judge(most)
-    # three samples are too few for a recording with speeds
-    assert isinstance(stop.value.recording, Recording) or motor.gain > 10_000.0
+    assert isinstance(stop.value.recording, Recording)
     assert "raise" not in str(stop.value)
     rests = "it stands now" if motor.has_friction else "it still turns 5 s after that"
     assert rests in str(stop.value)
 
 
-@pytest.mark.parametrize("fault", ["flips_at", "sticks_at"])
-def test_a_loop_that_runs_away_is_ended(fault: str) -> None:
+@pytest.mark.parametrize(
+    ("fault", "named"), [("flips_at", "command sign"), ("sticks_at", "stage stuck")]
+)
+def test_a_loop_that_runs_away_is_ended(fault: str, named: str) -> None:
     motor = Motor(gain=400.0, **{fault: 0.5})
     pid = Controller(
         Gains.standard(0.01, 0.1, u_unit="V", y_unit="RPM"), u_min=-10.0, u_max=10.0,
         filter_samples=8, counts_per_rev=4096,
     )  # fmt: skip
-    with pytest.raises(LinkError, match="expected at most 2000 RPM"):
+    with pytest.raises(LinkError, match="expected at most 2000 RPM") as stop:
         run(pid, bench(motor), np.full(3000, 1000.0), name="level")
     # a stage that is stuck has its own will: its command of rest comes as fast
     motor.judge(1.25 if fault == "flips_at" else math.inf)
+    assert stop.value.cause.name == named
+    assert stop.value.cause.at == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_loop_that_loses_its_encoder_is_ended_though_nobody_watches_it() -> None:
+    class Blind(Motor):
+        last = 0.0
+
+        @property
+        def counts(self) -> float:
+            if self.t < 0.5:
+                self.last = math.floor(4096 * self.angle)
+            return self.last
+
+    pid = Controller(
+        Gains.standard(0.01, 0.1, u_unit="V", y_unit="RPM"), u_min=-10.0, u_max=10.0,
+        filter_samples=8, counts_per_rev=4096,
+    )  # fmt: skip
+    motor = Blind(gain=400.0)
+    with pytest.raises(LinkError, match="expected the encoder to move") as stop:
+        run(pid, bench(motor), np.full(3000, 1000.0), name="level")
+    assert stop.value.cause.name in ("encoder lost", "stage off")
+    # a quarter of a second after the command reached half of its limit
+    assert len(motor.commands) < 1000
+    assert motor.commands[-1] == 0.0
 
 
 def test_commissioning_ends_on_a_machine_that_integrates() -> None:
@@ -102,6 +128,16 @@ def test_commissioning_ends_on_a_machine_that_integrates() -> None:
     with pytest.raises(LinkError, match="expected at most 2000 RPM"):
         commission(bench(motor), speed=1500, members=2, evaluations=60)
     motor.judge(1.25)
+
+
+def test_a_machine_that_states_no_speed_ends_at_twice_what_was_planned() -> None:
+    motor = Motor(gain=2000.0 * 0.1, has_friction=False)
+    rig = SteppedBench(motor, Ts=TS, counts_per_rev=4096, volt=10.0, name="rig")
+    with pytest.raises(LinkError, match=r"expected at most 3750 RPM.*integrates: ") as stop:
+        commission(rig, speed=1500, members=2, evaluations=60)
+    assert max(motor.speeds) < 1.1 * 3750.0
+    assert stop.value.cause.name == "integrates"
+    assert math.isinf(rig.speed)
 
 
 def test_a_machine_within_its_speed_is_left_alone() -> None:

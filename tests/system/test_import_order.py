@@ -16,7 +16,7 @@ import sewfast
 ORDER = """
     errors kinds units arrays storage tables plotting progress threads speed signals
     recordfile dataset readers benchmarks gains machine live recording
-    equilibrium dynamic_model validation comparison evidence models
+    causes equilibrium dynamic_model validation comparison evidence models
     motorfit identification sklearn
     rules control tuning trust analysis frequency deployment fleets
     link greybox report commissioning experiment studio cli __main__

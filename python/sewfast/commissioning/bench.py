@@ -17,6 +17,7 @@ from .. import _core
 from ..control.controller import SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import (
+    NO_MOTION,
     TOO_FAST,
     Followed,
     Machine,
@@ -84,7 +85,7 @@ class Aborted(Refusal):
 _SEEN = {
     "Speed": "expected at most {limit:g} RPM, it turned at {value:.4g}; " + TOO_FAST,
     "NoMotion": "expected the encoder to move, it has not by a count for .25 s at {value:.3g} V; "
-    "look for a lost encoder, an amplifier that has tripped, a shaft that is blocked",
+    + NO_MOTION,
     "Swinging": "expected a command that does not swing, it went 8 times in a row from limit to "
     "limit, at {value:.3g} Hz; look for play, for a shaft that gives, for a delay",
 }
@@ -223,16 +224,35 @@ class RecordedBench(MachineWrapper):
     note: Callable[[str, str, Recording, ClosedLoopRun | None], object]
     kept: Callable[[str, str], Recording | None]
     kept_run: Callable[[str, str, SampledController], RecordedRun | None]
+    runs: list[Recording] = field(default_factory=list)
+    """All runs so far, in order, the last one as far as it went."""
+    most: float = math.inf
+    """Speed that no machine needs to pass [RPM]; it counts if the machine states none."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.inner, SteppedBench) and math.isinf(self.inner.speed):
+            self.inner = self.inner.within(self.most)
 
     def excite(self, u: FloatArray, name: str) -> Recording:
         key = key_of(u)
         recording = self.kept(name, key)
         if recording is None:
-            recording = self.inner.excite(u, name)
-            require_record(self.inner, name, len(u), recording)
-            self._require_speed(name, key, recording)
+            with self._keeping_what_failed():
+                recording = self.inner.excite(u, name)
+                require_record(self.inner, name, len(u), recording)
+                self._require_speed(name, key, recording)
+        self.runs.append(recording)
         self.note(name, key, recording, None)
         return recording
+
+    @contextmanager
+    def _keeping_what_failed(self) -> Iterator[None]:
+        try:
+            yield
+        except (Aborted, LinkError) as stop:
+            if isinstance(stop.recording, Recording):
+                self.runs.append(stop.recording)
+            raise
 
     def follow(
         self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
@@ -247,23 +267,27 @@ class RecordedBench(MachineWrapper):
                 if watch is not None:
                     watch(first, u, counts)
 
-            try:
-                found = super().follow(controller, r, name, watch=both)
-            except (Aborted, LinkError) as stop:
-                # under another name, so that a resumed commissioning repeats the run
-                if isinstance(stop.recording, Recording):
-                    self.note(f"{name}{ABORTED}", key, stop.recording, None)
-                raise
-            _require_run(self.inner, name, len(r), found)
-            # nobody has watched a machine without a watch, nor the last samples of another
-            self._require_speed(name, key, found.recording)
+            with self._keeping_what_failed():
+                try:
+                    found = super().follow(controller, r, name, watch=both)
+                except (Aborted, LinkError) as stop:
+                    # under another name, so that a resumed commissioning repeats the run
+                    if isinstance(stop.recording, Recording):
+                        self.note(f"{name}{ABORTED}", key, stop.recording, None)
+                    raise
+                _require_run(self.inner, name, len(r), found)
+                # nobody has watched a machine without a watch, nor the last samples of another
+                self._require_speed(name, key, found.recording)
+        self.runs.append(found.recording)
         self.note(name, key, found.recording, found)
         return found
 
     @property
     def _stated(self) -> float:
         """The speed that the machine must not pass [RPM]; a drive's device watches its own."""
-        return math.inf if isinstance(self.inner, DriveBench) else self.inner.speed
+        if isinstance(self.inner, DriveBench):
+            return math.inf
+        return self.most if math.isinf(self.inner.speed) else self.inner.speed
 
     def _require_speed(self, name: str, key: str, recording: Recording) -> None:
         """Refuse a run that was faster than stated."""

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import signals
+from ..causes import Cause, cause_among, turns_at_rest
 from ..control.controller import Controller, SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import WATCHED, Machine, RecordedRun
 from ..dataset import FloatArray
-from ..errors import DataError, Interrupted, SettingError
+from ..errors import DataError, Interrupted, LinkError, SettingError
 from ..gains import vector
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
@@ -33,7 +34,7 @@ from ..tuning.task import GAINS
 from . import excitations
 from .bench import ABORTED, RecordedBench, bench_of, description_of
 from .checkpoint import STAGES, Checkpoint
-from .demands import Demands, Refusal, demands
+from .demands import Demands, Refusal, demands, require
 from .excitations import first_motion, standard, step_response
 from .gains import (
     Requirements,
@@ -69,6 +70,10 @@ SHORTEST = 2 * WATCHED
 """Least samples of a reference: fewer cannot be judged."""
 FALLS_SHORT = 0.7
 """Share of the planned acceleration; a drive that reaches less limits its current."""
+TWICE = 2.0
+"""Multiple of the largest planned speed at which a machine that states no limit is too fast."""
+LEAST_OF_STEP = 0.1
+"""Share of the step's acceleration that a larger command must reach."""
 
 References = Mapping[str, ArrayLike] | Sequence[str]
 Between = Callable[[str, Commissioning], object]
@@ -231,11 +236,17 @@ def commission(
                 return None
             return checkpoint.found_run(journal.stage, name, key, controller, machine.name)
 
+        recorded = RecordedBench(machine, note, kept, kept_run, most=TWICE * asked.top)
         try:
-            return _carry_out(RecordedBench(machine, note, kept, kept_run), asked, cost, journal)
-        except Refusal as refusal:
-            refusal.stage = journal.stage
-            refusal.so_far = journal.result("refused", str(refusal))
+            return _carry_out(recorded, asked, cost, journal)
+        except (Refusal, LinkError) as stop:
+            cause = journal.cause or _cause(recorded) or stop.cause
+            if cause is not None:
+                stop.explain(cause)
+                journal.keep(cause=cause)
+            if isinstance(stop, Refusal):
+                stop.stage = journal.stage
+                stop.so_far = journal.result("refused", str(stop))
             raise
         except KeyboardInterrupt as stop:
             best = getattr(stop, "best", None)
@@ -244,6 +255,11 @@ def commission(
             cancelled = cancel is not None and cancel.is_set()
             reason = "cancelled" if cancelled else "Ctrl-C"
             raise Interrupted(journal.result("interrupted", reason)) from stop
+
+
+def _cause(machine: RecordedBench) -> Cause | None:
+    """What is wrong with the machine, if its runs show it."""
+    return cause_among(machine.runs, volt=machine.volt, speed=machine.speed)
 
 
 def _require_kinds(cost: Any, progress: Any, cancel: Any, between: Any) -> None:
@@ -289,6 +305,9 @@ def _carry_out(
     journal.enter("first motion")
     motion = first_motion(machine, asked)
     journal.keep(motion=motion)
+    if (moves := turns_at_rest(machine.runs[0])) is not None:
+        journal.keep(cause=moves)
+        journal.say(moves.text)
 
     journal.enter("step response")
     step = step_response(machine, asked, motion)
@@ -384,7 +403,9 @@ def _carry_out(
             journal.say(f"the margins could not be measured at {speed:g} RPM")
     journal.finish()
     if missed := unreached(journal.result(VERIFIED).comparisons):
-        return journal.result(UNREACHED, missed)
+        if why := journal.cause or _cause(machine):
+            journal.keep(cause=why)
+        return journal.result(UNREACHED, f"{missed}; {why}" if why else missed)
     found = journal.result(VERIFIED)
     return replace(found, verdict=VERIFIED_POORLY) if found.is_predicted_poorly else found
 
@@ -412,6 +433,12 @@ def _pulses(machine: Machine, fopdt: Fopdt, asked: Demands) -> tuple[float, list
         shown = excitations.acceleration_from_rest(machine, fastest, asked)
     if shown > FALLS_SHORT * fastest:
         return min(shown, fastest), found
+    slowest = LEAST_OF_STEP * fopdt.K * fopdt.u_high / fopdt.T
+    require(
+        shown > slowest,
+        f"expected the largest command to accelerate the machine by at least {slowest:.3g} RPM/s, "
+        f"a tenth of what {fopdt.u_high:.3g} V did in the step response, it did by {shown:.3g}",
+    )
     u = excitations.pulses(fopdt, shown, asked, machine.Ts, asked.seed + 1)
     found.append(machine.excite(u, "pulses_limited"))
     again = excitations.acceleration_shown(found[1], asked)
@@ -624,6 +651,12 @@ class Journal:
         """Store a recording, except those along the references, which are stored as runs."""
         if self.stage != STAGES[-1] or name.startswith("hold_") or name.endswith(ABORTED):
             self._values["recordings"] = {**self._values["recordings"], name: recording}
+
+    @property
+    def cause(self) -> Cause | None:
+        """What was seen to be wrong with the machine."""
+        found: Cause | None = self._values.get("cause")
+        return found
 
     def result(self, verdict: str, reason: str = "") -> Commissioning:
         """The results so far."""

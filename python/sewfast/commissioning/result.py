@@ -16,6 +16,7 @@ import numpy as np
 
 from .. import __version__, storage
 from ..analysis.analysis import NUMBERS as ANALYSIS
+from ..causes import Cause
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun
 from ..errors import DataError, SettingError
@@ -59,6 +60,8 @@ class Commissioning:
         empty.
     stage, reason : str
         The last stage, and why it ended there.
+    cause : Cause or None
+        What is wrong with the machine, if it was refused or missed its target and a run shows why.
     seconds : mapping of stage to float
     recordings : mapping of name to Recording
         Recordings of the machine, for `identify`.
@@ -113,6 +116,7 @@ class Commissioning:
     stage: str
     reason: str
     seconds: Mapping[str, float]
+    cause: Cause | None = None
     recordings: Mapping[str, Recording] = field(default_factory=dict)
     motion: Motion | None = None
     fopdt: Fopdt | None = None
@@ -476,6 +480,7 @@ def numbers(c: Commissioning) -> dict[str, Any]:
         "verdict": c.verdict,
         "stage": c.stage,
         "reason": c.reason,
+        "cause": None if c.cause is None else c.cause.to_json(),
         "seconds": dict(c.seconds),
         "recordings": {name: len(r) * r.Ts for name, r in c.recordings.items()},
         "motion": None if c.motion is None else dict(vars(c.motion)),

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..control.controller import Controller
+from ..causes import Cause
+from ..control.controller import Controller, SampledController
 from ..control.loop import ClosedLoopRun, run
 from ..control.machine import WATCHED
 from ..dataset import FloatArray
@@ -71,7 +72,6 @@ APART = 0.05
 """Largest distance of measurement from prediction, rms over the reference's span."""
 SATURATED = 0.5
 """Largest share of samples at a limit."""
-RAILED_REMEDY = "raise u_max, or lower speed"
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,14 +267,36 @@ class Watching:
         if self._railed > SATURATED * len(self._u) + block:
             self._end(
                 end, "expected the command within its limits most of the time, it was already at "
-                f"one for half of the whole reference; {RAILED_REMEDY}",
+                "one for half of the whole reference", self._out_of_reach(end),
             )  # fmt: skip
 
-    def _end(self, end: int, reason: str) -> None:
-        raise Aborted.after(
+    def _out_of_reach(self, end: int) -> Cause:
+        y = np.diff(self._counts[:end], append=np.nan) * 60.0 / (self._per_turn * self._Ts)
+        r = np.repeat(self._predicted.r, self._k)[:end]
+        return out_of_reach(r, y, self._u[:end], self._controller, self._predicted.reference)
+
+    def _end(self, end: int, reason: str, cause: Cause | None = None) -> None:
+        stop = Aborted.after(
             f"{reason}; the controller is not verified", self._predicted.reference,
             self._u[:end], self._counts[:end], self._controller, self._per_turn,
         )  # fmt: skip
+        stop.cause = cause
+        raise stop
+
+
+def out_of_reach(
+    r: FloatArray, y: FloatArray, u: FloatArray, controller: SampledController, reference: str
+) -> Cause:
+    """The cause of a loop at the limit of its command: where it is farthest from its reference."""
+    railed = (u >= controller.u_max - 1e-9) | (u <= controller.u_min + 1e-9)
+    apart = np.where(railed & np.isfinite(y), np.abs(r - y), 0.0)
+    k = int(np.argmax(apart))
+    return Cause(
+        "out of reach",
+        f"{reference!r} asks for {r[k]:.4g} RPM where {u[k]:.4g} V reach {y[k]:.4g}; make it lower "
+        "or slower, or raise u_max if motor and machine bear it",
+        reference, k * controller.Ts, float(apart[k]),
+    )  # fmt: skip
 
 
 def unreached(comparisons: Sequence[Comparison]) -> str:
@@ -343,8 +365,10 @@ def require_alike(c: Comparison) -> None:
 def require_unsaturated(found: ClosedLoopRun) -> None:
     """Raise `Refusal` for a loop that is at the limit of its command for too long."""
     saturated = _at_limit(found)
-    require(
-        saturated <= SATURATED,
-        f"expected the command within its limits most of the time on {found.reference!r}, it was "
-        f"at one for {100 * saturated:.0f} % of the samples; {RAILED_REMEDY}",
-    )
+    if saturated > SATURATED:
+        refusal = Refusal(
+            "expected the command within its limits most of the time on "
+            f"{found.reference!r}, it was at one for {100 * saturated:.0f} % of the samples"
+        )
+        refusal.cause = out_of_reach(found.r, found.y, found.u, found.controller, found.reference)
+        raise refusal

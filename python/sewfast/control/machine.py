@@ -8,6 +8,7 @@ any that is advanced sample by sample. A drive behind a port is itself a `Machin
 from __future__ import annotations
 
 import contextlib
+import copy
 import inspect
 import math
 import os
@@ -21,12 +22,13 @@ from numpy.typing import ArrayLike
 
 from .. import _core
 from ..arrays import FloatArray
+from ..causes import cause_of
 from ..errors import DataError, LinkError, SettingError
 from ..gains import real
 from ..machine import VirtualMachine
 from ..recordfile.writer import require_replaceable
 from ..recording import Recording, require_finite
-from ..speed import Method
+from ..speed import Method, speed_or_nan
 from .controller import SampledController
 from .loop import ClosedLoopRun, run
 
@@ -368,6 +370,8 @@ TOO_FAST = (
     "recorded, wrong counts_per_rev, a counter that wraps"
 )
 """What to do about a machine that is faster than stated: never a higher limit."""
+NO_MOTION = "look for a lost encoder, an amplifier that has tripped, a shaft that is blocked"
+"""What to do about a machine that stands under a large command."""
 
 
 class Stepped(Protocol):
@@ -431,6 +435,12 @@ class SteppedBench:
                     remedy="see the data sheet",
                 )  # fmt: skip
 
+    def within(self, speed: float) -> SteppedBench:
+        """The same machine with another limit of speed [RPM]."""
+        limited = copy.copy(self)
+        object.__setattr__(limited, "speed", speed)
+        return limited
+
     def excite(self, u: FloatArray, name: str) -> Recording:
         require_finite("command", u)
         return self._played(lambda k, counts: float(u[k]), len(u), name)
@@ -443,12 +453,18 @@ class SteppedBench:
         per_count = 60.0 / (self.counts_per_rev * self.Ts)
         u, feedback, before = np.zeros(len(r)), np.zeros(len(r)), [0.0]
         seen = np.zeros(len(r))
+        # a loop that loses its encoder pushes ever harder; whoever watches looks for that, too
+        guard = None if watch is not None else _core.Guard(
+            Ts=self.Ts, counts_per_rev=self.counts_per_rev, volt=self.volt, speed=math.inf
+        )  # fmt: skip
 
         def decide(k: int, counts: float) -> float:
             if watch is not None and k and k % WATCHED == 0:
                 watch(k - WATCHED, u[k - WATCHED : k], seen[k - WATCHED : k])
             u[k] = core.step(float(r[k]), (counts - before[0]) * per_count)
             feedback[k], before[0], seen[k] = core.filtered, counts, counts
+            if guard is not None and guard.watch(u[k : k + 1], seen[k : k + 1]) is not None:
+                raise self._lost(name, u[: k + 1], seen[: k + 1])
             return float(u[k])
 
         recording = self._played(decide, len(r), name)
@@ -471,9 +487,14 @@ class SteppedBench:
 
         def recording(until: int) -> Recording:
             true = speed[:until] if hasattr(machine, "speed_rpm") else None
+            if until < samples:
+                y = speed_or_nan(counts[:until], self.Ts, self.counts_per_rev, "kalman")
+                return Recording(
+                    u[:until], counts[:until], y, true, self.Ts, self.counts_per_rev, name
+                )
             return Recording.of_counts(
-                u[:until], counts[:until], Ts=self.Ts, counts_per_rev=self.counts_per_rev,
-                name=name, speed_true=true,
+                u, counts, Ts=self.Ts, counts_per_rev=self.counts_per_rev, name=name,
+                speed_true=true,
             )  # fmt: skip
 
         try:
@@ -502,6 +523,20 @@ class SteppedBench:
                 return True
         return False
 
+    def _lost(self, name: str, u: FloatArray, counts: FloatArray) -> LinkError:
+        """The error for a loop without an encoder."""
+        error = LinkError(
+            name=f"{self.name}, {name}", expected="the encoder to move",
+            received=f"not a count for .25 s, at last at {u[-1]:.3g} V; rest was commanded",
+            remedy=NO_MOTION,
+        )  # fmt: skip
+        y = speed_or_nan(counts, self.Ts, self.counts_per_rev, "kalman")
+        lost = Recording(u, counts, y, None, self.Ts, self.counts_per_rev, name)
+        error.recording = lost
+        if (cause := cause_of(lost, volt=self.volt, speed=self.speed)) is not None:
+            error.explain(cause)
+        return error
+
     def _tripped(
         self, name: str, k: int, speed: float, u: float, rests: bool,
         recording: Callable[[int], Recording],
@@ -513,6 +548,9 @@ class SteppedBench:
             f"commanded, and {after}",
             remedy=TOO_FAST,
         )  # fmt: skip
-        with contextlib.suppress(DataError):  # too few samples for a speed
-            error.recording = recording(k)
+        error.recording = recording(k + 1)
+        with contextlib.suppress(DataError):  # too few samples
+            cause = cause_of(error.recording, volt=self.volt, speed=self.speed)
+            if cause is not None:
+                error.explain(cause)
         return error

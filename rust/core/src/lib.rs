@@ -5,6 +5,7 @@
 //! [`machine`]. Times are in seconds; outputs and inputs carry the caller's units.
 
 pub mod arx;
+pub mod causes;
 pub mod closed_loop;
 mod colour;
 pub mod data;

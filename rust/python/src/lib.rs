@@ -1,5 +1,6 @@
 //! The Python module `sewfast._core`: convert, release the interpreter, call, convert back.
 
+mod causes;
 mod control;
 mod device;
 mod greybox;
@@ -28,6 +29,7 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     control::register(module)?;
     loop_transfer::register(module)?;
     link::register(module)?;
+    causes::register(module)?;
     guard::register(module)?;
     device::register(module)
 }

@@ -1,0 +1,394 @@
+"""`cause_of`: the name of what is wrong with a machine, from a run and earlier ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from . import _core
+from .arrays import FloatArray
+from .errors import DataError
+from .recording import Recording
+
+EXPLAINED = 0.5
+"""A change is believed if no more than this share of the error is left with it: on runs of healthy
+drives, each fitted up to its change, .68 and more were left (docs/guards.md)."""
+UNSEEN = 0.25
+"""The same on a run that did not end the series."""
+NOTED, TIMES = 0.02, 3.0
+"""Without it the error must be larger than this share of the speed, and larger by this factor than
+on the earlier runs to which the motor was fitted."""
+ALIKE, UNSURE = 0.05, 0.1
+"""Shares of the speed by which a motor of its own errs on a run that can be an earlier one, and one
+motor on all earlier ones together."""
+LOST = 0.1
+"""Shares of motion that count as none."""
+TURNS = 5
+"""Counts without a command that are a motion, and no trembling at an edge of the encoder."""
+TIES = 1.05
+"""Changes with an error of up to this multiple of the least are equal: the likelier is taken."""
+STRONG = 3.0
+"""Gain is too large if the largest command reaches this many times the machine's own limit."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What is wrong with a machine.
+
+    Attributes
+    ----------
+    name : str
+        ``command sign``, ``encoder sign``, ``sign`` (one of both), ``encoder lost``, ``counts
+        scaled``, ``counts jumped``, ``stage stuck``, ``stage off``, ``gain``, ``gain too large``,
+        ``load``, ``turns at rest``, ``delay``, ``inertia``, ``friction``, ``dead zone``,
+        ``integrates``, ``no motion`` or ``out of reach``.
+    text : str
+        What was seen, in numbers, and what to check.
+    run : str
+        Name of the run that shows it.
+    at : float or None
+        When it began in that run [s]; None if it was there before.
+    value : float
+        The number that belongs to it: a factor, a command [V], counts or seconds.
+    """
+
+    name: str
+    text: str
+    run: str
+    at: float | None
+    value: float
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.text}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The fields as JSON values."""
+        return {
+            "name": self.name, "text": self.text, "run": self.run, "at": self.at,
+            "value": self.value,
+        }  # fmt: skip
+
+
+def cause_of(
+    recording: Recording,
+    before: Sequence[Recording] = (),
+    *,
+    volt: float = math.inf,
+    speed: float = math.inf,
+) -> Cause | None:
+    """Name what is wrong with a machine by one of its runs.
+
+    A motor of first order with delay, friction and a constant load is fitted to earlier runs or,
+    without any, to the run itself until something changes. Each change that a drive is known for is
+    then simulated at every time of the run, with the recorded commands, and the one that leaves
+    the smallest error is the cause, if it leaves no more than half. If nothing changed, the motor
+    itself is looked at.
+
+    Parameters
+    ----------
+    recording : Recording
+        A run from rest that went wrong, as far as it went (`LinkError.recording`).
+    before : sequence of Recording, optional
+        Earlier runs from rest, of the machine as it should be, at the same sample time.
+    volt : float, optional
+        Largest command [V].
+    speed : float, optional
+        Speed that the machine must not pass [RPM].
+
+    Returns
+    -------
+    Cause or None
+        None if no known cause explains the run, or no such motor the earlier ones.
+
+    Raises
+    ------
+    DataError
+        For fewer than three samples.
+    SettingError
+        For a sample time or counts per turn that are not above 0.
+    """
+    return _Look.at(recording, before, volt, speed).cause()
+
+
+MOST = 12
+"""Runs that are looked at, the last ones of a series: each takes some tenths of a second."""
+
+
+def cause_among(
+    runs: Sequence[Recording], *, volt: float = math.inf, speed: float = math.inf
+) -> Cause | None:
+    """The cause that ended a series of runs.
+
+    The last run is looked at alone, then compared with those before it that one motor explains. If
+    that shows nothing, a fault may have come unseen in one of those.
+    """
+    if not runs:
+        return None
+    last, moved = runs[-1], [r for r in runs[:-1] if np.ptp(r.counts) > 0.0]
+    if np.ptp(last.counts) == 0.0 and moved:
+        return _idle(runs)
+    look = _look(last, volt, speed)
+    if look is not None and (cause := look.change()):
+        return cause
+    known: list[Recording] = []
+    unseen: list[Cause] = []
+    for recording in moved[-MOST:]:
+        earlier = _look(recording, volt, speed)
+        if earlier is None:
+            continue
+        if cause := earlier.change(UNSEEN):
+            unseen.append(cause)
+        elif earlier.found["error"] <= ALIKE * earlier.found["size"]:
+            known.append(recording)
+    cause = cause_of(last, known, volt=volt, speed=speed) if known else None
+    if cause is None and look is not None:
+        cause = look.always()
+    return cause or (unseen[0] if unseen else None)
+
+
+def _look(recording: Recording, volt: float, speed: float) -> _Look | None:
+    try:
+        return _Look.at(recording, (), volt, speed)
+    except DataError:  # too few samples
+        return None
+
+
+def _idle(runs: Sequence[Recording]) -> Cause:
+    """Why a machine that has moved stands still at a command."""
+    largest = [float(np.max(np.abs(r.u), initial=0.0)) for r in runs]
+    moved = [u for r, u in zip(runs, largest, strict=True) if np.ptp(r.counts) > 0.0]
+    if min(moved) <= largest[-1]:
+        return Cause(
+            "encoder lost",
+            f"the encoder counts nothing at up to {largest[-1]:.3g} V, of which {min(moved):.3g} V "
+            f"moved it before; {_LOST_ENCODER}, whether the drive is still enabled",
+            runs[-1].name, None, 0.0,
+        )  # fmt: skip
+    stood = max(u for r, u in zip(runs, largest, strict=True) if np.ptp(r.counts) == 0.0)
+    return Cause(
+        "dead zone",
+        f"the first {stood:.3g} V move nothing; check friction, a brake that is on, the dead band "
+        "of the drive", runs[-1].name, None, stood,
+    )  # fmt: skip
+
+
+def turns_at_rest(r: Recording) -> Cause | None:
+    """Whether a machine moves before it is commanded."""
+    moves = np.flatnonzero(r.u)
+    end = int(moves[0]) if len(moves) else len(r)
+    counted = float(r.counts[max(0, end - 1)] - r.counts[0])
+    if not abs(counted) >= TURNS:
+        return None
+    rpm = 60.0 * counted / (r.counts_per_rev * (end - 1) * r.Ts)
+    return Cause(
+        "turns at rest", f"the machine turns at {rpm:.4g} RPM without a command; {_LOAD}", r.name,
+        None, rpm,
+    )  # fmt: skip
+
+
+def _columns(recording: Recording) -> tuple[FloatArray, FloatArray]:
+    """Commands and counts, until the first that a link has lost."""
+    known = np.isfinite(recording.u) & np.isfinite(recording.counts)
+    end = len(known) if known.all() else int(np.argmin(known))
+    u, counts = recording.u[:end], recording.counts[:end]
+    return np.ascontiguousarray(u), np.ascontiguousarray(counts, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A run with what the core found, and the limits of its machine."""
+
+    recording: Recording
+    found: dict[str, Any]
+    volt: float
+    speed: float
+
+    @classmethod
+    def at(
+        cls, recording: Recording, before: Sequence[Recording], volt: float, speed: float
+    ) -> _Look:
+        found = _core.causes(
+            *_columns(recording), [_columns(r) for r in before], Ts=recording.Ts,
+            counts_per_rev=recording.counts_per_rev,
+        )  # fmt: skip
+        return cls(recording, found, volt, speed)
+
+    def cause(self) -> Cause | None:
+        """What explains the run: a change, or what the motor of a run alone lacks."""
+        is_alone = math.isnan(self.found["unsure"])
+        return self.change() or (self.always() if is_alone else None)
+
+    def change(self, explained: float = EXPLAINED) -> Cause | None:
+        """The change that explains the run, leaving this share of the error at most."""
+        if (early := turns_at_rest(self.recording)) is not None:
+            return early
+        found = self.found
+        is_alone = math.isnan(found["unsure"])
+        if not (is_alone or found["unsure"] <= UNSURE):
+            return None
+        least = NOTED if is_alone else max(NOTED, TIMES * found["unsure"])
+        if found["error"] > least * found["size"] and found["findings"]:
+            most = min(explained * found["error"], TIES * found["findings"][0][3])
+            equal = {f[0]: f for f in found["findings"] if f[3] <= most}
+            if equal:
+                change = next(name for name in _NAMED if name in equal)
+                _, value, at, _, motor = equal[change]
+                return self.changed(change, value, at, motor)
+        return None
+
+    def changed(self, change: str, value: float, at: float, motor: dict[str, float]) -> Cause:
+        """The name of a change and its value."""
+        r = self.recording
+        # the first blocks of a run cannot be told from its start
+        early = at <= max(0.02, 10.0 * r.Ts)
+        when = f"from the start of {r.name!r}" if early else f"{at:.3g} s after {r.name!r} began"
+        largest = float(np.max(np.abs(r.u), initial=0.0))
+        if change == "stuck" and abs(value) < LOST * largest:
+            change, value = "gain", 0.0
+        if change == "friction" and value > (1.0 - LOST) * largest:
+            # more than any command: nothing is seen to move
+            change, value = "counts", 0.0
+        name, text = _NAMED[change](value, motor, when)
+        return Cause(name, text, r.name, None if early else at, value)
+
+    def always(self) -> Cause | None:
+        """What the motor that explains the whole run lacks."""
+        r, motor = self.recording, self.found["motor"]
+        largest = float(np.max(np.abs(r.u), initial=0.0))
+        travel = float(np.ptp(r.counts)) / r.counts_per_rev
+        gain, lag = motor["gain"], motor["lag"]
+        unlike = self.found["error"] / max(self.found["size"], 1e-9)
+        name: str
+        if travel == 0.0:
+            if largest < 0.5 * self.volt and math.isfinite(self.volt):
+                return None
+            name, value = "no motion", largest
+            text = (
+                f"the encoder does not count at all at up to {largest:.3g} V; {_LOST_ENCODER}, "
+                "whether the drive is enabled and the motor connected"
+            )
+        elif self.found["backwards"] < min(
+            UNSURE, self.found["error"] / self.found["size"] / TIMES
+        ):
+            name, value = "sign", -1.0
+            text = f"a positive command turns the machine backwards; {_SIGN}"
+        elif unlike > EXPLAINED:
+            return None
+        elif self.is_too_fast() and gain * self.volt > STRONG * self.speed:
+            value = gain * self.volt / self.speed
+            is_lag_seen = lag < len(r) * r.Ts
+            name = "gain too large" if is_lag_seen else "integrates"
+            text = self._strong(gain, abs(gain) / lag, is_lag_seen=is_lag_seen)
+        else:
+            return None
+        return Cause(name, text, r.name, None, float(value))
+
+    def is_too_fast(self) -> bool:
+        """Whether the run ended at the machine's own limit of speed."""
+        r = self.recording
+        k = min(4, len(r) - 1)
+        turns = abs(float(r.counts[-1] - r.counts[-1 - k])) / r.counts_per_rev
+        return 60.0 * turns / (k * r.Ts) > 0.8 * self.speed
+
+    def _strong(self, gain: float, rises: float, *, is_lag_seen: bool) -> str:
+        if is_lag_seen:
+            enough = self.speed / gain
+            return (
+                f"it turns at {gain:.4g} RPM per V, so that {enough:.3g} V of {self.volt:g} take "
+                f"it to its {self.speed:g} RPM; check counts_per_rev, the unit of the command, its "
+                "scale in the drive"
+            )
+        return (
+            f"the speed grows by {rises:.4g} RPM/s per V and does not settle: the command is a "
+            "torque without friction, or an acceleration; command it as a speed or a voltage, or "
+            "give the machine friction"
+        )
+
+
+_LOST_ENCODER = "check the encoder's cable and supply, the coupling, whether the shaft is blocked"
+_SIGN = "swap two motor leads or the encoder's A and B, or change a sign in the drive"
+_LOAD = "check what drives the shaft: gravity, a spring, a load, an offset of the command"
+
+
+def _gain(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
+    if value < -LOST:
+        return "command sign", (
+            f"{when} the machine answers with {value:.2g} times its gain: the sign of the command "
+            "has turned; check the motor leads, the direction signal, the sign in the drive"
+        )
+    if value < LOST:
+        return "stage off", (
+            f"{when} no command moves the machine any more; check whether the drive is enabled, "
+            "its fuse, its temperature, the motor leads"
+        )
+    what = "fallen" if value < 1.0 else "grown"
+    return "gain", (
+        f"{when} the machine answers with {value:.3g} times its gain: it has {what}; check the "
+        "supply, a limit of current or temperature, the scale of the command"
+    )
+
+
+def _counts(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
+    if value < -LOST:
+        return "encoder sign", (
+            f"{when} the encoder counts {value:.2g} times the motion: its sign has turned; check "
+            "A and B, and the setting of its direction"
+        )
+    if value < LOST:
+        return "encoder lost", f"{when} the encoder no longer counts; {_LOST_ENCODER}"
+    return "counts scaled", (
+        f"{when} the encoder counts {value:.3g} times the motion; check for a channel that is "
+        "lost, the setting of its resolution, a belt or coupling that slips"
+    )
+
+
+def _stuck(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
+    return "stage stuck", (
+        f"{when} the machine behaves as at {value:.3g} V, whatever the command; switch it off, "
+        "check the output stage and the line of the command"
+    )
+
+
+def _load(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
+    return "load", f"{when} a load worth {value:.3g} V of command acts; {_LOAD}"
+
+
+def _jump(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
+    wraps = next((n for n in (8, 12, 16, 24, 32) if abs(abs(value) / 2.0**n - 1.0) < 0.02), None)
+    what = (
+        f"as a counter of {wraps} bits that wraps; unwrap it where it is read"
+        if wraps
+        else "more than the machine can turn; check for disturbed lines and torn transfers"
+    )
+    return "counts jumped", f"{when} the counts jump by {value:.6g}: {what}"
+
+
+def _delay(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
+    return "delay", (
+        f"{when} the machine answers {1e3 * value:.3g} ms later; check filters in the drive, the "
+        "load of the bus and of the computer"
+    )
+
+
+def _inertia(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
+    return "inertia", (
+        f"{when} the time constant is {value:.3g} times as long at the same gain; check what is "
+        "coupled to the shaft, and for a limit of current"
+    )
+
+
+def _friction(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
+    return "friction", (
+        f"{when} friction or a braking load takes {value:.3g} V of command more; check for a "
+        "brake, a bearing, a shaft that jams, a load"
+    )
+
+
+_NAMED: dict[str, Callable[[float, dict[str, float], str], tuple[str, str]]] = {
+    "jump": _jump, "counts": _counts, "gain": _gain, "delay": _delay, "inertia": _inertia,
+    "friction": _friction, "load": _load, "stuck": _stuck,
+}  # fmt: skip

@@ -1,0 +1,148 @@
+"""`cause_of`: what is wrong with a machine gets its name."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from sewfast import Controller, DataError, Gains, Recording, cause_of, record, run
+from sewfast.commissioning import SteppedBench
+from sewfast.errors import LinkError
+
+TS, PER_TURN = 1e-3, 4096.0
+
+
+@dataclass
+class Motor:
+    """250 RPM/V, .1 s, .3 V of friction; from `at` on each field that is not None acts."""
+
+    at: float = math.inf
+    command: float = 1.0
+    stuck: float | None = None
+    load: float = 0.0
+    encoder: float = 1.0
+    jump: float = 0.0
+    late: int = 0
+    inertia: float = 1.0
+    friction: float = 0.3
+
+    def __post_init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self.t = self.speed_rpm = self.counted = 0.0
+        self.sent = [0.0] * 200
+
+    @property
+    def counts(self) -> float:
+        return math.floor(PER_TURN * self.counted)
+
+    def step(self, u: float) -> None:
+        wrong = self.t >= self.at
+        if wrong and self.jump and self.t - TS < self.at:
+            self.counted += self.jump / PER_TURN
+        self.sent.append(u)
+        drive = self.sent[-2 - self.late * wrong] * (self.command if wrong else 1.0)
+        drive = self.stuck if wrong and self.stuck is not None else drive
+        drive += self.load * wrong
+        friction = self.friction if wrong else 0.3
+        for _ in range(5):
+            held = math.copysign(friction, self.speed_rpm)
+            held = held if self.speed_rpm else min(max(drive, -friction), friction)
+            before = self.speed_rpm
+            rise = (250.0 * (drive - held) - before) / (0.1 * (self.inertia if wrong else 1.0))
+            self.speed_rpm += 0.2 * TS * rise
+            if before * self.speed_rpm < 0.0:
+                self.speed_rpm = 0.0
+            self.counted += 0.2 * TS * self.speed_rpm / 60.0 * (self.encoder if wrong else 1.0)
+        self.t += TS
+
+
+def rig(motor: Motor) -> SteppedBench:
+    return SteppedBench(motor, Ts=TS, counts_per_rev=PER_TURN, volt=10.0, speed=3000.0, name="rig")
+
+
+def looped(motor: Motor) -> Recording:
+    """A run along levels, as far as it goes."""
+    pid = Controller(
+        Gains.standard(0.004, 0.1, u_unit="V", y_unit="RPM"), u_min=-10.0, u_max=10.0,
+        filter_samples=4, counts_per_rev=PER_TURN,
+    )  # fmt: skip
+    levels = np.repeat([700.0, 1200.0, 400.0, 1000.0], 500)
+    try:
+        return run(pid, rig(motor), levels, name="levels").recording
+    except LinkError as stop:
+        found: Recording = stop.recording
+        return found
+
+
+CASES = [
+    (Motor(1.13, command=-1.0), "command sign", -1.0),
+    (Motor(1.13, encoder=-1.0), "encoder sign", -1.0),
+    (Motor(1.13, encoder=0.0), "encoder lost", 0.0),
+    (Motor(1.13, encoder=0.5), "counts scaled", 0.5),
+    (Motor(1.13, stuck=6.0), "stage stuck", 6.0),
+    (Motor(1.13, command=0.0), "stage off", 0.0),
+    (Motor(1.13, command=0.4), "gain", 0.4),
+    (Motor(1.13, load=1.5), "load", 1.5),
+    (Motor(1.13, friction=2.0), "friction", 1.7),
+    (Motor(1.13, late=30), "delay", 0.03),
+    (Motor(1.13, inertia=4.0), "inertia", 4.0),
+    (Motor(1.13, jump=3000.0), "counts jumped", 3000.0),
+]
+
+
+@pytest.mark.parametrize(("motor", "name", "value"), CASES, ids=[c[1] for c in CASES])
+def test_what_changed_in_a_run_is_named_with_its_number_and_time(
+    motor: Motor, name: str, value: float
+) -> None:
+    before = [record(rig(Motor()), np.repeat([0.0, 3.0, 6.0, 2.0], 500), name="steps")]
+    found = cause_of(looped(motor), before, volt=10.0, speed=3000.0)
+    assert found is not None
+    assert found.name == name
+    assert found.value == pytest.approx(value, rel=0.3, abs=0.05)
+    # a delay shows at the next edge
+    assert found.at == pytest.approx(1.13, abs=0.4 if name == "delay" else 0.06)
+    assert found.run == "levels"
+    assert "raise" not in str(found)
+    assert found.to_json()["name"] == name
+
+
+@pytest.mark.parametrize(
+    ("motor", "name"), [c[:2] for c in CASES[:8]], ids=[c[1] for c in CASES[:8]]
+)
+def test_a_run_alone_is_enough_if_it_was_well_at_first(motor: Motor, name: str) -> None:
+    found = cause_of(looped(motor))
+    assert found is not None
+    assert found.name == name
+
+
+def test_a_machine_that_was_never_as_thought_is_named_from_one_run() -> None:
+    step = np.concatenate([np.zeros(100), np.full(400, 5.0), np.linspace(5.0, 7.0, 400)])
+
+    def named(motor: Motor) -> str | None:
+        try:
+            found = cause_of(record(rig(motor), step, name="step"), volt=10.0, speed=3000.0)
+        except LinkError as stop:
+            found = stop.cause
+        return None if found is None else found.name
+
+    assert named(Motor()) is None
+    assert named(Motor(0.0, command=-1.0)) == "sign"
+    assert named(Motor(0.0, encoder=0.0)) == "no motion"
+    assert named(Motor(0.0, command=40.0)) == "gain too large"
+    assert named(Motor(0.0, stuck=3.0)) == "turns at rest"
+
+
+def test_a_machine_that_did_what_it_always_did_has_no_cause() -> None:
+    before = [record(rig(Motor()), np.repeat([0.0, 3.0, 6.0, 2.0], 500), name="steps")]
+    assert cause_of(looped(Motor()), before, volt=10.0) is None
+
+
+def test_too_short_a_run_is_refused() -> None:
+    lost, counts = np.full(4, np.nan), np.arange(4.0)
+    with pytest.raises(DataError, match="three samples"):
+        cause_of(Recording(lost, counts, counts, None, TS, PER_TURN, "lost"))
