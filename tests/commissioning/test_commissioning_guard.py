@@ -155,7 +155,7 @@ def run_at(y: FloatArray, u: float = 3.0) -> ClosedLoopRun:
 
 
 def test_what_was_predicted_and_missed_is_no_verification() -> None:
-    good = run_at(np.interp(np.arange(2000), [0, 450], [0.0, 1500.0]))
+    good = run_at(np.interp(np.arange(2000), [0, 405], [0.0, 1500.0]))
     short = run_at(np.interp(np.arange(2000), [0, 350], [0.0, 1200.0]))
     railed = run_at(good.y, u=10.0)
     assert unreached([Comparison("trapezoid", good, good, ())]) == ""
@@ -165,6 +165,26 @@ def test_what_was_predicted_and_missed_is_no_verification() -> None:
     assert "at a limit for 100 %" in unreached([Comparison("trapezoid", good, railed, ())])
     assert unreached([Comparison("trapezoid", railed, railed, ())]) == ""
     assert unreached([Comparison("trapezoid", short, None, ())]) == ""
+
+
+def test_a_smooth_reference_beyond_reach_and_a_short_end_are_no_verification() -> None:
+    t = TS * np.arange(4000)
+    pid = Controller(Gains.standard(0.01, 0.1), Ts=TS, u_min=-10.0, u_max=10.0)
+
+    def compared(r: FloatArray, y: FloatArray, u: FloatArray) -> str:
+        found = ClosedLoopRun(t, r, u, y, y, pid, "rig", "sweep")
+        return unreached([Comparison("sweep", found, found, ())])
+
+    wave = 750.0 * (1.0 - np.cos(2.0 * math.pi * t))
+    capped = np.minimum(wave, 1200.0)
+    limit = np.where(wave > 1200.0, 10.0, 3.0)
+    assert compared(wave, wave, limit) == ""
+    assert "300 RPM off while the command was at its limit" in compared(wave, capped, limit)
+    # as far off, but not for want of command
+    assert compared(wave, capped, np.full(4000, 3.0)) == ""
+    ends = np.where(t < 3.9, 1000.0, 0.0)
+    turning = np.where(t < 3.9, 1000.0, 200.0)
+    assert compared(ends, turning, np.full(4000, 1.0)) == "200 of 0 RPM on 'sweep'"
 
 
 @pytest.mark.parametrize(

@@ -288,8 +288,7 @@ def out_of_reach(
     r: FloatArray, y: FloatArray, u: FloatArray, controller: SampledController, reference: str
 ) -> Cause:
     """The cause of a loop at the limit of its command: where it is farthest from its reference."""
-    railed = (u >= controller.u_max - 1e-9) | (u <= controller.u_min + 1e-9)
-    apart = np.where(railed & np.isfinite(y), np.abs(r - y), 0.0)
+    apart = _off_at_limit(r, y, u, controller)
     k = int(np.argmax(apart))
     return Cause(
         "out of reach",
@@ -302,9 +301,10 @@ def out_of_reach(
 def unreached(comparisons: Sequence[Comparison]) -> str:
     """What the machine did not reach although it did what was predicted; empty if nothing.
 
-    A level that a reference holds for a tenth of its length must be met, in the mean over the
-    last quarter of the hold, within `APART` of the reference's span, and the command must be at a
-    limit no longer than predicted.
+    A level that a reference holds for a tenth of its length, or at its end, must be met, in the
+    mean over the last quarter of the hold, within `APART` of the reference's span. The command must
+    be at a limit no longer than predicted, and a reference without an edge must not be farther off
+    than that while it is, for more than `APART` of its length.
     """
     said = []
     for c in comparisons:
@@ -315,6 +315,13 @@ def unreached(comparisons: Sequence[Comparison]) -> str:
             mean = float(np.nanmean(alike.y[hold]))
             if abs(mean - level) > APART * c.span:
                 said.append(f"{mean:.4g} of {level:.4g} RPM on {c.reference!r}")
+        off = _off_at_limit(alike.r, alike.y, alike.u, alike.controller)
+        far = off > APART * c.span
+        if np.abs(np.diff(alike.r)).max() <= APART * c.span and np.mean(far) > APART:
+            said.append(
+                f"up to {off.max():.4g} RPM off while the command was at its limit, for "
+                f"{100 * np.mean(far):.0f} % of {c.reference!r}"
+            )
         # the median of the members' commands is at a limit only where most of them are
         runs = (alike, c.predicted, *c.members)
         limit, *expected = map(_at_limit, runs)
@@ -326,16 +333,26 @@ def unreached(comparisons: Sequence[Comparison]) -> str:
     return "; ".join(said)
 
 
+def _off_at_limit(
+    r: FloatArray, y: FloatArray, u: FloatArray, controller: SampledController
+) -> FloatArray:
+    """Distance from the reference where the command is at a limit, 0 elsewhere."""
+    railed = (u >= controller.u_max - 1e-9) | (u <= controller.u_min + 1e-9)
+    return np.where(railed & np.isfinite(y), np.abs(r - y), 0.0)
+
+
 def _at_limit(found: ClosedLoopRun) -> float:
     """Share of samples at a limit of the command."""
     return found.metrics()["saturated"] or 0.0
 
 
 def _holds(r: FloatArray) -> list[tuple[float, slice]]:
-    """Levels held for a tenth of a reference, each with the last quarter of its hold."""
+    """Levels held for a tenth of a reference or at its end, with the last quarter of each."""
     edges = np.flatnonzero(np.diff(r, prepend=np.nan, append=np.nan) != 0.0)
     pairs = zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
-    long = [(a, b) for a, b in pairs if b - a >= max(2.0, 0.1 * len(r))]
+    long = [
+        (a, b) for a, b in pairs if b - a >= (WATCHED if b == len(r) else max(2.0, 0.1 * len(r)))
+    ]
     return [(float(r[a]), slice(b - max(1, (b - a) // 4), b)) for a, b in long]
 
 
