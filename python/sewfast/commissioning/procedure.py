@@ -138,12 +138,11 @@ def commission(
         Controllers that the search tries.
     load : float, optional
         A braking load, in volts of command [V]: no member of the ensemble may recover from it later
-        under the tuned gains than under Eq. 12's. By default a tenth of `u_max`; 0 for no such
-        requirement.
+        under the tuned gains than under Eq. 12's, slowed down to the limit of Ms. By default a
+        tenth of `u_max`; 0 for no such requirement.
     Ms : float or None
         Largest sensitivity on the model of the machine's small signals or, without one, on every
-        member linearised at three quarters of the top speed; that of Eq. 12's gains if it is larger
-        and a load is required. None or inf for no limit.
+        member linearised at three quarters of the top speed. None or inf for no limit.
     time_budget : float, optional
         Time of the search [s], after which the best gains so far are used. Then the same seed no
         longer gives the same gains.
