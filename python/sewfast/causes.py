@@ -14,6 +14,8 @@ from .arrays import FloatArray
 from .errors import DataError
 from .recording import Recording
 
+ABORTED = "_aborted"
+"""Suffix of the names of recordings of runs that were ended early."""
 EXPLAINED = 0.5
 """A change is believed if no more than this share of the error is left with it: on runs of healthy
 drives, each fitted up to its change, .68 and more were left (docs/guards.md)."""
@@ -217,6 +219,11 @@ class _Look:
         )  # fmt: skip
         return cls(recording, found, volt, speed)
 
+    @property
+    def name(self) -> str:
+        """The run's name; one that was ended early is saved under another."""
+        return self.recording.name.removesuffix(ABORTED)
+
     def cause(self) -> Cause | None:
         """What explains the run: a change, or what the motor of a run alone lacks."""
         is_alone = math.isnan(self.found["unsure"])
@@ -245,15 +252,13 @@ class _Look:
         r = self.recording
         # the first blocks of a run cannot be told from its start
         early = at <= max(0.02, 10.0 * r.Ts)
-        when = f"from the start of {r.name!r}" if early else f"{at:.3g} s after {r.name!r} began"
-        largest = float(np.max(np.abs(r.u), initial=0.0))
-        if change == "stuck" and abs(value) < LOST * largest:
+        when = (
+            f"from the start of {self.name!r}" if early else f"{at:.3g} s after {self.name!r} began"
+        )
+        if change == "stuck" and abs(value * motor["gain"]) < LOST * self.found["size"]:
             change, value = "gain", 0.0
-        if change == "friction" and value > (1.0 - LOST) * largest:
-            # more than any command: nothing is seen to move
-            change, value = "counts", 0.0
         name, text = _NAMED[change](value, motor, when)
-        return Cause(name, text, r.name, None if early else at, value)
+        return Cause(name, text, self.name, None if early else at, value)
 
     def always(self) -> Cause | None:
         """What the motor that explains the whole run lacks."""
@@ -269,7 +274,7 @@ class _Look:
             name, value = "no motion", largest
             text = (
                 f"the encoder does not count at all at up to {largest:.3g} V; {_LOST_ENCODER}, "
-                "whether the drive is enabled and the motor connected"
+                "whether the drive is enabled, the motor connected and the shaft free"
             )
         elif self.found["backwards"] < min(
             UNSURE, self.found["error"] / self.found["size"] / TIMES
@@ -285,7 +290,7 @@ class _Look:
             text = self._strong(gain, abs(gain) / lag, is_lag_seen=is_lag_seen)
         else:
             return None
-        return Cause(name, text, r.name, None, float(value))
+        return Cause(name, text, self.name, None, float(value))
 
     def is_too_fast(self) -> bool:
         """Whether the run ended at the machine's own limit of speed."""

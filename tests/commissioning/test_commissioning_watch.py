@@ -199,9 +199,14 @@ class Failing:
 @pytest.mark.parametrize("what", ["encoder", "amplifier"])
 def test_a_loop_without_encoder_or_amplifier_is_ended_and_named(what: str) -> None:
     on = Fails(what)
-    with short(), pytest.raises(Refusal, match="look for a lost encoder, an amplifier") as refused:
+    with short(), pytest.raises(Refusal, match="expected the encoder to move") as refused:
         commission(on, **SMALL)
     assert refused.value.stage == "closed loop"
+    assert refused.value.so_far is not None
+    cause = refused.value.so_far.cause
+    assert cause is not None
+    assert cause.name == {"encoder": "encoder lost", "amplifier": "stage off"}[what]
+    assert cause.run == "trapezoids"
     # a quarter of a second without a count, and a block; a motor without amplifier coasts before
     most = {"encoder": 250, "amplifier": 1000}[what] + WATCHED
     assert on.machine.railed <= most  # type: ignore[attr-defined]

@@ -14,6 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from .. import _core
+from ..causes import ABORTED
 from ..control.controller import SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import (
@@ -43,10 +44,6 @@ __all__ = ["Bench", "Followed", "MachineBench", "Stepped", "SteppedBench"]
 
 Bench = Machine
 """Earlier name of `sewfast.Machine`."""
-
-
-ABORTED = "_aborted"
-"""Suffix of the names of recordings of aborted runs."""
 
 
 class Aborted(Refusal):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import signals
-from ..causes import Cause, cause_among, turns_at_rest
+from ..causes import ABORTED, Cause, cause_among, turns_at_rest
 from ..control.controller import Controller, SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import WATCHED, Machine, RecordedRun
@@ -32,7 +32,7 @@ from ..tuning.objective import LARGEST_MS, Cost
 from ..tuning.search import TuningResult
 from ..tuning.task import GAINS
 from . import excitations
-from .bench import ABORTED, RecordedBench, bench_of, description_of
+from .bench import RecordedBench, bench_of, description_of
 from .checkpoint import STAGES, Checkpoint
 from .demands import Demands, Refusal, demands, require
 from .excitations import first_motion, standard, step_response

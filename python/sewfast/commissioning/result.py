@@ -60,8 +60,6 @@ class Commissioning:
         empty.
     stage, reason : str
         The last stage, and why it ended there.
-    cause : Cause or None
-        What is wrong with the machine, if it was refused or missed its target and a run shows why.
     seconds : mapping of stage to float
     recordings : mapping of name to Recording
         Recordings of the machine, for `identify`.
@@ -109,6 +107,8 @@ class Commissioning:
         lowered.
     recorded_in : Path or None
         The folder in which each recording was written as it was taken.
+    cause : Cause or None
+        What is wrong with the machine, if it was refused or missed its target and a run shows why.
     """
 
     machine: str
@@ -116,7 +116,6 @@ class Commissioning:
     stage: str
     reason: str
     seconds: Mapping[str, float]
-    cause: Cause | None = None
     recordings: Mapping[str, Recording] = field(default_factory=dict)
     motion: Motion | None = None
     fopdt: Fopdt | None = None
@@ -139,6 +138,7 @@ class Commissioning:
     sample_time: float | None = None
     notes: tuple[str, ...] = ()
     recorded_in: Path | None = None
+    cause: Cause | None = None
 
     @property
     def is_verified(self) -> bool:

@@ -586,7 +586,9 @@ impl Candidate {
         let at = self.at.saturating_add_signed(later).min(blocks.len() - 1);
         let value = self.value + more;
         let is_possible = match self.change {
-            Change::Delay | Change::Friction => value >= 0.0,
+            Change::Delay => value >= 0.0,
+            // more than the largest command would only be a shaft that stands
+            Change::Friction => (0.0..=blocks.largest).contains(&value),
             Change::Inertia => value > 0.05,
             _ => true,
         };

@@ -140,7 +140,8 @@ fn each_change_is_named_with_its_value_after_earlier_runs() {
                 (best.value - value).abs() < 0.15 * value.abs().max(0.5),
                 "{said}"
             );
-            assert!((best.at - at as f64 * TS).abs() < 0.05, "{said}");
+            // a delay shows where the command moves
+            assert!((best.at - at as f64 * TS).abs() < 0.1, "{said}");
             assert!(best.error < 0.5 * found.error, "{said}");
         }
     }
