@@ -283,11 +283,21 @@ class _Look:
             text = f"a positive command turns the machine backwards; {_SIGN}"
         elif unlike > EXPLAINED:
             return None
+        elif unlike <= UNSURE and lag > 2.0 * len(r) * r.Ts:
+            name, value = "integrates", gain / lag
+            text = (
+                f"the speed grows by {value:.4g} RPM/s per V and does not settle: the command is a "
+                "torque without friction, or an acceleration; command it as a speed or a voltage, "
+                "or give the machine friction"
+            )
         elif self.is_too_fast() and gain * self.volt > STRONG * self.speed:
             value = gain * self.volt / self.speed
-            is_lag_seen = lag < len(r) * r.Ts
-            name = "gain too large" if is_lag_seen else "integrates"
-            text = self._strong(gain, abs(gain) / lag, is_lag_seen=is_lag_seen)
+            name = "gain too large"
+            text = (
+                f"it turns at {gain:.4g} RPM per V, so that {self.speed / gain:.3g} V of "
+                f"{self.volt:g} take it to its {self.speed:g} RPM; check counts_per_rev, the unit "
+                "of the command, its scale in the drive"
+            )
         else:
             return None
         return Cause(name, text, self.name, None, float(value))
@@ -298,20 +308,6 @@ class _Look:
         k = min(4, len(r) - 1)
         turns = abs(float(r.counts[-1] - r.counts[-1 - k])) / r.counts_per_rev
         return 60.0 * turns / (k * r.Ts) > 0.8 * self.speed
-
-    def _strong(self, gain: float, rises: float, *, is_lag_seen: bool) -> str:
-        if is_lag_seen:
-            enough = self.speed / gain
-            return (
-                f"it turns at {gain:.4g} RPM per V, so that {enough:.3g} V of {self.volt:g} take "
-                f"it to its {self.speed:g} RPM; check counts_per_rev, the unit of the command, its "
-                "scale in the drive"
-            )
-        return (
-            f"the speed grows by {rises:.4g} RPM/s per V and does not settle: the command is a "
-            "torque without friction, or an acceleration; command it as a speed or a voltage, or "
-            "give the machine friction"
-        )
 
 
 _LOST_ENCODER = "check the encoder's cable and supply, the coupling, whether the shaft is blocked"

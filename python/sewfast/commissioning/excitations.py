@@ -148,16 +148,21 @@ LEAST_FIT = 80.0
 
 def step_response(machine: Machine, demands: Demands, motion: Motion) -> Fopdt:
     """Record steps until one settles, and fit it.
+    Each longer step is so small that even a machine that integrates stays below the top speed.
     Raises `Refusal` if none settles, the fit is poor, or the command cannot reach the top speed.
     """
     u = min(motion.command(SHARE * demands.speed), demands.u_max)
     reason: Exception | None = None
-    for seconds in DURATIONS:
+    for k, seconds in enumerate(DURATIONS):
         recording = machine.excite(step(u, seconds, machine.Ts), "step")
         try:
             fopdt = fit_fopdt(recording.u, recording.y, Ts=recording.Ts)
         except (DataError, FitError) as error:
             reason = error
+            if seconds < DURATIONS[-1]:
+                at_worst = float(np.max(recording.y)) * DURATIONS[k + 1] / seconds
+                room = min(1.0, demands.top / max(at_worst, 1e-3 * demands.top))
+                u = motion.threshold + room * (u - motion.threshold)
             continue
         _checked(fopdt, demands)
         return fopdt

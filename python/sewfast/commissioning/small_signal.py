@@ -25,7 +25,7 @@ from ..identification.task import arrays, wrap
 from ..models import LinearOE, Model
 from ..recording import Recording
 from ..rules import Fopdt, fit_fopdt
-from .demands import Demands
+from .demands import OVER, Demands
 from .excitations import Motion
 
 SHAKEN_AT = 0.5
@@ -168,7 +168,9 @@ def shaking(
     demands: Demands, motion: Motion, fopdt: Fopdt, Ts: float, level: float
 ) -> tuple[FloatArray, int]:  # fmt: skip
     """The command [V] about a share of the top speed, and the sample at which it becomes random."""
-    held = min(motion.command(level * demands.speed), (1.0 - SIZE) * demands.u_max)
+    # a slow machine was still speeding up in its first motion, so that this asks too much of it
+    most = (OVER * level * demands.speed - fopdt.offset) / fopdt.K
+    held = min(motion.command(level * demands.speed), most, (1.0 - SIZE) * demands.u_max)
     settle = max(1, round(min(4.0 * fopdt.T, LONGEST) / Ts))
     samples = int(min(SAMPLES, max(500, LONGEST / Ts)))
     size = SIZE * demands.u_max

@@ -426,7 +426,7 @@ impl Residuals for Fit<'_> {
 }
 
 /// Time constants from which the fit begins, as shares of the longest run.
-const LAGS: [f64; 4] = [0.003, 0.02, 0.1, 1.0];
+const LAGS: [f64; 5] = [0.003, 0.02, 0.1, 1.0, 10.0];
 
 /// The motor with a gain of this sign that fits runs best; the zero motor if they do not move.
 fn fitted(runs: &[Blocks], lags: &[f64], sign: f64, monitor: &Monitor) -> Result<Motor> {
@@ -466,9 +466,11 @@ fn fitted(runs: &[Blocks], lags: &[f64], sign: f64, monitor: &Monitor) -> Result
     };
     let mut best = (f64::INFINITY, still);
     for &lag in lags {
+        // of a slow motor only the rise is seen
+        let gain = 1.0 + lag;
         let lag = (lag * longest).ln().clamp(low, high);
         let delay = (0.5 * shortest).min(0.2 * longest).ln();
-        let start = vec![1.0, lag, delay, 0.01, 0.0];
+        let start = vec![gain, lag, delay, 0.01, 0.0];
         let found = least_squares::solve(&mut fit, start, &settings, monitor)?;
         if found.cost < best.0 {
             best = (found.cost, fit.motor(&found.theta));
