@@ -33,6 +33,8 @@ TURNS = 5
 """Counts without a command that are a motion, and no trembling at an edge of the encoder."""
 TIES = 1.05
 """Changes with an error of up to this multiple of the least are equal: the likelier is taken."""
+MOST = 12
+"""Runs that are looked at, the last ones of a series: each takes some tenths of a second."""
 STRONG = 3.0
 """Gain is too large if the largest command reaches this many times the machine's own limit."""
 
@@ -114,10 +116,6 @@ def cause_of(
         For a sample time or counts per turn that are not above 0.
     """
     return _Look.at(recording, before, volt, speed).cause()
-
-
-MOST = 12
-"""Runs that are looked at, the last ones of a series: each takes some tenths of a second."""
 
 
 def cause_among(
@@ -276,9 +274,7 @@ class _Look:
                 f"the encoder does not count at all at up to {largest:.3g} V; {_LOST_ENCODER}, "
                 "whether the drive is enabled, the motor connected and the shaft free"
             )
-        elif self.found["backwards"] < min(
-            UNSURE, self.found["error"] / self.found["size"] / TIMES
-        ):
+        elif self.found["backwards"] < min(UNSURE, unlike / TIMES):
             name, value = "sign", -1.0
             text = f"a positive command turns the machine backwards; {_SIGN}"
         elif unlike > EXPLAINED:
