@@ -126,6 +126,8 @@ const OWN_PLACES: usize = 12;
 /// A motor is fitted to this many blocks at least, and must explain them within this share of their speed.
 const FEWEST: usize = 12;
 const UNSURE: f64 = 0.1;
+/// Error of each block, as a share of the largest speed, that a load of the largest command has to be worth.
+const UNLIKELY: f64 = 1e-3;
 
 /// Names the changes that explain `run`; `before` are earlier runs of the machine as it should be.
 ///
@@ -393,7 +395,7 @@ impl Residuals for Fit<'_> {
     }
 
     fn len(&self) -> usize {
-        self.runs.iter().map(Blocks::len).sum()
+        1 + self.runs.iter().map(Blocks::len).sum::<usize>()
     }
 
     fn residuals(&mut self, theta: &[f64], r: &mut [f64]) -> bool {
@@ -405,6 +407,8 @@ impl Residuals for Fit<'_> {
                 at += 1;
             });
         }
+        // in one direction friction and a load are one: then it is friction
+        r[at] = UNLIKELY * self.gain * self.largest * (at as f64).sqrt() * theta[4];
         r.iter().all(|x| x.is_finite())
     }
 
