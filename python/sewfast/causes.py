@@ -134,7 +134,7 @@ def cause_among(
     look = _look(last, volt, speed)
     if look is not None and (cause := look.change()):
         return cause
-    known: list[Recording] = []
+    known: list[_Look] = []
     unseen: list[Cause] = []
     for recording in moved[-MOST:]:
         earlier = _look(recording, volt, speed)
@@ -143,11 +143,16 @@ def cause_among(
         if cause := earlier.change(UNSEEN):
             unseen.append(cause)
         elif earlier.found["error"] <= ALIKE * earlier.found["size"]:
-            known.append(recording)
-    cause = cause_of(last, known, volt=volt, speed=speed) if known else None
-    if cause is None and look is not None:
-        cause = look.always()
-    return cause or (unseen[0] if unseen else None)
+            known.append(earlier)
+    own = None if look is None else look.always()
+    if own is not None and own.name == "integrates":
+        if all(earlier.is_unsettled() for earlier in known):
+            return own
+        own = None
+    cause = None
+    if known:
+        cause = cause_of(last, [k.recording for k in known], volt=volt, speed=speed)
+    return cause or own or (unseen[0] if unseen else None)
 
 
 def _look(recording: Recording, volt: float, speed: float) -> _Look | None:
@@ -277,9 +282,9 @@ class _Look:
         elif self.found["backwards"] < min(UNSURE, unlike / TIMES):
             name, value = "sign", -1.0
             text = f"a positive command turns the machine backwards; {_SIGN}"
-        elif unlike > EXPLAINED:
+        elif unlike > UNSURE:
             return None
-        elif unlike <= UNSURE and lag > 2.0 * len(r) * r.Ts:
+        elif self.is_unsettled():
             name, value = "integrates", gain / lag
             text = (
                 f"the speed grows by {value:.4g} RPM/s per V and does not settle: the command is a "
@@ -297,6 +302,10 @@ class _Look:
         else:
             return None
         return Cause(name, text, self.name, None, float(value))
+
+    def is_unsettled(self) -> bool:
+        """Whether the motor still speeds up as at first at the end of the run."""
+        return bool(self.found["motor"]["lag"] > 2.0 * len(self.recording) * self.recording.Ts)
 
     def is_too_fast(self) -> bool:
         """Whether the run ended at the machine's own limit of speed."""
