@@ -146,7 +146,8 @@ def test_gaps_and_spikes_cost_samples_and_no_accuracy() -> None:
     y[300:330] = np.nan
     y[[50, 400, 401, 900]] += [3000, -2000, 2500, 1e5]
     motor = physics(sewfast.Dataset.from_arrays(u, y, 0.02, output_unit="rad/s"))
-    assert 4 <= motor.spikes <= 6
+    # the largest has most of the record's power and is left out before
+    assert 3 <= motor.spikes <= 5
     assert motor.value("k_v") == pytest.approx(0.02, rel=0.01)
     assert motor.value("k_a") == pytest.approx(0.006, rel=0.02)
 
