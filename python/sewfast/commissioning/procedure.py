@@ -479,8 +479,8 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
         # alpha and beta do not affect the response to a load, only the error when it comes on
         start = start_of(rival, ensemble, practice, cost, asked.threads)
         required = Requirements.of(ensemble, plan.fopdt, plan.fastest, start, asked, small)
-        if required.rival is None:
-            start = start_of(first, ensemble, practice, cost, asked.threads)
+        # the slowed rule keeps the limit and its own recovery: the search begins at sound gains
+        start = required.rival or start_of(first, ensemble, practice, cost, asked.threads)
         return required, search(
             ensemble, practice, start, asked, cost, journal.within, requirements=required,
             disturbances=plan.pushes, rival=second, variations=plan.thinning.variations(),
