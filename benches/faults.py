@@ -106,11 +106,13 @@ class Bench(SteppedBench):
     """Tells the motor which run it is."""
 
     def excite(self, u: Any, name: str) -> Any:
-        self.machine.run = name  # type: ignore[attr-defined]
+        assert isinstance(self.machine, Motor)
+        self.machine.run = name
         return super().excite(u, name)
 
     def follow(self, controller: Any, r: Any, name: str, *, watch: Any = None) -> Any:
-        self.machine.run = name  # type: ignore[attr-defined]
+        assert isinstance(self.machine, Motor)
+        self.machine.run = name
         return super().follow(controller, r, name, watch=watch)
 
 

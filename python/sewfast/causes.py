@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -260,7 +261,7 @@ class _Look:
         )
         if change == "stuck" and abs(value * motor["gain"]) < LOST * self.found["size"]:
             change, value = "gain", 0.0
-        name, text = _NAMED[change](value, motor, when)
+        name, text = _NAMED[change](value, when)
         return Cause(name, text, self.name, None if early else at, value)
 
     def always(self) -> Cause | None:
@@ -320,7 +321,7 @@ _SIGN = "swap two motor leads or the encoder's A and B, or change a sign in the 
 _LOAD = "check what drives the shaft: gravity, a spring, a load, an offset of the command"
 
 
-def _gain(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
+def _gain(value: float, when: str) -> tuple[str, str]:
     if value < -LOST:
         return "command sign", (
             f"{when} the machine answers with {value:.2g} times its gain: the sign of the command "
@@ -338,7 +339,7 @@ def _gain(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
     )
 
 
-def _counts(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
+def _counts(value: float, when: str) -> tuple[str, str]:
     if value < -LOST:
         return "encoder sign", (
             f"{when} the encoder counts {value:.2g} times the motion: its sign has turned; check "
@@ -352,18 +353,7 @@ def _counts(value: float, motor: dict[str, float], when: str) -> tuple[str, str]
     )
 
 
-def _stuck(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
-    return "stage stuck", (
-        f"{when} the machine behaves as at {value:.3g} V, whatever the command; switch it off, "
-        "check the output stage and the line of the command"
-    )
-
-
-def _load(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
-    return "load", f"{when} a load worth {value:.3g} V of command acts; {_LOAD}"
-
-
-def _jump(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
+def _jump(value: float, when: str) -> tuple[str, str]:
     wraps = next((n for n in (8, 12, 16, 24, 32) if abs(abs(value) / 2.0**n - 1.0) < 0.02), None)
     what = (
         f"as a counter of {wraps} bits that wraps; unwrap it where it is read"
@@ -373,28 +363,32 @@ def _jump(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
     return "counts jumped", f"{when} the counts jump by {value:.6g}: {what}"
 
 
-def _delay(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
-    return "delay", (
-        f"{when} the machine answers {1e3 * value:.3g} ms later; check filters in the drive, the "
-        "load of the bus and of the computer"
-    )
+_TEXTS = {
+    "delay": "{when} the machine answers {ms:.3g} ms later; check filters in the drive, the load "
+    "of the bus and of the computer",
+    "inertia": "{when} the time constant is {value:.3g} times as long at the same gain; check what "
+    "is coupled to the shaft, and for a limit of current",
+    "friction": "{when} friction or a braking load takes {value:.3g} V of command more; check for "
+    "a brake, a bearing, a shaft that jams, a load",
+    "load": "{when} a load worth {value:.3g} V of command acts; " + _LOAD,
+    "stage stuck": "{when} the machine behaves as at {value:.3g} V, whatever the command; switch "
+    "it off, check the output stage and the line of the command",
+}
+"""Causes that one change has, whatever its value."""
 
 
-def _inertia(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
-    return "inertia", (
-        f"{when} the time constant is {value:.3g} times as long at the same gain; check what is "
-        "coupled to the shaft, and for a limit of current"
-    )
+def _text(name: str, value: float, when: str) -> tuple[str, str]:
+    return name, _TEXTS[name].format(when=when, value=value, ms=1e3 * value)
 
 
-def _friction(value: float, motor: dict[str, float], when: str) -> tuple[str, str]:
-    return "friction", (
-        f"{when} friction or a braking load takes {value:.3g} V of command more; check for a "
-        "brake, a bearing, a shaft that jams, a load"
-    )
-
-
-_NAMED: dict[str, Callable[[float, dict[str, float], str], tuple[str, str]]] = {
-    "jump": _jump, "counts": _counts, "gain": _gain, "delay": _delay, "inertia": _inertia,
-    "friction": _friction, "load": _load, "stuck": _stuck,
-}  # fmt: skip
+_NAMED: dict[str, Callable[[float, str], tuple[str, str]]] = {
+    "jump": _jump,
+    "counts": _counts,
+    "gain": _gain,
+    "delay": partial(_text, "delay"),
+    "inertia": partial(_text, "inertia"),
+    "friction": partial(_text, "friction"),
+    "load": partial(_text, "load"),
+    "stuck": partial(_text, "stage stuck"),
+}
+"""The changes of the core, the likelier first."""

@@ -35,7 +35,7 @@ class SewfastError(Exception):
     expected: str | None
     received: str | None
     remedy: str | None
-    cause: Any = None
+    cause: Any
 
     def __init__(
         self,
@@ -45,7 +45,9 @@ class SewfastError(Exception):
         expected: str | None = None,
         received: str | None = None,
         remedy: str | None = None,
+        cause: Any = None,
     ) -> None:
+        self.cause = cause
         if expected is not None:
             message = f"expected {expected}"
             message = f"{name}: {message}" if name else message

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from ..causes import Cause
 from ..control.machine import Machine
 from ..dataset import FloatArray
 from ..errors import FitError, SettingError
@@ -35,10 +36,10 @@ class Refusal(FitError):
     so_far: Commissioning | None = None
 
 
-def require(met: bool, message: str) -> None:
+def require(met: bool, message: str, cause: Cause | None = None) -> None:
     """Raise `Refusal` with this message unless the condition is met."""
     if not met:
-        raise Refusal(message)
+        raise Refusal(message, cause=cause)
 
 
 # --- `Demands` ------------------------------------------------------------------------------------

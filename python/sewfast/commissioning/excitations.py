@@ -72,17 +72,16 @@ def first_motion(machine: Machine, demands: Demands) -> Motion:
         "u_max is too small",
     )
     u, speed = levels[-1]
-    refusal = Refusal(
+    raise Refusal(
         f"expected {ENOUGH * demands.speed:.4g} RPM within {HOLD:g} s at {u:g} V, a fifth of the "
-        f"top speed of {demands.speed:g} RPM, the machine reached {speed:.4g}"
-    )
-    refusal.cause = Cause(
-        "out of reach",
-        f"{u:g} V reach {speed:.4g} RPM; see what brakes the machine, and whether motor and supply "
-        "are made for this speed, or lower speed",
-        f"motion_{100 * SHARES[-1]:g}", None, speed,
+        f"top speed of {demands.speed:g} RPM, the machine reached {speed:.4g}",
+        cause=Cause(
+            "out of reach",
+            f"{u:g} V reach {speed:.4g} RPM; see what brakes the machine, and whether motor and "
+            "supply are made for this speed, or lower speed",
+            f"motion_{100 * SHARES[-1]:g}", None, speed,
+        ),
     )  # fmt: skip
-    raise refusal
 
 
 def _pulse(u: float, Ts: float) -> FloatArray:
@@ -97,18 +96,17 @@ def _judged(recording: Recording, u: float, *, may_stall: bool) -> float | None:
     turns = (recording.counts - recording.counts[0]) / recording.counts_per_rev
     if np.max(np.abs(turns)) < MOVED:
         return None
-    if turns[-1] <= -MOVED:
-        refusal = Refusal(
-            f"expected a positive command to turn the machine forward, at {u:g} V it went "
-            f"{turns[-1]:.3g} turns"
-        )
-        refusal.cause = Cause(
+    require(
+        turns[-1] > -MOVED,
+        f"expected a positive command to turn the machine forward, at {u:g} V it went "
+        f"{turns[-1]:.3g} turns",
+        Cause(
             "sign",
             "a positive command turns the machine backwards, and a controller would run away; swap "
             "two motor leads or the encoder's A and B, or change the sign of the command in the "
             "drive", recording.name, None, -1.0,
-        )  # fmt: skip
-        raise refusal
+        ),
+    )  # fmt: skip
     tail = max(2, round(0.1 / recording.Ts))
     speed = 60.0 * (turns[-1] - turns[-tail]) / ((tail - 1) * recording.Ts)
     first = turns[: len(turns) // 2]
@@ -181,17 +179,16 @@ def _checked(fopdt: Fopdt, demands: Demands) -> None:
         "be reached",
     )
     needed = (demands.top - fopdt.offset) / fopdt.K
-    if needed > demands.u_max:
-        refusal = Refusal(
-            f"expected the top speed and a quarter more, {demands.top:.4g} RPM, to need less than "
-            f"u_max = {demands.u_max:g} V, the step response says {needed:.3g} V"
-        )
-        refusal.cause = Cause(
+    require(
+        needed <= demands.u_max,
+        f"expected the top speed and a quarter more, {demands.top:.4g} RPM, to need less than "
+        f"u_max = {demands.u_max:g} V, the step response says {needed:.3g} V",
+        Cause(
             "out of reach",
             f"{demands.u_max:g} V reach {fopdt.K * demands.u_max + fopdt.offset:.4g} RPM; lower "
             "speed, or raise u_max if motor and machine bear it", "step", None, needed,
-        )  # fmt: skip
-        raise refusal
+        ),
+    )  # fmt: skip
 
 
 # --- Signals for a machine of which only a first order with dead time is known --------------------

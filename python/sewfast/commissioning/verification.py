@@ -382,10 +382,9 @@ def require_alike(c: Comparison) -> None:
 def require_unsaturated(found: ClosedLoopRun) -> None:
     """Raise `Refusal` for a loop that is at the limit of its command for too long."""
     saturated = _at_limit(found)
-    if saturated > SATURATED:
-        refusal = Refusal(
-            "expected the command within its limits most of the time on "
-            f"{found.reference!r}, it was at one for {100 * saturated:.0f} % of the samples"
-        )
-        refusal.cause = out_of_reach(found.r, found.y, found.u, found.controller, found.reference)
-        raise refusal
+    require(
+        saturated <= SATURATED,
+        f"expected the command within its limits most of the time on {found.reference!r}, it was "
+        f"at one for {100 * saturated:.0f} % of the samples",
+        out_of_reach(found.r, found.y, found.u, found.controller, found.reference),
+    )

@@ -488,10 +488,7 @@ class SteppedBench:
         def recording(until: int) -> Recording:
             true = speed[:until] if hasattr(machine, "speed_rpm") else None
             if until < samples:
-                y = speed_or_nan(counts[:until], self.Ts, self.counts_per_rev, "kalman")
-                return Recording(
-                    u[:until], counts[:until], y, true, self.Ts, self.counts_per_rev, name
-                )
+                return self._part(name, u[:until], counts[:until], true)
             return Recording.of_counts(
                 u, counts, Ts=self.Ts, counts_per_rev=self.counts_per_rev, name=name,
                 speed_true=true,
@@ -530,11 +527,22 @@ class SteppedBench:
             received=f"not a count for .25 s, at last at {u[-1]:.3g} V; rest was commanded",
             remedy=NO_MOTION,
         )  # fmt: skip
+        return self._explained(error, self._part(name, u, counts))
+
+    def _part(
+        self, name: str, u: FloatArray, counts: FloatArray, true: FloatArray | None = None
+    ) -> Recording:
+        """What there is of a run that was ended, which can be too short for a speed."""
         y = speed_or_nan(counts, self.Ts, self.counts_per_rev, "kalman")
-        lost = Recording(u, counts, y, None, self.Ts, self.counts_per_rev, name)
-        error.recording = lost
-        if (cause := cause_of(lost, volt=self.volt, speed=self.speed)) is not None:
-            error.explain(cause)
+        return Recording(u, counts, y, true, self.Ts, self.counts_per_rev, name)
+
+    def _explained(self, error: LinkError, recording: Recording) -> LinkError:
+        """The error with what was recorded, and its cause if that shows one."""
+        error.recording = recording
+        with contextlib.suppress(DataError):  # too few samples
+            cause = cause_of(recording, volt=self.volt, speed=self.speed)
+            if cause is not None:
+                error.explain(cause)
         return error
 
     def _tripped(
@@ -548,9 +556,4 @@ class SteppedBench:
             f"commanded, and {after}",
             remedy=TOO_FAST,
         )  # fmt: skip
-        error.recording = recording(k + 1)
-        with contextlib.suppress(DataError):  # too few samples
-            cause = cause_of(error.recording, volt=self.volt, speed=self.speed)
-            if cause is not None:
-                error.explain(cause)
-        return error
+        return self._explained(error, recording(k + 1))
