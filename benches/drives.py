@@ -8,6 +8,7 @@ others with several differences at once.
     python benches/drives.py                    one commissioning on each, with its figures
     python benches/drives.py --only shaft60     one of them
     python benches/drives.py --oracle 200       beside gains tuned on the drive itself
+    python benches/drives.py --changed          and on the drive as it is later: CHANGES
 """
 
 from __future__ import annotations
@@ -25,8 +26,11 @@ from typing import Any
 
 import numpy as np
 
-from sewfast import commission
+from sewfast import Commissioning, commission
 from sewfast.commissioning import Refusal, SteppedBench
+from sewfast.commissioning.demands import demands
+from sewfast.commissioning.excitations import standard
+from sewfast.tuning.task import GAINS
 
 try:
     from numba import njit
@@ -218,6 +222,48 @@ def bench_of(simulator: Simulator) -> SteppedBench:
     )
 
 
+CHANGES: dict[str, Callable[[Drive], Drive]] = {
+    "inertia x .8": lambda d: replace(d, inertia=0.8 * d.inertia),
+    "inertia x 1.25": lambda d: replace(d, inertia=1.25 * d.inertia),
+    "gain x .8": lambda d: replace(d, gain=0.8 * d.gain),
+    "gain x 1.25": lambda d: replace(d, gain=1.25 * d.gain),
+    "2 ms later": lambda d: replace(d, late=d.late + round(2e-3 / d.Ts)),
+    **{
+        f"resonance {100 * s - 100:+.0f} %": lambda d, s=s: replace(d, shaft=s * d.shaft)
+        for s in (0.9, 0.95, 0.97, 1.03, 1.05, 1.1)
+    },
+}
+"""What a machine is some time after its commissioning."""
+
+
+def after_changes(found: Commissioning, drive: Drive) -> tuple[float, str]:
+    """The error over that of the drive as it was commissioned, rms; the worst of `CHANGES`.
+
+    On the standard references at a pace that the least gain reaches.
+    """
+    from oracle import driven
+
+    assert found.controller is not None
+    assert found.acceleration is not None
+    controller = found.controller
+    bench = bench_of(Simulator(drive))
+    asked = demands(
+        bench, u_max=controller.u_max, speed=found.comparisons[0].span, references=None, members=1,
+        evaluations=1, seed=0, threads=1,
+    )  # fmt: skip
+    references = standard(min(GAINS) * found.acceleration, asked, bench.Ts, short=True).values()
+
+    def error(drive: Drive) -> float:
+        runs = [driven(bench_of(Simulator(drive)), controller, r, "changed") for r in references]
+        return math.sqrt(float(np.mean(np.concatenate([(run.r - run.y) ** 2 for run in runs]))))
+
+    own = error(drive)
+    changed = {name: change(drive) for name, change in CHANGES.items()}
+    ratios = {name: error(d) / own for name, d in changed.items() if d != drive}
+    worst = max(ratios, key=lambda name: ratios[name])
+    return ratios[worst], worst
+
+
 # --- figures --------------------------------------------------------------------------------------
 
 
@@ -236,9 +282,13 @@ class Figures:
     railed: float
     moved: float
     cpu: float
+    changed: float | None = None
+    worst: str = ""
 
 
-def figures(drive: Drive, seed: int, evaluations: int = 0, **settings: Any) -> Figures:
+def figures(
+    drive: Drive, seed: int, evaluations: int = 0, *, changes: bool = False, **settings: Any
+) -> Figures:
     """Commission one machine; `railed` is the time at a limit of the command in all [s].
 
     `evaluations` are the oracle's; 0 for none.
@@ -259,9 +309,10 @@ def figures(drive: Drive, seed: int, evaluations: int = 0, **settings: Any) -> F
         from oracle import oracle
 
         best = oracle(bench_of(simulator), found, seed=seed, evaluations=evaluations).cost
+    later = after_changes(found, drive) if changes and found.measured_cost is not None else ()
     return Figures(
         drive.name, seed, verdict, stage, reason, found.predicted_cost, found.measured_cost, best,
-        railed, moved, used,
+        railed, moved, used, *later,
     )  # fmt: skip
 
 
@@ -273,6 +324,7 @@ def line(f: Figures) -> str:
     return (
         f"{f.machine:12}{f.seed:3} {f.verdict:9}{costs}  railed {f.railed:6.2f} s of "
         f"{f.moved:6.1f}  cpu {f.cpu:6.1f}  {f.stage} {f.reason[:150]}"
+        + (f"{f.changed:6.2f} times with {f.worst}" if f.changed is not None else "")
     )
 
 
@@ -281,6 +333,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", help="machines by name, drawnN among them")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--oracle", type=int, default=0, help="evaluations of an oracle")
+    parser.add_argument("--changed", action="store_true", help="on changed drives, too")
     parser.add_argument("-o", dest="out", type=Path, help="JSON to write, and to go on from")
     args = parser.parse_args()
     named = {d.name: d for d in FAMILY}
@@ -292,7 +345,7 @@ def main() -> int:
     for seed, drive in itertools.product(range(args.seeds), drives):
         if (drive.name, seed) in done:
             continue
-        found.append(figures(drive, seed, args.oracle))
+        found.append(figures(drive, seed, args.oracle, changes=args.changed))
         print(line(found[-1]), flush=True)
         if args.out is not None:  # after each, as a family takes an hour
             args.out.write_text(json.dumps([vars(f) for f in found], indent=1) + "\n")

@@ -767,6 +767,16 @@ def margins(path: LoopPath, num: _F, den: _F) -> dict[str, Any]:
     An unstable loop has infinite peaks and noise gain, its other margins are NaN.
     """
 
+def tolerance(
+    path: LoopPath, num: _F, den: _F
+) -> tuple[float, tuple[float, float, int, float] | None]:
+    """Ms as a limit of it is compared, and what a resonance adds to it; None without one.
+
+    That is the largest Ms with -20 to +25 % of gain, 0 or 2 samples of delay and 10 % of the
+    resonance's frequency, then the factor on the gain, the delay [samples] and the factor on the
+    frequency with which it is. The first is Ms, or half of that.
+    """
+
 def effort(u: _F, *, u_min: float, u_max: float) -> dict[str, float]:
     """u_rms, du_rms (change from sample to sample), saturated (share of samples at a limit)."""
 

@@ -116,7 +116,7 @@ def lowered(controller: Controller, plant: Model, Ms: float) -> Controller:
     # at the same Ti, a lower Kp costs phase on a plant slower than Ti; at the same Kp Ti not
     tried = [scaled(controller, s) for s in shares] + [stretched(controller, s) for s in shares]
     for found in tried:
-        if margins(found, plant).Ms <= Ms:
+        if margins(found, plant).Ms_robust <= Ms:
             return found
     raise Refusal(
         f"expected gains under which the loop is stable with an Ms of at most {Ms:g} on the "
@@ -332,7 +332,7 @@ def _within(rule: Controller, plants: Sequence[Model], speed: float, limit: floa
     """The rule's gains, slowed down until they keep the limit of Ms on every plant."""
     for k in range(SLOWER):
         slowed = stretched(rule, 0.9**k)
-        if all(margins(slowed, m, speed=speed).Ms <= limit for m in plants):
+        if all(margins(slowed, m, speed=speed).Ms_robust <= limit for m in plants):
             return slowed
     return slowed
 

@@ -224,6 +224,9 @@ class Margins(Plotted):
         Largest |S| and |T|; `Ms` is the inverse of the distance of L to -1.
     Ms_omega, Mt_omega : float
         Their frequencies [rad/s].
+    Ms_robust : float
+        What a limit of Ms is compared with: `Ms`, or half of the largest after a change of a plant
+        with a resonance.
     gain_margin : float
         The factor above 1 on the loop's gain that makes the loop unstable; inf if none does.
     gain_reduction : float
@@ -238,12 +241,18 @@ class Margins(Plotted):
         rms of the command over rms of white noise on the measured output [u/y].
     largest_pole : float
         Largest magnitude of a closed-loop pole; NaN with a memory of more than 250 samples.
+    changed : tuple of float, or None
+        For a plant with a resonance, the largest Ms if its gain changes by -20 to +25 %, its delay
+        by up to two samples, and the frequency of the resonance by 10 %: that Ms, the factor on the
+        gain, the delay [samples], the factor on the frequency. Gain and delay margins move the
+        whole plant; a resonance also moves by itself, and leaves its notch.
     u_unit, y_unit : str
     """
 
     stable: bool
     Ms: float
     Ms_omega: float
+    Ms_robust: float
     Mt: float
     Mt_omega: float
     gain_margin: float
@@ -254,6 +263,7 @@ class Margins(Plotted):
     phase_crossovers: tuple[float, ...]
     noise_gain: float
     largest_pole: float
+    changed: tuple[float, float, int, float] | None = None
     u_unit: str = "V"
     y_unit: str = "RPM"
 
@@ -316,8 +326,25 @@ class Margins(Plotted):
                 f"{self.phase_margin_deg:.1f} deg, delay margin {duration(self.delay_margin_s, 3)}",
                 f"crossover {crossing}, noise gain {self.noise_gain:.4g} "
                 f"{self.u_unit}/{self.y_unit}",
+                *([] if self.changed is None else [self.tolerance]),
             ]
         )
+
+    @property
+    def tolerance(self) -> str:
+        """`changed` in words; empty for a plant without a resonance."""
+        if self.changed is None:
+            return ""
+        Ms, gain, delay, pitch = self.changed
+        what = (
+            f"its resonance {100 * abs(pitch - 1):.0f} % {'lower' if pitch < 1 else 'higher'}"
+            if pitch != 1.0
+            else "its resonance where it is",
+            f"gain x {gain:g}" if gain != 1.0 else "",
+            f"{delay} samples later" if delay else "",
+        )
+        became = f"Ms {Ms:.3f}" if math.isfinite(Ms) else "unstable"
+        return f"{became} with {', '.join(w for w in what if w)}"
 
 
 def margins(controller: Controller, plant: Any, *, speed: float | None = None) -> Margins:
@@ -345,7 +372,9 @@ def margins(controller: Controller, plant: Any, *, speed: float | None = None) -
     """
     require_controller(controller, plant, "margins(controller, plant)")
     _require_units(controller.gains, plant)
-    found = _core.margins(loop_path(controller, speed=speed), *sampled(plant, controller.Ts, speed))
+    path, fraction = loop_path(controller, speed=speed), sampled(plant, controller.Ts, speed)
+    found = _core.margins(path, *fraction)
+    found["Ms_robust"], found["changed"] = _core.tolerance(path, *fraction)
     for name in ("gain_crossovers", "phase_crossovers"):
         found[name] = tuple(found[name])
     gains = controller.gains

@@ -62,7 +62,8 @@ class LinearLoops:
         if not (self.looked_at and isinstance(controller, Controller)):
             return 0.0, None
         found = [
-            (margins(controller, plant, speed=level).Ms, level) for plant, level in self.looked_at
+            (margins(controller, plant, speed=level).Ms_robust, level)
+            for plant, level in self.looked_at
         ]
         return max(found, key=lambda pair: pair[0])
 

@@ -220,11 +220,10 @@ impl<T: Real> PidController<T> {
         self.table.as_ref().map_or(&[], Table::rows)
     }
 
-    /// What a step computes with; `None` where the gains follow a schedule or there are biquads.
+    /// What a step computes with beside the biquads; `None` where the gains follow a schedule.
     pub fn numbers(&self) -> Option<Numbers<T>> {
         let (samples, lag, observer) = self.filter.parts();
-        let constant = self.table.is_none() && self.design.biquads.is_empty();
-        constant.then(|| Numbers {
+        self.table.is_none().then(|| Numbers {
             terms: self.pid.terms(),
             tracking: self.settings().tracking(),
             samples,

@@ -427,7 +427,7 @@ impl Kernel for ScalarLoop<'_> {
     fn run<V: F64x8>(self) {
         // Three ways to the same bits, so that what is chosen shows in the time only (16 % and 6.7 %, see above and
         // `kernel_plant`).
-        let constant = self.controller.pid().filter(|pid| pid.fits());
+        let constant = self.controller.pid().filter(|pid| pid.fits(pid));
         if let Some(pid) = constant {
             if SecondOrder::takes(&self.known) {
                 let plant = ScalarPlant::<V, SecondOrder>::new(self.known);

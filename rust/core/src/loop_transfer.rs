@@ -7,10 +7,11 @@
 //! L = R E G,    S = 1/(1 + L),    T = L/(1 + L),    u = -R/(1 + L) n    (n: noise on the measured output)
 //! ```
 //!
-//! [`Path`] is `R E`, [`Plant`] and [`Measured`] are `G`. [`margins`] says how far the loop is from instability, [`peak_sensitivity`] only `max |S|`, fast enough for a search.
+//! [`Path`] is `R E`, [`Plant`] and [`Measured`] are `G`. [`margins`] says how far the loop is from instability, [`peak_sensitivity`] only `max |S|`, fast enough for a search, [`Changing`] what that becomes when a resonance moves.
 
 mod margins;
 mod plant;
+mod tolerance;
 
 use nalgebra::{Complex, DMatrix, DVector};
 use sewfast_control::{Biquad, CAPACITY, Cascade, Refused, Standard};
@@ -19,6 +20,7 @@ use crate::{Error, Result};
 
 pub use margins::{Margins, margins, peak_sensitivity};
 pub use plant::{Measured, Plant};
+pub use tolerance::{Change, Changing};
 
 /// A place on the unit circle: `z^-1 = exp(-j theta)` and `1 - z^-1`, which keeps its digits at small angles.
 #[derive(Clone, Copy, Debug)]

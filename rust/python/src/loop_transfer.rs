@@ -5,7 +5,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::Standard;
 use sewfast_core::Result;
-use sewfast_core::loop_transfer::{self, Loop, Path, Plant};
+use sewfast_core::loop_transfer::{self, Change, Changing, Loop, Path, Plant};
 
 use crate::control::controller::{Section, cascade};
 use crate::seam::{array1, raise, slice};
@@ -16,7 +16,8 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<LoopPath>()?;
     module.add_function(wrap_pyfunction!(sampled_fopdt, module)?)?;
     module.add_function(wrap_pyfunction!(loop_response, module)?)?;
-    module.add_function(wrap_pyfunction!(margins, module)?)
+    module.add_function(wrap_pyfunction!(margins, module)?)?;
+    module.add_function(wrap_pyfunction!(tolerance, module)?)
 }
 
 /// The feedback path of a controller: what of it lies in the loop. Gains in standard form.
@@ -136,4 +137,27 @@ fn margins<'py>(
     dict.set_item("gain_crossovers", found.gain_crossovers)?;
     dict.set_item("phase_crossovers", found.phase_crossovers)?;
     Ok(dict)
+}
+
+/// Largest sensitivity after a change, factor on the gain, additional delay, factor on the resonances.
+type Changed = (f64, f64, usize, f64);
+
+#[pyfunction]
+#[pyo3(signature = (path, num, den))]
+fn tolerance(
+    py: Python<'_>,
+    path: &LoopPath,
+    num: Values<'_>,
+    den: Values<'_>,
+) -> PyResult<(f64, Option<Changed>)> {
+    let (num, den) = (slice(&num, "num")?, slice(&den, "den")?);
+    py.detach(|| {
+        let plant = Changing::new(Plant::new(num, den)?);
+        let of = |(most, Change { gain, delay, pitch })| (most, gain, delay, pitch);
+        Ok((
+            plant.sensitivity(&path.0),
+            plant.changed_sensitivity(&path.0).map(of),
+        ))
+    })
+    .map_err(|e| raise(py, e))
 }

@@ -1,7 +1,8 @@
 //! Controllers, one in each lane; or a single one.
 
 use sewfast_control::{
-    AnyController, Controller, Numbers, PidController, STATES, StateDesign, StateFeedback,
+    AnyController, BIQUADS, Biquad, Controller, Numbers, PidController, STATES, StateDesign,
+    StateFeedback,
 };
 
 use crate::simd::{Arithmetic, LANES};
@@ -11,8 +12,8 @@ pub(crate) trait InLanes: Controller<f64> {
     /// Eight of them, or a single one.
     type Lanes<V: Arithmetic>: LaneController<V>;
 
-    /// Whether this one can.
-    fn fits(&self) -> bool;
+    /// Whether this one can, beside the `first`.
+    fn fits(&self, first: &Self) -> bool;
 
     /// The first eight of `controllers`, at rest; missing ones are the first again.
     fn in_lanes<V: Arithmetic>(controllers: &[&Self]) -> Self::Lanes<V>;
@@ -67,7 +68,8 @@ fn all<'a, C: InLanes>(
     controllers: &[&'a AnyController<f64>],
     within: impl Fn(&'a AnyController<f64>) -> Option<&'a C>,
 ) -> Option<Vec<&'a C>> {
-    let fitting = |c: &&'a AnyController<f64>| within(c).filter(|c| c.fits());
+    let first = within(controllers.first()?)?;
+    let fitting = |c: &&'a AnyController<f64>| within(c).filter(|c| c.fits(first));
     // `Option<Vec>`: one that does not fit sends all of them to the scalar loop, which has the same bits.
     controllers.iter().map(fitting).collect()
 }
@@ -75,8 +77,9 @@ fn all<'a, C: InLanes>(
 impl InLanes for PidController<f64> {
     type Lanes<V: Arithmetic> = Controllers<V>;
 
-    fn fits(&self) -> bool {
-        self.numbers().is_some()
+    fn fits(&self, first: &Self) -> bool {
+        let sections = |c: &Self| c.design().biquads.sections().len();
+        self.numbers().is_some() && sections(self) == sections(first)
     }
 
     #[inline(always)]
@@ -90,6 +93,60 @@ impl InLanes for PidController<f64> {
 // Measured as a loop at rest that was slower threefold. What is dropped is beyond every digit of a command.
 const FADED: f64 = 1e-280;
 
+/// Eight cascades of biquads with as many sections each, and what they remember of feedback and reference.
+struct Cascades<V> {
+    count: usize,
+    /// `c0`, `c1`, `a1` and `-a2` of each section.
+    sections: [[V; 4]; BIQUADS],
+    of_y: [[V; 3]; BIQUADS],
+    of_r: [[V; 3]; BIQUADS],
+}
+
+impl<V: Arithmetic> Cascades<V> {
+    /// Of the first eight controllers; missing ones are the first again.
+    #[inline(always)]
+    fn new(controllers: &[&PidController<f64>]) -> Self {
+        let of = |i: usize| controllers.get(i).unwrap_or(&controllers[0]).design();
+        let number = |k: usize, of_section: &dyn Fn(&Biquad<f64>) -> f64| {
+            V::load(&std::array::from_fn(|i| {
+                of(i).biquads.sections().get(k).map_or(0.0, of_section)
+            }))
+        };
+        let rest = [[V::splat(0.0); 3]; BIQUADS];
+        Self {
+            count: of(0).biquads.sections().len(),
+            sections: std::array::from_fn(|k| {
+                [
+                    number(k, &|s| s.c0),
+                    number(k, &|s| s.c1),
+                    number(k, &|s| s.a1),
+                    number(k, &|s| -s.a2),
+                ]
+            }),
+            of_y: rest,
+            of_r: rest,
+        }
+    }
+
+    /// The next sample of a signal; the first one of all finds it at rest at `before`.
+    #[inline(always)]
+    fn step(sections: &[[V; 4]], memory: &mut [[V; 3]; BIQUADS], before: Option<V>, x: V) -> V {
+        let mut x = x;
+        for (&[c0, c1, a1, a2], state) in sections.iter().zip(memory) {
+            if let Some(level) = before {
+                *state = [level, V::splat(0.0), V::splat(0.0)];
+            }
+            // `Memory::step` of the crate `sewfast_control`; -(a2 d) and (-a2) d are the same bits
+            let [last, s1, s2] = *state;
+            let change = x.sub(last);
+            let d = c0.mul(change).add(s1);
+            *state = [x, c1.mul(change).sub(a1.mul(d)).add(s2), a2.mul(d)];
+            x = x.add(d);
+        }
+        x
+    }
+}
+
 /// Eight of [`PidController`] with constant gains: the same operations in the same order.
 pub(crate) struct Controllers<V> {
     average: Averages<V>,
@@ -100,6 +157,7 @@ pub(crate) struct Controllers<V> {
     observer: Option<[V; 3]>,
     /// Largest change of the reference in one sample; `None` where no lane has a ramp.
     ramp: Option<V>,
+    biquads: Option<Cascades<V>>,
     kp: V,
     ki: V,
     kd: V,
@@ -158,6 +216,7 @@ impl<V: Arithmetic> Controllers<V> {
             lag: each(&|n| n.lag),
             observer: any(&|c| c.design().observer_time > 0.0).then_some(observer),
             ramp: any(&|c| c.design().r_rate < f64::INFINITY).then_some(each(&|n| n.ramp)),
+            biquads: any(&|c| !c.design().biquads.is_empty()).then(|| Cascades::new(controllers)),
             kp: each(&|n| n.terms.kp),
             ki: each(&|n| n.terms.ki),
             kd: each(&|n| n.terms.kd),
@@ -187,12 +246,35 @@ impl<V: Arithmetic> Controllers<V> {
 impl<V: Arithmetic> LaneController<V> for Controllers<V> {
     #[inline(always)]
     fn take(&mut self, first: bool, measured: V) {
-        self.filtered = self.filter(first, measured);
+        let filtered = self.filter(first, measured);
+        self.filtered = match &mut self.biquads {
+            None => filtered,
+            Some(Cascades {
+                count,
+                sections,
+                of_y,
+                ..
+            }) => Cascades::step(
+                &sections[..*count],
+                of_y,
+                first.then_some(filtered),
+                filtered,
+            ),
+        };
     }
 
     #[inline(always)]
     fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V {
-        let r = self.reference(first, r);
+        let mut r = self.reference(first, r);
+        if let Some(Cascades {
+            count,
+            sections,
+            of_r,
+            ..
+        }) = &mut self.biquads
+        {
+            r = Cascades::step(&sections[..*count], of_r, first.then_some(self.filtered), r);
+        }
         self.control(r, self.filtered, feedforward)
     }
 
@@ -311,7 +393,7 @@ impl<V: Arithmetic> Controllers<V> {
 impl InLanes for StateFeedback<f64> {
     type Lanes<V: Arithmetic> = StateLanes<V>;
 
-    fn fits(&self) -> bool {
+    fn fits(&self, _first: &Self) -> bool {
         true
     }
 

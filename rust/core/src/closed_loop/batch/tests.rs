@@ -2,8 +2,8 @@
 
 use proptest::prelude::*;
 use sewfast_control::{
-    AnyController, Design, PidController, STATES, Settings, Standard, StateDesign, StateFeedback,
-    Weights, lqg,
+    AnyController, Biquad, Cascade, Design, PidController, STATES, Settings, Standard, StateDesign,
+    StateFeedback, Weights, lqg,
 };
 
 use super::*;
@@ -57,10 +57,23 @@ prop_compose! {
         high in 1.0..25.0,
         (samples, lag, observer) in (1_usize..9, prop_oneof![Just(0.0), 1e-3..0.01], prop_oneof![Just(0.0), 1e-3..0.01]),
         r_rate in prop_oneof![Just(f64::INFINITY), 1e3..1e5],
+        sections in prop::collection::vec((20.0..400.0, 0.02..0.5, 0.2..2.0), 2),
     ) -> Design<f64> {
         let gains = Standard { kp, ti, td };
         let pid = Settings { alpha, beta, n, tt, slew, u_min: -0.6 * high, u_max: high, ..Settings::new(gains, TS) };
-        Design { filter_samples: samples, filter_time: lag, observer_time: observer, r_rate, ..Design::new(pid) }
+        let notch = |&(hertz, depth, width): &(f64, f64, f64)| Biquad::notch(hertz, depth, width, TS).unwrap();
+        let biquads = Cascade::new(&sections.iter().map(notch).collect::<Vec<_>>()).unwrap();
+        Design { filter_samples: samples, filter_time: lag, observer_time: observer, r_rate, biquads, ..Design::new(pid) }
+    }
+}
+
+prop_compose! {
+    /// Controllers of one search: as many sections in each.
+    fn of_a_search()(mut designs in prop::collection::vec(designs(), 1..=MOST), count in 0_usize..3) -> Vec<Design<f64>> {
+        for design in &mut designs {
+            design.biquads = Cascade::new(&design.biquads.sections()[..count]).unwrap();
+        }
+        designs
     }
 }
 
@@ -205,7 +218,7 @@ proptest! {
     #![proptest_config(crate::laws::cases(60))]
     #[test]
     fn a_lane_is_its_loop_to_the_bit(
-        designs in prop::collection::vec(designs(), 1..=MOST),
+        designs in of_a_search(),
         seed in any::<u64>(),
         (na, nb, nk, hidden) in (1_usize..4, 1_usize..4, 1_usize..4, 1_usize..18),
         bypass in any::<bool>(),
@@ -230,7 +243,7 @@ proptest! {
 
     #[test]
     fn a_lane_around_a_difference_equation_is_its_loop(
-        designs in prop::collection::vec(designs(), 1..=MOST),
+        designs in of_a_search(),
         seed in any::<u64>(), nk in 1_usize..3, counts in prop_oneof![Just(0.0), Just(26.2)],
     ) {
         let model = LinearModel::new(vec![-1.6, 0.63], vec![3.0, 2.0], 1, nk, 1.0).unwrap();

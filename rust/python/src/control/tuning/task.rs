@@ -78,7 +78,7 @@ pub struct Given {
     u: Option<f64>,
     recovery: Option<OwnedMost>,
     load: Option<OwnedMost>,
-    loops: Vec<linear::Plant>,
+    loops: Vec<linear::Changing>,
     measured: Vec<linear::Measured>,
 }
 
@@ -160,10 +160,11 @@ fn measured(given: &[Lines<'_>], ts: f64) -> PyResult<Vec<linear::Measured>> {
 /// Numerator and denominator in powers of `z^-1`.
 type Fraction<'py> = (Values<'py>, Values<'py>);
 
-fn loops(given: &[Fraction<'_>]) -> PyResult<Vec<linear::Plant>> {
+fn loops(given: &[Fraction<'_>]) -> PyResult<Vec<linear::Changing>> {
     let plant = |(num, den): &Fraction<'_>| {
         let (num, den) = (slice(num, "num")?, slice(den, "den")?);
-        linear::Plant::new(num, den).map_err(|e| raise(given[0].0.py(), e))
+        let plant = linear::Plant::new(num, den).map_err(|e| raise(given[0].0.py(), e))?;
+        Ok(linear::Changing::new(plant))
     };
     given.iter().map(plant).collect()
 }
@@ -228,10 +229,7 @@ impl Given {
         let sensitivity = |design: &AnyDesign<f64>| {
             let paths = paths(design, encoder.is_some());
             let of = |path: &linear::Path| {
-                let plants = self.loops.iter().map(|plant| {
-                    linear::Loop::new(path, plant)
-                        .map_or(f64::INFINITY, |closed| linear::peak_sensitivity(&closed))
-                });
+                let plants = self.loops.iter().map(|plant| plant.sensitivity(path));
                 let measured = self.measured.iter().map(|m| m.peak_sensitivity(path));
                 plants.chain(measured).fold(1.0, f64::max)
             };
