@@ -8,10 +8,12 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -228,15 +230,43 @@ def test_only_the_page_in_control_moves_it(studio: Studio, device: VirtualDevice
         until(lambda: not _is_on(device))
 
 
-def test_taking_the_control_stops_what_runs(studio: Studio, device: VirtualDevice) -> None:
+def test_taking_the_control_takes_two_acts_and_stops_what_runs(
+    studio: Studio, device: VirtualDevice
+) -> None:
     with Watching(studio) as page, Watching(studio) as other:
         page.armed(device.port)
         _running(page, device)
-        other.ask("take")
+        # nothing counts as the second act before this page was told who holds the control
+        for over in (True, False):
+            told = other.ask("take", over=over)["found"]
+            assert told["moves"]
+            assert told["held_s"] > 0.0
+        assert _is_on(device)
+        assert "looks on" in other.ask("drive_arm")["error"]
+        assert other.ask("take", over=True)["found"] is None
         assert "another page" in page.event("stopped")["why"]
+        page.event("lost")
         until(lambda: not _is_on(device))
         again = {**LONG, "file": "again.mcap"}
         assert "press Arm" in other.ask("drive_record", **again)["error"]
+        # the page that lost it is asked as well, and what it was told before counts no longer
+        assert "held_s" in page.ask("take", over=True)["found"]
+        assert page.ask("stop")["found"] is None
+
+
+def test_taking_over_by_clicks(studio: Studio, device: VirtualDevice, browser: Any) -> None:
+    with Watching(studio) as page:
+        page.ask("take")
+        page.armed(device.port)
+        _running(page, device)
+        browser.get(studio.address)
+        _press(browser, "take")
+        until(lambda: browser.find_element("id", "take").text == "Take over")
+        assert "stops the motor" in browser.find_element("id", "control").text
+        assert _is_on(device)
+        _press(browser, "take")
+        until(lambda: not _is_on(device))
+        until(lambda: "holds the control" in browser.find_element("id", "control").text)
 
 
 def _both(found: dict[str, Any]) -> list[list[str]]:
@@ -388,6 +418,40 @@ def test_a_process_that_is_killed_stops_it(
                 until(lambda: not Path(f"/proc/{bench}").exists())
         finally:
             process.kill()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="needs the signals of POSIX")
+def test_sigterm_in_a_flood_ends_it_in_time(tmp_path: Path, device: VirtualDevice) -> None:
+    command = [*PROGRAM, "studio", str(tmp_path), "--no-browser"]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment()) as process,
+        ExitStack() as flood,
+    ):
+        try:
+            assert process.stdout is not None
+            address, _, token = process.stdout.readline().rstrip().partition("/#")
+            served = SimpleNamespace(port=int(address.rpartition(":")[2]), token=token)
+            page = Watching(served)
+            page.armed(device.port)
+            _running(page, device)
+            for i in range(60):  # silent, half a request, and answers that nobody reads
+                client = socket.create_connection(("127.0.0.1", served.port))
+                flood.enter_context(client)
+                client.send(
+                    ("", "GET / HTTP/1.1", f"GET / HTTP/1.1\r\nHost: {i}\r\n\r\n")[i % 3].encode()
+                )
+            for _ in range(10):
+                deaf = flood.enter_context(Page(served))
+                for _ in range(90):
+                    deaf.socket.send(json.dumps({"do": "ports"}))
+            began = time.monotonic()
+            process.send_signal(signal.SIGTERM)
+            process.wait(20.0)
+            assert time.monotonic() - began < 2.0
+            _require_off_since(device, began)
+        finally:
+            process.kill()
+    until(lambda: read_recording(tmp_path / "long.mcap").outcome == "cancelled")
 
 
 def _child(pid: int) -> int:

@@ -72,7 +72,8 @@ class SeenDrive(Drive):
 
     def _settle(self) -> None:
         self.off_at = time.monotonic()
-        super()._settle()
+        if not self.bench.is_left:  # nobody is there to hear that the motor is at rest
+            super()._settle()
 
 
 class _Both:
@@ -101,6 +102,7 @@ class Bench:
         self.drive: SeenDrive | None = None
         self.cancel = threading.Event()
         self.job = ""
+        self.is_left = False
         self._armed = False
         self._alive = -math.inf
         self._go = threading.Event()
@@ -165,6 +167,7 @@ class Bench:
                 self._go.set()
             else:
                 self.work.put(asked)
+        self.is_left = True
         self.stop("the server is gone")
         self.work.put(None)
         time.sleep(LAST_WORDS)

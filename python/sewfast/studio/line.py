@@ -171,14 +171,19 @@ class Line:
                 waiting.set_result(error)
         self._tell({**self.state, **error})
 
-    def close(self) -> None:
-        """Stop the motor, end the process."""
+    def release(self) -> None:
+        """End the pipe to the process, which then stops the motor and ends."""
         program = self._program
         if program is not None:
-            self.stop("the studio has ended")
             with self._writing, suppress(OSError):
                 assert program.stdin is not None
                 program.stdin.close()
+
+    def close(self) -> None:
+        """Wait for the end of the process."""
+        self.release()
+        program = self._program
+        if program is not None:
             try:
                 program.wait(CLOSING)
             except subprocess.TimeoutExpired:

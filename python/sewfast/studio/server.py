@@ -10,10 +10,13 @@ import hmac
 import json
 import logging
 import secrets
+import socket
 import threading
+import time
 from collections.abc import Mapping
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
+from weakref import WeakSet
 
 from ..errors import SettingError, not_installed
 from .bench import error_text
@@ -31,10 +34,10 @@ if TYPE_CHECKING:
 ADDRESS = "127.0.0.1"
 LARGEST_MESSAGE = 64 * 1024
 PATIENCE = 5.0
-"""Time for a socket to send its token [s]."""
+"""Time for a socket to send its token, and of a closing studio for what it still computes [s]."""
 
-FAREWELL = 1.0
-"""Time for a page to confirm the end of its socket [s]."""
+FAREWELL = 0.2
+"""Time for the pages to confirm the end of their sockets [s]."""
 
 WRITES = (
     "identify", "bode", "commission", "report", "cancel", "tune_search", "tune_save", "upload",
@@ -120,7 +123,9 @@ class Studio:
         self.project = project
         self.token = secrets.token_urlsafe(32)
         self._pages: set[Session] = set()
+        self._connections: WeakSet[ServerConnection] = WeakSet()
         self._writer: Session | None = None
+        self._since = 0.0
         self._uploads: dict[Session, Upload] = {}
         self._line = Line(project.folder, self._tell)
         self._jobs = Jobs(project.folder, self._tell)
@@ -132,6 +137,7 @@ class Studio:
             self._server = serve(
                 self._talk, ADDRESS, port, process_request=self._admit, max_size=LARGEST_MESSAGE,
                 server_header=None, compression=None, close_timeout=FAREWELL, logger=silent,
+                create_connection=cast("type[ServerConnection]", self._connected),
             )  # fmt: skip
         except OSError as e:
             if e.errno not in (errno.EADDRINUSE, errno.EACCES):
@@ -153,17 +159,27 @@ class Studio:
         self._server.serve_forever()
 
     def close(self) -> None:
-        """End a running step and every socket, even of pages that no longer answer."""
+        """End a running step and every socket, the motor first; a socket that takes long, as one
+        that never said anything or no longer reads, is cut off.
+        """
+        self._line.release()
         self._jobs.cancel()
         self._ended.set()
-        self._line.close()
         with self._lock:
             pages = list(self._pages)
         for page in pages:
-            page.connection.close(1001, "the studio has ended")
-        self._server.shutdown()
+            page.end()
+        ending = threading.Thread(target=self._server.shutdown, daemon=True)
+        ending.start()
+        self._line.close()
+        ending.join(FAREWELL)
+        for connection in list(self._connections):
+            with contextlib.suppress(OSError):
+                connection.socket.shutdown(socket.SHUT_RDWR)
+        end = time.monotonic() + PATIENCE
+        ending.join(PATIENCE)
         for page in pages:
-            page.wait(PATIENCE)
+            page.wait(max(end - time.monotonic(), 0.0))
         self._jobs.close()
 
     def __enter__(self) -> Studio:
@@ -174,6 +190,14 @@ class Studio:
     def __exit__(self, *exception: object) -> None:
         self.close()
         self._thread.join()
+
+    def _connected(self, *given: Any, **options: Any) -> ServerConnection:
+        """A socket that was opened, whatever becomes of it."""
+        from websockets.sync.server import ServerConnection
+
+        connection = ServerConnection(*given, **options)
+        self._connections.add(connection)
+        return connection
 
     # --- Access -----------------------------------------------------------------------------------
 
@@ -219,7 +243,8 @@ class Studio:
             page = Session(connection, self._answer)
             with self._lock:
                 self._pages.add(page)
-                self._writer = self._writer or page
+                if self._writer is None:
+                    self._writer, self._since = page, time.monotonic()
             try:
                 self._tell_all()
                 page.send(to_text(self._line.state))
@@ -237,7 +262,8 @@ class Studio:
                 if upload is not None:
                     upload.abandon()
                 page.end()
-                self._tell_all()
+                if not self._ended.is_set():
+                    self._tell_all()
 
     def _is_known(self, connection: ServerConnection) -> bool:
         try:
@@ -315,12 +341,7 @@ class Studio:
         fields = self._permitted(page, asked)
         name = str(asked["do"])
         if name == "take":
-            with self._lock:
-                before, self._writer = self._writer, page
-            if before is not page and self._line.may_move:
-                self._line.stop("another page has taken the control")
-            self._tell_all()
-            return None
+            return self._take(page, **fields)
         if name == "ports":
             return _ports()
         if name.startswith("upload"):
@@ -331,6 +352,25 @@ class Studio:
         if name == "tune_save":
             self._tell_all()
         return found
+
+    def _take(self, page: Session, over: bool = False) -> dict[str, Any] | None:
+        """Give a page the control. If another one holds that of a drive, the page is told so first,
+        and has to ask again, to take over.
+        """
+        line = self._line
+        with self._lock:
+            before = self._writer
+            others = before if before is not page else None
+            if others is not None and line.is_connected and not (over and page.told is others):
+                page.told = others
+                return {"held_s": time.monotonic() - self._since, "moves": line.may_move}
+            page.told, self._writer, self._since = None, page, time.monotonic()
+        if before is not page and line.may_move:
+            line.stop("another page has taken the control")
+        if others is not None:
+            others.send(to_text({"event": "lost"}))
+        self._tell_all()
+        return None
 
     # --- Uploads ----------------------------------------------------------------------------------
 

@@ -46,10 +46,13 @@ class Session:
         self._outgoing: queue.SimpleQueue[str | bytes | None] = queue.SimpleQueue()
         self._incoming: queue.SimpleQueue[str | bytes | None] = queue.SimpleQueue()
         self._answer = answer
+        self._is_over = False
         self._beats: dict[int, float] = {}
         self._beat = 0
         #: Number of heartbeats in a row with a prompt answer.
         self.prompt = 0
+        #: The page of which it was told that it holds the control of a drive.
+        self.told: Session | None = None
         self._threads = [
             threading.Thread(target=run, daemon=True) for run in (self._send, self._work)
         ]
@@ -67,6 +70,8 @@ class Session:
         self._incoming.put(message)
 
     def end(self) -> None:
+        """End the threads; messages that still wait are dropped."""
+        self._is_over = True
         self._outgoing.put(None)
         self._incoming.put(None)
 
@@ -80,11 +85,11 @@ class Session:
         from websockets.exceptions import ConnectionClosed
 
         with contextlib.suppress(ConnectionClosed):
-            while (message := self._outgoing.get()) is not None:
+            while (message := self._outgoing.get()) is not None and not self._is_over:
                 self.connection.send(message)
 
     def _work(self) -> None:
-        while (message := self._incoming.get()) is not None:
+        while (message := self._incoming.get()) is not None and not self._is_over:
             self._answer(self, message)
 
     def beat(self) -> None:
@@ -187,7 +192,7 @@ _SIGNAL = {
 
 # name: (fields, required fields)
 _MESSAGES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
-    "take": ({}, ()),
+    "take": ({"over": {"type": "boolean"}}, ()),
     "cancel": ({}, ()),
     **dict.fromkeys(("columns", "look", "validate", "identify"), (_STEP, ("file",))),
     "commission": ({"machine": NAME, **_EFFORT}, ()),

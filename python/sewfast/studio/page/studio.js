@@ -8,7 +8,7 @@ import { look } from "/drive.js";
 
 const { ask, on } = server, $ = id => document.getElementById(id), VIEWS = ["data", "bode", "tune", "drive", "commission"];
 const tune = mount(document, server);
-let first = true;
+let first = true, over = false, lost = false;
 
 // what the focus goes to must not be left below the header, whose lines depend on the width
 const header = document.querySelector("header");
@@ -27,10 +27,18 @@ bode.connect(tune, view);
 
 on("state", s => {
   $("folder").textContent = s.folder; $("take").hidden = s.writes;
-  $("control").textContent = (s.writes ? "this page holds the control" : "this page looks on") + (s.pages > 1 ? `; ${s.pages} pages are open` : "");
+  if (s.writes) { over = lost = false; $("take").textContent = "Take control"; }
+  $("control").textContent = (s.writes ? "this page holds the control" : lost ? "another page has taken the control; this page looks on" : "this page looks on") + (s.pages > 1 ? `; ${s.pages} pages are open` : "");
   if (first && s.port) { $("port").value = s.port; view("drive"); }
   else if (first && s.models.length && (s.demo || s.models.includes(s.first))) view("tune");
   first = false;
 });
-$("take").onclick = () => ask("take");
+on("lost", () => { lost = true; });
+$("take").onclick = async () => {
+  const held = await ask("take", { over });
+  over = Boolean(held);
+  if (!held) return;
+  $("control").textContent = `another page has held the control of the drive for ${Math.ceil(held.held_s)} s` + (held.moves ? ", and the motor can turn" : "") + "; taking it over stops the motor";
+  $("take").textContent = "Take over";
+};
 for (const v of VIEWS) $(`view-${v}`).onclick = () => view(v);
