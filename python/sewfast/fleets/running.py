@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import logging
 import math
+import multiprocessing
 import os
 import signal
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
@@ -348,23 +349,37 @@ def _connected(
             # messages of its processes about each other while they end are irrelevant
             "silence_logs": logging.CRITICAL,
         }
-        with _workers_without_ctrl_c():
-            cluster = distributed.LocalCluster(**options)
+        cluster = _without_ctrl_c(lambda: distributed.LocalCluster(**options))
         with cluster, distributed.Client(cluster) as made:
-            yield made
+            try:
+                yield made
+            except KeyboardInterrupt:
+                # nothing that they still compute is wanted, and to ask them to end takes seconds
+                for process in multiprocessing.active_children():
+                    process.kill()
+                raise
 
 
-@contextmanager
-def _workers_without_ctrl_c() -> Iterator[None]:
-    """Processes started in this block ignore Ctrl-C; this process handles it and ends them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _without_ctrl_c(start: Callable[[], Any]) -> Any:
+    """Start processes that ignore Ctrl-C, while this process hears it and ends them.
+    They inherit the signals that the thread blocks in which they are started.
+    """
+    started: Future[Any] = Future()
+
+    def run() -> None:
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            started.set_result(start())
+        except BaseException as error:
+            started.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
     try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+        return started.result()
+    except KeyboardInterrupt:
+        started.add_done_callback(lambda made: made.exception() or made.result().close())
+        raise
 
 
 # --- Journal --------------------------------------------------------------------------------------
