@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from collections.abc import Sequence
@@ -495,17 +496,18 @@ def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> li
     from ..plotting import style, svg
 
     place = Path(folder) / FOLDER
-    written = []
+    contents: dict[Path, bytes] = {}
     try:
         place.mkdir(parents=True, exist_ok=True)
         for name, figure in drawn.items():
             with style():
                 text = svg(figure, f"analysis-{name}", ALT[name])
                 if png:
-                    figure.savefig(place / f"{name}.png", dpi=150)
-                    written.append(place / f"{name}.png")
-            (place / f"{name}.svg").write_text(text, encoding="utf-8")
-            written.append(place / f"{name}.svg")
+                    content = io.BytesIO()
+                    figure.savefig(content, dpi=150)
+                    contents[place / f"{name}.png"] = content.getvalue()
+            contents[place / f"{name}.svg"] = text.encode()
+        storage.replace_files(contents)
         target = Path(folder) / NUMBERS
         values = {k: v for k, v in a.to_json().items() if k not in ("format", "version")}
         storage.write(target, "sewfast.analysis", 1, {**values, "figures": list(drawn)})
@@ -513,4 +515,4 @@ def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> li
         raise SettingError(
             f"{folder}: expected a folder to write to, received {e.strerror!r}; choose another"
         ) from e
-    return [target, *written]
+    return [target, *contents]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Callable
 from functools import partial
@@ -13,6 +14,7 @@ import numpy as np
 from ..dataset import FloatArray, labelled
 from ..errors import SettingError
 from ..plotting import DPI, Drawing, Panel, lettered, stacked, style, thin
+from ..storage import replace_file
 from .card import ReportCard
 from .correlations import ResidualTest
 
@@ -70,8 +72,10 @@ def save(card: ReportCard, folder: str | os.PathLike[str]) -> list[Path]:
         Path(folder).mkdir(parents=True, exist_ok=True)
         for name, figure in drawn.items():
             path = Path(folder) / f"{name}.png"
+            content = io.BytesIO()
             with style():
-                figure.savefig(path, dpi=DPI)
+                figure.savefig(content, dpi=DPI)
+            replace_file(path, content.getvalue())
             written.append(path)
     except OSError as e:
         raise SettingError(

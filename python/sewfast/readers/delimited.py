@@ -329,7 +329,9 @@ def _fast_pass(layout: _Layout) -> list[FloatArray] | None:
         body = body.replace(",", ".")
     try:
         values = np.loadtxt(
-            io.StringIO(body), delimiter=None if layout.delimiter == " " else layout.delimiter,
+            # a generator, so that Ctrl-C is heard within a long file
+            (line for line in io.StringIO(body)),
+            delimiter=None if layout.delimiter == " " else layout.delimiter,
             comments=None, quotechar='"', ndmin=2,
         )  # fmt: skip
     except (ValueError, OverflowError):
