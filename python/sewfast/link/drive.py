@@ -443,7 +443,9 @@ class Drive(Unique):
             self.outcome = run.finish() if wanted and run.pump(cancel) else run.abort(None)
         except BaseException as error:
             self.outcome = run.abort(error)
-            self._settle()
+            if not isinstance(error, KeyboardInterrupt):
+                # after Ctrl-C a person waits, the output is off, and the next run waits for rest
+                self._settle()
             raise
         if self.outcome.reason == "cancelled":
             self._settle()
