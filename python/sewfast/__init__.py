@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
+# typing takes longer to import than the rest, and until `__main__` is read Ctrl-C shows a traceback
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from . import rules, signals, trust
     from ._core import __version__
     from .analysis import Analysis, analyse

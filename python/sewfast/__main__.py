@@ -13,10 +13,14 @@ def main() -> int:
     listening = signal.getsignal(signal.SIGINT)
     if listening is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from .cli import interrupts
     from .cli import main as run
 
-    signal.signal(signal.SIGINT, listening)
-    return run()
+    interrupts.listen()
+    try:
+        return run()
+    finally:
+        interrupts.deaf()
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .arrays import FloatArray, labelled
 from .errors import DataError, ModelFileError, SettingError, not_installed, unreadable, unwritable
+from .written import staged as note
 
 LOG = logging.getLogger(__package__)
 
@@ -46,6 +47,7 @@ def replace_files(contents: Mapping[Any, bytes]) -> None:
             try:
                 staged.append(_names(path))
                 with staged[-1][0].open("xb") as file:
+                    note(*staged[-1], file.fileno())
                     file.write(content)
                     file.flush()
                     os.fsync(file.fileno())
@@ -378,7 +380,8 @@ def _csv(columns: _Columns, units: Mapping[str, str]) -> bytes:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([labelled(n, units.get(n, "")) for n in columns])
     # Python's repr of a float is the shortest text that reads back to the same bits
-    writer.writerows(zip(*(map(repr, c.tolist()) for c in columns.values()), strict=True))
+    rows = zip(*(map(repr, c.tolist()) for c in columns.values()), strict=True)
+    writer.writerows(row for row in rows)  # a generator, so that Ctrl-C is heard
     return text.getvalue().encode()
 
 

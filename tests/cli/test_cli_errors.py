@@ -19,6 +19,7 @@ from cli import call_refused as refused
 from cli import called as sewfast
 from cli import sewfast as started
 from sewfast import cli
+from sewfast.recordfile import Header, RecordWriter
 
 IDENTIFY = ("identify", "run.csv", "--input", "u", "--output", "y", "-o", "m.json")
 
@@ -460,24 +461,75 @@ def test_a_reference_in_another_unit_of_speed(folder: Path) -> None:
         assert ("expected r in RPM" in sewfast(folder, *given, done=done).err) == (done == 2)
 
 
-def test_interrupted_while_it_closes_a_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("step", "told"),
+    [(0, "nothing was written"), (1, "written: a.csv"), (2, "written: a.csv, run.mcap"),
+     (3, "written: 4 files in .")],
+)  # fmt: skip
+def test_an_interrupted_command_names_what_it_wrote(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    step: int,
+    told: str,
 ) -> None:
-    out = tmp_path / "run.mcap"
+    monkeypatch.chdir(tmp_path)
 
     def interrupted(args: object) -> None:
-        if write:
-            out.write_bytes(b"samples")
+        if step > 0:
+            api.write_table("a.csv", {"u": np.zeros(1)})
+        if step > 1:
+            RecordWriter("run.mcap", Header("step", 0.001, {"u": "V"}, n=1)).close()
+        if step > 2:
+            api.write_table("b.csv", {"u": np.zeros(1)})
+            api.write_table("c.csv", {"u": np.zeros(1)})
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sewfast.cli.recording.record_command", interrupted)
-    given = ["record", "--on", "virtual", "--signal", "step", "-o", str(out)]
-    write = False
-    assert cli.main(given) == 130
-    assert "nothing was written" in capsys.readouterr().err
-    write = True
-    assert cli.main(given) == 130
-    assert f"what came is in {out}" in capsys.readouterr().err
+    assert cli.main(["record", "--on", "virtual", "--signal", "step"]) == 130
+    assert capsys.readouterr().err == f"sewfast record: interrupted; {told}\n"
+
+
+DEAF = """
+import os, signal, sys, time
+from sewfast import cli
+from sewfast.storage import replace_file
+
+def deaf(args):
+    replace_file("done.csv", b"whole")
+    fsync = os.fsync
+    def slow(descriptor):
+        fsync(descriptor)
+        while True:
+            try:
+                signal.raise_signal(signal.SIGINT)
+                time.sleep(60)
+            except KeyboardInterrupt:
+                pass
+    os.fsync = slow
+    replace_file("half.csv", b"half")
+
+cli.recording.record_command = deaf
+from sewfast.__main__ import main
+sys.argv[1:] = ["record", "--on", "virtual", "--signal", "step"]
+sys.exit(main())
+"""
+
+
+@needs_sigint
+def test_a_command_that_does_not_hear_ctrl_c_ends_in_time(tmp_path: Path) -> None:
+    began = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-c", DEAF],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+    )
+    assert time.monotonic() - began < 10.0
+    assert done.returncode == cli.INTERRUPTED
+    assert done.stderr == "sewfast record: interrupted; written: done.csv\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["done.csv"]
 
 
 def test_interrupted_before_the_command_is_known(

@@ -6,13 +6,13 @@ import argparse
 import errno
 import os
 import sys
-import time
 import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ..errors import SettingError, SewfastError, printable
-from . import project
+from ..written import forget
+from . import interrupts, project
 from .drive import is_port
 from .output import DONE, FAULT, INTERRUPTED, REFUSED, logging_to_stderr
 from .parser import build_parser
@@ -23,10 +23,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     `argv` are the arguments after the program's name; None takes the process's own. Return 0 if it
     is done, 1 for a fault in sewfast, 2 if it is refused, 130 if it is interrupted.
     """
+    forget()
     try:
         args, found = _parsed(argv)
     except KeyboardInterrupt:
-        return _say("sewfast: interrupted; nothing was written", INTERRUPTED)
+        return _say(f"sewfast: {interrupts.told()}", INTERRUPTED)
     except SewfastError as e:
         return _say(f"sewfast: {e}", REFUSED)
     with logging_to_stderr(quiet=args.quiet, verbose=args.verbose):
@@ -36,7 +37,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _carried_out(args: argparse.Namespace) -> int:
     """One command: its exit code, or that of the exception that ended it."""
-    began = time.time()
     try:
         if args.out_of is not None and args.out is None:
             args.out = args.out_of(args)
@@ -48,7 +48,7 @@ def _carried_out(args: argparse.Namespace) -> int:
     except SewfastError as e:
         return _say(f"sewfast {args.name}: {e}", REFUSED)
     except KeyboardInterrupt:
-        return _say(f"sewfast {args.name}: {_interrupted(args, began)}", INTERRUPTED)
+        return _say(f"sewfast {args.name}: {interrupts.told()}", INTERRUPTED)
     except BrokenPipeError:
         # the reader closed the pipe; the interpreter must not flush into it again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -80,20 +80,9 @@ def _parsed(argv: Sequence[str] | None) -> tuple[argparse.Namespace, project.Pro
     return parser.parse_args(argv), found
 
 
-def _interrupted(args: argparse.Namespace, began: float) -> str:
-    """The message of an interrupted command, with its recording if one was written."""
-    out = getattr(args, "out", None)
-    place = out.with_suffix(".mcap") if isinstance(out, Path) and out.name else None
-    try:
-        written = place is not None and place.stat().st_mtime >= began - 1.0
-    except OSError:
-        written = False
-    return (
-        f"interrupted; what came is in {place}" if written else "interrupted; nothing was written"
-    )
-
-
 def _fault(args: argparse.Namespace, e: Exception) -> int:
+    if interrupts.is_pressed():  # an import or a library can turn an interrupt into its own error
+        return _say(f"sewfast {args.name}: {interrupts.told()}", INTERRUPTED)
     if args.debug:
         traceback.print_exc()
     return _say(

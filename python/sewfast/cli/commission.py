@@ -12,7 +12,7 @@ from ..errors import Interrupted, SettingError
 from ..progress import Progress
 from .arguments import Commands, add_command, add_overwrite
 from .drive import add_drive, is_port, machine_of, opened, require_no_drive_options
-from .output import print_json, print_rows
+from .output import INTERRUPTED, print_json, print_rows, suggested
 
 if TYPE_CHECKING:
     from ..commissioning import Commissioning
@@ -107,11 +107,7 @@ def command(args: argparse.Namespace) -> int | None:
             file=sys.stderr,
             flush=True,
         )
-    try:
-        return _kept(args)
-    except KeyboardInterrupt:
-        print(f"interrupted; {args.out} is incomplete, but its files are not", file=sys.stderr)
-        return 130
+    return _kept(args)
 
 
 def _kept(args: argparse.Namespace) -> int | None:
@@ -125,11 +121,13 @@ def _kept(args: argparse.Namespace) -> int | None:
             refusal.so_far.save(args.out, overwrite=True)
         raise Refusal(f"{refusal}; what there is lies in {args.out}") from refusal
     except Interrupted as stop:
-        # analysis and page take a second or two
-        print(f"interrupted; writing what there is to {args.out}", file=sys.stderr, flush=True)
-        place = stop.best.save(args.out, overwrite=True)
-        print(f"the best so far is kept: {place}", file=sys.stderr)
-        return 130
+        stop.best.save(args.out, overwrite=True, page=False)
+        print(
+            f"interrupted; kept the best so far in {args.out}, without a page "
+            f"({suggested('report', args.out)} writes it)",
+            file=sys.stderr,
+        )
+        return INTERRUPTED
     page = found.save(args.out, overwrite=True)
     if args.json:
         print_json({"folder": str(args.out), **found.numbers()})
@@ -286,7 +284,6 @@ def add_studio(commands: Commands) -> None:
 
 def studio_command(args: argparse.Namespace) -> None:
     import contextlib
-    import signal
     import tempfile
     import threading
     import webbrowser
@@ -296,12 +293,6 @@ def studio_command(args: argparse.Namespace) -> None:
     if args.demo and args.place is not None:
         raise SettingError(f"--demo: expected no folder, received {args.place}; leave one out")
     with contextlib.ExitStack() as left, contextlib.suppress(KeyboardInterrupt):
-        # clean up after a closed terminal or a shutdown, too
-        for name in ("SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)
-            if number is not None and signal.getsignal(number) == signal.SIG_DFL:
-                signal.signal(number, _as_ctrl_c)
-                left.callback(signal.signal, number, signal.SIG_DFL)
         port = args.place if args.place is not None and is_port(args.place) else None
         place = "." if port is not None else args.place or "."
         if args.demo:
@@ -315,11 +306,3 @@ def studio_command(args: argparse.Namespace) -> None:
         if args.browser:
             webbrowser.open(studio.address)
         threading.Event().wait()
-
-
-def _as_ctrl_c(number: int, _: object) -> None:
-    """Treat a signal as Ctrl-C; a second one, as sent by a shell, must not stop the clean-up."""
-    import signal
-
-    signal.signal(number, signal.SIG_IGN)
-    raise KeyboardInterrupt

@@ -29,7 +29,6 @@ from .drive import (
     opened,
     recording_place,
     require_no_drive_options,
-    say_interrupted,
 )
 from .output import print_json, write_columns
 
@@ -122,14 +121,11 @@ def run_command(args: argparse.Namespace) -> int | None:
         return None
     place = recording_place(args.out, overwrite=args.overwrite)
     reference = _wanted(args, controller)
-    try:
-        with opened(args) as drive:
-            found = run(
-                controller, drive, reference, name=name, file=place, live=args.live,
-                overwrite=args.overwrite,
-            )  # fmt: skip
-    except Interrupted as e:
-        return say_interrupted(len(e.best.t), place)
+    with opened(args) as drive:
+        found = run(
+            controller, drive, reference, name=name, file=place, live=args.live,
+            overwrite=args.overwrite,
+        )  # fmt: skip
     _show_run(args, found, place)
     return None
 

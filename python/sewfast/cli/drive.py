@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import LinkError, SettingError
 from .arguments import Commands, add_command, add_view
+from .interrupts import patient
 from .output import print_json, print_rows
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ def opened(args: argparse.Namespace) -> Iterator[Drive]:
         raise SettingError(
             f"--watchdog: expected 1 to 10000 ms, got {args.watchdog:g}; 100 suits most"
         )
-    with connect(args.on, baud=args.baud, watchdog=watchdog) as drive:
+    with patient(), connect(args.on, baud=args.baud, watchdog=watchdog) as drive:
         if limits is None and not drive.identity.is_computed:
             raise SettingError(
                 "expected --limits for a drive that is no virtual one, got none; say what motor "
@@ -248,20 +248,7 @@ def opened(args: argparse.Namespace) -> Iterator[Drive]:
         # limits of an earlier command must not stay in force unnoticed
         ceilings = dict(zip(LIMITS.values(), drive.limits().ceilings, strict=True))
         drive.set_limits(**(limits or ceilings))
-        with _signals_as_interrupts():
-            yield drive
-
-
-@contextmanager
-def _signals_as_interrupts() -> Iterator[None]:
-    """SIGTERM, and SIGHUP of a closed terminal, act as Ctrl-C, which stops the motor first."""
-    numbers = [getattr(signal, name, None) for name in ("SIGTERM", "SIGHUP")]
-    before = {n: signal.signal(n, signal.default_int_handler) for n in numbers if n is not None}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        yield drive
 
 
 def _require_untripped(port: str, drive: Drive) -> None:
@@ -308,13 +295,6 @@ def recording_place(out: Path | None, *, overwrite: bool) -> Path:
         # a table next to its recording can be made again from it; this one cannot
         require_free([out], overwrite=overwrite)
     return place
-
-
-def say_interrupted(count: int, place: Path) -> int:
-    """Report the recording of an interrupted run; return the exit code."""
-    left = f"{count} samples are in {place}" if count else "nothing had been recorded"
-    print(f"interrupted; {left}", file=sys.stderr)
-    return 130
 
 
 def stop_command(args: argparse.Namespace) -> None:
@@ -431,27 +411,26 @@ def device_command(args: argparse.Namespace) -> None:
     for log in (args.fault_log, args.trace):
         if log is not None:
             require_replaceable(log, overwrite=False)
-    with _signals_as_interrupts():
-        with (
-            VirtualDevice(
-                _named(args.machine),
-                fast=args.fast,
-                faults=args.faults,
-                seed=args.seed,
-                baud=args.baud,
-                endpoint="tcp" if args.tcp is not None else None,
-                link=args.link,
-                address=args.tcp or "127.0.0.1:0",
-                anyone=args.anyone,
-                once=args.once,
-                duration=args.duration,
-                fault_log=args.fault_log,
-                trace=args.trace,
-            ) as device,
-            suppress(KeyboardInterrupt),
-        ):
-            _serve(device, as_json=args.json)
-        _say_result(device, as_json=args.json)
+    with (
+        VirtualDevice(
+            _named(args.machine),
+            fast=args.fast,
+            faults=args.faults,
+            seed=args.seed,
+            baud=args.baud,
+            endpoint="tcp" if args.tcp is not None else None,
+            link=args.link,
+            address=args.tcp or "127.0.0.1:0",
+            anyone=args.anyone,
+            once=args.once,
+            duration=args.duration,
+            fault_log=args.fault_log,
+            trace=args.trace,
+        ) as device,
+        suppress(KeyboardInterrupt),
+    ):
+        _serve(device, as_json=args.json)
+    _say_result(device, as_json=args.json)
 
 
 def _serve(device: VirtualDevice, *, as_json: bool) -> None:

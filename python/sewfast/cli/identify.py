@@ -242,15 +242,11 @@ def identify_command(args: argparse.Namespace) -> int | None:
     # scored as identify took them, without dead stretches
     train = in_effect(train)
     train = alive(train, dead_stretches(train))
-    try:
-        others = _save_alternatives(args, model) if args.alternatives else []
-        scores = _scores(model, train, held)
-        if args.plot is not None:
-            scores["train" if held is None else "validation"].plot(file=args.plot)
-        _show(args, model, scores, others)
-    except KeyboardInterrupt:
-        print(f"interrupted; the model is in {args.out}, it was not scored", file=sys.stderr)
-        return 130
+    others = _save_alternatives(args, model) if args.alternatives else []
+    scores = _scores(model, train, held)
+    if args.plot is not None:
+        scores["train" if held is None else "validation"].plot(file=args.plot)
+    _show(args, model, scores, others)
     return None
 
 

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import Interrupted, SettingError
+from ..errors import SettingError
 from .arguments import (
     RECORDINGS,
     Commands,
@@ -23,7 +23,6 @@ from .drive import (
     opened,
     recording_place,
     require_no_drive_options,
-    say_interrupted,
 )
 from .output import print_json, print_rows, write_columns
 
@@ -92,28 +91,24 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
 
 
-def record_command(args: argparse.Namespace) -> int | None:
+def record_command(args: argparse.Namespace) -> None:
     require_place(args.out, RECORDINGS)
     u, Ts = _excitation(args)
     if not is_port(args.on):
         require_no_drive_options(args)
         _record_virtual(args, u, Ts)
-        return None
+        return
     place = recording_place(args.out, overwrite=args.overwrite)
-    try:
-        with opened(args) as drive:
-            from ..control.machine import record
+    with opened(args) as drive:
+        from ..control.machine import record
 
-            _require_period(args, Ts, drive.identity.Ts)
-            made = record(
-                drive, u, name=_name(args), file=place, live=args.live,
-                settings=_settings(args), overwrite=args.overwrite,
-            )  # fmt: skip
-            name = drive.identity.name
-    except Interrupted as e:
-        return say_interrupted(len(e.best), place)
+        _require_period(args, Ts, drive.identity.Ts)
+        made = record(
+            drive, u, name=_name(args), file=place, live=args.live,
+            settings=_settings(args), overwrite=args.overwrite,
+        )  # fmt: skip
+        name = drive.identity.name
     _write(args, made, name, place)
-    return None
 
 
 def _name(args: argparse.Namespace) -> str:

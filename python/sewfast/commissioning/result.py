@@ -173,7 +173,9 @@ class Commissioning:
         """Every number as JSON values."""
         return numbers(self)
 
-    def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+    def save(
+        self, folder: str | os.PathLike[str], *, overwrite: bool = False, page: bool = True
+    ) -> Path:
         """Write recordings, models, controllers, runs, `commissioning.json` and `report.html`.
 
         Parameters
@@ -182,11 +184,13 @@ class Commissioning:
             Created if it does not exist; see docs/CONVENTIONS.md for the layout.
         overwrite : bool
             Whether to replace files of these names that were not written by a commissioning.
+        page : bool
+            Whether to analyse the loop and write the page, which takes a second or two.
 
         Returns
         -------
         Path
-            The page, or `commissioning.json` if the report's packages are missing.
+            The page, or `commissioning.json` without it or the report's packages.
 
         Raises
         ------
@@ -195,7 +199,7 @@ class Commissioning:
         DataError
             If it cannot be created.
         """
-        return write(self, Path(folder), overwrite=overwrite)
+        return write(self, Path(folder), overwrite=overwrite, page=page)
 
     def plot(
         self,
@@ -377,7 +381,7 @@ def numbers_in(file: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
+def write(found: Commissioning, folder: Path, *, overwrite: bool, page: bool = True) -> Path:
     """Replace the artefacts of an earlier commissioning; then write the page.
     The report refuses a folder without `commissioning.json`, so an interruption in between leaves
     no mixture that looks complete. The checkpoint's recordings stay there until then.
@@ -395,7 +399,8 @@ def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
             if old.suffix in (".csv", ".json", ".npz", ".svg"):
                 old.unlink()
     _artefacts(found, folder)
-    _analysis(found, folder)
+    if page:
+        _analysis(found, folder)
     if found.response is not None:
         found.response.save(folder / RESPONSE)
     storage.write(folder / NUMBERS, FORMAT, VERSION, {"sewfast": __version__, **numbers(found)})
@@ -405,7 +410,7 @@ def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
         with suppress(OSError):
             # the tables hold the same: a failure here must not cost the page
             clear(folder)
-    return _page(folder)
+    return _page(folder) if page else folder / NUMBERS
 
 
 def _artefacts(found: Commissioning, folder: Path) -> None:

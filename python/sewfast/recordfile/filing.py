@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from ..errors import DataError, SettingError, SewfastError, unwritable
+from ..written import staged
 from . import format
 from .format import Assembler, Message, Topic, opening
 from .header import Header, bearable
@@ -149,6 +150,7 @@ class Sink:
             _own(path, self._file)
             # truncate only after the lock is held, so that a refusal loses nothing
             os.ftruncate(self._file, 0)
+            staged(path, path, self._file)
         except OSError as e:
             self.close()
             raise unwritable(DataError, path, e) from e
