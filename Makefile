@@ -28,7 +28,7 @@ MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest n
   python-test python-core docs package package-source
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults motors fleet interrupts fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -99,6 +99,9 @@ rust-rest: $(DEV)
 
 fleet: $(DEV) ## 2,000 recordings on one worker, on two, and with a worker killed every 10 s
 	$(BIN)/python benches/fleet.py
+
+interrupts: $(DEV) ## Ctrl-C, 20 times in each command that runs over 1 s: ended within 1 s, files whole, told truly (ONLY=tune,fleet, COUNT=)
+	$(BIN)/python benches/interrupts.py $(if $(ONLY),--only "$(ONLY)") $(if $(COUNT),--count $(COUNT))
 
 studio: $(DEV) ## the studio in a real browser: from a slider's event to painted plots, from Esc to output off
 	$(BIN)/python benches/studio.py
