@@ -14,7 +14,7 @@ from pathlib import Path
 import sewfast
 
 ORDER = """
-    errors kinds units arrays storage tables plotting progress threads speed signals
+    errors kinds units arrays written storage tables plotting progress threads speed signals
     recordfile dataset readers benchmarks gains machine live recording
     causes equilibrium dynamic_model validation comparison evidence models
     motorfit identification sklearn
