@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-
-# typing takes longer to import than the rest, and until `__main__` is read Ctrl-C shows a traceback
+# typing and importlib take longer to import than the rest: until `__main__` is read, Ctrl-C shows a
+# traceback
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
@@ -185,6 +184,8 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split
 
 
 def __getattr__(name: str) -> Any:
+    from importlib import import_module
+
     if name in _HOME_OF:
         value = getattr(import_module(f".{_HOME_OF[name]}", __name__), name)
     elif name in __all__:

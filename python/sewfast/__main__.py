@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import signal
+# the module signal takes longer to import, and until SIGINT is set Ctrl-C shows a traceback
+import _signal as signal  # type: ignore[import-not-found]
 import sys
 
 
