@@ -12,9 +12,10 @@ from sewfast import storage
 from sewfast.errors import ModelFileError
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
+TEXT = st.text(st.characters(exclude_categories=("C", "Zl", "Zp")))
 VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers(-(10**15), 10**15) | FINITE | st.text(),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    st.none() | st.booleans() | st.integers(-(10**15), 10**15) | FINITE | TEXT,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(TEXT, inner, max_size=4),
     max_leaves=20,
 )
 
@@ -34,6 +35,7 @@ def test_what_was_written_is_read(tmp_path_factory: Any, value: Any) -> None:
         ("[1, 2]", "expected a JSON object"),
         ("[" * 100_000, "damaged"),
         ('{"format": "sewfast.test", "version": 1, "a": 1e999}', "beyond the range"),
+        ('{"format": "sewfast.test", "version": 1, "a": 1%s}' % ("0" * 400), "beyond the range"),
         ('{"format": "sewfast.test", "version": 1, "a": NaN}', "not a finite number"),
         ('{"format": "sewfast.test", "version": 1, "a": -Infinity}', "not a finite number"),
         ('{"format": "sewfast.test", "version": 1, "a": 1, "a": 2}', "'a' occurs twice"),
@@ -53,6 +55,17 @@ def test_refuses_what_it_cannot_trust(tmp_path: Path, text: str, says: str) -> N
     assert says in str(caught.value)
 
 
+def test_texts_can_be_printed(tmp_path: Path) -> None:
+    """They came with their control characters, and halves of surrogate pairs could not be saved."""
+    path = tmp_path / "a.json"
+    values = '{"a": ["\\u001b[31mred", "two\\nlines", "\\ud800", "\u202eback", "\\ud83d\\ude00"]}'
+    path.write_text(f'{{"format": "sewfast.test", "version": 1, "\\u0000": {values}}}', "utf-8")
+    found = storage.read(path, "sewfast.test", (1,))
+    shown = ["\\x1b[31mred", "two\nlines", "\\ud800", "\\u202eback", "\U0001f600"]
+    assert found["\\x00"] == {"a": shown}
+    storage.write(path, "sewfast.test", 1, found)
+
+
 @given(st.binary(max_size=200))
 def test_any_bytes_are_refused_with_the_name_of_the_file(
     tmp_path_factory: Any, data: bytes
@@ -69,9 +82,10 @@ def test_refuses_missing_large_and_folders(tmp_path: Path) -> None:
         file.truncate(storage.LARGEST_FILE + 1)
     with pytest.raises(ModelFileError, match="16 MB"):
         storage.read(large, "sewfast.test", (1,))
-    for path in (tmp_path / "absent.json", tmp_path):
-        with refuses(ModelFileError, expected="can be read"):
-            storage.read(path, "sewfast.test", (1,))
+    with refuses(ModelFileError, expected="can be read"):
+        storage.read(tmp_path / "absent.json", "sewfast.test", (1,))
+    with refuses(ModelFileError, expected="a file", received="a folder"):
+        storage.read(tmp_path, "sewfast.test", (1,))
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import math
 import os
 import re
 import secrets
+import stat
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,7 +22,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import FloatArray, labelled
-from .errors import DataError, ModelFileError, SettingError, not_installed, unreadable, unwritable
+from .errors import (
+    DataError,
+    ModelFileError,
+    SettingError,
+    SewfastError,
+    not_installed,
+    printable,
+    unreadable,
+    unwritable,
+)
 from .written import staged as note
 
 LOG = logging.getLogger(__package__)
@@ -74,11 +84,51 @@ def _names(path: str | os.PathLike[str]) -> tuple[Path, Path]:
     return target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp"), target
 
 
+def file_bytes(
+    path: str | os.PathLike[str],
+    kind: type[SewfastError] = DataError,
+    *,
+    most: int = -1,
+    largest: float = math.inf,
+) -> bytes:
+    """The first `most` bytes of a file, by default all. Raises `kind` for what cannot be read or is
+    larger than `largest`, and for folders, pipes and devices: these may never end, or never begin.
+    """
+    try:
+        # without O_NONBLOCK, a pipe that nobody writes to could not even be opened
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        with open(path, "rb", opener=lambda name, _: os.open(name, flags)) as file:
+            found = os.fstat(file.fileno())
+            if not stat.S_ISREG(found.st_mode):
+                raise kind(
+                    name=os.fspath(path), expected="a file", received="a pipe or a device",
+                    remedy="copy its content to a file first",
+                )  # fmt: skip
+            if found.st_size > largest:
+                raise kind(
+                    name=os.fspath(path), expected=f"a file of at most {int(largest) >> 20} MB",
+                    received=f"{found.st_size} bytes", remedy="check the name",
+                )  # fmt: skip
+            return file.read(most)
+    except IsADirectoryError:
+        raise kind(
+            name=os.fspath(path), expected="a file", received="a folder",
+            remedy="name a file in it",
+        ) from None  # fmt: skip
+    except (OSError, ValueError) as error:
+        if isinstance(error, SewfastError):
+            raise
+        # open raises a ValueError for a name with the character 0
+        raise unreadable(kind, path, error) from error
+
+
 # --- JSON files of the package --------------------------------------------------------------------
 
 
 LARGEST_FILE = 16 * 1024 * 1024
 """Most bytes of a file: the package writes none that is larger."""
+LARGEST_NUMBER = 1e150
+"""Largest magnitude of a number that something is computed from; the square of it is finite."""
 
 
 def write(
@@ -147,14 +197,7 @@ def format_of(path: str | os.PathLike[str]) -> str:
 
 
 def _text(path: str | os.PathLike[str]) -> str:
-    try:
-        with Path(path).open("rb") as file:
-            data = file.read(LARGEST_FILE + 1)
-    except (OSError, ValueError) as error:
-        # open raises a ValueError for a name with the character 0
-        raise unreadable(ModelFileError, path, error) from error
-    if len(data) > LARGEST_FILE:
-        raise ModelFileError(f"{path}: expected a file of at most 16 MB, got a larger one")
+    data = file_bytes(path, ModelFileError, largest=LARGEST_FILE)
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -172,16 +215,32 @@ def _parse(path: str | os.PathLike[str], text: str) -> Any:
             "of a model",
         )  # fmt: skip
     try:
-        return json.loads(
+        found = json.loads(
             text,
             parse_constant=_refuse_constant,
             parse_float=_finite,
+            parse_int=_in_range,
             object_pairs_hook=_without_repetition,
         )
     except (ValueError, RecursionError) as error:
         raise ModelFileError(
             f"{path}: expected a complete JSON file, got a damaged one ({error}); save it again"
         ) from error
+    plain = text.isascii() and "\\" not in text and "\x7f" not in text
+    return found if plain else with_printable_texts(found)
+
+
+def with_printable_texts(value: Any) -> Any:
+    """The same document with control characters and halves of surrogate pairs as escapes in its
+    texts: a file can neither control the terminal nor hold what cannot be printed.
+    """
+    if isinstance(value, dict):
+        return {with_printable_texts(k): with_printable_texts(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [with_printable_texts(v) for v in value]
+    if isinstance(value, str) and not value.isprintable():
+        return "\n".join(printable(line) for line in value.split("\n"))
+    return value
 
 
 def _refuse_constant(name: str) -> NoReturn:
@@ -193,6 +252,13 @@ def _finite(digits: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{digits} is beyond the range of float64")
     return value
+
+
+def _in_range(digits: str) -> int:
+    # float64 has 309 digits before the point; thousands of them take long to read
+    if len(digits) > 310 or not math.isfinite(float(digits)):
+        raise ValueError(f"{digits[:20]}... is beyond the range of float64")
+    return int(digits)
 
 
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -294,16 +360,51 @@ class Fields:
             raise self.refuse(name, "an object", value)
         return Fields(self.path, value, f"{self.place}{name}.")
 
+    def conform(self, schema: Mapping[str, Any]) -> None:
+        """Raise for the first field that a JSON schema refuses. It knows the keywords `type`,
+        `minimum`, `properties`, `required`, `items`, `minItems` and `maxItems`.
+        """
+        for name in schema.get("required", ()):
+            self.any(name)
+        for name, inner in schema.get("properties", {}).items():
+            if name in self.values:
+                self._conform(name, self.values[name], inner)
+
+    def _conform(self, name: str, value: Any, schema: Mapping[str, Any]) -> None:
+        kinds = [schema["type"]] if isinstance(schema["type"], str) else schema["type"]
+        if type(value) not in [kind for k in kinds for kind in _TYPES[k][1]]:
+            raise self.refuse(name, " or ".join(_TYPES[k][0] for k in kinds), value)
+        if isinstance(value, dict):
+            self.nested(name, value).conform(schema)
+        elif isinstance(value, (list, tuple)):
+            low, high = schema.get("minItems", 0), schema.get("maxItems", math.inf)
+            if not low <= len(value) <= high:
+                raise self.refuse(name, f"{low} to {high} entries", value)
+            for i, entry in enumerate(value if "items" in schema else ()):
+                self._conform(f"{name}[{i}]", entry, schema["items"])
+        elif type(value) in (int, float):
+            least = schema.get("minimum", -LARGEST_NUMBER)
+            if self._float(name, value) < least:
+                raise self.refuse(name, f"a number of {least} or more", value)
+
     def _float(self, name: str, value: Any) -> float:
         if type(value) not in (int, float):
             raise self.refuse(name, "a number", value)
-        try:
-            number = float(value)
-        except OverflowError:
-            number = math.inf
-        if not math.isfinite(number):
-            raise self.refuse(name, "a finite number", value)
+        number = float(value)
+        if not abs(number) <= LARGEST_NUMBER:
+            raise self.refuse(name, f"a number of at most {LARGEST_NUMBER:g}", value)
         return number
+
+
+_TYPES: Mapping[str, tuple[str, tuple[type, ...]]] = {
+    "number": ("a number", (int, float)),
+    "integer": ("a whole number", (int,)),
+    "string": ("text", (str,)),
+    "array": ("a list", (list, tuple)),
+    "object": ("an object", (dict,)),
+    "null": ("null", (type(None),)),
+}
+"""Types of a JSON schema, in words and as Python has them."""
 
 
 def entries(shapes: Mapping[str, tuple[int, ...]]) -> tuple[str, ...]:

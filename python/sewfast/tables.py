@@ -19,10 +19,10 @@ def significant(value: float | None, digits: int = 3) -> str:
     if value == 0.0:
         return "0"
     # magnitude of the rounded value: 9.996 gives two digits before the point
-    size = int(f"{value:.{digits - 1}e}".split("e")[1])
+    mantissa, power = f"{value:.{digits - 1}e}".split("e")
+    size = int(power)
     if not -3 <= size <= 5:
-        mantissa = value / 10.0**size
-        text = f"{mantissa:.{digits - 1}f} × 10{_raised(size)}"
+        text = f"{mantissa} × 10{_raised(size)}"
         return text.replace("-", "−").replace(" ", _SPACE)
     return f"{value:,.{max(digits - 1 - size, 0)}f}".replace("-", "−")
 

@@ -221,7 +221,7 @@ DAMAGE: list[tuple[str, tuple[str | int, ...], Any, str]] = [
     ("arx", ("Ts",), 0.0, "'Ts': expected a positive number"),
     ("arx", ("Ts",), "0.01", "'Ts': expected a number"),
     ("arx", ("Ts",), True, "'Ts': expected a number"),
-    ("arx", ("Ts",), 10**400, "'Ts': expected a finite number"),
+    ("arx", ("Ts",), 10**400, "beyond the range of float64"),
     ("arx", ("inputs",), [], "at least one input"),
     ("arx", ("inputs",), {"name": "u"}, "'inputs': expected a list"),
     ("arx", ("inputs", 0, "name"), 7, r"'inputs\[0\].name': expected text"),

@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SettingError, not_installed, printable, unreadable, unwritable
+from ..errors import SettingError, not_installed, printable, unwritable
+from ..storage import file_bytes
 from .arguments import Commands, add_command
 from .drive import LIMITS, is_port
 from .output import note, print_json
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from ..readers import Table
 
 NAME = "sewfast.toml"
-_LARGEST = 1_000_000
+_LARGEST = 1 << 20
 _RANGE = ("u_min", "u_max")
 _KEYS: dict[str, tuple[str, ...]] = {
     "columns": ("input", "output", "time", "counts", "counts_per_rev", "ts", "weights"),
@@ -176,12 +177,7 @@ def _parsed(path: Path) -> dict[str, Any]:
         toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     except ModuleNotFoundError:
         raise not_installed("tomli", f"{path} on Python 3.10") from None
-    try:
-        raw = path.read_bytes()
-    except OSError as e:
-        raise unreadable(SettingError, path, e) from e
-    if len(raw) > _LARGEST:
-        raise SettingError(f"{path}: expected a few lines of settings, received {len(raw)} bytes")
+    raw = file_bytes(path, SettingError, largest=_LARGEST)
     try:
         found: dict[str, Any] = toml.loads(raw.decode("utf-8-sig"))
     except (UnicodeDecodeError, ValueError, RecursionError) as e:

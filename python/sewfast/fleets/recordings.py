@@ -21,6 +21,7 @@ from ..evidence import Residuals, estimate
 from ..identification import identify
 from ..models import Model
 from ..readers import read, read_table
+from ..storage import file_bytes
 from ..validation import validate
 from .table import Row
 
@@ -118,8 +119,8 @@ def _manifest(
     path: Path, inputs: tuple[str, ...], output: str | None, Ts: float | None
 ) -> Iterator[Job]:
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+        text = file_bytes(path, SettingError).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
         raise SettingError(
             f"{path}: expected a folder, or a manifest in CSV, got none that can be read ({error})"
         ) from error

@@ -286,10 +286,10 @@ def load_fleet(path: str | os.PathLike[str]) -> Fleet:
         if place.suffix.lower() == ".parquet":
             rows = _arrow()[1].read_table(place).to_pylist()
         elif place.suffix.lower() == ".json":
-            rows = json.loads(place.read_text(encoding="utf-8"))["rows"]
+            rows = json.loads(storage.file_bytes(place, SettingError))["rows"]
         else:
-            with place.open(encoding="utf-8-sig", newline="") as file:
-                rows = list(csv.DictReader(file))
+            text = storage.file_bytes(place, SettingError).decode("utf-8-sig")
+            rows = list(csv.DictReader(io.StringIO(text, newline="")))
         return Fleet(tuple(_read(row) for row in rows))
     except SettingError:
         raise

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
 from importlib.resources import files
 from typing import Any
 
 from .. import storage
 from ..dynamic_model import FORMAT, VERSION
-from ..errors import ModelFileError, SewfastError, located
+from ..errors import ModelFileError, SettingError, SewfastError, located
 from ..storage import Fields
 from .base import COMBINATIONS, MOST_MEMBERS, Ensemble, Model, SingleModel, StructuredModel
 from .grey_box import GreyBox
@@ -48,7 +50,12 @@ def load_model(path: str | os.PathLike[str]) -> Model:
         If the file is missing, damaged, of another format, or of an unknown version or kind;
         the message names the file and the field.
     """
-    return _read(Fields(os.fspath(path), storage.read(path, FORMAT, (VERSION,))))
+    model = _read(Fields(os.fspath(path), storage.read(path, FORMAT, (VERSION,))))
+    try:
+        _ = model.about_rest
+    except SettingError as e:
+        raise located(ModelFileError, f"{path}: field 'training.rest'", e) from e
+    return model
 
 
 def from_dict(values: dict[str, Any]) -> Model:
@@ -63,6 +70,11 @@ def restored(values: dict[str, Any], alternatives: tuple[Model, ...]) -> Model:
 
 def model_schema() -> dict[str, Any]:
     """The JSON schema (draft 2020-12) of the files that `Model.save` writes in this version."""
+    return deepcopy(_schema())
+
+
+@cache
+def _schema() -> dict[str, Any]:
     text = files("sewfast").joinpath("schema", SCHEMA).read_text(encoding="utf-8")
     schema: dict[str, Any] = json.loads(text)
     return schema
@@ -114,25 +126,18 @@ def _single(fields: Fields, own: Fields) -> Model:
 
 
 def _training(training: Fields, inputs: int) -> Mapping[str, Any]:
-    """Provenance; entries that are used later are checked, the rest is only kept."""
+    """Provenance; entries of the schema, which are used later, are checked, the rest is kept."""
     known = training.values
+    training.conform(_schema()["$defs"]["training"])
     if "input_range" in known:
         ranges = training.matrix("input_range")
         if ranges.shape != (inputs, 2) or (ranges[:, 0] > ranges[:, 1]).any():
             expected = f"{inputs} pairs of numbers, the lower one first"
             raise training.refuse("input_range", expected, known["input_range"])
     if "rest" in known:
-        rest = training.object("rest")
-        rest.number("y")
-        if len(rest.vector("u")) != inputs:
-            raise rest.refuse("u", f"{inputs} inputs at rest", known["rest"].get("u"))
-    if "noise" in known and training.number("noise") < 0.0:
-        raise training.refuse("noise", "a number of 0 or more", known["noise"])
-    if "data" in known:
-        for source in training.objects("data"):
-            source.text("name")
-    if "notes" in known:
-        training.items("notes")
+        rest = known["rest"]["u"]
+        if len(rest) != inputs:
+            raise training.refuse("rest.u", f"{inputs} inputs at rest", rest)
     return known
 
 

@@ -21,11 +21,11 @@ from ..errors import (
     located,
     not_installed,
     printable,
-    unreadable,
 )
 from ..recordfile.format import MAGIC
 from ..recordfile.reader import decode_recording
 from ..speed import speed_between_gaps
+from ..storage import file_bytes
 from .containers import Table, freeze, read_mat, read_npz
 from .delimited import read_delimited
 from .frames import collected, of_arrow, table_of
@@ -232,12 +232,7 @@ def _zipped(path: Path, raw: bytes) -> Table:
 
 
 def _bytes(path: Path) -> bytes:
-    if path.is_dir():
-        raise DataError(f"{path}: expected a file, received a folder; name a file in it")
-    try:
-        raw = path.read_bytes()
-    except (OSError, ValueError) as e:
-        raise unreadable(DataError, path, e) from e
+    raw = file_bytes(path)
     if not raw:
         raise DataError(
             name=str(path), expected="a header and rows of numbers", received="an empty file"

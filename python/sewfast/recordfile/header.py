@@ -14,6 +14,7 @@ import numpy as np
 
 from ..arrays import is_whole
 from ..errors import SettingError
+from ..storage import with_printable_texts
 
 FORMAT, VERSION = "sewfast.recording", 1
 MOST_COLUMNS = 256
@@ -150,6 +151,7 @@ class Header:
         SettingError
             If it is of another format or version, or a value is missing or unusable.
         """
+        content = with_printable_texts(content)
         if content.get("format") != FORMAT:
             raise SettingError(
                 name="format", expected=repr(FORMAT), received=repr(str(content.get("format"))[:60])

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import FloatArray, labelled, runs
-from ..errors import DataError, located, printable, unreadable
+from ..errors import DataError, located, printable
+from ..storage import file_bytes
 from .format import (
     CHANNEL,
     CHUNK,
@@ -398,19 +399,7 @@ def _named(path: object) -> Path:
 
 
 def _bytes(path: Path, most: int = -1) -> bytes:
-    if path.is_dir():
-        raise DataError(name=str(path), expected="a file", received="a folder")
-    try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE:
-            raise DataError(
-                name=str(path), expected=f"a recording of at most {LARGEST_FILE >> 30} GiB",
-                received=f"{size} bytes", remedy="record in parts",
-            )  # fmt: skip
-        with path.open("rb") as file:
-            return file.read(most)
-    except (OSError, ValueError) as e:
-        raise unreadable(DataError, path, e) from e
+    return file_bytes(path, most=most, largest=LARGEST_FILE)
 
 
 def decode_recording(path: Path, raw: bytes) -> RecordedFile:
