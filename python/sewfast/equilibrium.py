@@ -57,7 +57,7 @@ def linearise(
 
 
 def _linear(core: Any, u: FloatArray, level: float | None) -> Linearised:
-    left = 1.0 + core.a.sum()
+    left = 1.0 + float(core.a.sum())
     push = float(core.b.sum(axis=1) @ u + core.offset)
     settled = bool(abs(left) > 1e-12)
     if settled:

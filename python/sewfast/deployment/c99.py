@@ -45,6 +45,7 @@ KEYWORDS = frozenset(
     for keyword in line.split()
 )
 """Words of C and C++, and the file `fmi3`, which cannot be names."""
+_LARGEST = float(np.finfo(np.float32).max)
 _VECTORS = 200
 """Samples of the test that is written with the code."""
 _LICENCE = "The code in this file may be used under MIT, Apache-2.0 or 0BSD, as you like."
@@ -89,6 +90,11 @@ class Code:
             raise SettingError(
                 name="model", expected="numbers to write", received="NaN",
                 remedy="identify the model again",
+            )  # fmt: skip
+        if self.single and _LARGEST < abs(value) < math.inf:
+            raise SettingError(
+                name="precision", expected="numbers that single precision holds",
+                received=f"{value:g}", remedy="deploy it with precision f64",
             )  # fmt: skip
         if math.isinf(value):
             largest = "3.40282347e+38f" if self.single else "1.7976931348623157e+308"

@@ -34,6 +34,7 @@ _FORGOTTEN = 0.05
 _M = TypeVar("_M", bound=DynamicModel)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def check(
     model: DynamicModel,
     data: Dataset,

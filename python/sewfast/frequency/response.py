@@ -30,6 +30,9 @@ FORMAT = "sewfast-frequency-response"
 VERSION, VERSIONS = 2, (1, 2)
 """Before version 2, `blocks` was always one number."""
 
+PROVENANCE = {"properties": {"cautions": {"type": "array", "items": {"type": "string"}}}}
+"""Schema of the provenance that is printed."""
+
 LEVEL = 0.95
 """Confidence level of the bands."""
 LEAST_LINES = 3
@@ -128,7 +131,7 @@ class FrequencyResponse:
                 "were measured",
                 received=repr(hertz),
             )  # fmt: skip
-        size = np.interp(hertz, self.hertz, np.log(np.abs(self.value)))
+        size = np.interp(hertz, self.hertz, np.log(np.maximum(np.abs(self.value), 1e-300)))
         turn = np.interp(hertz, self.hertz, np.unwrap(np.angle(self.value)))
         return complex(np.exp(size + 1j * turn))
 
@@ -311,7 +314,8 @@ class FrequencyResponse:
             f"  band       95 %: {np.median(db):.2g} dB in the median, {db.max():.2g} dB at most",
         ]
         if self.noise is not None:
-            share = np.sqrt(np.median(np.maximum(self.variance - self.noise, 0.0) / self.variance))
+            beyond = np.maximum(self.variance - self.noise, 0.0)
+            share = np.sqrt(np.median(beyond / np.maximum(self.variance, 1e-300)))
             lines.append(
                 f"  distortion {100 * share:.0f} % of the uncertainty is no noise (in the median)"
             )
@@ -363,10 +367,14 @@ def response_of(fields: storage.Fields) -> FrequencyResponse:
     for name, array in {**arrays, **({} if noise is None else {"noise": noise})}.items():
         if array.shape != hertz.shape:
             raise fields.refuse(name, f"{len(hertz)} numbers, one per frequency", len(array))
+        if name in ("variance", "noise", "coherence") and array.min() < 0.0:
+            raise fields.refuse(name, "numbers of 0 or more", fields.any(name))
+    provenance = fields.object("provenance")
+    provenance.conform(PROVENANCE)
     return FrequencyResponse(
         hertz, arrays["real"] + 1j * arrays["imaginary"], arrays["variance"], arrays["coherence"],
         blocks, Ts, noise, fields.text("u_unit"), fields.text("y_unit"),
-        fields.flag("from_counts"), fields.any("provenance"),
+        fields.flag("from_counts"), provenance.values,
     )  # fmt: skip
 
 

@@ -168,17 +168,16 @@ def load_responses(path: str | os.PathLike[str]) -> ResponsesOverSpeed:
         For any other file.
     """
     fields = storage.Fields(str(path), storage.read(path, FORMAT, (VERSION,)))
-    speeds, inner = fields.vector("speeds"), fields.any("responses")
-    if not isinstance(inner, list) or len(inner) != len(speeds) or not inner:
-        raise fields.refuse("responses", f"{len(speeds)} responses, one per speed", inner)
+    speeds, inner = fields.vector("speeds"), fields.objects("responses")
+    if not inner or np.any(np.diff(speeds) <= 0.0):
+        raise fields.refuse("speeds", "rising speeds", speeds)
+    if len(inner) != len(speeds):
+        raise fields.refuse("responses", f"{len(speeds)} responses, one per speed", len(inner))
     refused = fields.any("refused")
     if not isinstance(refused, list) or not all(
         isinstance(x, list) and len(x) == 2 and isinstance(x[0], (int, float))
         and isinstance(x[1], str) for x in refused
     ):  # fmt: skip
         raise fields.refuse("refused", "pairs of a speed and a reason", refused)
-    found = {
-        float(speed): response_of(storage.Fields(f"{path}: {speed:g} RPM", part))
-        for speed, part in zip(speeds, inner, strict=True)
-    }
+    found = {float(speed): response_of(part) for speed, part in zip(speeds, inner, strict=True)}
     return ResponsesOverSpeed(found, {float(s): why for s, why in refused})

@@ -118,21 +118,26 @@ class Motor:
         Raises
         ------
         DataError
-            If the commands are not finite, one-dimensional numbers.
+            If the commands are not finite, one-dimensional numbers, or the speed is not.
         """
         step = self.Ts if Ts is None else float(Ts)
         factor = rad_per_second(self.speed_unit)
-        steps = int(np.clip(math.ceil(step / self._fine()), 1, 10_000))
+        steps = math.ceil(min(max(step / self._fine(), 1.0), 10_000.0))
         y, *_ = _core.greybox_run(
             self.theta, [], as_column(u, "u"), Ts=step, steps=steps, speed=factor * float(speed),
             orders=self.orders,
         )  # fmt: skip
+        if not np.isfinite(y).all():
+            raise DataError(
+                name="simulate", expected="a speed that stays finite", received="one that does not",
+                remedy="check the sizes of command and sample time, or identify the motor again",
+            )  # fmt: skip
         return np.asarray(y / factor)
 
     def _fine(self) -> float:
         tau, k_a = self.theta[NAMES.index("tau")], self.theta[NAMES.index("k_a")]
         fast = k_a / max(self.theta[0] + self.theta[1], 1e-12) / 30.0
-        return float(min(fast, tau / 2.0) if tau > 1e-6 * fast else fast)
+        return max(float(min(fast, tau / 2.0) if tau > 1e-6 * fast else fast), 1e-300)
 
     def to_model(self) -> LinearOE:
         """The turning motor as a linear model at the samples, without dry friction and loads."""
@@ -435,6 +440,10 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
     values = [math.inf if n == "limit" and theta.any(n) is None else theta.number(n) for n in NAMES]
     for name in ("k_a", "ripple", "w_s"):
         theta.positive(name)
+    if theta.number("k_e") + theta.number("k_b") <= 0.0:
+        raise theta.refuse("k_e", "a motor that turns faster at a larger command", theta.any("k_e"))
+    if not 0.0 <= theta.number("delay") <= 1000.0 * fields.positive("Ts"):
+        raise theta.refuse("delay", "0 to 1,000 sample times", theta.any("delay"))
     orders = fields.items("orders")
     if len(orders) != len(WAVES) or not all(type(n) is int and 0 <= n <= 10_000 for n in orders):
         raise fields.refuse("orders", f"{len(WAVES)} whole numbers from 0 to 10,000", orders)

@@ -10,6 +10,7 @@ import os
 from pathlib import Path
 
 from .. import plotting, storage
+from ..errors import ModelFileError, SewfastError
 from . import artefacts, commissioned, page
 
 __all__ = ["report"]
@@ -38,10 +39,31 @@ def report(folder: str | os.PathLike[str]) -> Path:
         If matplotlib or Jinja2 is not installed.
     """
     plotting.require()
-    target = Path(folder) / "report.html"
-    if commissioned.is_commissioning(Path(folder)):
-        text = page.fill("commissioning.html", commissioned.context(Path(folder)))
-    else:
-        text = page.render(artefacts.load(folder))
+    from jinja2 import UndefinedError
+
+    place = Path(folder)
+    commissioning = commissioned.is_commissioning(place)
+    try:
+        if commissioning:
+            text = page.fill("commissioning.html", commissioned.context(place))
+        else:
+            text = page.render(artefacts.load(place))
+    except SewfastError:
+        raise
+    except (
+        LookupError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        ArithmeticError,
+        UndefinedError,
+    ) as e:
+        name = commissioned.NUMBERS if commissioning else "results.json"
+        raise ModelFileError(
+            name=str(place / name), expected="the numbers that sewfast wrote there",
+            received=f"one that is missing or of another kind ({e})",
+            remedy="make the folder again with the command that made it",
+        ) from e  # fmt: skip
+    target = place / "report.html"
     storage.replace(target, text)
     return target

@@ -55,27 +55,21 @@ def context(folder: Path) -> dict[str, Any]:
     damaged.
     """
     found = storage.read(folder / NUMBERS, FORMAT, {VERSION})
-    try:
-        with style():
-            return {
-                "found": found,
-                "stages": _stages(found),
-                "gains": _gains(found),
-                "met": _met(found),
-                "opinion": _opinion(found),
-                "evidence": [_judged(*item) for item in found.get("evidence", {}).items()],
-                "verified": _verified(found),
-                "analysed": section(folder),
-                "margins": _predicted_and_measured(found),
-                "response": _response(folder),
-                "motor": motor_section(folder),
-                "loops": [_picture(folder, name, n) for name, n in found["references"].items()],
-            }
-    except (KeyError, TypeError, AttributeError) as e:
-        raise ModelFileError(
-            f"{folder / NUMBERS}: expected the numbers of a commissioning, one is missing or of "
-            f"another kind ({e}); commission again"
-        ) from e
+    with style():
+        return {
+            "found": found,
+            "stages": _stages(found),
+            "gains": _gains(found),
+            "met": _met(found),
+            "opinion": _opinion(found),
+            "evidence": [_judged(*item) for item in found.get("evidence", {}).items()],
+            "verified": _verified(found),
+            "analysed": section(folder),
+            "margins": _predicted_and_measured(found),
+            "response": _response(folder),
+            "motor": motor_section(folder),
+            "loops": [_picture(folder, name, n) for name, n in found["references"].items()],
+        }
 
 
 def _stages(found: Mapping[str, Any]) -> Table:
