@@ -28,7 +28,7 @@ MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest n
   python-test python-core docs package package-source
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults motors fleet interrupts fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults motors fleet interrupts fuzz-logs mutations studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -115,6 +115,9 @@ studio-kills: $(DEV) ## browser killed, hung, frozen or closed, studio killed, l
 
 fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; SECONDS= for each; ONLY="mf4 tdms"; hours)
 	$(BIN)/python tests/support/fuzzed_logs.py --count $(or $(COUNT),100000) $(if $(SECONDS),--seconds $(SECONDS)) $(if $(ONLY),--only $(ONLY))
+
+mutations: $(DEV) ## changed files of sewfast's own nine formats, refused or used (COUNT=1000; SEED=; ONLY="model fleet")
+	$(BIN)/python benches/mutations.py --count $(or $(COUNT),1000) --seed $(SEED) $(if $(ONLY),--formats $(ONLY))
 
 bits: $(DEV) ## compares deployed code with the core over ten million samples of every kind (an hour)
 	$(BIN)/python tests/support/deployed.py
