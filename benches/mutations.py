@@ -94,7 +94,7 @@ def changed_value(value: Any, rng: np.random.Generator, texts: Sequence[str]) ->
         return MARK + pick(RAW, rng)
     if isinstance(value, bool) or value is None:
         return pick((not value, 0, 1, *NUMBERS, "text"), rng)
-    if isinstance(value, (int, float)):
+    if isinstance(value, (int, float)) and abs(value) < 1e300:
         scaled = (-value, value * 10.0 ** rng.integers(-6, 7), value + 1, value - 1, float(value))
         return pick((*scaled, *NUMBERS), rng)
     if isinstance(value, str):

@@ -112,6 +112,7 @@ class Region:
         radius = max(_LEAST_RADIUS, _between_tenths(kept)) + covered
         return cls(mean, scale, centres, radius)
 
+    @np.errstate(over="ignore")
     def distance(self, points: FloatArray) -> FloatArray:
         """Scaled distance of points (N, d) to the nearest centre, shape (N,)."""
         return _nearest((points - self.mean) / self.scale, self.centres)

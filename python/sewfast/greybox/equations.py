@@ -30,6 +30,8 @@ Equations: TypeAlias = Callable[[Any, Any, Mapping[str, Any]], Any]
 """`f(x, u, p)`: derivatives of the state (n,), under a command, with parameters by name."""
 
 FORMAT, VERSION = "sewfast-equations", 1
+MOST = 1000
+"""Most states, and most substeps of a sample."""
 EVALUATIONS = 60
 DIFFERENCE = 1e-4
 """Half the step of a central difference, relative to the parameter."""
@@ -114,7 +116,7 @@ class EquationFit:
         SettingError
             Without the function, as after reading a file, or if it does not accept its arguments.
         DataError
-            If the commands are not finite, one-dimensional numbers.
+            If the commands are not finite, one-dimensional numbers, or the speed is not.
         """
         if self.equations is None:
             raise SettingError(
@@ -127,6 +129,11 @@ class EquationFit:
         x = np.array([list(self.values.values())]).T
         run = simulation.run(x, as_column(u, "u"), step, factor * float(speed), mean=False)
         found: FloatArray = run[:, 0] / factor
+        if not np.isfinite(found).all():
+            raise DataError(
+                name="simulate", expected="a speed that stays finite", received="one that does not",
+                remedy="check the sizes of command and sample time, or fit with more substeps",
+            )  # fmt: skip
         return found
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -184,8 +191,8 @@ def load_equations(path: str | os.PathLike[str]) -> EquationFit:
     parameters, undetermined, unit = findings(fields)
     values = fields.object("values")
     for name in ("states", "substeps"):
-        if fields.integer(name) < 1:
-            raise fields.refuse(name, "a whole number above 0", fields.integer(name))
+        if not 1 <= fields.integer(name) <= MOST:
+            raise fields.refuse(name, f"a whole number from 1 to {MOST}", fields.integer(name))
     return EquationFit(
         parameters,
         undetermined,
@@ -334,7 +341,7 @@ def fit_equations(
     if not callable(equations):
         raise _not_callable(equations)
     for name, count in (("states", states), ("substeps", substeps)):
-        require_whole(name, count, 1, 1000)
+        require_whole(name, count, 1, MOST)
     names, start, low, high = _starts(parameters)
     simulation = Simulation(equations, names, states, substeps)
     first = records.pieces[0]
