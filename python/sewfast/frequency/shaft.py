@@ -365,6 +365,11 @@ def _task_of(response: FrequencyResponse) -> tuple[_Task, float]:
             received=f"{f[0]:g} to {f[-1]:g} Hz, {Ts:g} s", remedy="sort the lines, each only once",
         )  # fmt: skip
     level = float(np.median(np.abs(value[usable])))
+    if level == 0.0:
+        raise DataError(
+            name="response", expected="an output that moves with the input", received="a gain of 0",
+            remedy="check which column is the output",
+        )  # fmt: skip
     g = value[usable] / level
     spread = np.minimum(np.sqrt(np.maximum(variance[usable], 0.0)) / level, 1e100)
     sigma = np.sqrt(0.5 * _smoothed(spread**2) + (FLOOR * np.abs(g)) ** 2)
