@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import storage
-from ..errors import SettingError
+from ..errors import SettingError, printable
 from ..plotting import Drawing, Plotted, lettered, stacked
 from ..tables import Table, percent, significant
 
@@ -309,7 +309,7 @@ def _read(row: Mapping[str, Any]) -> Row:
         elif of.type == "int":
             value = int(value)
         else:
-            value = str(value or "")
+            value = printable(str(value or ""))
         values[name] = value
     return Row(**values)
 
