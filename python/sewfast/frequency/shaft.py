@@ -189,6 +189,7 @@ class ShaftFit:
         return "\n".join([*found, *(f"  {self.notch(k + 1)}" for k in range(self.resonances))])
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> ShaftFit:
     """Fit a rigid machine, or two or three masses on shafts, to the response of its speed.
 
