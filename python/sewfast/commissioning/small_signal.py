@@ -12,7 +12,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -53,6 +56,8 @@ HOLD = 2
 """Samples that each random value is held: power up to a quarter of the sample rate."""
 ITERATIONS = 60
 ORDERS = (1, 2, 3, 4, 5)
+MANY = 20
+"""Order of the model that smooths the record."""
 LEAST_GAIN = math.log(1.005)
 """A smaller difference in (log) error does not count, however significant."""
 SWINGS = 0.3
@@ -184,8 +189,8 @@ def shaking(
 def explained(shaken: Shaken, fopdt: Fopdt) -> SmallSignal | None:
     """The simplest linear model of a record."""
     data = shaken.dataset()
-    part = folds(data)[0]
-    tried = {order: fitted(part, order) for order in ORDERS}
+    part, smooth = folds(data)[0], _smooth(shaken)
+    tried = {order: fitted(part, order, smooth) for order in ORDERS}
     found = {order: fit for order, fit in tried.items() if fit is not None}
     if not found or not min(errors.rmse for _, errors in found.values()) < part.spread:
         return None
@@ -196,20 +201,42 @@ def explained(shaken: Shaken, fopdt: Fopdt) -> SmallSignal | None:
     return SmallSignal(model, resonance, _first_order(core, shaken.Ts, fopdt))
 
 
-def fitted(part: Split, order: int) -> tuple[_core.LinearModel, Errors] | None:
-    """The better of output error and instrumental variables, as a resonance causes local minima."""
+def fitted(
+    part: Split, order: int, smooth: Dataset | None = None
+) -> tuple[_core.LinearModel, Errors] | None:
+    """The best of output error and instrumental variables, as a resonance causes local minima.
+    Output error also begins at what instrumental variables find in the `smooth` record: their own
+    beginning, a model of low order by least squares, is blind to a resonance below the noise.
+    """
+    asked: dict[str, Any] = {"na": order, "nb": order + 1, "nk": 1, "max_iterations": ITERATIONS}
+    fits = [_core.fit_oe, _core.fit_iv]
+    if smooth is not None:
+        with suppress(DataError, FitError):
+            start = _core.fit_iv(arrays(smooth), **asked).model
+            fits.append(partial(_core.fit_oe, initial=start))
     tried = []
-    for fit in (_core.fit_oe, _core.fit_iv):
+    for fit in fits:
         try:
-            found = fit(
-                arrays(part.fitted), na=order, nb=order + 1, nk=1, max_iterations=ITERATIONS
-            )
+            found = fit(arrays(part.fitted), **asked)
         except (DataError, FitError):
             continue
         if found.termination == "interrupted":  # the core has heard Ctrl-C and kept its best
             raise KeyboardInterrupt
         tried.append((found.model, errors_of(free_runs(found.model, part), part)))
     return min(tried, key=lambda t: t[1].rmse, default=None)
+
+
+def _smooth(shaken: Shaken) -> Dataset | None:
+    """The record with the free run of a model of high order in place of the speed.
+    It has the dynamics and hardly any noise (B. Wahlberg, IEEE Trans. Automatic Control 34, 1989).
+    """
+    try:
+        core = _core.fit_arx(arrays(shaken.dataset()), na=MANY, nb=MANY, nk=1, offset=True)
+    except (DataError, FitError):
+        return None
+    speed = core.simulate(shaken.u[:, None], shaken.speed[:MANY])
+    # an unstable one of the many poles
+    return replace(shaken, speed=speed).dataset() if np.isfinite(speed).all() else None
 
 
 def simplest(found: dict[int, tuple[_core.LinearModel, Errors]]) -> int:
