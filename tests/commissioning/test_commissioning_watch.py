@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,14 @@ from loops import QUIET, drive
 from sewfast import Controller, Gains, VirtualMachine, commission, run
 from sewfast.commissioning import Refusal
 from sewfast.commissioning.bench import Aborted, Guard, RecordedBench
-from sewfast.commissioning.verification import Watching, measure, predict
+from sewfast.commissioning.verification import Watching, measure, predict, restless
 from sewfast.control.controller import SampledController
 from sewfast.control.machine import WATCHED, MachineBench, RecordedRun, SteppedBench, Watch
 from sewfast.dataset import FloatArray
 from sewfast.link import VirtualDevice, connect
 from sewfast.models import Ensemble
 from sewfast.recording import Recording
+from sewfast.tuning.objective import Cost
 
 R = np.concatenate([np.linspace(0.0, 1500.0, 400), np.full(4600, 1500.0)])
 FIERCE = Controller(
@@ -134,7 +136,7 @@ def test_what_was_recorded_is_kept_and_a_machine_that_cannot_be_watched_runs_on(
         kept.clear()
         on = RecordedBench(machine, note, lambda *_: None, lambda *_: None)
         with pytest.raises(Refusal, match=r"the controller is not verified|limits most"):
-            measure(QUIET, on, predicted, {"hold": R}, lambda _: None)
+            measure(QUIET, on, predicted, {"hold": R}, lambda _: None, Cost())
         assert list(kept) == [name]
     assert len(kept["hold"]) == len(R)
 
@@ -244,3 +246,20 @@ def test_a_motor_that_stands_under_a_small_command_ends_no_run() -> None:
     with pytest.raises(Aborted, match=r"not by a count for \.25 s at 20 V") as stop:
         guard(0, np.full(20, 20.0), np.zeros(20))
     assert len(stop.value.recording) == 5251
+
+
+def test_a_loop_is_restless_if_it_swings_at_a_level_and_costs_twice_as_much() -> None:
+    predicted = predict(QUIET, Ensemble.of([drive()]), {"hold": R})[0]
+    expected = predicted.predicted
+    swing = np.sin(2.0 * np.pi * 20.0 * expected.t)
+    off = 10.0 * float(np.sqrt(np.mean((expected.r - expected.y) ** 2)))
+
+    def swings(volts: float, rpm: float) -> float | None:
+        run = replace(expected, u=expected.u + volts * swing, y=expected.y + rpm * swing)
+        found = restless(replace(predicted, measured=run), Cost())
+        return None if found is None else found.frequency
+
+    assert swings(1.0, off) == pytest.approx(20.0, abs=1.0)
+    assert swings(0.0, off) is None
+    assert swings(1e-3, 0.0) is None
+    assert swings(0.0, 0.0) is None

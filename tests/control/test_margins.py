@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from plants import bent_data
 from sewfast import (
+    Biquad,
     Controller,
     Ensemble,
     Gains,
@@ -190,6 +191,37 @@ def test_what_is_no_plant_is_refused() -> None:
         loop_response(PID, DRIVE, [0.0])
     with pytest.raises(SettingError, match=r"the order is margins\(controller, plant\)"):
         margins(DRIVE, PID)  # type: ignore[arg-type]
+
+
+def shaft(pitch: float = 1.0, gain: float = 1.0, delay: int = 0) -> Any:
+    """A motor of first order whose shaft swings at 60 Hz and stands at 40 Hz, sampled."""
+    control = pytest.importorskip("control", reason="needs the extra 'control'")
+    low, high = (2.0 * math.pi * pitch * f for f in (40.0, 60.0))
+    zeros, poles = ([1.0, 2.0 * 0.02 * w, w * w] for w in (low, high))
+    num = 490.0 * gain * (high / low) ** 2 * np.array(zeros)
+    sampled = control.sample_system(control.tf(num, np.polymul([0.25, 1.0], poles)), Ts)
+    return sampled * control.tf([1.0], [1.0] + delay * [0.0], Ts)
+
+
+def test_a_narrow_notch_bears_no_other_resonance() -> None:
+    plain = Controller(Gains.standard(0.03, 0.1, 0.0), Ts)
+    narrow, wide = (
+        replace(plain, biquads=(Biquad.notch(60.0, depth, width),))
+        for depth, width in ((0.016, 0.25), (0.1, 1.0))
+    )
+    found, bears = margins(narrow, shaft()), margins(wide, shaft())
+    assert found.changed is not None
+    assert bears.changed is not None
+    assert found.Ms < bears.Ms < 1.8
+    assert found.changed[0] == found.Ms_robust == math.inf
+    assert "unstable with its resonance" in str(found)
+    Ms, gain, delay, pitch = bears.changed
+    assert margins(wide, shaft(pitch, gain, delay)).Ms == pytest.approx(Ms, rel=0.01)
+    assert bears.Ms_robust == 0.5 * Ms
+    assert f"Ms {Ms:.3f} with its resonance 10 % lower" in str(bears)
+    stiff = margins(narrow, DRIVE)
+    assert stiff.changed is None
+    assert stiff.Ms_robust == stiff.Ms
 
 
 def test_margins_print_and_do_not_change() -> None:

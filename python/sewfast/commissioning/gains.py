@@ -430,15 +430,23 @@ def swing_of(
     u = u[np.isfinite(u)]
     reach = 0.5 * (limits.u_max - limits.u_min)
     railed = float(np.mean((u >= limits.u_max - 1e-9) | (u <= limits.u_min + 1e-9)))
-    k = np.arange(len(u))
-    # a command that is still settling is not an oscillation
-    rest = u - np.polyval(np.polyfit(k, u, 2), k)
-    deviation = float(rest.std())
-    if deviation <= max(CHATTER * reach, EXPECTED * expected) and railed <= RAILED:
+    rest = unsettled(u)
+    if rest.std() <= max(CHATTER * reach, EXPECTED * expected) and railed <= RAILED:
         return None
+    return Swing(share, frequency_of(rest, found.Ts), float(rest.std()), railed)
+
+
+def unsettled(u: FloatArray) -> FloatArray:
+    """A command without its slow part: one that is still settling is not an oscillation."""
+    k = np.arange(len(u))
+    rest: FloatArray = u - np.polyval(np.polyfit(k, u, 2), k)
+    return rest
+
+
+def frequency_of(rest: FloatArray, Ts: float) -> float:
+    """The frequency of an oscillation [Hz]."""
     power = np.abs(np.fft.rfft(rest * np.hanning(len(rest)))) ** 2
-    at = 1 + int(np.argmax(power[1:]))
-    return Swing(share, at / (len(u) * found.Ts), deviation, railed)
+    return (1 + int(np.argmax(power[1:]))) / (len(rest) * Ts)
 
 
 def cautious(

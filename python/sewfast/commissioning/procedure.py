@@ -43,13 +43,14 @@ from .gains import (
     cost_of,
     first_gains,
     ruled,
+    scaled,
     search,
     sensible,
     start_of,
 )
 from .result import UNREACHED, VERIFIED, VERIFIED_POORLY, Commissioning, require_own
 from .shaking import margins_at_work
-from .slow import Thinning, turn_load
+from .slow import Thinning, TurnLoad, turn_load
 from .small_signal import SHAKEN_AT, SmallSignal, small_signal
 from .training import ORDERS, THINNED, Rival, Trained, linear_rival, train
 from .verification import (
@@ -386,13 +387,7 @@ def _carry_out(
         controller = replace(controller, notes=f"{controller.notes}; {note}")
         journal.keep(controller=controller)
         journal.say(note)
-    comparisons = predict(
-        thinning.coarse(controller), ensemble, thinning.references(verify),
-        thinning.pushes(load, verify, machine.Ts),
-    )  # fmt: skip
-    journal.keep(comparisons=comparisons, judgement=judged(comparisons, ensemble))
-    journal.pause("references")
-    measure(controller, machine, comparisons, verify, lambda new: journal.keep(comparisons=new))
+    controller = _compared(machine, controller, ensemble, verify, load, plan, journal)
     if small is not None and small.resonance is not None:
         speed = SHAKEN_AT * asked.speed
         at_work = margins_at_work(machine, controller, small.model, speed, asked.seed)
@@ -407,6 +402,45 @@ def _carry_out(
         return journal.result(UNREACHED, f"{missed}; {why}" if why else missed)
     found = journal.result(VERIFIED)
     return replace(found, verdict=VERIFIED_POORLY) if found.is_predicted_poorly else found
+
+
+def _compared(
+    machine: RecordedBench,
+    controller: Controller,
+    ensemble: Ensemble,
+    verify: Mapping[str, FloatArray],
+    load: TurnLoad | None,
+    plan: _Plan,
+    journal: Journal,
+) -> Controller:
+    """Predict and measure every reference; the controller with its gains lowered until it is calm.
+    Raises `Refusal` if it is restless even with half of them.
+    """
+    thinning = plan.thinning
+    pushes = thinning.pushes(load, verify, machine.Ts)
+    swings = ""
+    for share in CALMER:
+        tried = scaled(controller, share)
+        if share < 1.0:
+            note = f"gains lowered to {100 * share:.0f} %, as the machine {swings}"
+            tried = replace(tried, notes=f"{controller.notes}; {note}")
+            journal.keep(controller=tried)
+            journal.say(note)
+        comparisons = predict(thinning.coarse(tried), ensemble, thinning.references(verify), pushes)
+        journal.keep(comparisons=comparisons, judgement=judged(comparisons, ensemble))
+        if share == 1.0:
+            journal.pause("references")
+        swing = measure(
+            tried, machine, comparisons, verify, lambda new: journal.keep(comparisons=new),
+            plan.cost,
+        )  # fmt: skip
+        if swing is None:
+            return tried
+        swings = (
+            f"swings at {swing.frequency:.3g} Hz where it should stand or hold a speed "
+            f"({swing.command:.3g} V rms): {cause(swing, plan.small)}"
+        )
+    raise Refusal(f"expected a quiet loop under half of the gains, the machine {swings}")
 
 
 def _instead(rival: Rival | None, judge: Recording, refusal: Refusal, journal: Journal) -> Trained:
@@ -442,6 +476,10 @@ def _pulses(machine: Machine, fopdt: Fopdt, asked: Demands) -> tuple[float, list
     found.append(machine.excite(u, "pulses_limited"))
     again = excitations.acceleration_shown(found[1], asked)
     return shown if math.isinf(again) else again, found
+
+
+CALMER = (1.0, 0.7, 0.5)
+"""Shares of Kp under which the references run, one after the other until the loop is calm."""
 
 
 @dataclass(frozen=True)

@@ -37,12 +37,10 @@ from .excitations import Motion
 from .slow import Thinning, TurnLoad
 from .small_signal import SmallSignal
 from .training import Rival
-from .verification import Comparison
+from .verification import POOR, Comparison
 
 VERIFIED, VERIFIED_POORLY = "verified", "verified, prediction poor"
 UNREACHED = "predicted, target not reached"
-POOR = 2.0
-"""Ratio of measured to predicted cost above which the prediction is poor."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,10 @@ from ..dataset import FloatArray
 from ..errors import FitError
 from ..models import Ensemble, Model
 from ..trust import Judgement, judge
+from ..tuning.objective import Cost
 from .bench import Aborted, RecordedBench
 from .demands import Refusal, require
+from .gains import EXPECTED, Swing, frequency_of, unsettled
 from .slow import Thinning
 
 DISAGREE = 0.05
@@ -168,10 +170,12 @@ def measure(
     predicted: tuple[Comparison, ...],
     references: Mapping[str, FloatArray],
     keep: Callable[[tuple[Comparison, ...]], object],
-) -> tuple[Comparison, ...]:
+    cost: Cost,
+) -> Swing | None:
     """Run the references on the machine, the shortest first, and compare each as it ends.
-    If the machine allows it, a run is also watched on the way. Raises `Refusal` as `require_alike`,
-    before the next reference runs, and if `Watching` ends a run.
+    If the machine allows it, a run is also watched on the way. A loop that is `restless` ends it.
+    Raises `Refusal` as `require_alike`, before the next reference runs, and if `Watching` ends a
+    run.
     """
     found = dict(enumerate(predicted))
     for i in sorted(found, key=lambda i: len(found[i].predicted.r)):
@@ -181,7 +185,30 @@ def measure(
         found[i] = replace(found[i], measured=run)
         keep(tuple(found[k] for k in range(len(predicted))))
         require_alike(found[i])
-    return tuple(found[k] for k in range(len(predicted)))
+        swing = restless(found[i], cost)
+        if swing is not None:
+            return swing
+    return None
+
+
+POOR = 2.0
+"""Multiple of the predicted cost above which a prediction is poor."""
+
+
+def restless(c: Comparison, cost: Cost) -> Swing | None:
+    """The swing of a command at a level that is held, of which no member knows anything.
+    Play and friction do so at amplitudes that look quiet beside the limits: it is one if the
+    command swings twice as far as under any member, in a run that costs twice as much.
+    """
+    run = c.alike
+    assert run is not None
+    if cost.of(run) <= POOR * max(cost.of(m) for m in c.members):
+        return None
+    for _, hold in _holds(c.predicted.r):
+        rest = unsettled(run.u[hold])
+        if rest.std() > EXPECTED * max(unsettled(m.u[hold]).std() for m in c.members):
+            return Swing(1.0, frequency_of(rest, run.Ts), float(rest.std()), 0.0)
+    return None
 
 
 WINDOW = 0.25
