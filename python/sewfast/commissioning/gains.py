@@ -299,10 +299,12 @@ class Requirements:
 
     def met(self, controller: Controller, ensemble: Ensemble) -> dict[str, Any]:
         """How a controller meets them on the members without variations, as JSON values."""
-        members = self.constraints.plant or ()
+        speed, members = self.constraints.speed, self.constraints.plant or ()
+        loops = [margins(controller, m, speed=speed) for m in members]
         found: dict[str, Any] = {
             "Ms_limit": self.constraints.Ms if self.constraints.limits_Ms else None,
-            "Ms": [margins(controller, m, speed=self.constraints.speed).Ms for m in members],
+            "Ms": [loop.Ms for loop in loops],
+            "tolerance": [loop.tolerance for loop in loops if loop.tolerance],
         }
         if self.rival is None:
             return found | {"load": None}

@@ -281,7 +281,8 @@ def _evidence(c: Commissioning) -> list[str]:
     if c.card is not None:
         lines.append(f"  report card    {c.card.verdict}{_named(c.card.lines)}")
     if c.met is not None and c.met["Ms"]:
-        lines.append(f"  Ms             {max(c.met['Ms']):.3g}")
+        borne = c.met.get("tolerance")  # a resonance is that of the one model of small signals
+        lines.append(f"  Ms             {max(c.met['Ms']):.3g}{f'; {borne[0]}' if borne else ''}")
     if c.met is not None and c.met["load"] is not None:
         tuned, rule = (max(c.met["recovery_ms"][n]) for n in ("tuned", "rule"))
         volt = abs(c.met["load"]["disturbance"])

@@ -108,6 +108,8 @@ def _met(found: Mapping[str, Any]) -> Table | None:
             ("largest sensitivity Ms", significant(max(met["Ms"])),
              significant(met["Ms_limit"])),
         )  # fmt: skip
+    rows += [("the same if the machine changes", borne, f"Ms {2.0 * met['Ms_limit']:g}")
+             for borne in met.get("tolerance", ())]  # fmt: skip
     if met["load"]:
         volt, level = abs(met["load"]["disturbance"]), met["load"]["level"]
         tuned, rule = (milliseconds(max(met["recovery_ms"][n])) for n in ("tuned", "rule"))
