@@ -32,8 +32,9 @@ def note(text: str) -> None:
 
 
 def suggested(*words: object) -> str:
-    """A command to type, with names that hold spaces in quotes."""
-    return shlex.join(["sewfast", *map(str, words)])
+    """A command to type: names that hold spaces in quotes, and none that looks like an option."""
+    safe = (f"./{w}" if isinstance(w, Path) and str(w).startswith("-") else str(w) for w in words)
+    return shlex.join(["sewfast", *safe])
 
 
 class _ToStderr(logging.Handler):
