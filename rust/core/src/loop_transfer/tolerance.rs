@@ -147,7 +147,7 @@ mod tests {
         let path = |depth, width| {
             let mut path = Path::new(
                 Standard {
-                    kp: 0.01,
+                    kp: 0.02,
                     ti: 0.1,
                     td: 0.0,
                 },
