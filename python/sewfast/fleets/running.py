@@ -349,13 +349,14 @@ def _connected(
             # messages of its processes about each other while they end are irrelevant
             "silence_logs": logging.CRITICAL,
         }
+        others = set(multiprocessing.active_children())  # of the program that calls this
         cluster = _without_ctrl_c(lambda: distributed.LocalCluster(**options))
         with cluster, distributed.Client(cluster) as made:
             try:
                 yield made
             except KeyboardInterrupt:
                 # nothing that they still compute is wanted, and to ask them to end takes seconds
-                for process in multiprocessing.active_children():
+                for process in set(multiprocessing.active_children()) - others:
                     process.kill()
                 raise
 
