@@ -191,7 +191,7 @@ CONTROLLERS = st.builds(
         unique_by=lambda point: round(point[0]),
     ).map(lambda points: tuple(sorted(points, key=lambda point: point[0]))),
     counts_per_rev=st.none() | POSITIVE,
-    notes=st.text(max_size=20),
+    notes=st.text(st.characters(exclude_categories=("C", "Z")) | st.just(" "), max_size=20),
 )
 
 

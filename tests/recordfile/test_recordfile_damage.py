@@ -271,7 +271,7 @@ def test_a_file_cannot_steer_the_terminal(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with RecordWriter(path, header(device={"name": "\x1b[2J\n"})) as writer:
         writer.event("a\x07")
-    assert read_recording(path).header.device["name"] == "\x1b[2J\n"
+    assert read_recording(path).header.device["name"] == "\\x1b[2J\n"
     assert "name: \\x1b[2J\\n" in str(read_recording(path))
     assert "\x07" not in str(read_recording(path))
 

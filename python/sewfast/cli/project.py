@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import SettingError, not_installed, printable, unwritable
-from ..storage import file_bytes
 from .arguments import Commands, add_command
 from .drive import LIMITS, is_port
 from .output import note, print_json
@@ -177,6 +176,8 @@ def _parsed(path: Path) -> dict[str, Any]:
         toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     except ModuleNotFoundError:
         raise not_installed("tomli", f"{path} on Python 3.10") from None
+    from ..storage import file_bytes  # loads NumPy
+
     raw = file_bytes(path, SettingError, largest=_LARGEST)
     try:
         found: dict[str, Any] = toml.loads(raw.decode("utf-8-sig"))

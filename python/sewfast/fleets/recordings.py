@@ -120,7 +120,7 @@ def _manifest(
 ) -> Iterator[Job]:
     try:
         text = file_bytes(path, SettingError).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
+    except (SettingError, UnicodeDecodeError) as error:
         raise SettingError(
             f"{path}: expected a folder, or a manifest in CSV, got none that can be read ({error})"
         ) from error
