@@ -111,7 +111,7 @@ def _requirement(bench: SteppedBench, found: Commissioning) -> Callable[[Control
     def short(controller: Controller) -> float:
         missed = 0.0
         if small is not None and limit is not None:
-            missed += _beyond(margins(controller, small.model).Ms, limit)
+            missed += _beyond(margins(controller, small.model).Ms_robust, limit)
         if load:
             missed += _beyond(deviation(bench, controller, load, ramp), most)
         return missed
