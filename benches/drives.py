@@ -28,8 +28,6 @@ import numpy as np
 
 from sewfast import Commissioning, commission
 from sewfast.commissioning import Refusal, SteppedBench
-from sewfast.commissioning.demands import demands
-from sewfast.commissioning.excitations import standard
 from sewfast.tuning.task import GAINS
 
 try:
@@ -241,17 +239,10 @@ def after_changes(found: Commissioning, drive: Drive) -> tuple[float, str]:
 
     On the standard references at a pace that the least gain reaches.
     """
-    from oracle import driven
+    from oracle import driven, practised
 
-    assert found.controller is not None
-    assert found.acceleration is not None
     controller = found.controller
-    bench = bench_of(Simulator(drive))
-    asked = demands(
-        bench, u_max=controller.u_max, speed=found.comparisons[0].span, references=None, members=1,
-        evaluations=1, seed=0, threads=1,
-    )  # fmt: skip
-    references = standard(min(GAINS) * found.acceleration, asked, bench.Ts, short=True).values()
+    references = practised(bench_of(Simulator(drive)), found, 0, min(GAINS)).values()
 
     def error(drive: Drive) -> float:
         runs = [driven(bench_of(Simulator(drive)), controller, r, "changed") for r in references]

@@ -66,11 +66,7 @@ def oracle(
     box = [_including(v, own, found) for v in found.tuning.variables]
     # not of the prediction, which takes every k-th sample of a slow drive
     verify = {c.reference: c.measured.r for c in found.comparisons if c.measured is not None}
-    asked = demands(
-        bench, u_max=own.u_max, speed=float(verify["trapezoid"].max()), references=None, members=1,
-        evaluations=evaluations, seed=seed, threads=1,
-    )  # fmt: skip
-    practice = standard(found.acceleration, asked, bench.Ts, short=True)
+    practice = practised(bench, found, seed)
     short = (lambda controller: 0.0) if cost_alone else _requirement(bench, found)
     tried: list[tuple[float, Controller]] = [(_cost(bench, own, practice, cost), own)]
 
@@ -96,6 +92,20 @@ def oracle(
     whole = [(_cost(bench, c, verify, cost), c) for c in (own, *finalists)]
     least, controller = min(whole, key=lambda t: t[0])
     return Oracle(controller, least, len(tried))
+
+
+def practised(
+    bench: SteppedBench, found: Commissioning, seed: int, pace: float = 1.0
+) -> Mapping[str, np.ndarray]:
+    """The short references of a commissioning, at a share of the acceleration that it measured."""
+    assert found.controller is not None
+    assert found.acceleration is not None
+    trapezoid = next(c for c in found.comparisons if c.reference == "trapezoid")
+    asked = demands(
+        bench, u_max=found.controller.u_max, speed=float(trapezoid.predicted.r.max()),
+        references=None, members=1, evaluations=1, seed=seed, threads=1,
+    )  # fmt: skip
+    return standard(pace * found.acceleration, asked, bench.Ts, short=True)
 
 
 def _requirement(bench: SteppedBench, found: Commissioning) -> Callable[[Controller], float]:

@@ -384,9 +384,7 @@ def _carry_out(
             f"gains lowered, as the machine swung at {swing.frequency:.3g} Hz "
             f"under {100 * swing.share:g} % of them: {cause(swing, small)}"
         )
-        controller = replace(controller, notes=f"{controller.notes}; {note}")
-        journal.keep(controller=controller)
-        journal.say(note)
+        controller = _noted(controller, note, journal)
     controller = _compared(machine, controller, ensemble, verify, load, plan, journal)
     if small is not None and small.resonance is not None:
         speed = SHAKEN_AT * asked.speed
@@ -402,6 +400,14 @@ def _carry_out(
         return journal.result(UNREACHED, f"{missed}; {why}" if why else missed)
     found = journal.result(VERIFIED)
     return replace(found, verdict=VERIFIED_POORLY) if found.is_predicted_poorly else found
+
+
+def _noted(controller: Controller, note: str, journal: Journal) -> Controller:
+    """The controller with a note on its gains, kept and said."""
+    noted = replace(controller, notes=f"{controller.notes}; {note}")
+    journal.keep(controller=noted)
+    journal.say(note)
+    return noted
 
 
 def _compared(
@@ -423,9 +429,7 @@ def _compared(
         tried = scaled(controller, share)
         if share < 1.0:
             note = f"gains lowered to {100 * share:.0f} %, as the machine {swings}"
-            tried = replace(tried, notes=f"{controller.notes}; {note}")
-            journal.keep(controller=tried)
-            journal.say(note)
+            tried = _noted(tried, note, journal)
         comparisons = predict(thinning.coarse(tried), ensemble, thinning.references(verify), pushes)
         journal.keep(comparisons=comparisons, judgement=judged(comparisons, ensemble))
         if share == 1.0:

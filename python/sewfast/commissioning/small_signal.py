@@ -11,7 +11,7 @@ distinguish it from a resonance: the frequency of a load moves with the speed.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -208,21 +208,27 @@ def fitted(
     Output error also begins at what instrumental variables find in the `smooth` record: their own
     beginning, a model of low order by least squares, is blind to a resonance below the noise.
     """
-    asked: dict[str, Any] = {"na": order, "nb": order + 1, "nk": 1, "max_iterations": ITERATIONS}
-    fits = [_core.fit_oe, _core.fit_iv]
+
+    def by(fit: Callable[..., Any], record: Dataset, **options: Any) -> _core.LinearModel:
+        found = fit(
+            arrays(record), na=order, nb=order + 1, nk=1, max_iterations=ITERATIONS, **options
+        )
+        if found.termination == "interrupted":  # the core has heard Ctrl-C and kept its best
+            raise KeyboardInterrupt
+        model: _core.LinearModel = found.model
+        return model
+
+    fits = [partial(by, _core.fit_oe), partial(by, _core.fit_iv)]
     if smooth is not None:
         with suppress(DataError, FitError):
-            start = _core.fit_iv(arrays(smooth), **asked).model
-            fits.append(partial(_core.fit_oe, initial=start))
+            fits.append(partial(by, _core.fit_oe, initial=by(_core.fit_iv, smooth)))
     tried = []
     for fit in fits:
         try:
-            found = fit(arrays(part.fitted), **asked)
+            model = fit(part.fitted)
         except (DataError, FitError):
             continue
-        if found.termination == "interrupted":  # the core has heard Ctrl-C and kept its best
-            raise KeyboardInterrupt
-        tried.append((found.model, errors_of(free_runs(found.model, part), part)))
+        tried.append((model, errors_of(free_runs(model, part), part)))
     return min(tried, key=lambda t: t[1].rmse, default=None)
 
 

@@ -151,13 +151,8 @@ fn tolerance(
     den: Values<'_>,
 ) -> PyResult<(f64, Option<Changed>)> {
     let (num, den) = (slice(&num, "num")?, slice(&den, "den")?);
-    py.detach(|| {
-        let plant = Changing::new(Plant::new(num, den)?);
-        let of = |(most, Change { gain, delay, pitch })| (most, gain, delay, pitch);
-        Ok((
-            plant.sensitivity(&path.0),
-            plant.changed_sensitivity(&path.0).map(of),
-        ))
-    })
-    .map_err(|e| raise(py, e))
+    let found = py.detach(|| Ok(Changing::new(Plant::new(num, den)?).sensitivity(&path.0)));
+    let (robust, worst) = found.map_err(|e| raise(py, e))?;
+    let changed = |(most, Change { gain, delay, pitch })| (most, gain, delay, pitch);
+    Ok((robust, worst.map(changed)))
 }

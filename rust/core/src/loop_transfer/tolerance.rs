@@ -49,17 +49,14 @@ impl Changing {
         Self { plant, changed }
     }
 
-    /// The largest `|S|` after any change, infinite for an unstable loop, and the change; `None` without a resonance.
-    pub fn changed_sensitivity(&self, path: &Path) -> Option<(f64, Change)> {
+    /// The largest `|S|` that a limit is compared with: the plant's, or [`LEFT`] of that after the worst change; and that of the
+    /// worst change with the change, infinite for an unstable loop, `None` without a resonance.
+    pub fn sensitivity(&self, path: &Path) -> (f64, Option<(f64, Change)>) {
         let of = |(change, plant): &(Change, Plant)| (peak(path, plant), *change);
         let all = self.changed.iter().map(of);
-        all.reduce(|most, next| if next.0 > most.0 { next } else { most })
-    }
-
-    /// The largest `|S|` that a limit is compared with: the plant's, or [`LEFT`] of that after the worst change.
-    pub fn sensitivity(&self, path: &Path) -> f64 {
-        let changed = self.changed_sensitivity(path);
-        peak(path, &self.plant).max(LEFT * changed.map_or(0.0, |(most, _)| most))
+        let worst = all.reduce(|most, next| if next.0 > most.0 { next } else { most });
+        let left = LEFT * worst.map_or(0.0, |(most, _)| most);
+        (peak(path, &self.plant).max(left), worst)
     }
 }
 
@@ -159,11 +156,12 @@ mod tests {
         let changing = Changing::new(plant.clone());
         let (narrow, wide) = (path(0.016, 0.25), path(0.1, 1.0));
         assert!(peak(&narrow, &plant) < 2.0);
-        let (most, change) = changing.changed_sensitivity(&narrow).unwrap();
+        let (robust, worst) = changing.sensitivity(&narrow);
+        let (most, change) = worst.unwrap();
         assert!(most > 10.0, "{most}");
         assert!(change.pitch != 1.0);
-        assert!(changing.changed_sensitivity(&wide).unwrap().0 < most);
-        assert!(changing.sensitivity(&narrow) >= LEFT * most);
+        assert!(changing.sensitivity(&wide).1.unwrap().0 < most);
+        assert!(robust >= LEFT * most);
     }
 
     #[test]
@@ -178,8 +176,7 @@ mod tests {
             },
             TS,
         );
-        assert_eq!(changing.changed_sensitivity(&path), None);
-        assert_eq!(changing.sensitivity(&path), peak(&path, &plant));
+        assert_eq!(changing.sensitivity(&path), (peak(&path, &plant), None));
     }
 
     proptest! {

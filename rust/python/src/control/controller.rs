@@ -178,8 +178,7 @@ macro_rules! controller_methods {
             #[getter]
             fn numbers<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
                 let (design, found) = (*self.core.design(), PyDict::new(py));
-                let (schedule, biquads) = (Schedule::NONE, Cascade::NONE);
-                let constant = Design { schedule, biquads, ..design };
+                let constant = Design { schedule: Schedule::NONE, ..design };
                 let constant = Core::new(constant).map_err(|e| raise(py, Error::from(e)))?;
                 let Some(numbers) = constant.numbers() else {
                     return Ok(found);

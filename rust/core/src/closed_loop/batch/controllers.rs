@@ -128,7 +128,21 @@ impl<V: Arithmetic> Cascades<V> {
         }
     }
 
-    /// The next sample of a signal; the first one of all finds it at rest at `before`.
+    /// The next sample of the feedback; the first one finds it at rest there.
+    #[inline(always)]
+    fn feedback(&mut self, first: bool, y: V) -> V {
+        let sections = &self.sections[..self.count];
+        Self::step(sections, &mut self.of_y, first.then_some(y), y)
+    }
+
+    /// The next sample of the reference; the first one finds it at rest at the output `y`.
+    #[inline(always)]
+    fn reference(&mut self, first: bool, y: V, r: V) -> V {
+        let sections = &self.sections[..self.count];
+        Self::step(sections, &mut self.of_r, first.then_some(y), r)
+    }
+
+    /// The next sample of a signal, which was at rest at `before` if this is its first.
     #[inline(always)]
     fn step(sections: &[[V; 4]], memory: &mut [[V; 3]; BIQUADS], before: Option<V>, x: V) -> V {
         let mut x = x;
@@ -246,34 +260,17 @@ impl<V: Arithmetic> Controllers<V> {
 impl<V: Arithmetic> LaneController<V> for Controllers<V> {
     #[inline(always)]
     fn take(&mut self, first: bool, measured: V) {
-        let filtered = self.filter(first, measured);
-        self.filtered = match &mut self.biquads {
-            None => filtered,
-            Some(Cascades {
-                count,
-                sections,
-                of_y,
-                ..
-            }) => Cascades::step(
-                &sections[..*count],
-                of_y,
-                first.then_some(filtered),
-                filtered,
-            ),
-        };
+        self.filtered = self.filter(first, measured);
+        if let Some(biquads) = &mut self.biquads {
+            self.filtered = biquads.feedback(first, self.filtered);
+        }
     }
 
     #[inline(always)]
     fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V {
         let mut r = self.reference(first, r);
-        if let Some(Cascades {
-            count,
-            sections,
-            of_r,
-            ..
-        }) = &mut self.biquads
-        {
-            r = Cascades::step(&sections[..*count], of_r, first.then_some(self.filtered), r);
+        if let Some(biquads) = &mut self.biquads {
+            r = biquads.reference(first, self.filtered, r);
         }
         self.control(r, self.filtered, feedforward)
     }

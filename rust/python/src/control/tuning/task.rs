@@ -229,7 +229,7 @@ impl Given {
         let sensitivity = |design: &AnyDesign<f64>| {
             let paths = paths(design, encoder.is_some());
             let of = |path: &linear::Path| {
-                let plants = self.loops.iter().map(|plant| plant.sensitivity(path));
+                let plants = self.loops.iter().map(|plant| plant.sensitivity(path).0);
                 let measured = self.measured.iter().map(|m| m.peak_sensitivity(path));
                 plants.chain(measured).fold(1.0, f64::max)
             };
