@@ -69,6 +69,11 @@ pub trait Problem: Sync {
         1
     }
 
+    /// Whether its costs are those that count, and not of a part of the work.
+    fn is_whole(&self) -> bool {
+        true
+    }
+
     /// How good each candidate is, whatever the others are; the work on one may end as soon as it cannot beat what it has
     /// to any more, or on a stop.
     fn judge(
@@ -165,9 +170,25 @@ fn run<P: Problem>(
     options: Options,
     monitor: &Monitor,
 ) -> Found {
+    let begun = Found {
+        point: vec![0.5; problem.dimensions()],
+        judgement: Judgement::HOPELESS,
+        trace: Vec::new(),
+        termination: Termination::Evaluations,
+    };
+    proceed(problem, strategy, begun, options, monitor)
+}
+
+/// Goes on with a search that has begun, as [`run`]; the evaluations are those of both.
+fn proceed<P: Problem>(
+    problem: &P,
+    strategy: &mut impl Strategy,
+    begun: Found,
+    options: Options,
+    monitor: &Monitor,
+) -> Found {
     let mut memories: Vec<_> = (0..options.threads).map(|_| problem.memory()).collect();
-    let mut best = (vec![0.5; problem.dimensions()], Judgement::HOPELESS);
-    let mut trace = Vec::with_capacity(options.evaluations.min(1 << 20));
+    let (mut best, mut trace) = ((begun.point, begun.judgement), begun.trace);
     let termination = loop {
         if monitor.stopped() {
             break Termination::Interrupted;
@@ -182,7 +203,9 @@ fn run<P: Problem>(
             let judged = problem.judge(memory, some, monitor);
             monitor.advance(some.len() as u64);
             for judged in judged.iter().filter(|j| j.violation == 0.0) {
-                monitor.report_cost(judged.cost);
+                if problem.is_whole() {
+                    monitor.report_cost(judged.cost);
+                }
             }
             judged
         });

@@ -21,7 +21,7 @@ use sewfast_control::{AnyDesign, Design};
 
 use crate::closed_loop::{Plant, Signals};
 use crate::search::{
-    Candidate, Judgement, Options, Problem, Termination, cma_es, genetic, several,
+    Candidate, Found, Judgement, Options, Problem, Termination, cma_es, genetic, several,
 };
 use crate::speed::Encoder;
 use crate::{Error, Monitor, Result};
@@ -96,6 +96,9 @@ pub struct Tuned {
     pub weights: Weights,
 }
 
+/// Share of the candidates that are judged on a part of the runs.
+const SCOUTS: f64 = 0.75;
+
 /// Costs that differ by less than this share are equal, when it is asked whether a population has come together.
 pub const TOLERANCE: f64 = 1e-5;
 
@@ -116,10 +119,6 @@ pub fn tune<P: Plant + Clone + Send + Sync>(
     options.check()?;
     monitor.set_total(options.evaluations as u64);
     let mut bench = Bench::new(task)?;
-    let problem = Searched {
-        task,
-        bench: bench.clone(),
-    };
     let first = moved(task.variables, &task.start)?;
     let start = bench.judge_one(task, &first, monitor);
     monitor.advance(1);
@@ -140,10 +139,7 @@ pub fn tune<P: Plant + Clone + Send + Sync>(
     };
     if rest.evaluations > 0 {
         let point = place(task.variables, &first);
-        let found = match method {
-            Method::Genetic => genetic::search(&problem, Some(&point), rest, monitor)?,
-            Method::CmaEs => cma_es::search(&problem, Some(&point), rest, monitor)?,
-        };
+        let found = staged(task, &bench, method, &point, rest, monitor)?;
         if found.judgement.beats(&start) {
             tuned.design = designed(task.variables, &found.point, &task.start)?;
             tuned.cost = found.judgement.cost;
@@ -154,6 +150,52 @@ pub fn tune<P: Plant + Clone + Send + Sync>(
         tuned.termination = found.termination;
     }
     tuned.checked()
+}
+
+/// Searches on a part of the runs for where the least is, then on all of them for the least itself.
+///
+/// The runs of different plants along different references say much the same about a controller. On a part in which each
+/// reference has one plant, most of the search costs as little as on one plant.
+fn staged<P: Plant + Clone + Send + Sync>(
+    task: &Task<'_, P>,
+    bench: &Bench<P>,
+    method: Method,
+    start: &[f64],
+    options: Options,
+    monitor: &Monitor,
+) -> Result<Found> {
+    let on = |extent| Searched {
+        task,
+        bench: bench.clone(),
+        extent,
+    };
+    let search = |problem, options| match method {
+        Method::Genetic => genetic::search(problem, Some(start), options, monitor),
+        Method::CmaEs => cma_es::search(problem, Some(start), options, monitor),
+    };
+    let scouts = (SCOUTS * options.evaluations as f64) as usize;
+    if task.plants.len() == 1 || scouts == 0 {
+        return search(&on(Extent::Whole), options);
+    }
+    let part = Options {
+        evaluations: scouts,
+        ..options
+    };
+    let scouted = search(&on(Extent::Part), part)?;
+    let mut trace = vec![Judgement::HOPELESS; scouted.trace.len()];
+    let Some(last) = trace.last_mut() else {
+        return Ok(scouted);
+    };
+    // A stop must not lose what has been found.
+    let design = designed(task.variables, &scouted.point, &task.start)?;
+    let judgement = bench.clone().judge_one(task, &design, &Monitor::default());
+    *last = judgement;
+    let found = Found {
+        judgement,
+        trace,
+        ..scouted
+    };
+    cma_es::refine(&on(Extent::Whole), found, options, monitor)
 }
 
 /// What each design costs, and by how much it violates the constraints; infinite where a run diverges.
@@ -172,7 +214,7 @@ pub fn costs<P: Plant + Clone + Send + Sync>(
     let mut benches = vec![bench; threads.clamp(1, designs.len().max(1))];
     Ok(several(&mut benches, designs, TOGETHER, |bench, some| {
         let trials: Vec<_> = some.iter().map(|d| (*d, Judgement::HOPELESS)).collect();
-        let judged = bench.judge(task, &trials, monitor);
+        let judged = bench.judge(task, Extent::Whole, &trials, monitor);
         monitor.advance(some.len() as u64);
         judged
     }))
@@ -240,6 +282,23 @@ impl<'a, P> Task<'a, P> {
             disturbance: self.disturbances.get(reference).copied(),
             noise: noise.map(|noise| &noise[..noise.len().min(r.len())]),
             ..Signals::new(r)
+        }
+    }
+
+    /// How many of a plant's runs weigh as much as one on all plants; `None` for a run that is not in this extent.
+    ///
+    /// In a part, every plant bears its load steps, as most constraints are about them, and each reference is followed by one
+    /// plant: the plants are taken as the golden ratio scatters them, which avoids one variation of every model.
+    fn share(&self, extent: Extent, plant: usize, run: usize) -> Option<f64> {
+        let Some(reference) = run.checked_sub(self.loads.len()) else {
+            return Some(1.0);
+        };
+        let plants = self.plants.len();
+        let golden = 0.5 * (5f64.sqrt() - 1.0);
+        let chosen = (reference as f64 * golden * plants as f64) as usize % plants;
+        match extent {
+            Extent::Whole => Some(1.0),
+            Extent::Part => (chosen == plant).then_some(plants as f64),
         }
     }
 
@@ -323,6 +382,14 @@ impl<'a, P> Task<'a, P> {
 struct Searched<'a, P> {
     task: &'a Task<'a, P>,
     bench: Bench<P>,
+    extent: Extent,
+}
+
+/// The runs on which candidates are judged: all of them, or for each reference that of one plant.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Extent {
+    Whole,
+    Part,
 }
 
 impl<P: Plant + Clone + Send + Sync> Problem for Searched<'_, P> {
@@ -340,6 +407,10 @@ impl<P: Plant + Clone + Send + Sync> Problem for Searched<'_, P> {
         TOGETHER
     }
 
+    fn is_whole(&self) -> bool {
+        self.extent == Extent::Whole
+    }
+
     fn judge(
         &self,
         bench: &mut Bench<P>,
@@ -352,7 +423,8 @@ impl<P: Plant + Clone + Send + Sync> Problem for Searched<'_, P> {
         };
         let trials: Vec<_> = candidates.iter().map(trial).collect();
         let known: Vec<_> = trials.iter().copied().flatten().collect();
-        let mut judged = bench.judge(self.task, &known, monitor).into_iter();
+        let judged = bench.judge(self.task, self.extent, &known, monitor);
+        let mut judged = judged.into_iter();
         let judgement = |trial: &Option<_>| trial.and_then(|_| judged.next());
         let judgements = trials.iter().map(judgement);
         judgements

@@ -8,12 +8,18 @@ use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
 use super::genetic::inside;
 use super::model::{Archive, Ellipsoid, Model};
-use super::{Candidate, Found, Judgement, Options, Problem, Strategy, run};
+use super::{Candidate, Found, Judgement, Options, Problem, Strategy, proceed, run};
 use crate::random::Random;
 use crate::{Monitor, Result};
 
 /// First step about a start, and without one, in shares of the box.
 const STEP: (f64, f64) = (0.15, 0.3);
+/// First step of a refinement, in shares of the box.
+const SMALL_STEP: f64 = 0.03;
+/// Size of a refinement's generations against the usual one: larger ones follow a rough landscape's slope.
+pub(super) const GENERATION: f64 = 1.4;
+/// A refinement has come to its end when the best improves by less than this share within so many generations.
+pub(super) const STALLED: (f64, usize) = (1e-3, 12);
 /// Steps smaller than this share of the box change nothing.
 const SMALLEST_STEP: f64 = 1e-11;
 /// Ratio of the longest to the shortest axis, squared, beyond which the matrix is of no use.
@@ -39,6 +45,51 @@ pub fn search<P: Problem>(
     options.check()?;
     let mut strategy = Restarts::new(problem.dimensions(), start, options);
     Ok(run(problem, &mut strategy, options, monitor))
+}
+
+/// Goes on from the best of a search of a part of the problem, by small steps until nothing improves any more. The evaluations
+/// are those of both.
+///
+/// # Errors
+/// As [`search`].
+pub fn refine<P: Problem>(
+    problem: &P,
+    begun: Found,
+    options: Options,
+    monitor: &Monitor,
+) -> Result<Found> {
+    options.check()?;
+    let size = (GENERATION * population(begun.point.len()) as f64) as usize;
+    let mut strategy = Refinement {
+        random: Random::new(options.seed),
+        now: Evolution::new(begun.point.clone(), SMALL_STEP, size),
+        archive: Archive::default(),
+        tolerance: options.tolerance,
+    };
+    Ok(proceed(problem, &mut strategy, begun, options, monitor))
+}
+
+/// One evolution to its end.
+struct Refinement {
+    random: Random,
+    now: Evolution,
+    archive: Archive,
+    tolerance: f64,
+}
+
+impl Strategy for Refinement {
+    fn ask(&mut self, limit: usize) -> Vec<Candidate> {
+        self.now.ask(limit, &mut self.random, &self.archive)
+    }
+
+    fn tell(&mut self, candidates: Vec<Candidate>, judgements: &[Judgement]) {
+        self.archive.keep(&candidates, judgements);
+        self.now.adapt(judgements);
+    }
+
+    fn converged(&self) -> bool {
+        self.now.ended(self.tolerance) || self.now.stalled(STALLED)
+    }
 }
 
 /// Evolutions one after the other; the evaluations of large and small populations are kept equal.

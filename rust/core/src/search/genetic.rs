@@ -7,7 +7,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::cma_es::Evolution;
+use super::cma_es::{Evolution, GENERATION, STALLED};
 use super::model::Archive;
 use super::{Candidate, Found, Judgement, Options, Problem, Strategy, run};
 use crate::random::Random;
@@ -22,14 +22,10 @@ pub(super) const JITTER: f64 = 0.08;
 /// Spread of a later population's members about the best so far, which itself is not among them: it would draw all
 /// others into its basin.
 const AWAY: f64 = 0.2;
-/// A refinement has come to its end when the best improves by less than this share within so many generations.
-const STALLED: (f64, usize) = (1e-3, 12);
 /// Share of all evaluations for the breeding before a refinement.
 const BRED: f64 = 0.18;
 /// Share of the population whose spread a refinement begins with.
 const ELITE: f64 = 0.25;
-/// Size of a refinement's generations against the usual one: larger ones follow a rough landscape's slope.
-const GENERATION: f64 = 1.4;
 /// Least spread that a refinement begins with.
 const LEAST_SPREAD: f64 = 0.015;
 /// How far blends reach beyond their parents, in shares of the parents' distance.

@@ -4,7 +4,7 @@
 use sewfast_control::{AnyController, AnyDesign, Controller};
 
 use super::cost::{Course, Measure, SMOOTHING, Terms, Weights};
-use super::{Aggregate, LoadLimit, LoadStep, Task};
+use super::{Aggregate, Extent, LoadLimit, LoadStep, Task};
 use crate::closed_loop::batch::{
     BatchLoop, InLanes, MOST, Sums, Tally, WithKind, are_of_a_kind, of_a_kind,
 };
@@ -72,7 +72,8 @@ impl<P: Plant + Clone> Bench<P> {
         design: &AnyDesign<f64>,
         monitor: &Monitor,
     ) -> Judgement {
-        let judged = self.judge(task, &[(*design, Judgement::HOPELESS)], monitor);
+        let trial = (*design, Judgement::HOPELESS);
+        let judged = self.judge(task, Extent::Whole, &[trial], monitor);
         judged.first().copied().unwrap_or(Judgement::HOPELESS)
     }
 
@@ -82,6 +83,7 @@ impl<P: Plant + Clone> Bench<P> {
     pub(super) fn judge(
         &mut self,
         task: &Task<'_, P>,
+        extent: Extent,
         trials: &[(AnyDesign<f64>, Judgement)],
         monitor: &Monitor,
     ) -> Vec<Judgement> {
@@ -91,8 +93,8 @@ impl<P: Plant + Clone> Bench<P> {
         let mut totals = vec![Total::default(); trials.len()];
         let mut judgements = vec![Judgement::HOPELESS; trials.len()];
         let designs = trials.iter().map(|(design, _)| *design).collect();
-        self.each_run(task, designs, monitor, |i, plant, run, terms| {
-            let Some(terms) = terms else {
+        self.each_run(task, extent, designs, monitor, |i, plant, run, terms| {
+            let Some((terms, share)) = terms else {
                 judgements[i] = Judgement::HOPELESS;
                 return false;
             };
@@ -100,7 +102,7 @@ impl<P: Plant + Clone> Bench<P> {
             total.go_to(plant);
             total.largest = total.largest.max(&terms);
             total.late = f64::max(total.late, task.constraints.of_load(plant, &terms));
-            total.own += weights.of(&terms) / task.alike(run);
+            total.own += share * weights.of(&terms) / task.alike(run);
             judgements[i] = Judgement {
                 violation: loops[i] + total.late + task.constraints.of_runs(&total.largest),
                 cost: total.lower_bound(task),
@@ -120,8 +122,9 @@ impl<P: Plant + Clone> Bench<P> {
         monitor: &Monitor,
     ) -> Vec<Option<(Terms, f64)>> {
         let mut means = vec![Some(Mean::default()); designs.len()];
-        self.each_run(task, designs.to_vec(), monitor, |i, plant, run, terms| {
-            let (Some(terms), Some(mean)) = (terms, &mut means[i]) else {
+        let (whole, all) = (Extent::Whole, designs.to_vec());
+        self.each_run(task, whole, all, monitor, |i, plant, run, terms| {
+            let (Some((terms, _)), Some(mean)) = (terms, &mut means[i]) else {
                 means[i] = None;
                 return false;
             };
@@ -144,23 +147,28 @@ impl<P: Plant + Clone> Bench<P> {
         means.into_iter().zip(designs).map(aggregated).collect()
     }
 
-    /// Runs every controller over every run on every plant; `take` is told of the controller's place, the plant, the run
-    /// and its terms, `None` where it diverges or on a stop, and says whether to go on with that controller.
+    /// Runs every controller over the extent's runs on every plant; `take` is told of the controller's place, the plant, the
+    /// run and its terms with their share, `None` where it diverges or on a stop, and says whether to go on with that controller.
     fn each_run(
         &mut self,
         task: &Task<'_, P>,
+        extent: Extent,
         designs: Vec<AnyDesign<f64>>,
         monitor: &Monitor,
-        mut take: impl FnMut(usize, usize, usize, Option<Terms>) -> bool,
+        mut take: impl FnMut(usize, usize, usize, Option<(Terms, f64)>) -> bool,
     ) {
         let made = designs.iter().map(AnyDesign::controller).enumerate();
         let mut open: Vec<_> = made.filter_map(|(i, made)| Some((i, made.ok()?))).collect();
         for plant in 0..self.plants.len() {
             for run in 0..task.runs() {
+                let Some(share) = task.share(extent, plant, run) else {
+                    continue;
+                };
                 let mut all = self
                     .several(task, plant, run, &mut open, monitor)
                     .into_iter();
-                open.retain(|(i, _)| take(*i, plant, run, all.next().flatten()));
+                let mut next = || Some((all.next()??, share));
+                open.retain(|(i, _)| take(*i, plant, run, next()));
             }
         }
     }

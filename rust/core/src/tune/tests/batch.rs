@@ -83,10 +83,10 @@ fn each_has_its_own_to_beat() {
             .into_iter()
             .zip(limits.into_iter().cycle())
             .collect();
-        let together = bench.judge(task, &trials, &Monitor::default());
+        let together = bench.judge(task, Extent::Whole, &trials, &Monitor::default());
         let alone = trials
             .iter()
-            .flat_map(|trial| bench.judge(task, &[*trial], &Monitor::default()));
+            .flat_map(|trial| bench.judge(task, Extent::Whole, &[*trial], &Monitor::default()));
         assert_eq!(together, alone.collect::<Vec<_>>());
         let given_up = together
             .iter()
