@@ -125,8 +125,9 @@ bits: $(DEV) ## compares deployed code with the core over ten million samples of
 instructions: $(DEV) ## counts instructions, code and memory of deployed code on an emulated Cortex-M4 (docs/deploy.md)
 	$(BIN)/python tests/support/deployed.py --costs
 
-laws: $(DEV) ## every property of the crates under 20 seeds with 10,000 cases each (hours; SEEDS=, CASES=, ONLY=word)
-	$(BIN)/python tests/support/laws.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(CASES),--cases $(CASES)) $(if $(ONLY),--only $(ONLY))
+laws: $(DEV) ## every property of the crates under 20 seeds with 10,000 cases each (two hours; SEEDS=, CASES=, ONLY=word; in parts: STATE=file MINUTES=)
+	$(BIN)/python tests/support/laws.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(CASES),--cases $(CASES)) $(if $(ONLY),--only $(ONLY)) \
+	  $(if $(STATE),--state $(STATE)) $(if $(MINUTES),--minutes $(MINUTES))
 
 no-std: ## links the controller crate without the standard library, and its frames without a path that can panic
 	cargo build --package sewfast-control --profile firmware --quiet

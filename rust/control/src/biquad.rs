@@ -239,6 +239,36 @@ impl<T: Real> Cascade<T> {
         self.sections.get(..self.length).unwrap_or_default()
     }
 
+    /// Where sections that are put in during a run begin at rest: at the output of the `last` ones, or, if they magnify a step,
+    /// at the `standing` input.
+    ///
+    /// The two differ by what filters and former sections hold back, and by rounding where nothing moves: a lag and an observer
+    /// come to rest some units in the last place beside what they are given. The difference reaches the output as it is from the
+    /// standing input, and times the gain from the other place: a lead of 1e5 would make a bump of the last place.
+    pub(crate) fn origin(&self, last: T, standing: Option<T>) -> T {
+        let magnified = standing.filter(|x| x.is_finite() && self.magnifies());
+        magnified.unwrap_or(last)
+    }
+
+    /// Lets a jump of the input that other settings of a filter will make pass as it is, for the same reason, if the sections
+    /// magnify a step.
+    pub(crate) fn carry(&self, memory: &mut Memory<T>, jump: Option<T>) {
+        let jump = jump.unwrap_or(T::ZERO);
+        // adding 0 would turn -0 into 0
+        if jump.is_finite() && jump != T::ZERO && self.magnifies() {
+            for state in &mut memory.states {
+                state.x += jump;
+            }
+        }
+    }
+
+    /// Whether the first answer to a step is larger than the step.
+    fn magnifies(&self) -> bool {
+        let each = self.sections().iter();
+        let gain = each.fold(T::ONE, |gain, section| gain * (T::ONE + section.c0));
+        gain > T::ONE || gain < -T::ONE
+    }
+
     /// Whether there is none.
     pub fn is_empty(&self) -> bool {
         self.length == 0

@@ -57,6 +57,12 @@ impl<T: Real> MovingAverage<T> {
         self.mean()
     }
 
+    /// The sample that came last; `None` before the first one.
+    fn newest(&self) -> Option<T> {
+        let last = self.next.checked_sub(1).unwrap_or(self.length - 1);
+        self.samples.get(last).copied().filter(|_| self.started)
+    }
+
     fn mean(&self) -> T {
         let memory = self.samples.get(..self.length).unwrap_or_default();
         let sum = memory.iter().fold(T::ZERO, |sum, &x| sum + x);
@@ -158,6 +164,16 @@ impl<T: Real> Feedback<T> {
         (self.average.length, self.lag.weight, &self.observer)
     }
 
+    /// The measurement that came last; `None` before the first one.
+    pub(crate) fn newest(&self) -> Option<T> {
+        self.average.newest()
+    }
+
+    /// What it would give next if this measurement came.
+    pub(crate) fn given(&self, x: T) -> T {
+        self.clone().step(x)
+    }
+
     /// These settings with the memory of `other`, so that a constant output goes on where that one's was.
     pub(crate) fn after(self, other: &Self) -> Self {
         Self {
@@ -210,6 +226,11 @@ impl<T: Real> Ramp<T> {
         self.r = moved;
         self.started = true;
         moved
+    }
+
+    /// The reference that it gave last; `None` before the first one.
+    pub(crate) fn newest(&self) -> Option<T> {
+        self.started.then_some(self.r)
     }
 
     /// Largest change in one sample \[y\].

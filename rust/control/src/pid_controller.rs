@@ -151,8 +151,11 @@ impl<T: Real> PidController<T> {
     }
 
     /// Another design from the next sample on, without a bump in the command: filter, ramp and derivative keep what they
-    /// remember, other biquads begin at rest where the former's signals were, and the integral term takes up what the other
-    /// terms change by.
+    /// remember, other biquads begin at rest, and the integral term takes up what the other terms change by.
+    ///
+    /// Where biquads begin: at the output of the former ones, or, if they magnify a step, where the reference's ramp and the new
+    /// filter are. So they never magnify what filters hold back, not even the last place by which a filter at rest misses what it
+    /// is given. Biquads that stay are told of another filter for the same reason.
     ///
     /// Without integral action what it took up stays; [`reset`](Self::reset) forgets it.
     ///
@@ -163,19 +166,28 @@ impl<T: Real> PidController<T> {
         let expected = "the sample time at which the controller runs";
         Refused::unless(ts == now, "Ts", expected, ts.to_f64())?;
         let new = Self::new(design)?;
+        // what the sections are given next if nothing moves: by the former filter and by the new one
+        let given = |y: Option<T>, filter: &Feedback<T>| y.map(|y| filter.given(y));
+        let measured = self.filter.newest();
+        let before = given(measured, &self.filter);
         self.filter = new.filter.after(&self.filter);
+        let standing = given(measured, &self.filter);
         self.ramp = new.ramp.after(&self.ramp);
         let terms = match &new.table {
             Some(table) => table.at(self.filtered),
             None => new.pid.terms(),
         };
-        if design.biquads != self.design.biquads {
-            for (memory, last) in [
-                (&mut self.of_y, self.filtered),
-                (&mut self.of_r, self.pid.reference()),
+        let sections = design.biquads;
+        if sections == self.design.biquads {
+            let jump = before.zip(standing).map(|(from, to)| to - from);
+            sections.carry(&mut self.of_y, jump);
+        } else {
+            for (memory, last, standing) in [
+                (&mut self.of_y, self.filtered, standing),
+                (&mut self.of_r, self.pid.reference(), self.ramp.newest()),
             ] {
                 if memory.started {
-                    memory.rest_at(last);
+                    memory.rest_at(sections.origin(last, standing));
                 }
             }
         }

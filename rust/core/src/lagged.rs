@@ -26,6 +26,10 @@ const MOST_LAGS: usize = 1_000;
 const RELAXATIONS: usize = 6;
 /// In so short a record other starts are tried too, as two basins may look alike.
 const SHORT: usize = 1000;
+/// The least weight of the prior of the initial state.
+const LEAST_PRIOR: f64 = 1e-9;
+/// A run whose squares are below this share of the outputs' is exact: the record is clean, and no other state is nearer.
+const EXACT: f64 = 1e-10;
 
 impl Lags {
     /// Orders that make a model.
@@ -228,7 +232,8 @@ pub trait Lagged {
     ///
     /// Damped Gauss-Newton steps on `sum e^2 + rho |y_past - level|^2` from several starts; `level` is the mean of
     /// the first outputs. `rho` is first 1e-2, then the ratio of the residual's to the output's variance where that is
-    /// smaller: a noisy or short record cannot give a wild state, a clean one gives the exact state.
+    /// smaller: a noisy or short record cannot give a wild state. A clean one gives the exact state: where the least `rho` leads
+    /// to an exact run, that is kept.
     ///
     /// # Errors
     /// `ErrorKind::Data` for wrong shapes or no measured samples, `ErrorKind::Fit` where every start leaves the finite
@@ -255,7 +260,19 @@ pub trait Lagged {
             }
             best = search.descend(best.1.clone()).unwrap_or(best);
         }
-        if known.len() <= SHORT {
+        let squares: f64 = known.iter().map(|y| (y - level) * (y - level)).sum();
+        let mut exact = search.squares(&best.1) <= EXACT * squares;
+        if !exact && known.len() > 2 * lags.na {
+            // a state far from `level` that is soon forgotten: its prior outweighs the few outputs that tell of it
+            let prior = std::mem::replace(&mut search.rho, LEAST_PRIOR);
+            match search.descend(best.1.clone()) {
+                Some(found) if search.squares(&found.1) <= EXACT * squares => {
+                    (best, exact) = (found, true);
+                }
+                _ => search.rho = prior,
+            }
+        }
+        if known.len() <= SHORT && !exact {
             // a network need not be monotone: starts with all past outputs alike can all lead to a state that is not the nearest
             for start in spread_starts(lags.na, level, &known) {
                 best = match search.descend(start) {
@@ -443,13 +460,20 @@ impl<'a, M: Lagged + ?Sized> StateSearch<'a, M> {
         Some((cost, state))
     }
 
+    /// Sum of squared residuals.
+    fn squares(&mut self, state: &[f64]) -> f64 {
+        let prior = std::mem::replace(&mut self.rho, 0.0);
+        let squares = self.evaluate(state);
+        self.rho = prior;
+        squares
+    }
+
     /// Lowers the prior's weight to what the residual says; false where it is low enough already.
     fn relax(&mut self, state: &[f64], level: f64, known: &[f64]) -> bool {
         let (prior, samples) = (self.rho, known.len());
-        self.rho = 0.0;
-        let residual = self.evaluate(state) / (samples - self.lags.na) as f64;
+        let residual = self.squares(state) / (samples - self.lags.na) as f64;
         let spread = known.iter().map(|y| (y - level) * (y - level)).sum::<f64>() / samples as f64;
-        self.rho = (residual / spread.max(f64::MIN_POSITIVE)).clamp(1e-9, prior);
+        self.rho = (residual / spread.max(f64::MIN_POSITIVE)).clamp(LEAST_PRIOR, prior);
         self.rho < prior
     }
 }

@@ -303,7 +303,7 @@ mod tests {
     }
 
     proptest! {
-        #![proptest_config(crate::laws::cases(40))]
+        #![proptest_config(crate::laws::cases(80))]
         #[test]
         fn sensitivities_agree_with_differences(seed in any::<u64>(), hidden in 1usize..10, bypass in any::<bool>()) {
             let model = random_model(seed, hidden, bypass, false);
@@ -332,6 +332,25 @@ mod tests {
             let again = model.simulate(&u, 2, &state).unwrap();
             let worst = y.iter().zip(&again).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
             prop_assert!(worst < 1e-3 * model.scaling().y_scale, "{worst}");
+        }
+    }
+
+    #[test]
+    fn a_state_that_is_soon_forgotten_comes_back_from_a_clean_record() {
+        // far from the outputs, so that its prior outweighed the few that tell of it
+        for (seed, inputs) in [
+            (17_557_077_261_666_588_454, 80),
+            (12_707_694_688_172_175_531, 40),
+        ] {
+            let model = random_model(seed, 5, true, false);
+            let mut random = Random::stream(seed, 2);
+            let u: Vec<f64> = (0..inputs).map(|_| random.normal()).collect();
+            let y = model.simulate(&u, 2, &[12.0, -5.0]).unwrap();
+            let state = model.estimate_initial_state(&u, 2, &y).unwrap();
+            assert!(
+                (state[0] - 12.0).abs() < 1e-3 && (state[1] + 5.0).abs() < 1e-3,
+                "{state:?}"
+            );
         }
     }
 

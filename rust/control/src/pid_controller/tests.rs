@@ -86,8 +86,9 @@ fn creep(design: &Design<f64>, e: f64) -> f64 {
 proptest! {
     #[test]
     fn a_change_of_design_moves_nothing_at_once(
-        old in free(), new in free(), r in -40.0..40.0, y in -40.0..40.0, feedforward in -5.0..5.0,
+        old in free(), new in free(), r in -40.0..40.0, y in -40.0..40.0, feedforward in -5.0..5.0, kept in any::<bool>(),
     ) {
+        let new = Design { biquads: if kept { old.biquads } else { new.biquads }, ..new };
         let mut controller = PidController::new(old).unwrap();
         controller.step_with(r, y / 2.0, feedforward);
         let before = (0..fading(&old, 40.0)).map(|_| controller.step_with(r, y, feedforward)).last().unwrap();
@@ -257,6 +258,40 @@ fn biquads_filter_a_step_of_the_reference_at_the_first_sample() {
         let later = (0..2000).map(|_| controller.step(100.0, 20.0)).last();
         assert!((later.unwrap() - 80.0).abs() < 1e-9);
         controller.reset();
+    }
+}
+
+#[test]
+fn a_lead_makes_no_bump_of_the_last_place() {
+    // the observer rests a unit in the last place beside its input, and the lead answers a step by 4e5
+    let lead = Biquad::resonance(0.5, 1.0, 499.0, 1.0, TS).unwrap();
+    let lead = Cascade::new(&[lead]).unwrap();
+    let observed = Design {
+        observer_time: 0.0157,
+        ..Design::new(pid(1.0, f64::INFINITY, 0.0))
+    };
+    let plain = Design {
+        biquads: lead,
+        observer_time: 0.0,
+        ..observed
+    };
+    for before in [Cascade::NONE, lead] {
+        let mut missed = 0;
+        for y in (1..=20).map(|k| 36.3 + f64::from(k).sqrt()) {
+            let biquads = before;
+            let mut controller = PidController::new(Design {
+                biquads,
+                ..observed
+            })
+            .unwrap();
+            controller.step(0.0, y / 2.0);
+            let u = (0..20_000).map(|_| controller.step(0.0, y)).last().unwrap();
+            missed += u32::from(controller.filtered() != y);
+            controller.set_design(plain).unwrap();
+            let after = controller.step(0.0, y);
+            assert!((after - u).abs() < 1e-12, "{u} {after}");
+        }
+        assert!(missed > 0);
     }
 }
 

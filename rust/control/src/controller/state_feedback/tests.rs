@@ -2,6 +2,7 @@
 
 use super::*;
 use proptest::prelude::*;
+use std::sync::LazyLock;
 use std::vec::Vec;
 
 const TS: f64 = 1e-3;
@@ -146,8 +147,10 @@ macro_rules! laws {
                     r in -300.0..300.0 as $float,
                 ) {
                     // without integral action, which keeps what it has learned
-                    let exact = lqg(motor(), Weights { integral: 0.0, ..WEIGHTS }).unwrap();
-                    let numbers = exact.numbers().map(|x| x as $float);
+                    static EXACT: LazyLock<StateDesign<f64>> = LazyLock::new(|| {
+                        lqg(motor(), Weights { integral: 0.0, ..WEIGHTS }).unwrap()
+                    });
+                    let numbers = EXACT.numbers().map(|x| x as $float);
                     let mut numbers = numbers.into_iter();
                     let design = StateDesign::from_numbers(|| numbers.next(), TS as $float).unwrap();
                     let mut controller = StateFeedback::new(design).unwrap();

@@ -59,7 +59,7 @@ impl Equations {
 }
 
 proptest! {
-    #![proptest_config(crate::laws::cases(64))]
+    #![proptest_config(crate::laws::cases(128))]
     #[test]
     fn the_whole_loop_equals_its_linear_equations(
         kp in 1e-4..2e-3, ti in 0.05..1.0, td in 0.0..0.01, alpha in -0.5..1.0, beta in -0.5..1.0, n in 1.0..20.0,
@@ -78,7 +78,7 @@ proptest! {
             biquads: Cascade::new(&[notch]).unwrap(),
             ..Design::new(Settings { alpha, beta, n, ..Settings::new(gains, TS) })
         };
-        let samples = 400;
+        let samples = 200;
         let reference: Vec<f64> = (0..samples).map(|k| if k < 5 { 0.0 } else { level }).collect();
         let added = |scale: f64, period: f64| -> Vec<f64> {
             (0..samples).map(|k| scale * (k as f64 / period).sin()).collect()
