@@ -278,6 +278,9 @@ drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONL
 faults: $(VENV)/bench.stamp ## commissioning on drives with 30 faults: ended in time, never verified, named (SEEDS=20, ONLY=word)
 	$(BIN)/python benches/faults.py $(if $(ONLY),--only "$(ONLY)") $(if $(SEEDS),--seeds $(SEEDS))
 
+nonsense: $(DEV) ## records that deceive and good ones: praised, named, accused (COUNT=2 of each kind, ONLY=word)
+	$(BIN)/python benches/nonsense.py $(if $(COUNT),--count $(COUNT)) $(if $(ONLY),--only "$(ONLY)")
+
 motors: $(DEV) ## commissioning on 20 motors of MuJoCo, compared with an oracle (ONLY="3 7", SEEDS=)
 	$(BIN)/python benches/mujoco_motors.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))
 

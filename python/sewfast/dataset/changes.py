@@ -74,7 +74,7 @@ def changed(data: Dataset) -> Change | None:
     i, e = known[found.experiment]
     row = found.start - sum(map(len, us[: found.experiment]))
     # of the rows that have a share of both parts, one explains none
-    row = max(0, row - span // 2)
+    row = row - span // 2 if row > 2 * span else 0
     return Change(i, e.start + row * every, found.gain, found.shift * every, found.left)
 
 
@@ -183,10 +183,12 @@ class _Rows:
                 yield i, a + k * (b - a) // PARTS
 
     def sides(self, experiment: int, start: int) -> tuple[Rows, Rows]:
-        """The rows of the part from `start` on, and the others; none that have a share of both."""
+        """The rows before `start` and of other experiments, and those after; none that may have a
+        share of both parts.
+        """
         known, k = np.isfinite(self.y), np.arange(len(self.y))
-        inside = (k >= start) & (k < self.edges[experiment + 1])
-        return known & ~inside, known & inside & (k >= start + self.span)
+        own = (k >= self.edges[experiment]) & (k < self.edges[experiment + 1])
+        return known & ~(own & (k >= start - self.span)), known & own & (k >= start + self.span)
 
     def at(self, experiment: int, start: int, *, worth: bool = False) -> _Found | None:
         """The change from `start` on that explains most; with `worth`, only where one can."""
@@ -202,7 +204,7 @@ class _Rows:
         found = []
         if sum(apart) <= most:
             gain, error, fits = pair.scaled(self.X)
-            found.append(_Found(experiment, start, gain, 0, error, *fits))
+            found.append(_Found(experiment, start, gain, 0, error, fits[0], fits[1]))
         # rows that were lost are in the future of one part: each is fitted, and the other found
         # along that fit
         for is_late in (False, True):
@@ -240,19 +242,21 @@ class _Rows:
         errors = np.where(count < 0.5 * m.sum(), np.inf, np.maximum(left, 0.0) * m.sum() / count)
         best = int(np.argmin(errors))
         shift = int(shifts[best])
-        moved = np.full_like(fit, np.nan)
-        k = np.arange(max(own.start, own.start - shift), min(own.stop, own.stop - shift))
-        moved[k] = fit[k + shift] + (sy[best] - sf[best]) / count[best]
+        k = np.arange(len(fit))
+        moved = fit[np.clip(k + shift, 0, len(fit) - 1)] + (sy[best] - sf[best]) / count[best]
+        is_own, is_from = ((i >= own.start) & (i < own.stop) for i in (k, k + shift))
+        moved[is_own & ~is_from] = np.nan
         return rest.alone + float(errors[best]), shift, fit, moved
 
     def sharper(self, found: _Found) -> int:
         """From where on what explains the later rows is better than what explains the others."""
         a, b = self.edges[found.experiment], self.edges[found.experiment + 1]
+        # the answers to inputs that were lost are explained by neither
+        if found.start == a or found.shift < 0:
+            return found.start
         before, after = ((self.y[a:b] - f[a:b]) ** 2 for f in (found.before, found.after))
         total = np.cumsum(np.nan_to_num(after - before))[self.span : -self.span]
-        if found.start == a or len(total) == 0:
-            return found.start
-        return a + 1 + self.span + int(np.argmax(total))
+        return a + 1 + self.span + int(np.argmax(total)) if len(total) else found.start
 
 
 @dataclass(frozen=True)
@@ -283,8 +287,9 @@ class _Pair:
         """Sums of squares if the second part has another gain, and the fits to both."""
         G = self.G[0] + gains[:, None, None] ** 2 * self.G[1] + self.ridge
         r = self.r[0] + gains[:, None] * self.r[1]
-        theta = np.linalg.solve(G, r[:, :, None])[:, :, 0]
-        return np.maximum(sum(self.of_y) - (r * theta).sum(axis=1), 0.0), theta
+        theta: FloatArray = np.linalg.solve(G, r[:, :, None])[:, :, 0]
+        left: FloatArray = np.maximum(sum(self.of_y) - (r * theta).sum(axis=1), 0.0)
+        return left, theta
 
     @property
     def one(self) -> float:
@@ -301,7 +306,7 @@ class _Pair:
         x, level = self.means[0]
         return np.asarray((X - x) @ self.fitted(np.zeros(1))[1][0] + level)
 
-    def scaled(self, X: FloatArray) -> tuple[float, float, tuple[FloatArray, FloatArray]]:
+    def scaled(self, X: FloatArray) -> tuple[float, float, list[FloatArray]]:
         """The gain of the second part that explains most, what it leaves, and both fits."""
         gains = SCALES
         for _ in range(2):
@@ -309,7 +314,5 @@ class _Pair:
             best = int(np.argmin(errors))
             gain, error, of = float(gains[best]), float(errors[best]), theta[best]
             gains = gain * 2.0 ** np.linspace(-0.5, 0.5, 41)
-        (x_a, level_a), (x_b, level_b) = self.means
-        before: FloatArray = (X - x_a) @ of + level_a
-        after: FloatArray = gain * ((X - x_b) @ of) + level_b
-        return gain, error, (before, after)
+        fits = [g * ((X - x) @ of) + v for g, (x, v) in zip((1.0, gain), self.means, strict=True)]
+        return gain, error, fits
