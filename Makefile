@@ -28,7 +28,7 @@ MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest n
   python-test python-core docs package package-source
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults motors fleet interrupts fuzz-logs mutations studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults nonsense motors fleet interrupts fuzz-logs mutations studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14

@@ -14,6 +14,7 @@ from nonsense import GOOD, HELD, NONSENSE, data, good, held, lag, nonsense
 from sewfast import diagnose
 from sewfast.dataset import Dataset
 from sewfast.dataset.faults import faults
+from sewfast.studio.project import Project, Step
 
 SEEDS = range(HELD, HELD + (12 if FULL else 1))
 
@@ -118,6 +119,12 @@ def test_every_part_that_judges_a_record_says_the_same(tmp_path: Path) -> None:
     ]
     assert "first mend the record" in card.summary
     assert [x for x in model.check(api.read(sound)).lines if x.name == "record"] == []
+    model.save(torn.parent / "model.json")
+    shown = Project(torn.parent).validate(Step("torn.csv", ("u",), "y"))
+    assert "first mend the record" in shown["verdict"]
+    assert fault.text in " ".join(shown["card"].split())
+    assert fault.text in Project(torn.parent).look(Step("torn.csv", ("u",), "y"))["text"]
+    (torn.parent / "model.json").unlink()
     table = api.fleet(torn.parent, model="oe", workers=0)
     assert table.rows[0].message == f"{fault.text}: {fault.remedy}"
     assert f"faulty  torn.csv: {fault.text}" in str(table)

@@ -288,8 +288,8 @@ class _Pair:
         G = self.G[0] + gains[:, None, None] ** 2 * self.G[1] + self.ridge
         r = self.r[0] + gains[:, None] * self.r[1]
         theta: FloatArray = np.linalg.solve(G, r[:, :, None])[:, :, 0]
-        left: FloatArray = np.maximum(sum(self.of_y) - (r * theta).sum(axis=1), 0.0)
-        return left, theta
+        left = np.maximum(sum(self.of_y) - (r * theta).sum(axis=1), 0.0)
+        return np.asarray(left, dtype=np.float64), theta
 
     @property
     def one(self) -> float:
@@ -308,11 +308,11 @@ class _Pair:
 
     def scaled(self, X: FloatArray) -> tuple[float, float, list[FloatArray]]:
         """The gain of the second part that explains most, what it leaves, and both fits."""
-        gains = SCALES
+        gains: FloatArray = SCALES
         for _ in range(2):
             errors, theta = self.fitted(gains)
             best = int(np.argmin(errors))
             gain, error, of = float(gains[best]), float(errors[best]), theta[best]
-            gains = gain * 2.0 ** np.linspace(-0.5, 0.5, 41)
+            gains = np.asarray(gain * 2.0 ** np.linspace(-0.5, 0.5, 41))
         fits = [g * ((X - x) @ of) + v for g, (x, v) in zip((1.0, gain), self.means, strict=True)]
         return gain, error, fits
