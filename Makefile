@@ -28,7 +28,7 @@ MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest n
   python-test python-core docs package package-source
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults motors fleet interrupts fuzz-logs mutations studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults nonsense motors fleet interrupts fuzz-logs mutations studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -278,6 +278,9 @@ drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONL
 
 faults: $(VENV)/bench.stamp ## commissioning on drives with 30 faults: ended in time, never verified, named (SEEDS=20, ONLY=word)
 	$(BIN)/python benches/faults.py $(if $(ONLY),--only "$(ONLY)") $(if $(SEEDS),--seeds $(SEEDS))
+
+nonsense: $(DEV) ## records that deceive and good ones: praised, named, accused (COUNT=2 of each kind, ONLY=word)
+	$(BIN)/python benches/nonsense.py $(if $(COUNT),--count $(COUNT)) $(if $(ONLY),--only "$(ONLY)")
 
 motors: $(DEV) ## commissioning on 20 motors of MuJoCo, compared with an oracle (ONLY="3 7", SEEDS=)
 	$(BIN)/python benches/mujoco_motors.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))

@@ -15,7 +15,9 @@ sys.path.append(str(Path(__file__).parents[2] / "benches"))
 import sewfast
 from kinds import model_of
 from refusals import refuses
+from sewfast.commissioning.result import numbers_in
 from sewfast.errors import DataError, ModelFileError, SewfastError
+from sewfast.report.artefacts import drawing
 
 pytest.importorskip("resource", reason="bounds memory as POSIX systems can")
 mutations = pytest.importorskip("mutations", reason="needs fork")
@@ -101,5 +103,8 @@ def test_pipes_and_devices_are_no_files(tmp_path: Path) -> None:
         for read in reading:
             with pytest.raises(SewfastError, match="a pipe or a device"):
                 read(path)
+        assert numbers_in(path) == {}
+        with pytest.raises(DataError, match="a pipe or a device"):
+            drawing(path)
     with refuses(DataError, expected="a file", received="a folder"):
         sewfast.read_table(tmp_path)

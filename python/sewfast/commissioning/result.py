@@ -374,8 +374,8 @@ def _may_be_replaced(folder: Path) -> bool:
 def numbers_in(file: Path) -> dict[str, Any]:
     """The content of a file of results; empty if it is damaged or missing."""
     try:
-        found = json.loads(file.read_bytes())
-    except (OSError, ValueError):
+        found = json.loads(storage.file_bytes(file))
+    except (DataError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -121,7 +121,8 @@ def diagnose(data: Dataset) -> Diagnosis:
     `dead_sensor`       the output keeps one value while the rest says that it cannot
     `spike`             a few samples of the output have more power than all others
     `wraps`             the output is an angle that jumps back by a turn
-    `no_dynamics`       the output is the input times a number: a column was read twice
+    `no_dynamics`       the output is computed from the input: a multiple, a mean, an integral
+    `changes`           from a sample on the output has another sign, scale or time
     `exchanged`         the input answers the output
     `late_input`        the output moves before the input, which was logged late
     `at_once`           the output moves in the sample in which the input does

@@ -13,7 +13,9 @@ fails on any numbers: columns are compared about their mean, in units of their d
   rest of the output.
 - A counter that wraps: the output jumps by its whole range against the way that it moves before and
   after.
-- No dynamics: in one sample and for the whole record, the output is the input times a number.
+- No dynamics: for the whole record, the output is the input times a number, or it or its change is
+  a sum of an input in the same sample and in some before.
+- A change: one part of the record predicts the other with another sign, scale or time (`changes`).
 - The order in time: the past of a cause helps to predict its effect beyond the effect's own past,
   and not the other way (Granger 1969).
 """
@@ -33,6 +35,7 @@ from numpy.typing import NDArray
 from ..arrays import FloatArray, labelled, runs
 from ..errors import DataError
 from ..units import duration
+from .changes import NOTED, changed
 from .outliers import quantum
 from .pieces import LARGEST_FITTED, SMALLEST_FITTED
 from .stability import unstable_pole
@@ -290,13 +293,47 @@ def copied(data: Dataset) -> Copy | None:
             continue
         gain = covariance / float(u.var())
         offset = float(y.mean() - gain * u.mean())
-        # what the rounding of either column leaves; printed to six digits where no step is seen
-        rounding = 0.5 * (quantum(y) or 1e-5 * np.ptp(y)) + 0.5 * abs(gain) * (
-            quantum(u) or 1e-5 * np.ptp(u)
-        )
-        coarse = rounding > 0.02 * float(y.std())
-        if not coarse and float(np.abs(y - gain * u - offset).max()) <= 1.01 * rounding:
+        rounding = _rounding(y) + abs(gain) * _rounding(u)
+        if float(np.abs(y - gain * u - offset).max()) <= 1.01 * rounding:
             return Copy(j, gain, offset, delay)
+    return None
+
+
+def _rounding(column: FloatArray) -> float:
+    """Half of a step: of the grid that was printed, or of six digits where none is seen or the
+    grid is so coarse that its steps are levels.
+    """
+    step = quantum(column) or 0.0
+    return 0.5 * (step if 0.0 < step < 0.02 * column.std() else 1e-5 * float(np.ptp(column)))
+
+
+def computed(data: Dataset) -> str | None:
+    """Whether the output, or its change, is a sum of inputs, in the same sample too, to rounding.
+    A simulation without noise answers one sample later, and a plant has a memory of its own.
+    """
+    pieces = [] if data.looks_ahead else _pieces(data)
+    if sum(map(len, pieces)) < 10 * PAST * (1 + data.n_inputs):
+        return None
+    lags = range(PAST + 1)
+    u = np.concatenate([np.hstack([p[PAST - i : len(p) - i, :-1] for i in lags]) for p in pieces])
+    now = np.concatenate([p[PAST:, -1] for p in pieces])
+    change = np.concatenate([np.diff(p[PAST - 1 :, -1]) for p in pieces])
+    # any response fits a few moves
+    if np.count_nonzero(np.diff(u[:, : data.n_inputs], axis=0).any(axis=1)) < 2 * PAST:
+        return None
+    digits = 0.5e-5 * np.ptp(u, axis=0)
+    roundings = 0.5e-5 * float(np.ptp(now)), _rounding(now)
+
+    def is_exact(target: FloatArray, first: int) -> bool:
+        X = np.column_stack([u[:, first:], np.ones(len(u))])
+        theta = np.linalg.lstsq(X, target, rcond=1e-10)[0]
+        of_u = float(np.abs(theta[:-1]) @ digits[first:])
+        allowed = [v for r in roundings if (v := 2.0 * r + of_u) < 0.02 * float(target.std())]
+        return float(np.abs(target - X @ theta).max()) <= max(allowed, default=0.0)
+
+    for name, target in (("output", now), ("change", change)):
+        if is_exact(target, 0) and not is_exact(target, data.n_inputs):
+            return name
     return None
 
 
@@ -443,21 +480,26 @@ class Fault:
     dead: Dead | None = None
 
     @property
+    def is_of_plant(self) -> bool:
+        """Whether the plant is so, and the record may be sound."""
+        return self.kind in ("unstable", "at_once")
+
+    @property
     def warning(self) -> str:
         """For the notes of a model."""
         return f"warning: {self.text}" + ("; left out" if self.dead else f": {self.remedy}")
 
 
 def faults(data: Dataset) -> tuple[Fault, ...]:
-    """Dead stretches of the output's sensor, columns that are no input and output of a plant, or a
-    plant that only a closed loop holds."""
+    """Dead stretches of the output's sensor, columns that are no input and output of a plant, a
+    record in two parts that do not go together, or a plant that only a closed loop holds."""
     if wrap := tuple(_wraps(data)):
         return wrap
     if apart := spikes(data):
         rest = faults(alive(data, apart))
         return (*(_spike_fault(data, spike) for spike in apart), *rest)
     found = (*(_dead_fault(data, dead) for dead in dead_stretches(data)), *_order_fault(data))
-    return found or tuple(_unstable_fault(data))
+    return found or tuple(_change_fault(data)) or tuple(_unstable_fault(data))
 
 
 def _wraps(data: Dataset) -> Iterator[Fault]:
@@ -542,6 +584,17 @@ def _order_fault(data: Dataset) -> Iterator[Fault]:
             {"input": name, "gain": copy.gain, "offset": copy.offset, "delay": float(copy.delay)},
         )
         return
+    if (sums := computed(data)) is not None:
+        names = " and ".join(data.input_names)
+        yield Fault(
+            "no_dynamics",
+            f"{'each change of ' if sums == 'change' else ''}{y} is a sum of {names} in the same "
+            f"sample and in up to {PAST} before, to rounding: the column was computed from the "
+            "other, as a mean, a difference or an integral is",
+            "name the column of a sensor as output",
+            {"input": names, "sums": sums},
+        )
+        return
     if (order := order_in_time(data)) is None:
         return
     name = data.input_names[order.input]
@@ -577,6 +630,34 @@ def _order_fault(data: Dataset) -> Iterator[Fault]:
             "identify it with nk=0 (--nk 0), to simulate",
             evidence,
         )
+
+
+def _change_fault(data: Dataset) -> Iterator[Fault]:
+    if (change := changed(data)) is None:
+        return
+    e, u = data.experiments[change.experiment], " and ".join(data.input_names)
+    of = "" if len(data.experiments) == 1 else f" of {e.name}"
+    y = labelled(data.output_name, data.output_unit)
+    gain, shift = change.gain, change.shift
+    if shift:
+        lost = f"rows of {data.output_name if shift > 0 else u} are missing there"
+        when = "earlier" if shift > 0 else "later"
+        what = f"comes {abs(shift)} samples {when} against {u}: {lost}"
+    elif abs(gain) < NOTED:
+        what = f"no longer answers {u}: a motor that is off, a cable, a sensor"
+    else:
+        why = "its sign has turned" if gain < 0.0 else "another scale, unit or load"
+        what = f"answers {u} with {gain:.2g} times its gain: {why}"
+    yield Fault(
+        "changes",
+        f"from about sample {change.start}{of} ({duration(change.start * data.Ts)}) on {y} "
+        f"{what}; this explains {1.0 - change.left:.0%} of what one model of the "
+        "whole record leaves",
+        "identify each part by itself, "
+        f'data.slice("{e.start}:{change.start}") (--train {e.start}:{change.start}), and check how '
+        "the file was written, its units, leads and sensors",
+        {"first": float(change.start), "gain": gain, "shift": float(shift), "left": change.left},
+    )
 
 
 def _unstable_fault(data: Dataset) -> Iterator[Fault]:

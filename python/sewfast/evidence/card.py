@@ -157,6 +157,7 @@ _NAMED = 3
 """Most lines listed by name; of the others only the number is given."""
 _STEPS = (
     # most important first: mending a later line does not help a model that fails an earlier one
+    ("record", "mend the record: its line says how"),
     ("free run", "check the columns, the delay and the orders, or record with a larger excitation"),
     ("largest pole", "record at the operating points that are unstable, and train on them as well"),
     (
@@ -192,7 +193,7 @@ def summary(lines: Sequence[Line]) -> str:
     warned = [x for x in lines if x.verdict == "warn"]
     free = next((x for x in lines if x.name == "free run"), None)
     if free is not None and free.verdict == "fail":
-        return f"useless here ({free.shown}); first {_step([free])}"
+        return f"useless here ({free.shown}); first {_step(failed)}"
     shown = "" if free is None else f" ({free.shown})"
     if free is not None and free.verdict == "info":
         return "the output is constant here, which does not test the model; record one that moves"

@@ -88,7 +88,7 @@ def check(
     noise = noise_of([r.y[r.counts] for r in free.runs])
     rmse = scores.pooled["free run"].rmse
     share = by_input(rmse, without_input(model, data, init))
-    lines = verdicts.accuracy(scores, unit, noise, share)
+    lines = verdicts.accuracy(scores, unit, noise, share) + verdicts.record(data)
     if training is not None and training is not data:
         lines.append(
             verdicts.generalisation(

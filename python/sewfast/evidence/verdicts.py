@@ -11,6 +11,7 @@ import numpy as np
 
 from ..arrays import in_unit
 from ..dataset import Dataset, FloatArray
+from ..dataset.faults import faults
 from ..dataset.standing import SIGMAS, standing
 from ..dynamic_model import DynamicModel
 from ..validation import FAIR, Scores, judged
@@ -331,6 +332,15 @@ def region(outside: float, farthest: float) -> Line:
         )
     text += f" (up to {farthest:.3g} times the region's bound)"
     return Line(name, outside, shown, limit, "warn", text)
+
+
+def record(data: Dataset) -> list[Line]:
+    """A line for each fault of the record itself, as `look` and `identify` name it."""
+    return [
+        Line("record", math.nan, fault.kind.replace("_", " "), "none",
+             "warn" if fault.is_of_plant else "fail", f"{fault.text}: {fault.remedy}")
+        for fault in faults(data)
+    ]  # fmt: skip
 
 
 def rest(model: DynamicModel, data: Dataset) -> list[Line]:

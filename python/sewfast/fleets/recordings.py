@@ -16,6 +16,7 @@ import numpy as np
 
 from ..control.controller import Controller
 from ..dataset import Dataset
+from ..dataset.faults import faults
 from ..errors import SettingError, SewfastError, printable
 from ..evidence import Residuals, estimate
 from ..identification import identify
@@ -209,7 +210,8 @@ def _identified(job: Job, settings: Mapping[str, Any], controller: Controller | 
         fit_percent=float(scores.fit_percent),
         rmse=float(scores.rmse),
         noise=noise,
-        verdict=str(model.training.get("verdict", "")),
+        message="; ".join(f"{fault.text}: {fault.remedy}" for fault in faults(data)),
+        verdict=str(model.training.get("verdict", {}).get("text", "")),
         parameters=hashlib.sha256(model.theta.tobytes()).hexdigest()[:16],
         **quantities,
         **gains,

@@ -44,6 +44,7 @@ class Row:
     status : str
         `ok`, or `failed` with a message instead of a model.
     message : str
+        Why it failed, or what is wrong with the recording (`sewfast.diagnose`).
     samples : int
     Ts : float
         [s]
@@ -221,6 +222,10 @@ class Fleet(Plotted):
         lines += [f"failed  {row.file}: {row.message}" for row in self.failed[:10]]
         if len(self.failed) > 10:
             lines.append(f"  and {len(self.failed) - 10} more; they are in the table")
+        faulty = [row for row in done if row.message]
+        lines += [f"faulty  {row.file}: {row.message}" for row in faulty[:10]]
+        if len(faulty) > 10:
+            lines.append(f"  and {len(faulty) - 10} more; they are in the table")
         lines += [f"drift   {drift}" for drift in self.drifts]
         return "\n".join(lines)
 

@@ -321,7 +321,7 @@ def _excerpt(model: Model, data: Dataset, clock: Clock) -> Dataset:
     return thinned(data, max(LEAST_EVIDENCE, round(left * EVIDENCE_RATE / width)))
 
 
-_JUDGED = ("unstable", "late_input")
+_JUDGED = ("unstable", "late_input", "changes")
 """Faults of a record that the verdict names, and the notes so need not."""
 
 
@@ -330,8 +330,8 @@ def _judged_by(model: Model, faults: Sequence[Fault]) -> Model:
     own: Provenance = model.training["verdict"]
     for fault in faults:
         grade, evidence = own["grade"], own["text"].partition(": ")[2]
-        if fault.kind == "late_input":
-            # it may fit, with a delay that the plant does not have
+        if fault.kind in ("late_input", "changes"):
+            # it may fit, with a delay that the plant does not have, or one part
             grade = "poor" if grade in ("good", "fair") else grade
             text = f"{TEXTS[grade]}: {fault.text} ({evidence})"
         elif (

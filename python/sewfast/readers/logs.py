@@ -27,6 +27,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import DataError, not_installed, printable
 from ..recordfile.format import LIBRARY, MAGIC
+from ..storage import file_bytes
 from .blackbox import BLACKBOX, SALEAE, blackbox_series, saleae_series
 from .containers import MAX_COLUMNS, Table, freeze
 
@@ -112,7 +113,7 @@ def send(name: str) -> None:
     """
     out, sys.stdout = sys.stdout.buffer, sys.stderr
     path = Path(sys.argv[1])
-    raw = path.read_bytes()
+    raw = file_bytes(path)
     _bound_memory(MEMORY + MEMORY_PER_BYTE * len(raw))
     arrays: dict[str, Any] = {}
     texts: list[str] = []

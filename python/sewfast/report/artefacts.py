@@ -154,8 +154,8 @@ def _drawings(results: Mapping[str, Any]) -> list[str]:
 def drawing(path: Path) -> str:
     """An SVG without active content; anything else is a `DataError`."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as e:
+        text = storage.file_bytes(path).decode()
+    except (DataError, UnicodeDecodeError) as e:
         raise DataError(
             f"{path}: expected by the report, cannot be read ({e}); run `sewfast demo` again"
         ) from e
