@@ -287,7 +287,7 @@ class _Pair:
         """Sums of squares if the second part has another gain, and the fits to both."""
         G = self.G[0] + gains[:, None, None] ** 2 * self.G[1] + self.ridge
         r = self.r[0] + gains[:, None] * self.r[1]
-        theta: FloatArray = np.linalg.solve(G, r[:, :, None])[:, :, 0]
+        theta = np.asarray(np.linalg.solve(G, r[:, :, None])[:, :, 0], dtype=np.float64)
         left = np.maximum(sum(self.of_y) - (r * theta).sum(axis=1), 0.0)
         return np.asarray(left, dtype=np.float64), theta
 
