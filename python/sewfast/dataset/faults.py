@@ -286,17 +286,23 @@ def copied(data: Dataset) -> Copy | None:
         is_binary = len(np.unique(u[:MOST])) < 3
         if len(y) < 4 * PAST or (is_binary and np.count_nonzero(np.diff(u)) < PAST):
             continue
-        if _scale([np.column_stack([u, y])]) is None:
+        # most records show in their beginning that this is none
+        if not _is_line(u[:MOST], y[:MOST]) or _scale([np.column_stack([u, y])]) is None:
+            continue
+        if not _is_line(u, y):
             continue
         covariance = float(np.mean((u - u.mean()) * (y - y.mean())))
-        if abs(covariance) < 0.999 * float(u.std() * y.std()):
-            continue
         gain = covariance / float(u.var())
         offset = float(y.mean() - gain * u.mean())
         rounding = _rounding(y) + abs(gain) * _rounding(u)
         if float(np.abs(y - gain * u - offset).max()) <= 1.01 * rounding:
             return Copy(j, gain, offset, delay)
     return None
+
+
+def _is_line(u: FloatArray, y: FloatArray) -> bool:
+    covariance = float(np.mean((u - u.mean()) * (y - y.mean())))
+    return abs(covariance) >= 0.999 * float(u.std() * y.std())
 
 
 def _rounding(column: FloatArray) -> float:

@@ -19,7 +19,7 @@ from .operating import operating_range
 from .parameters import Criteria, Parameters, StoredInformation, estimate
 from .portmanteau import LAGS, parameter_test, residual_tests
 from .region import RegionRuns, region_runs, training_region
-from .residuals import Residuals, horizon_scores, representative
+from .residuals import Horizon, Residuals, horizon_scores, representative
 from .simulation_bands import (
     LEVEL,
     Bands,
@@ -31,6 +31,8 @@ from .simulation_bands import (
 )
 
 _FORGOTTEN = 0.05
+TESTED = 200_000
+"""Most samples that the tests of the residual use, in blocks: of more all are significant."""
 _M = TypeVar("_M", bound=DynamicModel)
 
 
@@ -72,6 +74,8 @@ def check(
     SettingError
         For a level out of range.
     """
+    from ..identification.folds import thinned
+
     require_dataset(data, "data")
     require_level(level)
     weighed = in_effect(data)
@@ -81,7 +85,10 @@ def check(
     data = weighed
     free = Residuals.of(model, data, init, "free run")
     has_gaps = not all(np.isfinite(e.y).all() for e in data.experiments)
-    tested = free if model.kind != "arx" or has_gaps else Residuals.of(model, data, init)
+    horizon: Horizon = "one step" if model.kind == "arx" and not has_gaps else "free run"
+    tested, part = free, thinned(data, TESTED)
+    if part is not data or horizon != "free run":
+        tested = Residuals.of(model, part, init, horizon)
     scores = horizon_scores(model, data, free)
     unit = free.unit
     on_training = training is data or (training is None and is_training_data(model, data))
