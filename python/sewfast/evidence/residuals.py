@@ -120,7 +120,8 @@ def _gram(series: Sequence[tuple[FloatArray, NDArray[np.bool_]]], order: int) ->
         if len(e) <= order:
             continue
         rows = np.lib.stride_tricks.sliding_window_view(e, order + 1)[:, ::-1]
-        whole = np.lib.stride_tricks.sliding_window_view(known, order + 1).all(axis=1)
+        windows = np.lib.stride_tricks.sliding_window_view(known, order + 1)
+        whole = np.asarray(windows.all(axis=1))
         # a copy of all windows of a long record is larger than everything else together
         for k in range(0, len(rows), WINDOWS):
             kept = rows[k : k + WINDOWS][whole[k : k + WINDOWS]]
