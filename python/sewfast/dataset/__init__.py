@@ -3,7 +3,8 @@
 Read in this order: `experiment` and `dataset` (the values, immutable; as tables of other packages),
 `pieces` (parts, gaps, what a data set must fulfil); preparation: `trends` (offsets, kept for
 restoring), `rates` (sample times, the speed of a position), `outliers`; properties: `summary`,
-`diagnosis` and `feedback` (integrators, closed loops, repetitions).
+`diagnosis` and `feedback` (integrators, closed loops, repetitions), `faults` and `changes` (records
+that deceive).
 """
 
 from ..arrays import FloatArray, HasUnits, labelled, require_same_units

@@ -104,6 +104,10 @@ def fast_length(n: int) -> int:
     return min(f << max(0, (-(-n // f) - 1).bit_length()) for f in (1, 3, 5))
 
 
+WINDOWS = 1 << 17
+"""Windows that are copied at a time."""
+
+
 def _largest_order(series: Sequence[tuple[FloatArray, NDArray[np.bool_]]]) -> int:
     longest = max((int(known.sum()) for _, known in series), default=0)
     return min(LARGEST_ORDER, int(10.0 * np.log10(max(longest, 1))), longest // 20)
@@ -116,10 +120,13 @@ def _gram(series: Sequence[tuple[FloatArray, NDArray[np.bool_]]], order: int) ->
         if len(e) <= order:
             continue
         rows = np.lib.stride_tricks.sliding_window_view(e, order + 1)[:, ::-1]
-        whole = np.lib.stride_tricks.sliding_window_view(known, order + 1).all(axis=1)
-        kept = rows[whole]
-        total[:-1] += gram(kept)
-        total[-1, 0] += len(kept)
+        windows = np.lib.stride_tricks.sliding_window_view(known, order + 1)
+        whole = np.asarray(windows.all(axis=1))
+        # a copy of all windows of a long record is larger than everything else together
+        for k in range(0, len(rows), WINDOWS):
+            kept = rows[k : k + WINDOWS][whole[k : k + WINDOWS]]
+            total[:-1] += gram(kept)
+            total[-1, 0] += len(kept)
     return total
 
 
