@@ -71,7 +71,7 @@ class Figures:
     notes: str
 
 
-ORACLE_EVALUATIONS = 1500
+ORACLE_EVALUATIONS = 3000
 
 
 def main() -> int:

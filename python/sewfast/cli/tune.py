@@ -174,7 +174,7 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--evaluations", type=int, metavar="N",
-        help="controllers tried (1500; 3000 with --pareto)",
+        help="controllers tried (3000)",
     )  # fmt: skip
     parser.add_argument(
         "--time-budget", type=float, metavar="S",

@@ -40,7 +40,7 @@ from .verdict import Verdict, out_of_reach, verdict_of
 
 Method: TypeAlias = Literal["genetic", "cma-es"]
 
-EVALUATIONS = 1500
+EVALUATIONS = 3000
 """Controllers tried by default."""
 _ENDED_BY = {
     "evaluations": "their number",
