@@ -1,7 +1,7 @@
 """Records that deceive, and good ones: how many are praised, named and accused (`make nonsense`).
 
 A record is praised if the verdict on its model is good or fair and no samples were left out. All
-records are those held back: no rule was made on them (`tests/support/nonsense.py`).
+records are those held back: no rule was made on them (`tests/support/deceivers.py`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
-from nonsense import GOOD, HELD, NONSENSE, data, good, nonsense
+from deceivers import GOOD, HELD, NONSENSE, data, good, nonsense
 from sewfast import SewfastError, identify
 from sewfast.dataset import Dataset
 from sewfast.dataset.faults import faults

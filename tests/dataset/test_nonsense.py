@@ -9,8 +9,8 @@ import pytest
 
 import sewfast as api
 from cli import called as sewfast
+from deceivers import GOOD, HELD, NONSENSE, data, good, held, lag, nonsense
 from effort import FULL
-from nonsense import GOOD, HELD, NONSENSE, data, good, held, lag, nonsense
 from sewfast import diagnose
 from sewfast.dataset import Dataset
 from sewfast.dataset.faults import faults

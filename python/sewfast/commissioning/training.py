@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..dataset import Dataset, Experiment
+from ..dataset.pieces import thinned
 from ..errors import FitError
 from ..evidence import ReportCard, check, with_training_evidence
 from ..identification import seeded
-from ..identification.folds import folds, thinned
+from ..identification.folds import folds
 from ..identification.task import wrap
 from ..models import Ensemble, LinearOE, Model
 from ..recording import Recording

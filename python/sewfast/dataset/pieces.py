@@ -328,6 +328,28 @@ def split_at_gaps(
     return replace(data, experiments=kept, notes=(*data.notes, *dropped))
 
 
+BLOCKS, SHORTEST = 4, 40
+"""Blocks of an experiment that is thinned, and samples of one at least."""
+
+
+def thinned(data: Dataset, samples: int) -> Dataset:
+    """Blocks spread over every experiment: a chirp is a different signal at its end."""
+    if len(data) <= samples:
+        return data
+    share = samples / len(data)
+    pieces = (piece for e in data.experiments for piece in _blocks(e, round(share * len(e))))
+    return replace(data, experiments=tuple(pieces))
+
+
+def _blocks(e: Experiment, samples: int) -> list[Experiment]:
+    length = max(SHORTEST, samples // BLOCKS)
+    if BLOCKS * length >= len(e):
+        return [e]
+    starts = (round(i * (len(e) - length) / (BLOCKS - 1)) for i in range(BLOCKS))
+    blocks = [e.cut(a, a + length) for a in starts]
+    return [b for b in blocks if len(b) - b.unmeasured > SHORTEST // 2]
+
+
 # --- Missing samples: outputs without weight, inputs filled by a stated assumption ----------------
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..dataset import Dataset, require_dataset
 from ..dataset.experiment import in_effect
+from ..dataset.pieces import thinned
 from ..dynamic_model import INIT, DynamicModel
 from ..errors import FitError, SewfastError
 from ..validation import Scores, by_input, noise_of, without_input
@@ -74,8 +75,6 @@ def check(
     SettingError
         For a level out of range.
     """
-    from ..identification.folds import thinned
-
     require_dataset(data, "data")
     require_level(level)
     weighed = in_effect(data)

@@ -15,7 +15,7 @@ from ..arrays import require_whole
 from ..dataset import Dataset, diagnose, require_dataset
 from ..dataset.experiment import in_effect
 from ..dataset.faults import Fault, sound
-from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
+from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane, thinned
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted, SettingError
 from ..evidence import with_training_evidence
@@ -26,7 +26,7 @@ from ..models.linear import LinearDifference
 from ..progress import shown_in_notebooks
 from ..threads import Workers, available, require_workers
 from . import further, grey_box, lagged, linear, mixture
-from .folds import TEXTS, UNSEEN_DATA, Split, thinned, unstable_verdict, verdict
+from .folds import TEXTS, UNSEEN_DATA, Split, unstable_verdict, verdict
 from .outputs import OUTPUTS
 from .rest import for_loops
 from .task import Clock, Progress, Provenance, Task, with_provenance

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.experiment import mean_square, weights_of
+from ..dataset.pieces import thinned
 from ..dynamic_model import INIT, Core
 from ..errors import DataError, FitError
 from ..models import Model
@@ -33,7 +34,6 @@ memorises the record; a later part is the honest test if there are many data.
 FOLDS = 3
 """Number of later parts on which models are judged, each trained on the data before the part."""
 LEAST_HELD_OUT = 2 * INIT
-BLOCKS = 4
 RUN_UP = 10 * INIT
 """Fitted samples at the beginning of a held-out part, so that its state is known for scoring."""
 
@@ -182,24 +182,6 @@ def _shortened(data: Dataset, samples: int) -> Dataset:
     kept = [max(LEAST_HELD_OUT, round(share * len(e))) for e in data.experiments]
     pieces = (e.cut(0, min(n, len(e))) for n, e in zip(kept, data.experiments, strict=True))
     return replace(data, experiments=tuple(pieces))
-
-
-def thinned(data: Dataset, samples: int) -> Dataset:
-    """Blocks spread over every experiment: a chirp is a different signal at its end."""
-    if len(data) <= samples:
-        return data
-    share = samples / len(data)
-    pieces = (piece for e in data.experiments for piece in _blocks(e, round(share * len(e))))
-    return replace(data, experiments=tuple(pieces))
-
-
-def _blocks(e: Experiment, samples: int) -> list[Experiment]:
-    length = max(LEAST_HELD_OUT, samples // BLOCKS)
-    if BLOCKS * length >= len(e):
-        return [e]
-    starts = (round(i * (len(e) - length) / (BLOCKS - 1)) for i in range(BLOCKS))
-    blocks = [e.cut(a, a + length) for a in starts]
-    return [b for b in blocks if len(b) - b.unmeasured > INIT]
 
 
 # --- Errors on held-out data, and their comparison ------------------------------------------------

@@ -13,6 +13,7 @@ import numpy as np
 from .. import _core
 from ..arrays import gram
 from ..dataset import Dataset, Experiment, FloatArray
+from ..dataset.pieces import thinned
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, SettingError
 from ..models import Model
@@ -20,7 +21,7 @@ from ..models.grey_box import MOST_UNITS, GreyBox
 from ..motorfit import PLACE, estimated, rad_per_second, records_of
 from ..motorfit.estimation import Normal, minimised
 from ..progress import TimeUp
-from .folds import Errors, Split, compared, errors_of, folds, free_runs, thinned
+from .folds import Errors, Split, compared, errors_of, folds, free_runs
 from .task import Look, Pool, Provenance, R, Task, finite
 
 TERMS = ("lag", "delay", "coulomb", "offset", "drop", "stribeck", "limit")

@@ -17,13 +17,14 @@ import numpy as np
 from .. import _core
 from ..dataset import Dataset, Diagnosis, FloatArray
 from ..dataset.experiment import mean_square, weights_of
+from ..dataset.pieces import thinned
 from ..errors import FitError, Interrupted
 from ..models import Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from ..models.base import EnsembleCore
 from ..models.grey_box import GreyBox
 from . import grey_box
 from .blocks import LEAST, Blocks, Mixture, Row, blocked, combined
-from .folds import TEXTS, Split, thinned, verdict, what_to_record
+from .folds import TEXTS, Split, verdict, what_to_record
 from .grey_box import or_none
 from .linear import LinearCandidate, linear_provenance, short
 from .table import SHARE_OF_REFIT, TRAINING, Table

@@ -22,10 +22,10 @@ from typing import Any, TypeAlias
 
 from .. import _core
 from ..dataset import Diagnosis, diagnose
+from ..dataset.pieces import thinned
 from ..models.base import EnsembleCore
 from . import grey_box
 from .blocks import FAR, Blocks, Mixture, Row, near
-from .folds import thinned
 from .grey_box import or_none
 from .linear import HELD_OUT, MISLED, ROUNDING, LinearTable, raised, time_constant
 from .outputs import ABS, LINEAR, Output, named, rectified_start, suggested
