@@ -186,9 +186,10 @@ fn staged<P: Plant + Clone + Send + Sync>(
     let Some(last) = trace.last_mut() else {
         return Ok(scouted);
     };
-    // A stop must not lose what has been found.
-    let design = designed(task.variables, &scouted.point, &task.start)?;
-    let judgement = bench.clone().judge_one(task, &design, &Monitor::default());
+    // a stop must not lose what has been found
+    let judge = |design| bench.clone().judge_one(task, &design, &Monitor::default());
+    let design = designed(task.variables, &scouted.point, &task.start);
+    let judgement = design.map_or(Judgement::HOPELESS, judge);
     *last = judgement;
     let found = Found {
         judgement,
@@ -287,8 +288,8 @@ impl<'a, P> Task<'a, P> {
 
     /// How many of a plant's runs weigh as much as one on all plants; `None` for a run that is not in this extent.
     ///
-    /// In a part, every plant bears its load steps, as most constraints are about them, and each reference is followed by one
-    /// plant: the plants are taken as the golden ratio scatters them, which avoids one variation of every model.
+    /// In a part, every plant bears its load steps, as most constraints are about them, and one plant follows each reference.
+    /// Plants are a model's variations, one model after the other: steps of the golden ratio meet several of both.
     fn share(&self, extent: Extent, plant: usize, run: usize) -> Option<f64> {
         let Some(reference) = run.checked_sub(self.loads.len()) else {
             return Some(1.0);
