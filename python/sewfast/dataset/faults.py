@@ -287,11 +287,10 @@ def copied(data: Dataset) -> Copy | None:
         if len(y) < 4 * PAST or (is_binary and np.count_nonzero(np.diff(u)) < PAST):
             continue
         # most records show in their beginning that this is none
-        if not _is_line(u[:MOST], y[:MOST]) or _scale([np.column_stack([u, y])]) is None:
+        if _of_line(u[:MOST], y[:MOST]) is None or _scale([np.column_stack([u, y])]) is None:
             continue
-        if not _is_line(u, y):
+        if (covariance := _of_line(u, y)) is None:
             continue
-        covariance = float(np.mean((u - u.mean()) * (y - y.mean())))
         gain = covariance / float(u.var())
         offset = float(y.mean() - gain * u.mean())
         rounding = _rounding(y) + abs(gain) * _rounding(u)
@@ -300,9 +299,10 @@ def copied(data: Dataset) -> Copy | None:
     return None
 
 
-def _is_line(u: FloatArray, y: FloatArray) -> bool:
+def _of_line(u: FloatArray, y: FloatArray) -> float | None:
+    """The covariance of two columns that lie on a line; None if they do not."""
     covariance = float(np.mean((u - u.mean()) * (y - y.mean())))
-    return abs(covariance) >= 0.999 * float(u.std() * y.std())
+    return covariance if abs(covariance) >= 0.999 * float(u.std() * y.std()) else None
 
 
 def _rounding(column: FloatArray) -> float:
@@ -491,9 +491,14 @@ class Fault:
         return self.kind in ("unstable", "at_once")
 
     @property
+    def with_remedy(self) -> str:
+        """What is wrong and what to do."""
+        return f"{self.text}: {self.remedy}"
+
+    @property
     def warning(self) -> str:
         """For the notes of a model."""
-        return f"warning: {self.text}" + ("; left out" if self.dead else f": {self.remedy}")
+        return f"warning: {f'{self.text}; left out' if self.dead else self.with_remedy}"
 
 
 def faults(data: Dataset) -> tuple[Fault, ...]:

@@ -338,7 +338,7 @@ def record(data: Dataset) -> list[Line]:
     """A line for each fault of the record itself, as `look` and `identify` name it."""
     return [
         Line("record", math.nan, fault.kind.replace("_", " "), "none",
-             "warn" if fault.is_of_plant else "fail", f"{fault.text}: {fault.remedy}")
+             "warn" if fault.is_of_plant else "fail", fault.with_remedy)
         for fault in faults(data)
     ]  # fmt: skip
 

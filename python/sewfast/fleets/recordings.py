@@ -210,7 +210,7 @@ def _identified(job: Job, settings: Mapping[str, Any], controller: Controller | 
         fit_percent=float(scores.fit_percent),
         rmse=float(scores.rmse),
         noise=noise,
-        message="; ".join(f"{fault.text}: {fault.remedy}" for fault in faults(data)),
+        message="; ".join(fault.with_remedy for fault in faults(data)),
         verdict=str(model.training.get("verdict", {}).get("text", "")),
         parameters=hashlib.sha256(model.theta.tobytes()).hexdigest()[:16],
         **quantities,

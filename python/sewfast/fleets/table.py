@@ -219,13 +219,10 @@ class Fleet(Plotted):
                 f"fit on the held-back 30 %: median {middle:.1f} %, worst "
                 f"{worst.fit_percent:.1f} % ({worst.file})"
             )
-        lines += [f"failed  {row.file}: {row.message}" for row in self.failed[:10]]
-        if len(self.failed) > 10:
-            lines.append(f"  and {len(self.failed) - 10} more; they are in the table")
-        faulty = [row for row in done if row.message]
-        lines += [f"faulty  {row.file}: {row.message}" for row in faulty[:10]]
-        if len(faulty) > 10:
-            lines.append(f"  and {len(faulty) - 10} more; they are in the table")
+        for word, rows in ("failed", self.failed), ("faulty", [r for r in done if r.message]):
+            lines += [f"{word}  {row.file}: {row.message}" for row in rows[:10]]
+            if len(rows) > 10:
+                lines.append(f"  and {len(rows) - 10} more; they are in the table")
         lines += [f"drift   {drift}" for drift in self.drifts]
         return "\n".join(lines)
 

@@ -235,9 +235,9 @@ def tune(
     A candidate runs on every plant in every variation over every reference, with encoder, feedback
     filter and limits in the loop. A run's cost is a weighted sum of terms (`Cost`). Three quarters
     of the candidates follow each reference on one plant only; the others, about the best of these,
-    do all of it until nothing improves any more. Gains are as good in a third of the time. A seed
-    gives the same bits at any number of threads. The result is never worse than a start that keeps
-    to the constraints.
+    do all of it until nothing improves any more. Costs are within some percent of a search over
+    everything, in less than half of its time. A seed gives the same bits at any number of threads.
+    The result is never worse than a start that keeps to the constraints.
 
     Parameters
     ----------

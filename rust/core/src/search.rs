@@ -202,10 +202,9 @@ fn proceed<P: Problem>(
         let judgements = several(&mut memories, &candidates, together, |memory, some| {
             let judged = problem.judge(memory, some, monitor);
             monitor.advance(some.len() as u64);
-            for judged in judged.iter().filter(|j| j.violation == 0.0) {
-                if problem.is_whole() {
-                    monitor.report_cost(judged.cost);
-                }
+            let counts = |j: &&Judgement| problem.is_whole() && j.violation == 0.0;
+            for judged in judged.iter().filter(counts) {
+                monitor.report_cost(judged.cost);
             }
             judged
         });
