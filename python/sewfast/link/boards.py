@@ -40,8 +40,9 @@ ANSWER_WITHIN = 0.25
 """Longest wait for a line [s]."""
 QUIET, QUIET_WITHIN = 0.02, 0.5
 """Time without a byte after which the line counts as quiet, and the longest wait for that [s]."""
-WATCHDOG = 0.2
-"""Time without a command after which a board switches the motor off by itself [s]."""
+WATCHDOG, SAMPLES = 0.2, 3.0
+"""Time without a command after which a board switches the motor off by itself [s], and its least
+number of samples: a command that is one sample late ends a run, and must find a board that runs."""
 LONGEST_LINE = 4096
 """A line with more characters does not come from a board of this kind."""
 
@@ -123,6 +124,11 @@ class PolledBoard(Unique, ABC):
         except BaseException:
             self._port.close()
             raise
+
+    @property
+    def _alive_within(self) -> float:
+        """Time of the board's watchdog [s]."""
+        return max(WATCHDOG, SAMPLES * self.Ts)
 
     # --- each board's own part ------------------------------------------------------------------
 

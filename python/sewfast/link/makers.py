@@ -12,7 +12,7 @@ import time
 from contextlib import suppress
 
 from ..errors import LinkError, SettingError
-from .boards import QUIET_WITHIN, WATCHDOG, Clock, PolledBoard
+from .boards import QUIET_WITHIN, Clock, PolledBoard
 from .ports import Port
 
 IDLE, CLOSED_LOOP = 1, 8
@@ -42,8 +42,9 @@ class ODrive(PolledBoard):
 
     Notes
     -----
-    During a run the axis's own watchdog is set to 0.2 s: if this computer dies, the ODrive switches
-    the motor off by itself. Afterwards control mode, input mode and watchdog are as before.
+    During a run the axis's own watchdog is set to 0.2 s, or 3 `Ts`: if this computer dies, the
+    ODrive switches the motor off by itself. Afterwards control mode, input mode and watchdog are
+    as before.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class ODrive(PolledBoard):
         for what, value in (
             ("controller.config.control_mode", TORQUE),
             ("controller.config.input_mode", PASSTHROUGH),
-            ("config.watchdog_timeout", WATCHDOG),
+            ("config.watchdog_timeout", self._alive_within),
         ):
             self._before.setdefault(what, self._read(f"{self._place}.{what}"))
             self._write(what, value)
@@ -267,7 +268,7 @@ class SimpleFOC(PolledBoard):
         motor = self._motor
         wanted = {f"{motor}LU": self.volt}
         if self._watchdog is not None:
-            wanted[self._watchdog] = 1e3 * WATCHDOG
+            wanted[self._watchdog] = 1e3 * self._alive_within
         for command, answer in ((f"{motor}C0", "torque"), (f"{motor}T0", "volt")):
             if (found := self._ask(command)) != answer:
                 raise self._unexpected(f"{answer!r} in answer to {command!r}", found)
