@@ -337,7 +337,7 @@ def untrue(
     faults = []
     for name in row.made:
         is_new = any(n == name or n.startswith(f"{name}/") for n in new)
-        if (name in told) != is_new:
+        if bool(re.search(rf"(?<![\w.]){re.escape(name)}(?![\w.])", told)) != is_new:
             faults.append(
                 f"{name} {'was' if is_new else 'was not'} written; said: {told.strip()[:200]}"
             )

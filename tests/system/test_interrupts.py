@@ -53,5 +53,5 @@ def test_ctrl_c_at_any_time_ends_a_command_and_leaves_whole_files(
             at = drawn.uniform(0.0, SPAN)
             found = bench["trial"](row, place, at, twice=i % 4 == 1, old=None, usual=0)
             if found.faults:
-                faults[row.name, at] = found.faults
+                faults[row.name, at] = (*found.faults, found.text)
     assert faults == {}

@@ -13,9 +13,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -349,6 +350,10 @@ def _connected(
             # messages of its processes about each other while they end are irrelevant
             "silence_logs": logging.CRITICAL,
         }
+        # nor is what it says in this process once it has been closed on an interruption
+        logger = logging.getLogger("distributed")
+        level = logger.level
+        logger.setLevel(logging.CRITICAL)
         others = set(multiprocessing.active_children())  # of the program that calls this
         cluster = _without_ctrl_c(lambda: distributed.LocalCluster(**options))
         with cluster, distributed.Client(cluster) as made:
@@ -359,6 +364,7 @@ def _connected(
                 for process in set(multiprocessing.active_children()) - others:
                     process.kill()
                 raise
+        logger.setLevel(level)
 
 
 def _without_ctrl_c(start: Callable[[], Any]) -> Any:
@@ -369,6 +375,8 @@ def _without_ctrl_c(start: Callable[[], Any]) -> Any:
 
     def run() -> None:
         if hasattr(signal, "pthread_sigmask"):
+            # one that started later would unblock the signals of this thread
+            resource_tracker.ensure_running()
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             started.set_result(start())
@@ -379,8 +387,14 @@ def _without_ctrl_c(start: Callable[[], Any]) -> Any:
     try:
         return started.result()
     except KeyboardInterrupt:
-        started.add_done_callback(lambda made: made.exception() or made.result().close())
+        started.add_done_callback(_closed)
         raise
+
+
+def _closed(made: Future[Any]) -> None:
+    """Close a cluster that nobody wants any more, unless the end of this process did so."""
+    with suppress(Exception):
+        made.result().close()
 
 
 # --- Journal --------------------------------------------------------------------------------------
