@@ -309,11 +309,11 @@ class _Look:
         return bool(self.found["motor"]["lag"] > 2.0 * len(self.recording) * self.recording.Ts)
 
     def is_too_fast(self) -> bool:
-        """Whether the run ended at the machine's own limit of speed."""
+        """Whether the run reached the machine's own limit of speed."""
         r = self.recording
         k = min(4, len(r) - 1)
-        turns = abs(float(r.counts[-1] - r.counts[-1 - k])) / r.counts_per_rev
-        return 60.0 * turns / (k * r.Ts) > 0.8 * self.speed
+        turns = np.nanmax(np.abs(r.counts[k:] - r.counts[:-k])) / r.counts_per_rev
+        return bool(60.0 * turns / (k * r.Ts) > 0.8 * self.speed)
 
 
 _LOST_ENCODER = "check the encoder's cable and supply, the coupling, whether the shaft is blocked"

@@ -478,7 +478,8 @@ def cautious(
         except Aborted as stop:
             if stop.frequency is None:
                 raise
-            swing = Swing(share, stop.frequency, float(stop.recording.u.std()), 1.0)
+            u = np.trim_zeros(stop.recording.u, "b")  # then it came to rest
+            swing = Swing(share, stop.frequency, float(u.std()), 1.0)
         if swing is None:
             continue
         kept = BACK * share

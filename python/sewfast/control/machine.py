@@ -14,7 +14,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeGuard, cast
 
 import numpy as np
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from .. import _core
 from ..arrays import FloatArray
 from ..causes import cause_of
-from ..errors import DataError, LinkError, SettingError
+from ..errors import DataError, LinkError, SettingError, SewfastError
 from ..gains import real
 from ..machine import VirtualMachine
 from ..recordfile.writer import require_replaceable
@@ -363,8 +363,9 @@ class MachineBench:
         return RecordedRun.of(found, recording)
 
 
-COAST = 5.0
-"""Longest wait for rest after a machine has been too fast [s]."""
+COAST, TAIL = 5.0, 0.25
+"""Longest wait for rest after a run was ended, and how much of it is recorded [s]: in seconds of a
+machine that nothing stops, what happened before would count little."""
 TOO_FAST = (
     "look for a load that drives it, a turned sign of command or encoder, a gain larger than "
     "recorded, wrong counts_per_rev, a counter that wraps"
@@ -464,7 +465,7 @@ class SteppedBench:
             u[k] = core.step(float(r[k]), (counts - before[0]) * per_count)
             feedback[k], before[0], seen[k] = core.filtered, counts, counts
             if guard is not None and guard.watch(u[k : k + 1], seen[k : k + 1]) is not None:
-                raise self._lost(name, u[: k + 1], seen[: k + 1])
+                raise self._lost(name, u[k])
             return float(u[k])
 
         recording = self._played(decide, len(r), name)
@@ -484,76 +485,74 @@ class SteppedBench:
             Ts=self.Ts, counts_per_rev=self.counts_per_rev, volt=self.volt, speed=self.speed
         )
         u, counts, speed = np.zeros(samples), np.zeros(samples), np.zeros(samples)
-
-        def recording(until: int) -> Recording:
-            true = speed[:until] if hasattr(machine, "speed_rpm") else None
-            if until < samples:
-                return self._part(name, u[:until], counts[:until], true)
-            return Recording.of_counts(
-                u, counts, Ts=self.Ts, counts_per_rev=self.counts_per_rev, name=name,
-                speed_true=true,
-            )  # fmt: skip
-
         try:
             for k in range(samples):
                 counts[k], speed[k] = machine.counts - first, getattr(machine, "speed_rpm", np.nan)
                 seen = guard.take(counts[k]) if math.isfinite(counts[k]) else None
+                until = name, u[: k + 1], counts[: k + 1]
                 if seen is not None:
-                    rests = self._rests(guard, first)
-                    raise self._tripped(name, k, seen[1], u[max(0, k - 1)], rests, recording)
-                u[k] = min(max(decide(k, float(counts[k])), -self.volt), self.volt)
+                    recording = self._rested(guard, first, *until)
+                    error = self._too_fast(name, k, seen[1], u[max(0, k - 1)], guard)
+                    self._explain(error, recording)
+                    raise error
+                try:
+                    command = decide(k, float(counts[k]))
+                except SewfastError as stop:  # of who watches
+                    self._explain(stop, self._rested(guard, first, *until))
+                    raise
+                u[k] = min(max(command, -self.volt), self.volt)
                 machine.step(u[k])
         finally:
             # a test rig holds its last command: no run may leave it turning, however it ends
             machine.step(0.0)
-        return recording(samples)
+        return Recording.of_counts(
+            u, counts, Ts=self.Ts, counts_per_rev=self.counts_per_rev, name=name,
+            speed_true=speed if hasattr(machine, "speed_rpm") else None,
+        )  # fmt: skip
 
-    def _rests(self, guard: _core.Guard, first: float) -> bool:
-        """Command rest until the machine stands, for `COAST` at most; whether it does."""
-        for _ in range(round(COAST / self.Ts)):
+    def _rested(
+        self, guard: _core.Guard, first: float, name: str, u: FloatArray, counts: FloatArray
+    ) -> Recording:
+        """The run so far and how the machine comes to rest: rest is commanded from the last sample
+        on until it stands. A stage that is stuck, or a load that drives it, obeys no such command.
+        """
+        coast: list[float] = []
+        while len(coast) * self.Ts < COAST and not guard.at_rest:
             self.machine.step(0.0)
-            counts = self.machine.counts - first
-            if not math.isfinite(counts):
-                return False
-            guard.take(counts)
-            if guard.at_rest:
-                return True
-        return False
+            now = self.machine.counts - first
+            if not math.isfinite(now):
+                break
+            guard.take(now)
+            coast.append(now)
+        shown = coast[: round(TAIL / self.Ts)]
+        u, counts = np.append(u[:-1], np.zeros(1 + len(shown))), np.append(counts, shown)
+        # it can be too short for a speed
+        y = speed_or_nan(counts, self.Ts, self.counts_per_rev, "kalman")
+        return Recording(u, counts, y, None, self.Ts, self.counts_per_rev, name)
 
-    def _lost(self, name: str, u: FloatArray, counts: FloatArray) -> LinkError:
+    def _explain(self, error: Any, recording: Recording) -> None:
+        """Tell an error what was recorded, and its cause if that shows one."""
+        part = getattr(error, "recording", None)
+        error.recording = recording if part is None else replace(recording, name=part.name)
+        if isinstance(error, LinkError):
+            with contextlib.suppress(DataError):  # too few samples
+                cause = cause_of(recording, volt=self.volt, speed=self.speed)
+                if cause is not None:
+                    error.explain(cause)
+
+    def _lost(self, name: str, u: float) -> LinkError:
         """The error for a loop without an encoder."""
-        error = LinkError(
+        return LinkError(
             name=f"{self.name}, {name}", expected="the encoder to move",
-            received=f"not a count for .25 s, at last at {u[-1]:.3g} V; rest was commanded",
+            received=f"not a count for .25 s, at last at {u:.3g} V; rest was commanded",
             remedy=NO_MOTION,
         )  # fmt: skip
-        return self._explained(error, self._part(name, u, counts))
 
-    def _part(
-        self, name: str, u: FloatArray, counts: FloatArray, true: FloatArray | None = None
-    ) -> Recording:
-        """What there is of a run that was ended, which can be too short for a speed."""
-        y = speed_or_nan(counts, self.Ts, self.counts_per_rev, "kalman")
-        return Recording(u, counts, y, true, self.Ts, self.counts_per_rev, name)
-
-    def _explained(self, error: LinkError, recording: Recording) -> LinkError:
-        """The error with what was recorded, and its cause if that shows one."""
-        error.recording = recording
-        with contextlib.suppress(DataError):  # too few samples
-            cause = cause_of(recording, volt=self.volt, speed=self.speed)
-            if cause is not None:
-                error.explain(cause)
-        return error
-
-    def _tripped(
-        self, name: str, k: int, speed: float, u: float, rests: bool,
-        recording: Callable[[int], Recording],
-    ) -> LinkError:  # fmt: skip
-        after = "it stands now" if rests else f"it still turns {COAST:g} s after that"
-        error = LinkError(
+    def _too_fast(self, name: str, k: int, speed: float, u: float, guard: _core.Guard) -> LinkError:
+        after = "it stands now" if guard.at_rest else f"it still turns {COAST:g} s after that"
+        return LinkError(
             name=f"{self.name}, {name}", expected=f"at most {self.speed:g} RPM",
             received=f"{speed:.4g} RPM after {k * self.Ts:.3g} s, under {u:.3g} V; rest was "
             f"commanded, and {after}",
             remedy=TOO_FAST,
         )  # fmt: skip
-        return self._explained(error, recording(k + 1))
