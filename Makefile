@@ -43,11 +43,10 @@ dev: $(DEV) ## builds and installs what the checks need (--jobs=2: in parallel)
 
 # compilers side by side: one that optimises a crate keeps one processor busy
 SYNC := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
-# package before lint: clippy sets pyo3 up in another way than maturin, and each compiles it anew after the other
-FIRST ?= dev package rust-units
 test: ## every check of the day; ends with pytest's summary, which names what is left to `make nightly`
-	$(MAKE) --no-print-directory --jobs=3 $(SYNC) $(FIRST)
-	$(MAKE) --no-print-directory --jobs=2 $(SYNC) rust-rest lint no-std c-test
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) dev rust-units
+# package first: clippy sets pyo3 up in another way than maturin, and each compiles it anew after the other
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) package rust-rest lint no-std c-test
 	$(MAKE) --no-print-directory python-test
 
 test-core: ## the crates and the package without documentation, extras, ports and browser

@@ -73,6 +73,7 @@ def results(demo: Path) -> dict[str, Any]:
     return dict(json.loads((demo / "results.json").read_text()))
 
 
+@pytest.mark.slow("the first that asks for the experiment, which every test of it shares")
 def test_the_results_hold_every_score(results: dict[str, Any]) -> None:
     assert (results["format"], results["version"]) == ("sewfast.results", 1)
     for model in ("paper", "neural_oe", "oe", "oe_all", "arx"):

@@ -198,9 +198,10 @@ def test_a_slower_and_a_later_one_are_what_they_say() -> None:
 # --- as a candidate of the search -----------------------------------------------------------------
 
 
+@pytest.mark.slow("the one full search by day that ends in a motor")
 @pytest.mark.parametrize("seed", [1, 2, 3] if FULL else [1])
 def test_the_search_takes_a_motor_for_a_motor(seed: int) -> None:
-    model: Any = sewfast.identify(_plant(4000, seed), seed=seed)
+    model: Any = sewfast.identify(_plant(1500, seed), seed=seed)
     assert model.kind == "grey_box"
     choice = model.training["choice"]
     assert choice["chosen"] == "grey_box"

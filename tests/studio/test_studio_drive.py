@@ -286,21 +286,31 @@ def _run(command: list[str], folder: Path) -> None:
 # --- What is seen and kept ------------------------------------------------------------------------
 
 
-def test_a_recording_is_seen_kept_and_can_be_copied(studio: Studio, tmp_path: Path) -> None:
-    asked = {"signal": "step", "seed": 0, "scale": 0.3, "file": "step.mcap"}
+STEP = {"signal": "step", "seed": 0, "scale": 0.3, "file": "step.mcap"}
+
+
+def test_a_recording_is_seen_and_kept(studio: Studio, tmp_path: Path) -> None:
     with Watching(studio) as page:
         page.armed("virtual:1", volt=12.0)
-        assert page.ask("drive_record", **asked)["found"] is None
-        found = page.event("driven")
-        assert found["found"]["file"] == "step.mcap"
+        assert page.ask("drive_record", **STEP)["found"] is None
+        assert page.event("driven")["found"]["file"] == "step.mcap"
         seen = page.ask("live", seconds=30, columns=4000)
         assert seen["found"]["end"] == seen["found"]["received"] == 3000
-        assert "there is such a file" in page.ask("drive_record", **asked)["error"]
+        assert "there is such a file" in page.ask("drive_record", **STEP)["error"]
         page.event("state", recordings=["step.mcap"])
     kept = read_recording(tmp_path / "step.mcap")
     assert kept.outcome == "complete"
     assert kept.header.settings["limits"]["volt"] == 12.0
     np.testing.assert_allclose(seen["curves"]["u_low"], kept.columns["u"], atol=1e-6)
+
+
+@pytest.mark.nightly("recordings, made twice")
+def test_copies_of_a_recording_do_the_same(studio: Studio, tmp_path: Path) -> None:
+    with Watching(studio) as page:
+        page.armed("virtual:1", volt=12.0)
+        assert page.ask("drive_record", **STEP)["found"] is None
+        found = page.event("driven")
+    kept = read_recording(tmp_path / "step.mcap")
     for command in _both(found):
         (tmp_path / "step.mcap").unlink()
         _run(command, tmp_path)
@@ -441,7 +451,7 @@ def test_sigterm_in_a_flood_ends_it_in_time(tmp_path: Path, device: VirtualDevic
                     ("", "GET / HTTP/1.1", f"GET / HTTP/1.1\r\nHost: {i}\r\n\r\n")[i % 3].encode()
                 )
             for _ in range(10):
-                deaf = flood.enter_context(Page(served))
+                deaf = flood.enter_context(Page(served, close_timeout=0.1))
                 for _ in range(90):
                     deaf.socket.send(json.dumps({"do": "ports"}))
             began = time.monotonic()

@@ -17,9 +17,9 @@ import json, sys
 import numpy as np
 import sewfast
 from sewfast import _core
-u = np.sin(np.linspace(0.0, 60.0, 1200) ** 1.3)
-y = np.zeros(1200)
-for k in range(1, 1200):
+u = np.sin(np.linspace(0.0, 60.0, 600) ** 1.3)
+y = np.zeros(600)
+for k in range(1, 600):
     y[k] = 0.9 * y[k - 1] + 0.2 * np.tanh(1.5 * u[k - 1])
 data = sewfast.Dataset.from_arrays(u, y, 0.001)
 told = {"cpu": _core.cpu}

@@ -140,6 +140,7 @@ def test_a_killed_host_leaves_the_output_off_in_time() -> None:
     assert min(late) > 0.5 * watchdog, late
 
 
+@pytest.mark.nightly("measures the link, records and runs in real time")
 @needs_board
 def test_the_command_goes_from_doctor_to_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -153,6 +154,12 @@ def test_the_command_goes_from_doctor_to_run(
     assert {p.name for p in out.iterdir()} >= {"chirp.mcap", "first.json", "first.mcap"}
     assert main(words) == 2
     assert "--overwrite" in capsys.readouterr().err
+
+
+@needs_board
+def test_the_command_refuses_a_place_that_cannot_be_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "file").touch()
     for wrong in (tmp_path / "file" / "below", tmp_path / ("x" * 300)):
         assert main(["pil", "--firmware", str(FIRMWARE), "--out", str(wrong)]) == 2
