@@ -238,7 +238,7 @@ def test_a_speed_that_reverses_is_refused() -> None:
 
 
 class Lag:
-    """100 RPM/V with a time constant of .1 s, and how often it was advanced at a limit of 4 V."""
+    """100 RPM/V with a time constant of .1 s, and how often it was advanced at its limit of 4 V."""
 
     def __init__(self) -> None:
         self.limited = 0
@@ -248,7 +248,7 @@ class Lag:
         self.turns = self.speed = self.counts = 0.0
 
     def step(self, u: float) -> None:
-        self.limited += u in (0.0, 4.0) and self.turns > 0.0
+        self.limited += u == 4.0
         self.speed += 0.01 * (100.0 * u - self.speed)
         self.turns += self.speed / 60.0 * 1e-3
         self.counts = float(np.floor(self.turns * 4096.0))

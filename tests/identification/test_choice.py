@@ -150,7 +150,7 @@ def first_order(seed: int, delay: int, n: int = 1500, noise: float = 0.3) -> Dat
     return Dataset.from_arrays(u, y + noise * rng.normal(size=n), 0.01)
 
 
-@pytest.mark.nightly("a search for each delay", by_day=["4"])
+@pytest.mark.nightly("a search for each delay")
 @pytest.mark.parametrize("delay", [1, 4])
 def test_a_small_order_and_the_delay_are_found(delay: int) -> None:
     orders = []
