@@ -98,6 +98,11 @@ def test_a_loop_that_runs_away_is_ended(fault: str, named: str) -> None:
     motor.judge(1.25 if fault == "flips_at" else math.inf)
     assert stop.value.cause.name == named
     assert stop.value.cause.at == pytest.approx(0.5, abs=0.05)
+    # on the way to rest, which a turned sign allows and a stuck stage does not
+    u, counts = stop.value.recording.u, stop.value.recording.counts
+    assert len(u) == len(counts) and not u[-200:].any() and u[-260:].any()
+    speeds = np.diff(counts[-200:])
+    assert (abs(speeds[-1]) < 0.5 * abs(speeds[0])) == (fault == "flips_at")
 
 
 def test_a_loop_that_loses_its_encoder_is_ended_though_nobody_watches_it() -> None:
