@@ -541,6 +541,11 @@ def _wraps(data: Dataset) -> Iterator[Fault]:
     if back < 2 or back < 4 * other:
         return
     period = float(np.median(sizes))
+    # what wraps stays within one turn but for noise (six deviations are at most eight of its median
+    # steps); a stretch that is shifted does not
+    steps = np.concatenate([np.abs(np.diff(y)) for y in columns])
+    if span > period + 8.0 * float(np.median(steps)):
+        return
     turns = (360.0, math.tau, 1.0, *(2.0**b for b in range(8, 33)))
     period = next((turn for turn in turns if abs(period / turn - 1.0) < 0.02), period)
     yield Fault(
