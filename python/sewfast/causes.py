@@ -310,9 +310,9 @@ class _Look:
 
     def is_too_fast(self) -> bool:
         """Whether the run reached the machine's own limit of speed."""
-        r = self.recording
-        k = min(4, len(r) - 1)
-        turns = np.nanmax(np.abs(r.counts[k:] - r.counts[:-k])) / r.counts_per_rev
+        r, (_, counts) = self.recording, _columns(self.recording)
+        k = min(4, len(counts) - 1)
+        turns = np.abs(counts[k:] - counts[:-k]).max() / r.counts_per_rev
         return bool(60.0 * turns / (k * r.Ts) > 0.8 * self.speed)
 
 

@@ -72,6 +72,7 @@ def test_ms_of_a_network_is_that_about_the_level(tmp_path: Path) -> None:
         page.ask("tune_search", evaluations=30, seed=1, constraints={"Ms": 1.8}, **asked)
         asked["values"] = page.event("searched")["found"]["values"]
         said = page.ask("tune_save", file="controller.json", **asked)["found"]
+    assert "--constraint Ms=1.8" in said["commands"]
     written = (tmp_path / "controller.json").read_bytes()
     assert _run(tmp_path, said["python"], said["commands"], "controller.json") == [written] * 2
 

@@ -94,7 +94,9 @@ def test_the_split_is_that_of_the_docstring() -> None:
 @pytest.mark.parametrize("name", families.FAMILIES)
 def test_a_case_is_what_it_claims_to_be(name: str, seed: int) -> None:
     c = case(name, seed)
-    assert (200 if name.startswith("short_") else 500) <= c.samples <= 100_000
+    is_short = name.startswith("short_")
+    least, most = (families.short.LEAST, families.short.MOST) if is_short else (500, 100_000)
+    assert least <= c.samples <= most
     for r in (*c.train, *c.test):
         assert len(r.u) == len(r.y) > c.n
         assert np.isfinite(r.u).all()
@@ -102,7 +104,8 @@ def test_a_case_is_what_it_claims_to_be(name: str, seed: int) -> None:
     # test outputs are the truth's, to the last digit; training outputs are not
     assert all(np.array_equal(c.truth.simulate(r), r.y) for r in c.test)
     spread = np.concatenate([r.y for r in c.train]).std()
-    assert 16 < 20 * math.log10(spread / c.noise) < 62
+    quiet, loud = (42, 13) if is_short else (62, 18)
+    assert loud < 20 * math.log10(spread / c.noise) < quiet
     inputs, outputs = ([getattr(r, x) for r in c.train] for x in ("u", "y"))
     low, high = (f(np.concatenate(outputs)) for f in (np.min, np.max))
     for r in c.test:

@@ -485,20 +485,23 @@ class SteppedBench:
             Ts=self.Ts, counts_per_rev=self.counts_per_rev, volt=self.volt, speed=self.speed
         )
         u, counts, speed = np.zeros(samples), np.zeros(samples), np.zeros(samples)
+
+        def rested(k: int) -> Recording:
+            return self._rested(guard, first, name, u[: k + 1], counts[: k + 1], speed[: k + 1])
+
         try:
             for k in range(samples):
                 counts[k], speed[k] = machine.counts - first, getattr(machine, "speed_rpm", np.nan)
                 seen = guard.take(counts[k]) if math.isfinite(counts[k]) else None
-                until = name, u[: k + 1], counts[: k + 1]
                 if seen is not None:
-                    recording = self._rested(guard, first, *until)
+                    recording = rested(k)
                     error = self._too_fast(name, k, seen[1], u[max(0, k - 1)], guard)
                     self._explain(error, recording)
                     raise error
                 try:
                     command = decide(k, float(counts[k]))
                 except SewfastError as stop:  # of who watches
-                    self._explain(stop, self._rested(guard, first, *until))
+                    self._explain(stop, rested(k))
                     raise
                 u[k] = min(max(command, -self.volt), self.volt)
                 machine.step(u[k])
@@ -511,24 +514,27 @@ class SteppedBench:
         )  # fmt: skip
 
     def _rested(
-        self, guard: _core.Guard, first: float, name: str, u: FloatArray, counts: FloatArray
-    ) -> Recording:
+        self, guard: _core.Guard, first: float, name: str, u: FloatArray, counts: FloatArray,
+        speed: FloatArray,
+    ) -> Recording:  # fmt: skip
         """The run so far and how the machine comes to rest: rest is commanded from the last sample
         on until it stands. A stage that is stuck, or a load that drives it, obeys no such command.
         """
-        coast: list[float] = []
+        coast: list[tuple[float, float]] = []
         while len(coast) * self.Ts < COAST and not guard.at_rest:
             self.machine.step(0.0)
             now = self.machine.counts - first
             if not math.isfinite(now):
                 break
             guard.take(now)
-            coast.append(now)
-        shown = coast[: round(TAIL / self.Ts)]
-        u, counts = np.append(u[:-1], np.zeros(1 + len(shown))), np.append(counts, shown)
+            coast.append((now, getattr(self.machine, "speed_rpm", np.nan)))
+        shown = np.reshape(coast[: round(TAIL / self.Ts)], (-1, 2))
+        u = np.append(u[:-1], np.zeros(1 + len(shown)))
+        counts, speed = np.append(counts, shown[:, 0]), np.append(speed, shown[:, 1])
         # it can be too short for a speed
         y = speed_or_nan(counts, self.Ts, self.counts_per_rev, "kalman")
-        return Recording(u, counts, y, None, self.Ts, self.counts_per_rev, name)
+        true = speed if hasattr(self.machine, "speed_rpm") else None
+        return Recording(u, counts, y, true, self.Ts, self.counts_per_rev, name)
 
     def _explain(self, error: Any, recording: Recording) -> None:
         """Tell an error what was recorded, and its cause if that shows one."""

@@ -521,8 +521,8 @@ def _wraps(data: Dataset) -> Iterator[Fault]:
     if span == 0.0:
         return
     back, other, sizes = 0, 0, []
-    for y in columns:
-        change = np.diff(y)
+    changes = [np.diff(y) for y in columns]
+    for change in changes:
         # changes of an angle are either small or jumps; noise has changes of all sizes between
         other += int(np.sum((np.abs(change) > 0.35 * span) & (np.abs(change) <= 0.7 * span)))
         jumps = np.where(np.abs(change) > 0.7 * span, np.sign(change), 0.0)
@@ -543,8 +543,7 @@ def _wraps(data: Dataset) -> Iterator[Fault]:
     period = float(np.median(sizes))
     # what wraps stays within one turn but for noise (six deviations are at most eight of its median
     # steps); a stretch that is shifted does not
-    steps = np.concatenate([np.abs(np.diff(y)) for y in columns])
-    if span > period + 8.0 * float(np.median(steps)):
+    if span > period + 8.0 * float(np.median(np.abs(np.concatenate(changes)))):
         return
     turns = (360.0, math.tau, 1.0, *(2.0**b for b in range(8, 33)))
     period = next((turn for turn in turns if abs(period / turn - 1.0) < 0.02), period)

@@ -350,10 +350,6 @@ def _connected(
             # messages of its processes about each other while they end are irrelevant
             "silence_logs": logging.CRITICAL,
         }
-        # nor is what it says in this process once it has been closed on an interruption
-        logger = logging.getLogger("distributed")
-        level = logger.level
-        logger.setLevel(logging.CRITICAL)
         others = set(multiprocessing.active_children())  # of the program that calls this
         cluster = _without_ctrl_c(lambda: distributed.LocalCluster(**options))
         with cluster, distributed.Client(cluster) as made:
@@ -363,8 +359,9 @@ def _connected(
                 # nothing that they still compute is wanted, and to ask them to end takes seconds
                 for process in set(multiprocessing.active_children()) - others:
                     process.kill()
+                # the cluster's own silence ends before its last messages
+                logging.getLogger("distributed").setLevel(logging.CRITICAL)
                 raise
-        logger.setLevel(level)
 
 
 def _without_ctrl_c(start: Callable[[], Any]) -> Any:
