@@ -224,7 +224,7 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
 
 def identify_command(args: argparse.Namespace) -> int | None:
     from ..dataset.experiment import in_effect
-    from ..dataset.faults import alive, dead_stretches
+    from ..dataset.sensor import alive, dead_stretches
 
     require_place(args.out, (".json",))
     require_plot(args.plot)

@@ -5,12 +5,7 @@ All tests compare a record with itself, and take the side of the record in doubt
 `identify` refuses count as not known, and no test judges columns that do not move, so that none
 fails on any numbers: columns are compared about their mean, in units of their deviation.
 
-- A dead sensor: the output keeps one value to the last bit while a linear model of the rest, whose
-  output is limited to the recorded range, moves; the input has the levels there at which the output
-  moves elsewhere, so that friction or a dead zone is no explanation; and a limit of the output was
-  not reached by motion, so that a saturation or an end stop is none either.
-- A value that stands out: a few samples, far from those before and after, have more power than the
-  rest of the output.
+- A sensor that died, or said nonsense for a few samples (`sensor`).
 - A counter that wraps: the output jumps by its whole range against the way that it moves before and
   after.
 - No dynamics: for the whole record, the output is the input times a number, or it or its change is
@@ -30,22 +25,28 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import FloatArray, labelled, runs
 from ..errors import DataError
 from ..units import duration
 from .changes import NOTED, changed
 from .outliers import quantum
-from .pieces import LARGEST_FITTED, SMALLEST_FITTED
+from .pieces import LARGEST_FITTED
+from .sensor import (
+    PAST,
+    Dead,
+    alive,
+    dead_stretches,
+    known_rows,
+    measured_columns,
+    scale_of,
+    spikes,
+)
 from .stability import unstable_pole
 
 if TYPE_CHECKING:
     from .dataset import Dataset
-    from .experiment import Experiment
 
-PAST = 10
-"""Past outputs and inputs in the regressions, and largest lead in samples."""
 MOST = 20_000
 """Most samples that a regression uses."""
 SURE = 60.0
@@ -56,209 +57,6 @@ PARTS = 8
 `tests/dataset/test_faults.py` one bump said 65 to 189 for a late input, the other parts below 0."""
 OCTAVES = 6
 """Means of an input over 10, 20, 40 .. samples before these: plants with long dead times."""
-
-
-def _columns(e: Experiment) -> FloatArray:
-    """Inputs and output, NaN where they are not known or no measured quantity is as large."""
-    columns = np.column_stack([e.u, e.y])
-    return np.where(np.abs(columns) < LARGEST_FITTED, columns, np.nan)
-
-
-def _known(columns: FloatArray) -> NDArray[np.bool_]:
-    known: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(columns), axis=1)
-    return known
-
-
-def _scale(parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray] | None:
-    """Mean and deviation of each column over all parts; None if one of them does not move."""
-    whole = np.concatenate(parts) if parts else np.zeros((1, 1))
-    if (np.ptp(whole, axis=0) < SMALLEST_FITTED).any():
-        return None
-    return whole.mean(axis=0), whole.std(axis=0)
-
-
-# --- A sensor that died ---------------------------------------------------------------------------
-
-ORDER = 4
-"""Past outputs and inputs of the model of the rest."""
-LEAST_PART = 0.01
-"""Least part of its experiment for a dead stretch."""
-WINDOWS = 8
-"""Least number of windows of the rest with which a stretch is compared."""
-APART = 10.0
-"""Ratio of squared errors, in the stretch to the worst window of the rest. Of 2,400 sound records
-of `tests/dataset/test_faults.py` the worst has 4.5 (a saturation), of 766 dead sensors the least
-20."""
-
-
-@dataclass(frozen=True)
-class Dead:
-    """A stretch in which the output's sensor says nothing: samples `start` to `stop`, excluded.
-    Samples are those of the file, 0-based; `experiment` is the index in the data set.
-    """
-
-    experiment: int
-    start: int
-    stop: int
-    value: float
-
-
-def dead_stretches(data: Dataset) -> tuple[Dead, ...]:
-    """Stretches in which the output stands still while the rest says that it cannot."""
-    return tuple(
-        Dead(i, e.start + first, e.start + first + count, float(e.y[first]))
-        for i, e in enumerate(data.experiments)
-        for first, count in _dead_in(e)
-    )
-
-
-def _dead_in(e: Experiment) -> list[tuple[int, int]]:
-    columns, least = _columns(e), max(4 * ORDER, LEAST_PART * len(e))
-    known = _known(columns)
-    same = known[1:] & known[:-1] & (e.y[1:] == e.y[:-1])
-    still = [(a, count + 1) for a, count in runs(same) if count + 1 >= least]
-    still = sorted(still, key=lambda s: -s[1])[:20]
-    for first, count in still:
-        known[first : first + count] = False
-    model = _Rest.of(columns, known) if still else None
-    return [] if model is None else sorted(s for s in still if model.contradicts(*s))
-
-
-@dataclass(frozen=True)
-class _Rest:
-    """A linear model of the part of an experiment in which the output moves."""
-
-    u: FloatArray
-    y: FloatArray
-    theta: FloatArray
-    pieces: tuple[tuple[int, int], ...]
-
-    @classmethod
-    def of(cls, columns: FloatArray, rest: NDArray[np.bool_]) -> _Rest | None:
-        pieces = tuple(p for p in runs(rest) if p[1] > 4 * ORDER)
-        scale = _scale([columns[a : a + n] for a, n in pieces])
-        if scale is None:
-            return None
-        u, y = np.split((columns - scale[0]) / scale[1], [-1], axis=1)
-        y = y[:, 0]
-        X = np.concatenate([_regressors(u[a : a + n], y[a : a + n]) for a, n in pieces])
-        if len(X) < 10 * ORDER * (2 + u.shape[1]):
-            return None
-        target = np.concatenate([y[a + ORDER : a + n] for a, n in pieces])
-        theta = np.asarray(np.linalg.lstsq(X, target, rcond=1e-10)[0])
-        return cls(u, y, theta, pieces)
-
-    def contradicts(self, first: int, count: int) -> bool:
-        """Whether the output moves in this stretch, by everything known from the rest."""
-        length = min(count, sum(n for _, n in self.pieces) // WINDOWS)
-        if length <= 2 * ORDER:
-            return False
-        others = np.array([
-            k for a, n in self.pieces for k in range(a, a + n - length + 1, max(1, length // 2))
-        ])  # fmt: skip
-        if len(others) < WINDOWS // 2:
-            return False
-        if not (self._covers(first, count) and self._jumps(first, count)):
-            return False
-        own = np.arange(first, first + count - length + 1, length)
-        errors = self._errors(others, length)
-        return bool(np.median(self._errors(own, length)) > APART * errors.max())
-
-    def _covers(self, first: int, count: int) -> bool:
-        """Whether an input reaches the levels here that it has while the output moves.
-        Friction, a dead zone or a closed valve keep an output still at some levels, but not at the
-        middle half of those at which it moves.
-        """
-        own = self.u[first : first + count]
-        rest = np.concatenate([self.u[a : a + n] for a, n in self.pieces])
-        low, high = np.quantile(rest, [0.25, 0.75], axis=0)
-        inside = (own.min(axis=0) <= low) & (own.max(axis=0) >= high)
-        return bool((inside & (np.ptp(own, axis=0) > 0.0)).any())
-
-    def _jumps(self, first: int, count: int) -> bool:
-        """Whether the output can be at no limit: it is inside the range, or reached it at a jump.
-        A saturated output and an end stop are reached by motion.
-        """
-        y, value = self.y, self.y[first]
-        if np.nanmin(y) < value < np.nanmax(y):
-            return True
-        ends = [abs(y[k] - y[k - 1]) for k in (first, first + count) if 0 < k < len(y)]
-        usual = max(float(np.abs(np.diff(y[a : a + n])).max()) for a, n in self.pieces)
-        return max(ends, default=0.0) > usual
-
-    def _errors(self, starts: np.ndarray, length: int) -> FloatArray:
-        """Mean square errors of free runs from the measured start of each window."""
-        low, high = np.nanmin(self.y), np.nanmax(self.y)
-        past = [self.y[starts + i] for i in range(ORDER)][::-1]
-        total = np.zeros(len(starts))
-        for k in range(ORDER, length):
-            columns = [*past, *(self.u[starts + k - i, j] for j in range(self.u.shape[1])
-                                for i in range(1, ORDER + 1)), np.ones(len(starts))]  # fmt: skip
-            y = np.clip(np.stack(columns, axis=1) @ self.theta, low, high)
-            total += (self.y[starts + k] - y) ** 2
-            past = [y, *past[:-1]]
-        return total / (length - ORDER)
-
-
-def _regressors(u: FloatArray, y: FloatArray) -> FloatArray:
-    k = np.arange(ORDER, len(y))
-    past = [y[k - i] for i in range(1, ORDER + 1)]
-    inputs = [u[k - i, j] for j in range(u.shape[1]) for i in range(1, ORDER + 1)]
-    return np.stack([*past, *inputs, np.ones(len(k))], axis=1)
-
-
-# --- Values that no plant has ---------------------------------------------------------------------
-
-SPIKE = 3
-"""Most samples in a row that are a spike and no motion."""
-SPIKES = 20
-"""Most spikes of an experiment that are looked for."""
-
-
-def spikes(data: Dataset) -> tuple[Dead, ...]:
-    """Short stretches of the output that have most of its power, while no input stands out."""
-    return tuple(
-        Dead(i, e.start + first, e.start + first + count, float(e.y[first]))
-        for i, e in enumerate(data.experiments)
-        for first, count in _spikes_in(_columns(e))
-    )
-
-
-def _spikes_in(columns: FloatArray) -> Iterator[tuple[int, int]]:
-    y = columns[:, -1]
-    for _ in range(SPIKES):
-        if np.isfinite(y).sum() < 4 * PAST or (stretch := _spike(y)) is None:
-            return
-        first, count = stretch
-        # the answer to a blow on the input is no spike
-        near = slice(max(0, first - PAST), first + count)
-        if any(
-            (inside := _spike(u)) and near.start <= inside[0] < near.stop for u in columns.T[:-1]
-        ):
-            return
-        yield first, count
-        y[first : first + count] = np.nan
-
-
-def _spike(column: FloatArray) -> tuple[int, int] | None:
-    """`SPIKE` samples or fewer about the farthest value, if they have most of the power."""
-    if not np.isfinite(column).any():
-        return None
-    apart = np.abs(column - np.nanmedian(column))
-    k = int(np.nanargmax(apart))
-    if apart[k] == 0.0:
-        return None
-    far = apart > 0.5 * apart[k]
-    first = k - int(np.argmin(far[k::-1])) + 1 if not far[: k + 1].all() else 0
-    last = k + int(np.argmin(far[k:])) if not far[k:].all() else len(far)
-    # away and back: a step that settles in a sample begins or ends elsewhere
-    if last - first > SPIKE or first == 0 or last == len(column):
-        return None
-    if not abs(column[first - 1] - column[last]) < 0.5 * apart[k]:
-        return None
-    power = (apart / apart[k]) ** 2
-    inside = float(np.nansum(power[first:last]))
-    return (first, last - first) if inside > float(np.nansum(power)) - inside else None
 
 
 # --- Columns of which one is computed from the other, exchanged, or late --------------------------
@@ -276,7 +74,7 @@ class Copy:
 
 def copied(data: Dataset) -> Copy | None:
     """An input that the output repeats to rounding, up to `PAST` samples later."""
-    experiments = [_columns(e) for e in data.experiments]
+    experiments = [measured_columns(e) for e in data.experiments]
     for j, delay in itertools.product(range(data.n_inputs), range(PAST + 1)):
         u = np.concatenate([c[: max(0, len(c) - delay), j] for c in experiments])
         y = np.concatenate([c[delay:, -1] for c in experiments])
@@ -287,7 +85,7 @@ def copied(data: Dataset) -> Copy | None:
         if len(y) < 4 * PAST or (is_binary and np.count_nonzero(np.diff(u)) < PAST):
             continue
         # most records show in their beginning that this is none
-        if _of_line(u[:MOST], y[:MOST]) is None or _scale([np.column_stack([u, y])]) is None:
+        if _of_line(u[:MOST], y[:MOST]) is None or scale_of([np.column_stack([u, y])]) is None:
             continue
         if (covariance := _of_line(u, y)) is None:
             continue
@@ -381,12 +179,12 @@ def _pieces(data: Dataset) -> list[FloatArray]:
     """Known stretches of the longest experiments, at most `MOST` samples, each column scaled."""
     pieces, left = [], MOST
     for e in sorted(data.experiments, key=len, reverse=True):
-        columns = _columns(e)
-        for first, count in runs(_known(columns)):
+        columns = measured_columns(e)
+        for first, count in runs(known_rows(columns)):
             if min(count, left) > 4 * PAST:
                 pieces.append(columns[first : first + min(count, left)])
                 left -= len(pieces[-1])
-    scale = _scale(pieces)
+    scale = scale_of(pieces)
     return [] if scale is None else [(p - scale[0]) / scale[1] for p in pieces]
 
 
@@ -704,14 +502,3 @@ def sound(data: Dataset) -> tuple[Dataset, tuple[Fault, ...]]:
             remedy=wrong.remedy,
         )  # fmt: skip
     return alive(data, [f.dead for f in found if f.dead]), found
-
-
-def alive(data: Dataset, dead: Sequence[Dead]) -> Dataset:
-    """The data without these dead stretches."""
-    if not dead:
-        return data
-    masks = [np.zeros(len(e), dtype=np.bool_) for e in data.experiments]
-    for d in dead:
-        start = data.experiments[d.experiment].start
-        masks[d.experiment][d.start - start : d.stop - start] = True
-    return data.mask(masks, why="that no plant has left out")
