@@ -27,6 +27,7 @@ class Page:
         origin = headers.pop("origin", f"http://127.0.0.1:{studio.port}")
         place = f"ws://127.0.0.1:{studio.port}/socket"
         self._left = contextlib.ExitStack()
+        self._meanwhile: list[dict[str, Any]] = []
         self.socket = self._left.enter_context(websockets.connect(place, origin=origin, **headers))
         self.socket.send(studio.token if token is None else token)
 
@@ -44,11 +45,22 @@ class Page:
                 return dict(heard)
 
     def event(self, name: str) -> dict[str, Any]:
+        """The next event of this name, which may have come before the answer to the last `ask`."""
+        for i, heard in enumerate(self._meanwhile):
+            if heard.get("event") == name:
+                return self._meanwhile.pop(i)
         return self.hear(lambda m: m.get("event") == name)
 
     def ask(self, do: str, **asked: Any) -> dict[str, Any]:
+        self._meanwhile.clear()
+
+        def is_answer(heard: dict[str, Any]) -> bool:
+            if heard.get("id") != 7:
+                self._meanwhile.append(heard)
+            return heard.get("id") == 7
+
         self.socket.send(json.dumps({"id": 7, "do": do, **asked}))
-        return self.hear(lambda m: m.get("id") == 7)
+        return self.hear(is_answer)
 
 
 class Watching:
