@@ -760,11 +760,14 @@ def sampled_fopdt(K: float, T: float, L: float, *, Ts: float) -> tuple[_F, _F]:
 def loop_response(path: LoopPath, num: _F, den: _F, omega: _F) -> NDArray[np.complex128]:
     """L, broken at the plant's input, at omega [rad/s]; the plant in powers of z^-1."""
 
-def margins(path: LoopPath, num: _F, den: _F) -> dict[str, Any]:
+def margins(path: LoopPath, num: _F, den: _F, level: float | None = None) -> dict[str, Any]:
     """stable, largest_pole, Ms, Ms_omega, Mt, Mt_omega, gain_margin, gain_reduction, phase_margin_deg,
-    delay_margin_s, noise_gain, gain_crossovers, phase_crossovers; omegas and crossovers in rad/s.
+    delay_margin_s, noise_gain, bandwidth, gain_crossovers, phase_crossovers; omegas, bandwidth and
+    crossovers in rad/s.
 
-    An unstable loop has infinite peaks and noise gain, its other margins are NaN.
+    An unstable loop has infinite peaks and noise gain, its other margins are NaN. With a ``level`` of |S|
+    ``levels`` has it and where it is first reached [rad/s], then the height of each peak beyond and where that is
+    first exceeded, up to 1.
     """
 
 def tolerance(

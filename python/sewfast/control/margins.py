@@ -239,6 +239,9 @@ class Margins(Plotted):
         Frequencies at which |L| is 1, and at which L is real and negative [rad/s].
     noise_gain : float
         rms of the command over rms of white noise on the measured output [u/y].
+    bandwidth : float
+        Frequency at which |S| first reaches 1/sqrt(2) [rad/s]: slower disturbances are weakened by
+        3 dB or more.
     largest_pole : float
         Largest magnitude of a closed-loop pole; NaN with a memory of more than 250 samples.
     changed : tuple of float, or None
@@ -262,6 +265,7 @@ class Margins(Plotted):
     gain_crossovers: tuple[float, ...]
     phase_crossovers: tuple[float, ...]
     noise_gain: float
+    bandwidth: float
     largest_pole: float
     changed: tuple[float, float, int, float] | None = None
     u_unit: str = "V"

@@ -37,18 +37,21 @@ BLIND = 1.25
 """Safety factor on the loop's gain, from the fit, above the measured lines."""
 BESIDE = (0.6, 1.5)
 """Start of a second filter, relative to the first one's frequency; it begins without effect."""
-GRID = 400
-"""Number of frequencies at which the bandwidth is searched."""
+GRID = 100
+"""Number of frequencies above the measured lines at which the loop's gain is looked at."""
 SPREADS = (0.4, 0.2, 0.1)
 """Sizes of the simplex in a round of the search, each started from the previous best."""
-ROUNDS, FURTHER = 2, 1.01
+ROUNDS, FURTHER = 4, 1.01
 """Most rounds, and least gain in bandwidth of a round for another one."""
-STEPS = 50
+STEPS = 100
 """Evaluations of one round per searched number."""
 SAME = 1e-4
 """Difference of best and worst point of a simplex, in log bandwidth, at which it ends."""
 OUTSIDE = 30.0
-"""Weight of an Ms above the limit, relative to it, against the logarithm of the bandwidth."""
+"""Weight of an Ms above the limit, relative to it, against the logarithm of the bandwidth, and of a
+peak of |S| above `LEVEL` below it: the bandwidth itself would jump where such a peak arises."""
+LEVEL = 0.99 / math.sqrt(2.0)
+"""What |S| is to keep below: a little less than its value at the bandwidth."""
 SLOWEST = 8.0
 """Largest integral time, in radians of the bandwidth: a slow integral would not remove a lasting
 disturbance, however large the bandwidth."""
@@ -59,7 +62,6 @@ DEPTH, WIDTH, DAMPING = (0.005, 1.0), (0.02, 5.0), (1e-3, 3.0)
 """Least and largest numbers of filters."""
 INVERSE = 0.3
 """Initial damping of the poles that the inverse of a shaft puts on its antiresonance."""
-HALF = 1.0 / math.sqrt(2.0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -164,22 +166,21 @@ def _freed(frequency: float, depth: float, width: float) -> FloatArray:
 
 def _proposal(task: _Task, x: FloatArray) -> Proposal:
     controller = task.controller(x)
-    return Proposal(
-        controller, task.bandwidth(controller), margins(controller, task.fit.to_model())
-    )  # fmt: skip
+    found = margins(controller, task.fit.to_model())
+    return Proposal(controller, found.bandwidth / (2.0 * math.pi), found)
 
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """The fit on a dense grid, and the controller and merit of a search point."""
+    """What the search compares with, and the controller and merit of a search point."""
 
     fit: ShaftFit
     like: Controller
     Ms: float
-    hertz: FloatArray
-    plant: Complex
-    everywhere: FrequencyResponse
-    """Ones on the grid and at the measured lines with enough coherence, to compute feedback."""
+    above: Complex
+    """The fit above the measured lines."""
+    ones: FrequencyResponse
+    """Ones there and at the measured lines with enough coherence, to compute feedback."""
     lines: Complex
     circles: FloatArray
     """Measured response at these lines, and the radius of its 95 % circles."""
@@ -189,7 +190,6 @@ class _Task:
     @classmethod
     def of(cls, fit: ShaftFit, like: Controller, Ms: float) -> _Task:
         of = fit.response
-        hertz = np.geomspace(0.05 * of.hertz[0], 0.499 / of.Ts, GRID)
         of.loop(like)  # raises for another sample time or other units
         model = sampled(fit.to_model(), of.Ts)
         per_unit, reach = like.counts_per_unit, 0.5 * (like.u_max - like.u_min)
@@ -197,12 +197,13 @@ class _Task:
         # a speed is the difference of two roundings of variance 1/12
         quiet = QUIET * reach * math.sqrt(6.0) * per_unit * of.Ts if known else math.inf
         seen = of.coherence > 0.5
-        places = np.concatenate([hertz, of.hertz[seen]])
-        everywhere = replace(of, hertz=places, value=np.ones(len(places), dtype=np.complex128))
+        last = of.hertz[seen][-1]
+        above = np.geomspace(last, max(last, 0.499 / of.Ts), GRID)
+        places = np.concatenate([above, of.hertz[seen]])
+        ones = replace(of, hertz=places, value=np.ones(len(places), dtype=np.complex128))
         return cls(
-            fit, like, Ms, hertz, fit.at(hertz), everywhere, of.value[seen], of.radius()[seen],
-            model, quiet,
-        )  # fmt: skip
+            fit, like, Ms, fit.at(above), ones, of.value[seen], of.radius()[seen], model, quiet
+        )
 
     def controller(self, x: FloatArray) -> Controller:
         """The controller of logarithms of Kp, Ti, Td, the lag, and the filters.
@@ -258,38 +259,21 @@ class _Task:
             for s in shares
         ]
 
-    def bandwidth(self, controller: Controller) -> float:
-        """Frequency at which |S| first reaches 1/sqrt(2) [Hz]."""
-        return self._bandwidth(self._feedback(controller)[0])
-
-    def _bandwidth(self, feedback: Complex) -> float:
-        S = 1.0 / np.abs(1.0 + self.plant * feedback)
-        above = np.flatnonzero(S >= HALF)
-        if not len(above) or above[0] == 0:
-            return float(self.hertz[0 if len(above) else -1])
-        k = int(above[0])
-        share = math.log(HALF / S[k - 1]) / math.log(S[k] / S[k - 1])
-        return float(self.hertz[k - 1] * (self.hertz[k] / self.hertz[k - 1]) ** share)
-
-    def _feedback(self, controller: Controller) -> tuple[Complex, Complex]:
-        """Feedback on the grid, and at the measured lines with enough coherence."""
-        found = self.everywhere.loop(controller)
-        return found[: len(self.hertz)], found[len(self.hertz) :]
-
     def merit(self, x: FloatArray) -> float:
         """Logarithm of the bandwidth, minus a penalty for exceeding Ms; -inf if unstable."""
         try:
             controller = self.controller(x)
         except SettingError:
             return -math.inf
-        found = _core.margins(loop_path(controller), *self.model)
+        found = _core.margins(loop_path(controller), *self.model, level=LEVEL)
         if not found["stable"]:
             return -math.inf
-        on_grid, at_lines = self._feedback(controller)
-        worst = max(float(found["Ms"]), self._measured(at_lines), self._unmeasured(on_grid))
+        feedback = self.ones.loop(controller)
+        above, at_lines = feedback[:GRID], feedback[GRID:]
+        worst = max(float(found["Ms"]), self._measured(at_lines), self._unmeasured(above))
         excess = max(0.0, worst / self.Ms - 1.0)
-        bandwidth = self._bandwidth(on_grid)
-        slow = controller.gains.Ti * 2.0 * math.pi * bandwidth / SLOWEST
+        bandwidth = max(omega / (level / LEVEL) ** OUTSIDE for level, omega in found["levels"])
+        slow = controller.gains.Ti * bandwidth / SLOWEST
         noise = float(found["noise_gain"]) / self.quiet
         return (
             math.log(bandwidth) - OUTSIDE * min(excess, 10.0) - max(0.0, math.log(slow))
@@ -303,10 +287,7 @@ class _Task:
 
     def _unmeasured(self, feedback: Complex) -> float:
         """Largest sensitivity above the measured lines, from the loop's gain alone."""
-        above = self.hertz > self.everywhere.hertz[-1]
-        if not above.any():
-            return 1.0
-        gain = float(np.abs(self.plant * feedback)[above].max())
+        gain = float(np.abs(self.above * feedback).max())
         return float(1.0 / (1.0 - min(BLIND * gain, 0.999)))
 
 

@@ -102,19 +102,24 @@ fn loop_response<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (path, num, den))]
+#[pyo3(signature = (path, num, den, level=None))]
 fn margins<'py>(
     py: Python<'py>,
     path: &LoopPath,
     num: Values<'py>,
     den: Values<'py>,
+    level: Option<f64>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let (num, den) = (slice(&num, "num")?, slice(&den, "den")?);
     // half a millisecond, that a search asks for thousands of times: on a busy computer a thread of its own waits for longer
-    let found = py
+    let (found, levels) = py
         .detach(|| {
             let plant = Plant::new(num, den)?;
-            Ok(loop_transfer::margins(&Loop::new(&path.0, &plant)?))
+            let closed = Loop::new(&path.0, &plant)?;
+            Ok(match level {
+                Some(level) => loop_transfer::margins_and_levels(&closed, level),
+                None => (loop_transfer::margins(&closed), Vec::new()),
+            })
         })
         .map_err(|e| raise(py, e))?;
     let dict = PyDict::new(py);
@@ -130,12 +135,16 @@ fn margins<'py>(
         ("phase_margin_deg", found.phase_margin),
         ("delay_margin_s", found.delay_margin),
         ("noise_gain", found.noise_gain),
+        ("bandwidth", found.bandwidth),
     ];
     for (name, value) in numbers {
         dict.set_item(name, value)?;
     }
     dict.set_item("gain_crossovers", found.gain_crossovers)?;
     dict.set_item("phase_crossovers", found.phase_crossovers)?;
+    if level.is_some() {
+        dict.set_item("levels", levels)?;
+    }
     Ok(dict)
 }
 

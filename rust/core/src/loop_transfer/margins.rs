@@ -2,7 +2,7 @@
 //! `L` that they are read from, as dense as it turns.
 
 use std::cmp::Ordering;
-use std::f64::consts::PI;
+use std::f64::consts::{FRAC_1_SQRT_2, PI};
 
 use nalgebra::Complex;
 
@@ -156,6 +156,8 @@ pub struct Margins {
     pub phase_margin: f64,
     /// The additional delay that reaches instability \[s\].
     pub delay_margin: f64,
+    /// Where `|S|` first reaches `1/sqrt(2)`: slower disturbances are weakened by 3 dB or more.
+    pub bandwidth: f64,
     /// Where `|L| = 1`.
     pub gain_crossovers: Vec<f64>,
     /// Where `L` is real and negative.
@@ -166,7 +168,24 @@ pub struct Margins {
 
 /// All margins of a loop; for an unstable one the peaks and the noise gain are infinite, the other margins NaN.
 pub fn margins(closed: &Loop<'_>) -> Margins {
-    let (curve, states) = (Curve::of(closed), States::of(closed));
+    margins_on(closed, &Curve::of(closed))
+}
+
+/// The margins, and what `|S|` passes from `level` on \[rad/s\]: that level and where it is first reached, then the height of each
+/// peak beyond and where that is first exceeded, up to 1. A search that pays for a level has no jump where a peak rises above
+/// the first one.
+pub fn margins_and_levels(closed: &Loop<'_>, level: f64) -> (Margins, Vec<(f64, f64)>) {
+    let curve = Curve::of(closed);
+    let levels = passed(closed, &curve.points, level);
+    let per_second = |(level, theta)| (level, theta / closed.path.ts);
+    (
+        margins_on(closed, &curve),
+        levels.into_iter().map(per_second).collect(),
+    )
+}
+
+fn margins_on(closed: &Loop<'_>, curve: &Curve) -> Margins {
+    let states = States::of(closed);
     let largest_pole = states.as_ref().map_or(f64::NAN, States::largest_pole);
     // NaN where there are too many states to ask
     let stable = curve.unstable == Some(0)
@@ -201,6 +220,7 @@ pub fn margins(closed: &Loop<'_>) -> Margins {
         gain_reduction: unless_unstable(below, f64::NAN),
         phase_margin: unless_unstable(phase_margin(&gain_crossovers), f64::NAN),
         delay_margin: unless_unstable(ts * delay_margin(&gain_crossovers), f64::NAN),
+        bandwidth: unless_unstable(reached(closed, &curve.points, FRAC_1_SQRT_2) / ts, f64::NAN),
         gain_crossovers: per_second(&gain_crossovers),
         phase_crossovers: per_second(&phase_crossovers),
         noise_gain: if stable { noise() } else { f64::INFINITY },
@@ -240,6 +260,57 @@ fn peak(closed: &Loop<'_>, points: &[Point], size: fn(Complex<f64>) -> f64) -> (
         }
     }
     best
+}
+
+/// Where `|S|` first reaches a level: 0 where it begins above, pi where it stays below.
+fn reached(closed: &Loop<'_>, points: &[Point], level: f64) -> f64 {
+    let size = |theta: f64| sensitivity(closed.at(&Place::at(theta)));
+    let mut below = 0.0;
+    for (i, point) in points.iter().enumerate() {
+        let mut above = (sensitivity(point.l) >= level).then_some(point.theta);
+        // a peak between points, which is at most little higher than they are
+        if above.is_none() && sensitivity(point.l) >= 0.9 * level {
+            above = peak_at(closed, points, i)
+                .filter(|(height, theta)| *height >= level && *theta > below)
+                .map(|found| found.1);
+        }
+        if let Some(mut high) = above {
+            for _ in 0..LOCATED {
+                let middle = 0.5 * (below + high);
+                if size(middle) >= level {
+                    high = middle
+                } else {
+                    below = middle
+                }
+            }
+            return high;
+        }
+        below = point.theta;
+    }
+    PI
+}
+
+/// Height and angle of a peak of `|S|` about a point of the locus, if there is one.
+fn peak_at(closed: &Loop<'_>, points: &[Point], i: usize) -> Option<(f64, f64)> {
+    let value = sensitivity(points[i].l);
+    let (before, after) = (points.get(i.checked_sub(1)?)?, points.get(i + 1)?);
+    let peaks = value >= sensitivity(before.l) && value >= sensitivity(after.l);
+    peaks.then(|| narrowed(closed, before.theta, after.theta, sensitivity))
+}
+
+fn passed(closed: &Loop<'_>, points: &[Point], level: f64) -> Vec<(f64, f64)> {
+    let mut found = Vec::new();
+    let mut next = Some(level);
+    while let Some(level) = next.filter(|level| *level < 1.0) {
+        let theta = reached(closed, points, level);
+        found.push((level, theta));
+        let beyond = (1..points.len() - 1).filter(|i| points[i + 1].theta > theta);
+        next = beyond
+            .filter_map(|i| peak_at(closed, points, i))
+            .map(|(height, _)| height * (1.0 + 1e-9))
+            .find(|height| *height > level);
+    }
+    found
 }
 
 /// Golden section.

@@ -198,13 +198,42 @@ fn margins_of_a_first_order_loop_by_hand() {
     // |z - a| = k: 1 - 2 a cos w + a^2 = k^2
     let crossover = ((1.0 + a * a - k * k) / (2.0 * a)).acos();
     assert!((found.gain_crossovers[0] * TS - crossover).abs() < 1e-9);
-    // u = -k n - k y: the noise gain's square is k^2 (1 + k^2/(1 - p^2)), p = a - k
+    // |S| = |z - a| / |z - a + k| = 1/sqrt(2)
     let p: f64 = a - k;
+    let reached = ((1.0 + 2.0 * a * a - p * p) / (4.0 * a - 2.0 * p)).acos();
+    assert!((found.bandwidth * TS - reached).abs() < 1e-9);
+    // u = -k n - k y: the noise gain's square is k^2 (1 + k^2/(1 - p^2)), p = a - k
     let exact = k * (1.0 + k * k / (1.0 - p * p)).sqrt();
     assert!(
         (found.noise_gain - exact).abs() < 1e-12,
         "{found:?} {exact}"
     );
+}
+
+/// A slow integral and a fast lead leave a peak of `|S|` below the bandwidth, which is passed one level later.
+#[test]
+fn levels_are_passed_one_after_the_other() {
+    let mut path = path(0.05, 0.5, 0.0);
+    path.biquads = Cascade::new(&[Biquad::notch(5.0, 0.4, 1.0, TS).unwrap()]).unwrap();
+    let plant = drive();
+    let closed = Loop::new(&path, &plant).unwrap();
+    let size = |omega: f64| 1.0 / (closed.response(omega) + 1.0).norm();
+    let below = |omega: f64| {
+        (1..4_000)
+            .map(|i| size(omega * f64::from(i) / 4_000.0))
+            .fold(0.0, f64::max)
+    };
+    let (found, levels) = margins_and_levels(&closed, 0.5);
+    assert_eq!(levels[0].0, 0.5);
+    assert!(levels.len() > 1, "{levels:?}");
+    for pair in levels.windows(2) {
+        assert!(pair[0].0 < pair[1].0 && pair[0].1 < pair[1].1);
+    }
+    for (level, omega) in levels {
+        assert!((size(omega) / level - 1.0).abs() < 1e-6, "{level} {omega}");
+        assert!(below(omega) < level * (1.0 + 1e-6), "{level} {omega}");
+    }
+    assert!((size(found.bandwidth) - 0.5_f64.sqrt()).abs() < 1e-9);
 }
 
 #[test]
