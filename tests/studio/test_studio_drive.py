@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -177,6 +177,15 @@ def studio(tmp_path: Path) -> Iterator[Studio]:
         yield running
 
 
+@contextmanager
+def two_pages(studio: Studio) -> Iterator[tuple[Watching, Watching]]:
+    """The page that holds the control, and one that is opened after it."""
+    with Watching(studio) as page:
+        page.event("state", writes=True)
+        with Watching(studio) as other:
+            yield page, other
+
+
 def _is_on(device: VirtualDevice) -> bool:
     return _ends(device)[-1:] == ["on"]
 
@@ -218,7 +227,7 @@ def test_nothing_moves_before_it_is_armed(studio: Studio, device: VirtualDevice)
 
 
 def test_only_the_page_in_control_moves_it(studio: Studio, device: VirtualDevice) -> None:
-    with Watching(studio) as page, Watching(studio) as other:
+    with two_pages(studio) as (page, other):
         page.armed(device.port)
         for name in ("drive_arm", "drive_connect", "drive_go", "drive_disconnect"):
             assert "looks on" in other.ask(name)["error"]
@@ -233,7 +242,7 @@ def test_only_the_page_in_control_moves_it(studio: Studio, device: VirtualDevice
 def test_taking_the_control_takes_two_acts_and_stops_what_runs(
     studio: Studio, device: VirtualDevice
 ) -> None:
-    with Watching(studio) as page, Watching(studio) as other:
+    with two_pages(studio) as (page, other):
         page.armed(device.port)
         _running(page, device)
         # nothing counts as the second act before this page was told who holds the control

@@ -125,7 +125,8 @@ class Watching:
     def armed(self, port: str, watchdog: float = 2.0, **limits: float) -> Watching:
         """Connected, limited and armed, by patience where the machine is busy."""
         # a watchdog that a busy machine keeps to: what stops the motor here is something else
-        assert "found" in self.ask("drive_connect", port=port, watchdog=watchdog)
+        found = self.ask("drive_connect", port=port, watchdog=watchdog)
+        assert "found" in found, found
         usual = {"volt": None, "speed_rpm": None, "acceleration": None, "current": None}
         assert "found" in self.ask("drive_limits", **{**usual, **limits})
         self.arm()
