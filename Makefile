@@ -25,7 +25,7 @@ REPORT := $(VENV)/report.stamp
 LIBRARIES := $(VENV)/libraries.stamp
 DEV := $(VENV)/dev.stamp
 MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest no-std c-test python-lint types stubs \
-  python-test python-core docs package package-source
+  python-test computing waiting budgets python-core docs package package-source
 
 .DEFAULT_GOAL := help
 .PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults nonsense motors fleet interrupts fuzz-logs mutations studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
@@ -46,8 +46,11 @@ SYNC := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
 test: ## every check of the day; ends with pytest's summary, which names what is left to `make nightly`
 	$(MAKE) --no-print-directory --jobs=2 $(SYNC) dev rust-units
 # package first: clippy sets pyo3 up in another way than maturin, and each compiles it anew after the other
-	$(MAKE) --no-print-directory --jobs=2 $(SYNC) package rust-rest lint no-std c-test
-	$(MAKE) --no-print-directory python-test
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) package rust-rest rust-lint python-lint no-std c-test
+	$(MAKE) --no-print-directory computing
+# tests that wait leave processors to the checks of types
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) waiting types stubs
+	$(MAKE) --no-print-directory budgets
 
 test-core: ## the crates and the package without documentation, extras, ports and browser
 	$(MAKE) --no-print-directory --jobs=2 $(SYNC) dev rust-units
@@ -75,10 +78,10 @@ python-lint: $(DEV)
 	$(BIN)/ruff format --check .
 
 types: $(DEV)
-	$(BIN)/mypy
+	nice $(BIN)/mypy
 
 stubs: $(DEV)
-	MYPYPATH=python $(BIN)/python -m mypy.stubtest --allowlist tests/support/stubtest.txt sewfast._core
+	MYPYPATH=python nice $(BIN)/python -m mypy.stubtest --allowlist tests/support/stubtest.txt sewfast._core
 
 # the seed of every property, in Rust and in Python, comes from the commit: a build that passed passes again, and the next
 # commit tries others
@@ -191,9 +194,18 @@ firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian:
 ONE_BY_ONE := $(BIN)/python -m pytest --hypothesis-seed=$(SEED)
 PYTEST := $(ONE_BY_ONE) -n 2 --dist worksteal
 COMPUTES := not alone and not budget
-python-test: $(DEV) ## pytest, with the snippets of the documentation and every example
+python-test: ## pytest, with the snippets of the documentation and every example
+	$(MAKE) --no-print-directory computing
+	$(MAKE) --no-print-directory waiting
+	$(MAKE) --no-print-directory budgets
+
+computing: $(DEV)
 	$(PYTEST) -m '$(COMPUTES)'
+
+waiting: $(DEV)
 	$(PYTEST) -m alone
+
+budgets: $(DEV)
 	$(ONE_BY_ONE) -m budget
 
 CORE_TESTS := $(addprefix tests/,analysis control dataset evidence files greybox identification models tuning) \
@@ -275,8 +287,8 @@ physics: $(VENV)/bench.stamp ## parameters of motors whose truth is known (docs/
 drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONLY="shaft60 lash", SEEDS=)
 	$(BIN)/python benches/drives.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))
 
-faults: $(VENV)/bench.stamp ## commissioning on drives with 30 faults: ended in time, never verified, named (SEEDS=20, ONLY=word)
-	$(BIN)/python benches/faults.py $(if $(ONLY),--only "$(ONLY)") $(if $(SEEDS),--seeds $(SEEDS))
+faults: $(VENV)/bench.stamp firmware ## commissioning on drives, motors of MuJoCo and a board with 30 faults: ended in time, never verified, named (ONLY=word, STATE=file to go on with)
+	$(BIN)/python benches/faults.py $(if $(ONLY),--only "$(ONLY)") $(if $(STATE),--out $(STATE))
 
 nonsense: $(DEV) ## records that deceive and good ones: praised, named, accused (COUNT=2 of each kind, ONLY=word)
 	$(BIN)/python benches/nonsense.py $(if $(COUNT),--count $(COUNT)) $(if $(ONLY),--only "$(ONLY)")

@@ -189,11 +189,13 @@ def turns_at_rest(r: Recording) -> Cause | None:
     counted = float(r.counts[max(0, end - 1)] - r.counts[0])
     if not abs(counted) >= TURNS:
         return None
-    rpm = 60.0 * counted / (r.counts_per_rev * (end - 1) * r.Ts)
-    return Cause(
-        "turns at rest", f"the machine turns at {rpm:.4g} RPM without a command; {_LOAD}", r.name,
-        None, rpm,
-    )  # fmt: skip
+    return turning(60.0 * counted / (r.counts_per_rev * (end - 1) * r.Ts), r.name)
+
+
+def turning(rpm: float, run: str) -> Cause:
+    """The cause of a machine that turns without a command."""
+    text = f"the machine turns at {rpm:.4g} RPM without a command; {_LOAD}"
+    return Cause("turns at rest", text, run, None, rpm)
 
 
 def _columns(recording: Recording) -> tuple[FloatArray, FloatArray]:
@@ -242,7 +244,10 @@ class _Look:
         if not (is_alone or found["unsure"] <= UNSURE):
             return None
         least = NOTED if is_alone else max(NOTED, TIMES * found["unsure"])
-        if found["error"] > least * found["size"] and found["findings"]:
+        # the difference of two counts, each rounded
+        r = self.recording
+        rounding = 60.0 / (r.counts_per_rev * r.Ts) / math.sqrt(6.0)
+        if found["error"] > max(least * found["size"], rounding) and found["findings"]:
             most = min(explained * found["error"], TIES * found["findings"][0][3])
             equal = {f[0]: f for f in found["findings"] if f[3] <= most}
             if equal:

@@ -211,3 +211,30 @@ def test_an_emulator_that_ends_is_reported(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     with pytest.raises(LinkError, match="out of order"):
         EmulatedBoard(FIRMWARE)
+
+
+@needs_board
+def test_a_broken_motor_is_named_in_a_loop_and_at_rest() -> None:
+    r = np.repeat([700.0, 1200.0, 900.0], 700)
+    with EmulatedBoard(FIRMWARE, boot_id=3) as board, connect(board.port) as drive:
+        drive.set_limits(volt=20.0, speed_rpm=2400.0)
+        sewfast.run(controller(), drive, r)
+        assert 1100.0 < board.fastest < 1800.0
+        board.break_motor(0.9, command=-1.0)
+        with pytest.raises(LinkError) as ended:
+            sewfast.run(controller(), drive, r)
+        cause = ended.value.cause
+        assert cause is not None, ended.value
+        assert cause.name == "command sign"
+        assert abs(cause.at - 0.9) < 0.05
+        assert "clear it" in str(ended.value)
+        board.mend_motor()
+        drive.clear()
+        drive.wait_for_rest(20.0)
+        board.break_motor(load=1.0)
+        with pytest.raises(LinkError) as driven:
+            sewfast.record(drive, np.ones(100))
+        cause = driven.value.cause
+        assert cause is not None, driven.value
+        assert cause.name == "turns at rest"
+        assert cause.value == pytest.approx(490.0 * (1.0 - 0.25), rel=0.05)

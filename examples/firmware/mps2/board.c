@@ -38,6 +38,13 @@ typedef struct {
     uint64_t heard;       /* us: when bytes last arrived */
     uint64_t safe;        /* us: when the output was last switched off */
     uint32_t enabled;
+    /* from the computer: what is wrong with the motor, from a time after its output was switched on (0: always) */
+    uint32_t is_wrong;
+    uint32_t after;       /* us */
+    float command, encoder, lag;      /* factors */
+    float load, stuck, dead, brake;   /* V; stuck: NAN if it obeys, infinite if it stays as it is */
+    float jump;           /* counts, once */
+    float fastest;        /* RPM, to the computer */
 } shared_memory;
 __attribute__((section(".shared"))) static volatile shared_memory shared;
 
@@ -52,6 +59,9 @@ static float fraction;    /* counts */
 static int32_t counts;
 static uint32_t measured; /* ticks: when the last measurement without an output was handed over */
 static bool pending;
+static uint64_t switched_on; /* us: when the output was last switched on */
+static bool wrong;           /* what is wrong with the motor has begun */
+static float stays;          /* V: its command then */
 
 /* A byte for which the ring has no room stays in the UART, which then accepts no other. */
 static void pump(void) {
@@ -87,14 +97,30 @@ uint64_t board_time(void) {
 }
 
 static void turn_the_motor(void) {
-    const float share = 1e-6f * PERIOD / LAG;
-    const bool held = fabsf(applied) <= FRICTION;
+    const bool due = shared.after == 0 || (shared.enabled && sampled - switched_on >= shared.after);
+    if (!wrong && shared.is_wrong && due) {
+        counts += (int32_t)shared.jump;
+        stays = applied;
+    }
+    wrong = shared.is_wrong && (wrong || due);
+    float u = applied, friction = FRICTION, lag = LAG, encoder = 1.0f;
+    if (wrong) {
+        u = shared.command * copysignf(fmaxf(fabsf(u) - shared.dead, 0.0f), u);
+        if (!isnan(shared.stuck)) u = isinf(shared.stuck) ? stays : shared.stuck;
+        u += shared.load;
+        friction += shared.brake;
+        lag *= shared.lag;
+        encoder = shared.encoder;
+    }
+    const float share = 1e-6f * PERIOD / lag;
+    const bool held = fabsf(u) <= friction;
     if (speed != 0.0f || !held) {
-        const float against = copysignf(FRICTION, speed != 0.0f ? speed : applied);
-        const float next = speed + share * (GAIN * (applied - against) - speed);
+        const float against = copysignf(friction, speed != 0.0f ? speed : u);
+        const float next = speed + share * (GAIN * (u - against) - speed);
         speed = held && next * speed <= 0.0f ? 0.0f : next;
     }
-    fraction += speed * COUNTS_PER_REV * (1e-6f * PERIOD / 60.0f);
+    if (fabsf(speed) > shared.fastest) shared.fastest = fabsf(speed);
+    fraction += encoder * speed * COUNTS_PER_REV * (1e-6f * PERIOD / 60.0f);
     const int32_t whole = (int32_t)floorf(fraction);
     counts += whole;
     fraction -= (float)whole;
@@ -133,6 +159,7 @@ void board_apply(sewfast_output output) {
     /* an output holds from its sample on, even if the sample is computed late */
     if (shared.enabled && !output.enabled) shared.safe = pending ? sampled : board_time();
     if (pending) count_the_step();
+    if (!shared.enabled && output.enabled) switched_on = sampled;
     shared.enabled = output.enabled;
     applied = output.enabled ? output.u : 0.0f;
 }

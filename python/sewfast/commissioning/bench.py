@@ -247,8 +247,10 @@ class RecordedBench(MachineWrapper):
         try:
             yield
         except (Aborted, LinkError) as stop:
-            if isinstance(stop.recording, Recording):
-                self.runs.append(stop.recording)
+            # a device ends a loop with the run so far
+            found = getattr(stop.recording, "recording", stop.recording)
+            if isinstance(found, Recording):
+                self.runs.append(found)
             raise
 
     def follow(

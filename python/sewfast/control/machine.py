@@ -105,6 +105,14 @@ class RecordedRun(ClosedLoopRun):
         return self
 
 
+def explain(error: LinkError, recording: Recording, *, volt: float, speed: float) -> None:
+    """Put the cause into an error that ended a run, if the run shows one."""
+    with contextlib.suppress(DataError):  # too few samples
+        cause = cause_of(recording, volt=volt, speed=speed)
+        if cause is not None:
+            error.explain(cause)
+
+
 def Followed(run: ClosedLoopRun, recording: Recording) -> RecordedRun:
     """Earlier name of `RecordedRun.of`."""
     return RecordedRun.of(run, recording)
@@ -541,10 +549,7 @@ class SteppedBench:
         part = getattr(error, "recording", None)
         error.recording = recording if part is None else replace(recording, name=part.name)
         if isinstance(error, LinkError):
-            with contextlib.suppress(DataError):  # too few samples
-                cause = cause_of(recording, volt=self.volt, speed=self.speed)
-                if cause is not None:
-                    error.explain(cause)
+            explain(error, recording, volt=self.volt, speed=self.speed)
 
     def _lost(self, name: str, u: float) -> LinkError:
         """The error for a loop without an encoder."""

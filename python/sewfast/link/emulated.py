@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import secrets
@@ -26,6 +27,8 @@ PACKAGES = "gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm rustc-web 
 
 # as in examples/firmware/mps2/board.c and board.ld
 _SHARED = struct.Struct("<6I3QI")
+_WRONG = struct.Struct("<2I8f")
+_FASTEST = struct.Struct("<f")
 _STACK_TOP = 1 << 20
 _STACK = 64 << 10
 _PAINT = b"\xa5"
@@ -245,6 +248,42 @@ class EmulatedBoard:
         """
         *_, heard, safe, enabled = _SHARED.unpack_from(self._memory)
         return None if enabled else (safe - heard) * 1e-6
+
+    def break_motor(
+        self, after: float = 0.0, *, command: float = 1.0, encoder: float = 1.0, lag: float = 1.0,
+        load: float = 0.0, stuck: float = math.nan, dead: float = 0.0, brake: float = 0.0,
+        jump: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Put a fault into the emulated motor, to see what its host does.
+
+        Parameters
+        ----------
+        after : float
+            Time from when the output is next switched on until the fault begins [s]; 0 is at once.
+        command, encoder, lag : float
+            Factors on the command, on the counted motion and on the motor's time constant.
+        load, dead, brake : float
+            Added command, dead band and added friction [V].
+        stuck : float
+            Command at which the output stage is stuck [V]; inf is the one it has then.
+        jump : float
+            Added to the counter once.
+        """
+        self.mend_motor()
+        numbers = (command, encoder, lag, load, stuck, dead, brake, jump)
+        _WRONG.pack_into(self._memory, _SHARED.size, 0, round(1e6 * after), *numbers)
+        self._memory[_SHARED.size] = 1
+
+    def mend_motor(self) -> None:
+        """Take the fault out of the emulated motor, and forget its fastest speed."""
+        _WRONG.pack_into(self._memory, _SHARED.size, *[0] * 10)
+        _FASTEST.pack_into(self._memory, _SHARED.size + _WRONG.size, 0.0)
+
+    @property
+    def fastest(self) -> float:
+        """Fastest speed of the emulated motor since its boot, or since a change of it [RPM]."""
+        found: float = _FASTEST.unpack_from(self._memory, _SHARED.size + _WRONG.size)[0]
+        return found
 
     def close(self) -> None:
         """End the emulator."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import threading
@@ -14,7 +15,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..control.controller import SampledController
-from ..control.machine import RecordedRun, Watch, cancelled_by
+from ..control.machine import RecordedRun, Watch, cancelled_by, explain
 from ..errors import Interrupted, LinkError, SettingError, SewfastError
 from ..live import Feed, ViewKind, open_view
 from ..recordfile import Header, RecordWriter, read_recording
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+_OF_MACHINE = ("speed", "acceleration", "current", "no motion", "swinging")
+"""Trips whose cause is the machine."""
 _OF_A_RUN = ("started", "gap")
 """Events that show that the device has accepted a start."""
 
@@ -225,7 +228,15 @@ def _converted(drive: Drive, plan: Plan, convert: Callable[[RunResult], T], **op
     try:
         return convert(run_plan(drive, plan, **options))
     except Stopped as stopped:
-        raise stopped.as_error(convert) from stopped.cause
+        error = stopped.as_error(convert)
+        outcome = stopped.run.outcome
+        tripped = outcome.state == "tripped" and outcome.reason in _OF_MACHINE
+        if isinstance(error, LinkError) and tripped:
+            error.remedy = ""  # the message keeps how to clear the trip
+            found = getattr(error.recording, "recording", error.recording)
+            with contextlib.suppress(LinkError):  # the drive has gone meanwhile
+                explain(error, found, volt=drive.volt, speed=drive.speed)
+        raise error from stopped.cause
 
 
 def _recording(

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._core import LinkUpload
+from ..causes import turning
 from ..errors import LinkError, SettingError
 from . import wire
 from .connection import SILENCE, Connection, DeviceReset
@@ -66,6 +67,9 @@ ARMED_SILENCE = 0.25
 REST_US = 120_000
 """Device time without a count after which a motor counts as at rest; ARM requires 100 ms."""
 STEP_US = 20_000
+COASTS = 0.9
+"""A motor that keeps more than this share of its speed over the second half of the wait for its
+rest is driven: one that coasts loses speed."""
 MEASURED_WITHIN = 1.0
 """Longest wait for a booting device to finish its first measurements [s]."""
 ARMS_WITHIN = 10.0
@@ -81,12 +85,18 @@ def wait_for_rest(link: Connection, timeout: float) -> None:
     since = began = status.time_us
     # the host's clock too: the time of a device that takes no credit stands still
     deadline = time.monotonic() + timeout + (5.0 if link.identity.on_credit else 0.0)
+    half = math.inf
     while status.time_us - since < REST_US:
+        if math.isinf(half) and status.time_us - began > 0.5e6 * timeout:
+            half = abs(status.speed_rpm)
         if status.time_us - began > timeout * 1e6 or time.monotonic() > deadline:
-            raise LinkError(
+            error = LinkError(
                 name=link.port.url, expected=f"the motor at rest within {timeout:g} s",
                 received=f"{status.speed_rpm:.0f} RPM", remedy="brake it or wait longer",
             )  # fmt: skip
+            if abs(status.speed_rpm) > COASTS * half:
+                error.explain(turning(status.speed_rpm, "before a run"))
+            raise error
         link.let_pass(STEP_US)
         before, status = status, link.status()
         if status.counts != before.counts:
