@@ -25,7 +25,8 @@ REPORT := $(VENV)/report.stamp
 LIBRARIES := $(VENV)/libraries.stamp
 DEV := $(VENV)/dev.stamp
 MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest no-std c-test python-lint types stubs \
-  python-test computing waiting budgets python-core docs package package-source
+  python-test computing waiting budgets python-core docs package package-source board release-bits night-laws \
+  night-bits night-logs night-computing night-waiting night-budgets
 
 .DEFAULT_GOAL := help
 .PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults nonsense motors fleet interrupts fuzz-logs mutations studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
@@ -44,28 +45,42 @@ dev: $(DEV) ## builds and installs what the checks need (--jobs=2: in parallel)
 # compilers side by side: one that optimises a crate keeps one processor busy
 SYNC := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
 test: ## every check of the day; ends with pytest's summary, which names what is left to `make nightly`
-	$(MAKE) --no-print-directory --jobs=2 $(SYNC) dev rust-units
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) dev rust-units board
 # package first: clippy sets pyo3 up in another way than maturin, and each compiles it anew after the other
 	$(MAKE) --no-print-directory --jobs=2 $(SYNC) package rust-rest rust-lint python-lint no-std c-test
 	$(MAKE) --no-print-directory computing
 # tests that wait leave processors to the checks of types
-	$(MAKE) --no-print-directory --jobs=2 $(SYNC) waiting types stubs
+	$(MAKE) --no-print-directory --jobs=2 waiting types stubs
 	$(MAKE) --no-print-directory budgets
 
 test-core: ## the crates and the package without documentation, extras, ports and browser
 	$(MAKE) --no-print-directory --jobs=2 $(SYNC) dev rust-units
 	$(MAKE) --no-print-directory python-core
 
-# an hour at the most; what takes longer goes on where the night before stopped
+# an hour at the most; what takes longer goes on where the night before stopped. One that fails keeps no other from running.
 NIGHT := target/nightly
-nightly: $(DEV) ## the long proofs: counts, every page, emulated boards, browser, wheel from source, a portion of laws and bits
-	$(MAKE) --no-print-directory counts package-source
+nightly: $(DEV) board ## the long proofs: counts, every page, emulated boards, browser, wheel from source, a portion of laws and bits
+	$(MAKE) --no-print-directory --keep-going counts release-bits night-laws night-bits night-logs night-computing night-waiting night-budgets
+
+night-laws: $(DEV)
 	$(BIN)/python tests/support/laws.py --state $(NIGHT)/laws --minutes 8
+
+night-bits: $(DEV)
 	$(BIN)/python tests/support/deployed.py --state $(NIGHT)/bits --minutes 8
-	$(BIN)/python tests/support/fuzzed_logs.py --seconds 20
-	$(PYTEST) --nightly -m '$(COMPUTES)'
-	$(PYTEST) --nightly -m alone
+
+night-logs: $(DEV)
+	$(BIN)/python tests/support/fuzzed_logs.py --seconds 20 --seed $(SEED)
+
+night-computing night-waiting: $(DEV)
+	$(PYTEST) --nightly -m '$(if $(filter %waiting,$@),alone,$(COMPUTES))'
+
+night-budgets: $(DEV)
 	$(ONE_BY_ONE) --nightly -m budget
+
+release-bits: package-source ## the wheel as released has the bits of the build that the tests use
+	target/package/venv/bin/python -I tests/support/bits.py > target/package/released.json
+	$(BIN)/python -I tests/support/bits.py > target/package/built.json
+	cmp target/package/released.json target/package/built.json
 
 lint: rust-lint python-lint types stubs ## formatting, clippy, ruff, mypy, stubs
 
@@ -170,8 +185,12 @@ constraints: ## packaging/constraints.txt, the newest versions that fit together
 licences: ## LICENSE-THIRD-PARTY, from the licences of the crates in a wheel
 	$(PYTHON) tests/support/licences.py
 
-killed: firmware ## kills the host of the emulated board 100 times; its output goes off in time
+killed: $(DEV) firmware ## kills the host of the emulated board 100 times; its output goes off in time
 	SEWFAST_TRIALS=100 $(BIN)/python -m pytest tests/system/test_emulated.py -k killed
+
+board:
+	@if [ -x /usr/bin/rustc ] && command -v arm-none-eabi-gcc >/dev/null; then $(MAKE) --no-print-directory firmware; \
+	else echo 'no compilers for the emulated boards here (see make firmware): their checks are left out'; fi
 
 # the library is the M4's: an M7 runs it as it is, and its external memory lies elsewhere
 M4 = thumbv7em-none-eabihf
@@ -287,8 +306,9 @@ physics: $(VENV)/bench.stamp ## parameters of motors whose truth is known (docs/
 drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONLY="shaft60 lash", SEEDS=)
 	$(BIN)/python benches/drives.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))
 
-faults: $(VENV)/bench.stamp firmware ## commissioning on drives, motors of MuJoCo and a board with 30 faults: ended in time, never verified, named (ONLY=word, STATE=file to go on with)
-	$(BIN)/python benches/faults.py $(if $(ONLY),--only "$(ONLY)") $(if $(STATE),--out $(STATE))
+faults: $(VENV)/bench.stamp board ## commissioning on drives, motors of MuJoCo and a board with 30 faults: ended in time, never verified, named (ONLY=word, STATE=file to go on with, DRIVES=12 MOTORS=7 BOARDS=1)
+	$(BIN)/python benches/faults.py $(if $(ONLY),--only "$(ONLY)") $(if $(STATE),--out $(STATE)) \
+	  $(if $(DRIVES),--drives $(DRIVES)) $(if $(MOTORS),--motors $(MOTORS)) $(if $(BOARDS),--boards $(BOARDS))
 
 nonsense: $(DEV) ## records that deceive and good ones: praised, named, accused (COUNT=2 of each kind, ONLY=word)
 	$(BIN)/python benches/nonsense.py $(if $(COUNT),--count $(COUNT)) $(if $(ONLY),--only "$(ONLY)")
@@ -301,6 +321,7 @@ SOAKED := $(shell grep -rl --include='test_*.py' 'import FULL' tests)
 soak: $(DEV) ## every case, seed and second of the tests that take a part otherwise: faults, kills, flips, hostile bytes, searches (hours)
 	SEWFAST_SOAK=1 cargo test --package sewfast-control --package sewfast-link --profile built --quiet
 	SEWFAST_SOAK=1 $(BIN)/python -m pytest -s $(SOAKED)
+	SEWFAST_SOAK=1 $(BIN)/python -m pytest -s --nightly $(SOAKED)
 
 counts: $(DEV) ## compares the kernels' instruction counts with those in benches/counts.json (valgrind; Linux)
 	$(BIN)/python benches/counts.py

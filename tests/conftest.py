@@ -59,9 +59,9 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
         return None
     waits = ALONE.match(collection_path.name) is not None
     chosen = config.option.markexpr
-    if chosen == "not alone and not budget":
+    if chosen == PARTS[0]:
         return waits or None
-    if chosen in ("alone", "budget"):
+    if chosen in PARTS:
         marked = f"mark.{chosen}" in collection_path.read_text(encoding="utf-8")
         return None if marked or (waits and chosen == "alone") else True
     return None
@@ -85,6 +85,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if ALONE.match(item.path.name):
             item.add_marker("alone")
+        for mark in item.iter_markers():
+            if mark.name in ("nightly", "slow") and not mark.args:
+                raise pytest.UsageError(f"{item.nodeid}: expected the reason of its {mark.name}")
     _expect_cases(config, items)
     at_night = [_is_for_the_night(item) for item in items]
     wanted = config.getoption("--nightly")
@@ -153,11 +156,30 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
         )
         for taken, name in reversed(long):
             terminalreporter.line(f"{taken:6.1f} s  {name}")
-    left = collections.Counter(name.partition("[")[0] for name in config.stash[LEFT])
+    left = collections.Counter(name.partition("[")[0] for name in _left(config))
     if left:
-        terminalreporter.section(f"left to `make nightly`: {left.total()} tests")
+        terminalreporter.section(f"left to `make nightly`: {left.total()} tests, and {OTHERS}")
         for name, count in sorted(left.items()):
             terminalreporter.line(f"{name}{f' ({count} cases)' if count > 1 else ''}")
+
+
+PARTS = ("not alone and not budget", "alone", "budget")
+"""What `-m` of the three parts of `make test` chooses; the last one names what all have left."""
+OTHERS = "counts, bits of the release, a wheel from source, laws, bits, damaged logs"
+
+
+def _left(config: pytest.Config) -> list[str]:
+    """Names of what is left to the night; nothing before the last part of `make test`."""
+    own, chosen = config.stash[LEFT], config.option.markexpr
+    if config.getoption("--nightly") or chosen not in PARTS:
+        return own
+    folder = ROOT / "target" / "left"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{chosen}.txt").write_text("\n".join(own), encoding="utf-8")
+    if chosen != PARTS[-1]:
+        return []
+    kept = [folder / f"{part}.txt" for part in PARTS]
+    return [n for p in kept if p.exists() for n in p.read_text(encoding="utf-8").split("\n") if n]
 
 
 @pytest.fixture

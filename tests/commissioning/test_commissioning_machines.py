@@ -32,6 +32,7 @@ from sewfast.tuning.objective import LARGEST_MS
 sys.path.insert(0, str(Path(__file__).parents[2] / "benches"))
 drives = pytest.importorskip("drives")
 pytest.importorskip("numba", reason="the simulator takes minutes without numba")
+pytestmark = pytest.mark.nightly("compiles another simulator, and commissions its machines")
 
 
 def bench(name: str, **changes: float) -> SteppedBench:

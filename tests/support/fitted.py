@@ -73,8 +73,9 @@ def _place(recipe: Callable[..., object], arguments: tuple[object, ...]) -> Path
 def build() -> str:
     """Hash of all that a fit may depend on."""
     found = hashlib.sha256()
-    compiled = [p for p in _PRODUCT.iterdir() if p.suffix in (".so", ".pyd")]
-    for path in sorted([*compiled, *_PRODUCT.rglob("*.py"), *Path(__file__).parent.glob("*.py")]):
+    # templates, pages and tables as well
+    product = [p for p in _PRODUCT.rglob("*") if p.is_file() and "__pycache__" not in p.parts]
+    for path in sorted([*product, *Path(__file__).parent.glob("*.py")]):
         found.update(str(path.name).encode())
         found.update(path.read_bytes())
     return found.hexdigest()[:24]

@@ -104,8 +104,8 @@ def fuzz(name: str, count: int, seed: int, folder: Path, seconds: float) -> bool
     try:
         whole = MAKE[name](folder / name)
     except BaseException as error:  # pytest's own, where a library is missing
-        print(f"{name}: left out, {error}")
-        return True
+        print(f"{name}: no file to damage, {error}")
+        return False
     raw = whole.read_bytes()
     kind = logs._KINDS.get(logs._kind_of(raw) or "")
     if kind is not None and kind.module is not None:

@@ -146,6 +146,8 @@ def main() -> int:
     with ThreadPoolExecutor(asked.jobs) as pool:
         todo = portion(work, asked.state, asked.minutes)
         while some := list(itertools.islice(todo, asked.jobs)):
+            if asked.state:  # all of these are done again if they are interrupted
+                asked.state.write_text(str(some[0]))
             for f in pool.map(lambda t: try_law(programs[t.package], t, asked.cases), some):
                 found.append(f)
                 print(f"{f.trial}: {'FAILED' if f.said else 'ok'}, {f.seconds:.1f} s", flush=True)
