@@ -21,7 +21,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -32,10 +32,12 @@ from drives import FAMILY, Drive, Simulator, drawn
 from sewfast.commissioning import SteppedBench
 from sewfast.errors import SewfastError
 from sewfast.link import connect
-from sewfast.link.emulated import EmulatedBoard, build_firmware
+from sewfast.link.emulated import EmulatedBoard
 
 VOLT, SPEED = 20.0, 1500.0
 """Largest command [V] and top of the working range [RPM] of a drive."""
+FIRMWARE = Path(__file__).parents[1] / "target" / "bare" / "mps2-an386.elf"
+"""Of the emulated board (`make firmware`)."""
 STATED = 1.6
 """Speed that must not be passed, over the top of the working range."""
 
@@ -329,8 +331,11 @@ class _Board(AbstractContextManager[Any]):
         self.fastest = 0.0
 
     def __enter__(self) -> Any:
-        self._board = EmulatedBoard(build_firmware(), boot_id=1)
-        self._drive = drive = connect(self._board.port)
+        self._opened = ExitStack()
+        self._board = self._opened.enter_context(EmulatedBoard(FIRMWARE, boot_id=1))
+        with self._opened.pop_all() as opening:
+            drive = opening.enter_context(connect(self._board.port))
+            self._opened = opening.pop_all()
         drive.set_limits(volt=VOLT, speed_rpm=STATED * SPEED)
         for name in ("excite", "follow"):
             setattr(drive, name, self._watched(getattr(drive, name)))
@@ -348,18 +353,19 @@ class _Board(AbstractContextManager[Any]):
 
     def __exit__(self, *exception: object) -> None:
         self.fastest = self._board.fastest
-        self._drive.close()
-        self._board.close()
+        self._opened.close()
 
 
 def machines(args: argparse.Namespace) -> Iterator[tuple[Machine, int]]:
-    """Each with its seed."""
-    first = args.first
-    yield from ((Machine(drawn(seed)), seed) for seed in range(first, first + args.drives))
-    yield from (
-        (Machine(mujoco_motors.drawn(n, seed=1)), n) for n in range(first, first + args.motors)
-    )
-    yield from ((BOARD, seed) for seed in range(first, first + args.boards))
+    """Each with its seed, of every kind by turns."""
+    for i in range(max(args.drives, args.motors, args.boards)):
+        seed = args.first + i
+        if i < args.drives:
+            yield Machine(drawn(seed)), seed
+        if i < args.motors:
+            yield Machine(mujoco_motors.drawn(seed, seed=1)), seed
+        if i < args.boards:
+            yield BOARD, seed
 
 
 def cases(args: argparse.Namespace) -> Iterator[tuple[Fault, Machine, int]]:
@@ -367,11 +373,11 @@ def cases(args: argparse.Namespace) -> Iterator[tuple[Fault, Machine, int]]:
         yield from ((HEALTHY, Machine(d), seed) for d in FAMILY for seed in range(2))
         yield from ((HEALTHY, m, seed) for m, seed in machines(args))
         return
-    for fault in FAULTS:
-        if args.only in fault.name:
-            for machine, seed in machines(args):
-                if machine is not BOARD or fault.wrong.keys() <= ON_BOARD:
-                    yield fault, machine, seed
+    for machine, seed in machines(args):
+        for fault in FAULTS:
+            can_be = machine is not BOARD or fault.wrong.keys() <= ON_BOARD
+            if args.only in fault.name and can_be:
+                yield fault, machine, seed
 
 
 def main() -> None:
@@ -385,6 +391,8 @@ def main() -> None:
     parser.add_argument("--healthy", action="store_true", help="machines without a fault")
     parser.add_argument("--out", type=Path, help="JSON; what it has already is not run again")
     args = parser.parse_args()
+    if args.boards and not FIRMWARE.exists():
+        parser.error(f"expected {FIRMWARE}, there is none: make firmware, or --boards 0")
     found: list[dict[str, Any]] = []
     if args.out and args.out.exists():
         found = json.loads(args.out.read_text(encoding="utf-8"))

@@ -244,10 +244,8 @@ class _Look:
         if not (is_alone or found["unsure"] <= UNSURE):
             return None
         least = NOTED if is_alone else max(NOTED, TIMES * found["unsure"])
-        # the difference of two counts, each rounded
-        r = self.recording
-        rounding = 60.0 / (r.counts_per_rev * r.Ts) / math.sqrt(6.0)
-        if found["error"] > max(least * found["size"], rounding) and found["findings"]:
+        least = max(least * found["size"], found["rounding"])
+        if found["error"] > least and found["findings"]:
             most = min(explained * found["error"], TIES * found["findings"][0][3])
             equal = {f[0]: f for f in found["findings"] if f[3] <= most}
             if equal:

@@ -228,8 +228,17 @@ def test_a_broken_motor_is_named_in_a_loop_and_at_rest() -> None:
         assert cause.name == "command sign"
         assert abs(cause.at - 0.9) < 0.05
         assert "clear it" in str(ended.value)
-        board.mend_motor()
         drive.clear()
+        drive.wait_for_rest(20.0)
+        # another fault begins anew, by its own time
+        board.break_motor(0.8, command=0.5)
+        slow = np.diff(sewfast.record(drive, np.full(1400, 3.0)).counts)
+        assert slow[750:790].mean() > 1.8 * slow[-40:].mean()
+        drive.wait_for_rest(20.0)
+        for wrong in ({"lag": 0.0}, {"load": np.nan}, {"jump": 1e12}, {"after": -1.0}):
+            with pytest.raises(SettingError, match=f"{next(iter(wrong))}: expected"):
+                board.break_motor(**wrong)
+        board.mend_motor()
         drive.wait_for_rest(20.0)
         board.break_motor(load=1.0)
         with pytest.raises(LinkError) as driven:

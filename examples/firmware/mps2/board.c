@@ -39,7 +39,7 @@ typedef struct {
     uint64_t safe;        /* us: when the output was last switched off */
     uint32_t enabled;
     /* from the computer: what is wrong with the motor, from a time after its output was switched on (0: always) */
-    uint32_t is_wrong;
+    uint32_t fault;       /* its number; 0: nothing is wrong */
     uint32_t after;       /* us */
     float command, encoder, lag;      /* factors */
     float load, stuck, dead, brake;   /* V; stuck: NAN if it obeys, infinite if it stays as it is */
@@ -60,7 +60,8 @@ static int32_t counts;
 static uint32_t measured; /* ticks: when the last measurement without an output was handed over */
 static bool pending;
 static uint64_t switched_on; /* us: when the output was last switched on */
-static bool wrong;           /* what is wrong with the motor has begun */
+static uint32_t fault;       /* the number of what is wrong with the motor */
+static bool wrong;           /* it has begun */
 static float stays;          /* V: its command then */
 
 /* A byte for which the ring has no room stays in the UART, which then accepts no other. */
@@ -98,11 +99,15 @@ uint64_t board_time(void) {
 
 static void turn_the_motor(void) {
     const bool due = shared.after == 0 || (shared.enabled && sampled - switched_on >= shared.after);
-    if (!wrong && shared.is_wrong && due) {
+    if (fault != shared.fault) {
+        fault = shared.fault;
+        wrong = false;
+    }
+    if (!wrong && fault != 0 && due) {
         counts += (int32_t)shared.jump;
         stays = applied;
+        wrong = true;
     }
-    wrong = shared.is_wrong && (wrong || due);
     float u = applied, friction = FRICTION, lag = LAG, encoder = 1.0f;
     if (wrong) {
         u = shared.command * copysignf(fmaxf(fabsf(u) - shared.dead, 0.0f), u);

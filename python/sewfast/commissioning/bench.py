@@ -31,6 +31,7 @@ from ..control.machine import (
     is_streaming,
     is_watched,
     machine_of,
+    recording_of,
 )  # fmt: skip
 from ..dataset import FloatArray
 from ..errors import DataError, LinkError, SettingError
@@ -247,8 +248,7 @@ class RecordedBench(MachineWrapper):
         try:
             yield
         except (Aborted, LinkError) as stop:
-            # a device ends a loop with the run so far
-            found = getattr(stop.recording, "recording", stop.recording)
+            found = recording_of(stop)
             if isinstance(found, Recording):
                 self.runs.append(found)
             raise
@@ -271,8 +271,9 @@ class RecordedBench(MachineWrapper):
                     found = super().follow(controller, r, name, watch=both)
                 except (Aborted, LinkError) as stop:
                     # under another name, so that a resumed commissioning repeats the run
-                    if isinstance(stop.recording, Recording):
-                        self.note(f"{name}{ABORTED}", key, stop.recording, None)
+                    ended = recording_of(stop)
+                    if isinstance(ended, Recording):
+                        self.note(f"{name}{ABORTED}", key, ended, None)
                     raise
                 _require_run(self.inner, name, len(r), found)
                 # nobody has watched a machine without a watch, nor the last samples of another

@@ -240,7 +240,9 @@ def commission(
         try:
             return _carry_out(recorded, asked, cost, journal)
         except (Refusal, LinkError) as stop:
-            cause = journal.cause or _cause(recorded) or stop.cause
+            # one that no run shows was seen between them
+            between = stop.cause if getattr(stop, "recording", None) is None else None
+            cause = journal.cause or between or _cause(recorded) or stop.cause
             if cause is not None:
                 stop.explain(cause)
                 journal.keep(cause=cause)

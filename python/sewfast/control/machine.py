@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from .. import _core
 from ..arrays import FloatArray
-from ..causes import cause_of
+from ..causes import Cause, cause_of
 from ..errors import DataError, LinkError, SettingError, SewfastError
 from ..gains import real
 from ..machine import VirtualMachine
@@ -105,12 +105,16 @@ class RecordedRun(ClosedLoopRun):
         return self
 
 
-def explain(error: LinkError, recording: Recording, *, volt: float, speed: float) -> None:
-    """Put the cause into an error that ended a run, if the run shows one."""
-    with contextlib.suppress(DataError):  # too few samples
-        cause = cause_of(recording, volt=volt, speed=speed)
-        if cause is not None:
-            error.explain(cause)
+def recording_of(error: Any) -> Any:
+    """What an error says was recorded: a loop on a device ends with its run."""
+    return getattr(error.recording, "recording", error.recording)
+
+
+def cause_in(recording: Recording, *, volt: float, speed: float = math.inf) -> Cause | None:
+    """The cause that a run which was ended shows, if it has samples enough."""
+    with contextlib.suppress(DataError):
+        return cause_of(recording, volt=volt, speed=speed)
+    return None
 
 
 def Followed(run: ClosedLoopRun, recording: Recording) -> RecordedRun:
@@ -549,7 +553,9 @@ class SteppedBench:
         part = getattr(error, "recording", None)
         error.recording = recording if part is None else replace(recording, name=part.name)
         if isinstance(error, LinkError):
-            explain(error, recording, volt=self.volt, speed=self.speed)
+            cause = cause_in(recording, volt=self.volt, speed=self.speed)
+            if cause is not None:
+                error.explain(cause)
 
     def _lost(self, name: str, u: float) -> LinkError:
         """The error for a loop without an encoder."""

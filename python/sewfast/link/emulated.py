@@ -27,6 +27,7 @@ PACKAGES = "gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm rustc-web 
 
 # as in examples/firmware/mps2/board.c and board.ld
 _SHARED = struct.Struct("<6I3QI")
+_FAULT = struct.Struct("<I")
 _WRONG = struct.Struct("<2I8f")
 _FASTEST = struct.Struct("<f")
 _STACK_TOP = 1 << 20
@@ -176,6 +177,7 @@ class EmulatedBoard:
                 remedy=f"on Debian: apt-get install {EMULATOR}",
             )  # fmt: skip
         self._counts = clock == "credit"
+        self._faults = 0
         drawn = secrets.randbits(32) if boot_id is None else boot_id & 0xFFFFFFFF
         with ExitStack() as opened:
             folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="sewfast-"))
@@ -268,11 +270,29 @@ class EmulatedBoard:
             Command at which the output stage is stuck [V]; inf is the one it has then.
         jump : float
             Added to the counter once.
+
+        Raises
+        ------
+        SettingError
+            For a number that is out of its range.
         """
+        numbers = {
+            "command": command, "encoder": encoder, "lag": lag, "load": load, "stuck": stuck,
+            "dead": dead, "brake": brake, "jump": jump,
+        }  # fmt: skip
+        for name, value in numbers.items():
+            least = {"lag": 1e-3, "dead": 0.0, "brake": 0.0}.get(name, -1e6)
+            if not (least <= value <= 1e6 or name == "stuck"):
+                raise SettingError(
+                    name=name, expected=f"a number from {least:g} to 1e6", received=f"{value:g}"
+                )
+        if not 0.0 <= after <= 4000.0:
+            raise SettingError(name="after", expected="0 to 4000 s", received=f"{after:g}")
         self.mend_motor()
-        numbers = (command, encoder, lag, load, stuck, dead, brake, jump)
-        _WRONG.pack_into(self._memory, _SHARED.size, 0, round(1e6 * after), *numbers)
-        self._memory[_SHARED.size] = 1
+        self._faults += 1
+        place = self._memory, _SHARED.size
+        _WRONG.pack_into(*place, 0, round(1e6 * after), *numbers.values())
+        _FAULT.pack_into(*place, self._faults)  # last: it begins with this
 
     def mend_motor(self) -> None:
         """Take the fault out of the emulated motor, and forget its fastest speed."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..control.controller import SampledController
-from ..control.machine import RecordedRun, Watch, cancelled_by, explain
+from ..control.machine import RecordedRun, Watch, cancelled_by, cause_in, recording_of
 from ..errors import Interrupted, LinkError, SettingError, SewfastError
 from ..live import Feed, ViewKind, open_view
 from ..recordfile import Header, RecordWriter, read_recording
@@ -232,10 +232,12 @@ def _converted(drive: Drive, plan: Plan, convert: Callable[[RunResult], T], **op
         outcome = stopped.run.outcome
         tripped = outcome.state == "tripped" and outcome.reason in _OF_MACHINE
         if isinstance(error, LinkError) and tripped:
-            error.remedy = ""  # the message keeps how to clear the trip
-            found = getattr(error.recording, "recording", error.recording)
             with contextlib.suppress(LinkError):  # the drive has gone meanwhile
-                explain(error, found, volt=drive.volt, speed=drive.speed)
+                cause = cause_in(recording_of(error), volt=drive.volt)
+                # a limit that its owner has set low ends a healthy motor before it settles
+                if cause is not None and cause.name != "integrates":
+                    error.remedy = ""  # the message keeps how to clear the trip
+                    error.explain(cause)
         raise error from stopped.cause
 
 

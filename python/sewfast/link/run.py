@@ -67,7 +67,7 @@ ARMED_SILENCE = 0.25
 REST_US = 120_000
 """Device time without a count after which a motor counts as at rest; ARM requires 100 ms."""
 STEP_US = 20_000
-COASTS = 0.9
+COASTS = 0.99
 """A motor that keeps more than this share of its speed over the second half of the wait for its
 rest is driven: one that coasts loses speed."""
 MEASURED_WITHIN = 1.0
@@ -87,16 +87,17 @@ def wait_for_rest(link: Connection, timeout: float) -> None:
     deadline = time.monotonic() + timeout + (5.0 if link.identity.on_credit else 0.0)
     half = math.inf
     while status.time_us - since < REST_US:
-        if math.isinf(half) and status.time_us - began > 0.5e6 * timeout:
-            half = abs(status.speed_rpm)
         if status.time_us - began > timeout * 1e6 or time.monotonic() > deadline:
             error = LinkError(
                 name=link.port.url, expected=f"the motor at rest within {timeout:g} s",
                 received=f"{status.speed_rpm:.0f} RPM", remedy="brake it or wait longer",
             )  # fmt: skip
             if abs(status.speed_rpm) > COASTS * half:
+                error.remedy = ""  # both are said
                 error.explain(turning(status.speed_rpm, "before a run"))
             raise error
+        if math.isinf(half) and status.time_us - began > 0.5e6 * timeout:
+            half = abs(status.speed_rpm)
         link.let_pass(STEP_US)
         before, status = status, link.status()
         if status.counts != before.counts:

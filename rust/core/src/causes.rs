@@ -110,6 +110,8 @@ pub struct Causes {
     pub error: f64,
     /// Rms of the speed itself \[RPM\].
     pub size: f64,
+    /// The part of the error that comes from rounding to counts \[RPM\].
+    pub rounding: f64,
     /// The changes, each at its best sample and value, the smallest error first.
     pub findings: Vec<Finding>,
 }
@@ -198,6 +200,8 @@ pub fn causes(
         backwards: unexplained(whole, &backwards),
         error: rms(without),
         size: rms(blocks.energy()),
+        // a block's speed is the difference of two roundings of variance 1/12
+        rounding: blocks.per_count / 6.0_f64.sqrt(),
         findings,
     })
 }

@@ -57,6 +57,7 @@ fn causes<'py>(
     all.set_item("backwards", found.backwards)?;
     all.set_item("error", found.error)?;
     all.set_item("size", found.size)?;
+    all.set_item("rounding", found.rounding)?;
     let findings = found
         .findings
         .iter()

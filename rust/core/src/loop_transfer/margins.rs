@@ -5,6 +5,7 @@ use std::cmp::Ordering;
 use std::f64::consts::{FRAC_1_SQRT_2, PI};
 
 use nalgebra::Complex;
+use sewfast_control::Biquad;
 
 use super::{Loop, Place, States};
 
@@ -45,12 +46,14 @@ impl Curve {
         let ratio = (PI / last.theta).powf(1.0 / count as f64);
         points.push(last);
         let (mut turned, mut resolved) = (from_rest(closed, last.l), true);
-        for i in 1..=count {
-            let theta = if i == count {
-                PI
-            } else {
-                points[0].theta * ratio.powi(i as i32)
-            };
+        let mut angles: Vec<f64> = (1..count)
+            .map(|i| last.theta * ratio.powi(i as i32))
+            .chain(turns(closed))
+            .filter(|theta| *theta > last.theta && *theta < PI)
+            .collect();
+        angles.sort_by(f64::total_cmp);
+        angles.push(PI);
+        for theta in angles {
             let next = at(theta);
             resolved &= refine(&at, &mut points, last, next, DEPTH, &mut turned);
             last = next;
@@ -63,6 +66,30 @@ impl Curve {
             unstable: resolved.then(|| encircled(closed, turned)).flatten(),
         }
     }
+}
+
+/// Where a lightly damped filter or plant turns the locus, which can be between two points of the grid: the angles of its poles and
+/// zeros, and beside them.
+fn turns(closed: &Loop<'_>) -> Vec<f64> {
+    let sections = closed.path.biquads.sections().iter();
+    let roots = sections.flat_map(|&Biquad { c0, c1, a1, a2 }| {
+        let zeros = upper_root(1.0 + c0, a1 + c1 - c0, a2 - c1);
+        [zeros, upper_root(1.0, a1, a2)].into_iter().flatten()
+    });
+    let poles = closed.plant.poles.iter().copied().filter(|p| p.im > 0.0);
+    roots
+        .chain(poles)
+        .flat_map(|root| {
+            let (theta, width) = (root.arg(), (1.0 - root.norm()).abs());
+            [-3.0, -1.0, 0.0, 1.0, 3.0].map(|k| theta + k * width)
+        })
+        .collect()
+}
+
+/// The root of `b0 z^2 + b1 z + b2` above the real axis.
+fn upper_root(b0: f64, b1: f64, b2: f64) -> Option<Complex<f64>> {
+    let under = 4.0 * b0 * b2 - b1 * b1;
+    (under > 0.0).then(|| Complex::new(-b1, under.sqrt()) / (2.0 * b0))
 }
 
 /// Adds the points after `from` up to `to`; false where they cannot be brought near enough.

@@ -236,6 +236,34 @@ fn levels_are_passed_one_after_the_other() {
     assert!((size(found.bandwidth) - 0.5_f64.sqrt()).abs() < 1e-9);
 }
 
+/// A filter so narrow that it lies between the points of the grid.
+#[test]
+fn a_narrow_filter_is_seen_wherever_it_lies() {
+    let plant = Plant::fopdt(100.0, 0.1, 0.002, TS).unwrap();
+    for i in 0..60 {
+        let hertz = 0.3 * 1.04_f64.powi(i);
+        for filter in [
+            Biquad::notch(hertz, 0.005, 0.02, TS).unwrap(),
+            Biquad::resonance(hertz, 0.001, hertz, 0.01, TS).unwrap(),
+        ] {
+            let mut path = path(0.05, 0.2, 0.0);
+            path.biquads = Cascade::new(&[filter]).unwrap();
+            let closed = Loop::new(&path, &plant).unwrap();
+            let size = |omega: f64| 1.0 / (closed.response(omega) + 1.0).norm();
+            let beside = |k: i32| std::f64::consts::TAU * hertz * (1.0 + 2e-4 * f64::from(k));
+            let top = (-200..=200).map(beside).map(size).fold(0.0, f64::max);
+            let found = margins_of(&path, &plant);
+            assert!(found.ms.0 > top * (1.0 - 1e-6), "{hertz} {top} {found:?}");
+            let first = (-200..=200)
+                .map(beside)
+                .find(|w| size(*w) > 0.5_f64.sqrt());
+            if let Some(first) = first {
+                assert!(found.bandwidth <= first * (1.0 + 1e-6), "{hertz} {first} {found:?}");
+            }
+        }
+    }
+}
+
 #[test]
 fn the_delay_and_the_gain_that_the_margins_state_are_the_last_that_the_loop_bears() {
     let (path, plant) = (path(0.012, 0.06, 0.004), drive());
