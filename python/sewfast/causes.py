@@ -26,8 +26,8 @@ NOTED, TIMES = 0.02, 3.0
 """Without it the error must be larger than this share of the speed, and larger by this factor than
 on the earlier runs to which the motor was fitted."""
 ALIKE, UNSURE = 0.05, 0.1
-"""Shares of the speed by which a motor of its own errs on a run that can be an earlier one, and one
-motor on all earlier ones together."""
+"""Shares of the speed by which a motor of its own errs at most on a run that can be an earlier one,
+and on one that shows what the machine always was."""
 LOST = 0.1
 """Shares of motion that count as none."""
 TURNS = 5
@@ -124,8 +124,9 @@ def cause_among(
 ) -> Cause | None:
     """The cause that ended a series of runs.
 
-    The last run is looked at alone, then compared with those before it that one motor explains. If
-    that shows nothing, a fault may have come unseen in one of those.
+    The last run is looked at alone, compared with those before it that a motor explains, and with
+    all of them; the change that leaves the smallest error is the cause. If that shows nothing, a
+    fault may have come unseen in an earlier run.
     """
     if not runs:
         return None
@@ -133,8 +134,6 @@ def cause_among(
     if np.ptp(last.counts) == 0.0 and moved:
         return _idle(runs)
     look = _look(last, volt, speed)
-    if look is not None and (cause := look.change()):
-        return cause
     known: list[_Look] = []
     unseen: list[Cause] = []
     for recording in moved[-MOST:]:
@@ -145,15 +144,22 @@ def cause_among(
             unseen.append(cause)
         elif earlier.found["error"] <= ALIKE * earlier.found["size"]:
             known.append(earlier)
-    own = None if look is None else look.always()
-    if own is not None and own.name == "integrates":
-        if all(earlier.is_unsettled() for earlier in known):
+    if look is not None:
+        changes, own = [look.explanation()], look.always()
+        if own is not None and own.name == "integrates":
+            if changes[0] is None and all(earlier.is_unsettled() for earlier in known):
+                return own
+            own = None
+        # a fault that nobody saw yet spoils a motor of all runs, few runs one of those that agree
+        for before in ([k.recording for k in known], moved[-MOST:]):
+            if before:
+                changes.append(_Look.at(last, before, volt, speed).explanation())
+        explained = [change for change in changes if change is not None]
+        if explained:
+            return min(explained, key=lambda change: change[0])[1]
+        if own is not None:
             return own
-        own = None
-    cause = None
-    if known:
-        cause = cause_of(last, [k.recording for k in known], volt=volt, speed=speed)
-    return cause or own or (unseen[0] if unseen else None)
+    return unseen[0] if unseen else None
 
 
 def _look(recording: Recording, volt: float, speed: float) -> _Look | None:
@@ -237,12 +243,15 @@ class _Look:
 
     def change(self, explained: float = EXPLAINED) -> Cause | None:
         """The change that explains the run, leaving this share of the error at most."""
+        change = self.explanation(explained)
+        return None if change is None else change[1]
+
+    def explanation(self, explained: float = EXPLAINED) -> tuple[float, Cause] | None:
+        """The error that such a change leaves [RPM], and the change."""
         if (early := turns_at_rest(self.recording)) is not None:
-            return early
+            return 0.0, early
         found = self.found
         is_alone = math.isnan(found["unsure"])
-        if not (is_alone or found["unsure"] <= UNSURE):
-            return None
         least = NOTED if is_alone else max(NOTED, TIMES * found["unsure"])
         least = max(least * found["size"], found["rounding"])
         if found["error"] > least and found["findings"]:
@@ -250,8 +259,8 @@ class _Look:
             equal = {f[0]: f for f in found["findings"] if f[3] <= most}
             if equal:
                 change = next(name for name in _NAMED if name in equal)
-                _, value, at, _, motor = equal[change]
-                return self.changed(change, value, at, motor)
+                _, value, at, error, motor = equal[change]
+                return error, self.changed(change, value, at, motor)
         return None
 
     def changed(self, change: str, value: float, at: float, motor: dict[str, float]) -> Cause:
