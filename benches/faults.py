@@ -207,7 +207,7 @@ FAULTS = (
     Fault("encoder dead", {"encoder": 0.0}, LOST),
     Fault("stage off", {"command": 0.0}, ("no motion", "stage off")),
     Fault("turns at 0 V", {"load": 0.05}, ("turns at rest",), may_verify=True),
-    Fault("integrates", {"free": 1.0}, ("integrates",)),
+    Fault("integrates", {"free": 1.0}, ("integrates",), may_verify=True),
     Fault("supply is 5 times as high", {"command": 5.0}, ("gain",), LOOP, 0.7),
     Fault("dead band of 40 %", {"dead": 0.4}, ("dead zone", "friction")),
     Fault("stuck stage", {"stuck": 0.15}, ("turns at rest", "stage stuck", "load")),

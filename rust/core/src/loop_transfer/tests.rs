@@ -254,11 +254,12 @@ fn a_narrow_filter_is_seen_wherever_it_lies() {
             let top = (-200..=200).map(beside).map(size).fold(0.0, f64::max);
             let found = margins_of(&path, &plant);
             assert!(found.ms.0 > top * (1.0 - 1e-6), "{hertz} {top} {found:?}");
-            let first = (-200..=200)
-                .map(beside)
-                .find(|w| size(*w) > 0.5_f64.sqrt());
+            let first = (-200..=200).map(beside).find(|w| size(*w) > 0.5_f64.sqrt());
             if let Some(first) = first {
-                assert!(found.bandwidth <= first * (1.0 + 1e-6), "{hertz} {first} {found:?}");
+                assert!(
+                    found.bandwidth <= first * (1.0 + 1e-6),
+                    "{hertz} {first} {found:?}"
+                );
             }
         }
     }
