@@ -189,7 +189,7 @@ killed: $(DEV) firmware ## kills the host of the emulated board 100 times; its o
 	SEWFAST_TRIALS=100 $(BIN)/python -m pytest tests/system/test_emulated.py -k killed
 
 board:
-	@if [ -x /usr/bin/rustc ] && command -v arm-none-eabi-gcc >/dev/null; then $(MAKE) --no-print-directory firmware; \
+	@if [ -x /usr/bin/rustc ] && [ -d /usr/lib/rustlib/src/rust ] && command -v arm-none-eabi-gcc >/dev/null; then $(MAKE) --no-print-directory firmware; \
 	else echo 'no compilers for the emulated boards here (see make firmware): their checks are left out'; fi
 
 # the library is the M4's: an M7 runs it as it is, and its external memory lies elsewhere

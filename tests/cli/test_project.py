@@ -59,7 +59,7 @@ STRANGERS = [
 ]
 
 
-@pytest.mark.nightly("default searches for each header; by day examples/own_recording.py has one")
+@pytest.mark.nightly("default searches for each header; by day test_grey_box.py has one")
 @pytest.mark.parametrize(("header", "seed"), STRANGERS if FULL else STRANGERS[:2])
 def test_three_commands_without_an_option_reach_a_verified_controller(
     tmp_path: Path, header: str, seed: int

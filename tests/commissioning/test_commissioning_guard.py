@@ -221,6 +221,7 @@ def test_coarse_steps_and_counts_that_are_none_trip_nothing(per_turn: float, sca
     assert max(motor.speeds) > 0.7 * STATED
 
 
+@pytest.mark.nightly("a whole commissioning")
 def test_a_machine_that_states_just_what_training_needs_is_not_tripped() -> None:
     motor = Motor(gain=300.0)
     rig = SteppedBench(motor, Ts=TS, counts_per_rev=4096, volt=10.0, speed=1250.0)

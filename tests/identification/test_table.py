@@ -259,6 +259,7 @@ def test_a_curve_without_memory_gets_a_network() -> None:
     assert model.training["verdict"]["fit_percent"] > 80.0
 
 
+@pytest.mark.nightly("a default search")
 def test_a_rectified_output_is_no_question_of_a_delay() -> None:
     rng = np.random.default_rng(0)
     rng.normal(size=600)

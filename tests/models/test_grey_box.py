@@ -226,6 +226,7 @@ def test_what_is_linear_stays_linear_whatever_its_unit() -> None:
         assert sewfast.identify(data, seed=seed).kind == "oe"
 
 
+@pytest.mark.nightly("a search of seconds")
 @pytest.mark.parametrize(
     "given", [{"nx": 2}, {"nk": 1}, {"hidden": 4}, {"output": "linear"}] if FULL else [{"nk": 1}]
 )

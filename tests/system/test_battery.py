@@ -188,6 +188,7 @@ def test_the_digest_is_of_the_data() -> None:
 # --- the default ----------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly("a default search; by day test_choice and test_table have some")
 @pytest.mark.parametrize(
     "name",
     ["first_order_encoder", *(("wiener", "prbs_drift", "dead_time", "tanks") if FULL else ())],

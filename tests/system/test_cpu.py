@@ -40,6 +40,7 @@ def answer(level: str, program: str = PROGRAM) -> subprocess.CompletedProcess[st
     )
 
 
+@pytest.mark.nightly("trains on every level; by day the core's tests compare lanes")
 def test_every_level_trains_the_same_networks() -> None:
     found = {}
     for level in LEVELS[: LEVELS.index(_core.cpu) + 1]:

@@ -13,8 +13,14 @@ from cli import environment
 EXAMPLES = sorted(Path(__file__).resolve().parents[2].glob("examples/*.py"))
 
 
-@pytest.mark.slow("one of them searches for a structure with all defaults")
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
+SEARCHES = pytest.mark.nightly("searches for a structure with all defaults")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=[SEARCHES] if p.stem == "own_recording" else []) for p in EXAMPLES],
+    ids=lambda p: p.stem,
+)
 def test_example(path: Path, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, str(path)],

@@ -89,7 +89,7 @@ fn turns(closed: &Loop<'_>) -> Vec<f64> {
 /// The root of `b0 z^2 + b1 z + b2` above the real axis.
 fn upper_root(b0: f64, b1: f64, b2: f64) -> Option<Complex<f64>> {
     let under = 4.0 * b0 * b2 - b1 * b1;
-    (under > 0.0).then(|| Complex::new(-b1, under.sqrt()) / (2.0 * b0))
+    (under > 0.0).then(|| Complex::new(-b1 / (2.0 * b0), under.sqrt() / (2.0 * b0.abs())))
 }
 
 /// Adds the points after `from` up to `to`; false where they cannot be brought near enough.
