@@ -71,8 +71,11 @@ night-bits: $(DEV)
 night-logs: $(DEV)
 	$(BIN)/python tests/support/fuzzed_logs.py --seconds 20 --seed $(SEED)
 
-night-computing night-waiting: $(DEV)
-	$(PYTEST) --nightly -m '$(if $(filter %waiting,$@),alone,$(COMPUTES))'
+night-computing: $(DEV)
+	$(PYTEST) --nightly -m '$(COMPUTES)'
+
+night-waiting: $(DEV)
+	$(PYTEST) --nightly -m alone
 
 night-budgets: $(DEV)
 	$(ONE_BY_ONE) --nightly -m budget

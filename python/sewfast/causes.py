@@ -133,10 +133,10 @@ def cause_among(
     last, moved = runs[-1], [r for r in runs[:-1] if np.ptp(r.counts) > 0.0]
     if np.ptp(last.counts) == 0.0 and moved:
         return _idle(runs)
-    look = _look(last, volt, speed)
+    look, recent = _look(last, volt, speed), moved[-MOST:]
     known: list[_Look] = []
     unseen: list[Cause] = []
-    for recording in moved[-MOST:]:
+    for recording in recent:
         earlier = _look(recording, volt, speed)
         if earlier is None:
             continue
@@ -151,9 +151,11 @@ def cause_among(
                 return own
             own = None
         # a fault that nobody saw yet spoils a motor of all runs, few runs one of those that agree
-        for before in ([k.recording for k in known], moved[-MOST:]):
-            if before:
-                changes.append(_Look.at(last, before, volt, speed).explanation())
+        series = [[k.recording for k in known]] if known else []
+        if len(known) < len(recent):
+            series.append(recent)
+        for before in series:
+            changes.append(_Look.at(last, before, volt, speed).explanation())
         explained = [change for change in changes if change is not None]
         if explained:
             return min(explained, key=lambda change: change[0])[1]

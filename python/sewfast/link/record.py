@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_OF_MACHINE = ("speed", "acceleration", "current", "no motion", "swinging")
-"""Trips whose cause is the machine."""
 _OF_A_RUN = ("started", "gap")
 """Events that show that the device has accepted a start."""
 
@@ -366,6 +364,8 @@ def _more_time(watchdog: float) -> str:
 
 _LIMITED = {"speed": (1, "RPM"), "acceleration": (2, "RPM/s"), "current": (3, "A")}
 """Trips by a limit: its place among the limits, its unit."""
+_OF_MACHINE = (*_LIMITED, "no motion", "swinging")
+"""Trips whose cause is the machine."""
 
 
 def _why(reason: str, drive: Drive) -> str:
