@@ -29,7 +29,7 @@ MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest n
   night-bits night-logs night-computing night-waiting night-budgets
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults nonsense motors fleet interrupts fuzz-logs mutations studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults nonsense motors fleet interrupts fuzz-logs mutations studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed parting laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -229,6 +229,14 @@ waiting: $(DEV)
 
 budgets: $(DEV)
 	$(ONE_BY_ONE) -m budget
+
+# every test of the day and of the list, with the lines that each reaches; budgets take the time that they have
+PARTED := $(CURDIR)/target/parting
+parting: $(VENV)/bench.stamp ## writes tests/night.txt: which tests of over a second are left to the night (quarter of an hour)
+	rm -rf $(PARTED) && mkdir -p $(PARTED) && : > tests/night.txt
+	for part in '$(COMPUTES)' alone; do COVERAGE_FILE=$(PARTED)/lines $(PYTEST) -m "$$part" --cov --cov-append --cov-context=test \
+	  --cov-config=tests/support/coverage.ini --cov-report= || exit 1; done
+	$(BIN)/python tests/support/parting.py target/seconds $(PARTED)/lines
 
 CORE_TESTS := $(addprefix tests/,analysis control dataset evidence files greybox identification models tuning) \
   $(wildcard tests/test_*.py)

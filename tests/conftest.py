@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import json
 import os
 import re
 import shutil
@@ -70,6 +71,9 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 SLOW = 10.0
 """Seconds from which a test of `make test` needs `@pytest.mark.slow("reason")`."""
 LEFT = pytest.StashKey[list[str]]()
+LISTED = (ROOT / "tests" / "night.txt").read_text(encoding="utf-8").splitlines()
+NIGHT = frozenset(line for line in LISTED if not line.startswith("#"))
+"""What is left to the night because its lines are reached by day as well (`make parting`)."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -103,9 +107,11 @@ def _case(item: pytest.Item) -> str:
 
 
 def _is_for_the_night(item: pytest.Item) -> bool:
-    """Of a family, the cases that `by_day` names run in `make test`."""
+    """Marked, but for the cases of a family that `by_day` names, or listed and not `slow`."""
     mark = item.get_closest_marker("nightly")
-    return mark is not None and _case(item) not in mark.kwargs.get("by_day", ())
+    if mark is not None:
+        return _case(item) not in mark.kwargs.get("by_day", ())
+    return item.nodeid in NIGHT and item.get_closest_marker("slow") is None
 
 
 def _expect_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -122,6 +128,10 @@ def _expect_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
     lost = [f"{name}[{case}]" for name, cases in missing.items() for case in sorted(cases)]
     if lost:
         raise pytest.UsageError(f"by_day names cases that are not there: {', '.join(lost)}")
+    read = {item.nodeid.partition("::")[0] for item in items}
+    listed = {name for name in NIGHT if name.partition("::")[0] in read}
+    if gone := sorted(listed - {item.nodeid for item in items}):
+        raise pytest.UsageError(f"tests/night.txt names tests that are not there: {gone}")
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
@@ -149,6 +159,10 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
         for report in reports:
             if not getattr(report, "is_slow", True):
                 seconds[report.nodeid] += report.duration
+    if config.option.markexpr in PARTS:
+        kept = ROOT / "target" / "seconds" / f"{config.option.markexpr}.json"
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_text(json.dumps(seconds), encoding="utf-8")
     long = sorted((s, name) for name, s in seconds.items() if s > SLOW)
     if long and not config.getoption("--nightly"):
         terminalreporter.section(

@@ -339,6 +339,7 @@ def test_what_was_second_is_kept_and_pickled_with_the_model() -> None:
     ]
 
 
+@pytest.mark.slow("the one full search by day that ends in a linear model")
 def test_a_linear_truth_stays_linear() -> None:
     kinds = [identify(linear_data(700, seed=s, noise=0.5), seed=s).kind for s in SEEDS]
     assert set(kinds) == {"oe"}

@@ -86,6 +86,7 @@ def test_the_network_fits_what_no_linear_model_can() -> None:
 # --- selection --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow("the one full search by day that ends in a network")
 def test_auto_takes_the_network_where_it_helps_and_says_why() -> None:
     model = identify(bent_data(noise=0.01), **SMALL)
     assert isinstance(model, (NeuralSS, Ensemble))

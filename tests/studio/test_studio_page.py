@@ -21,6 +21,7 @@ from studio_page import EVIL
 
 
 @pytest.mark.alone
+@pytest.mark.slow("the one way by clicks by day")
 def test_the_way_by_clicks(studio: Studio, browser: Any) -> None:
     def at(name: str) -> Any:
         return browser.find_element("id", name)

@@ -16,6 +16,7 @@ architecture = pytest.importorskip("architecture")
 PAGE = (ROOT / "docs" / "ARCHITECTURE.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow("a change of structure is seen at once")
 def test_the_picture_is_up_to_date() -> None:
     drawn = architecture.drawn()
     assert architecture.PICTURE.read_text(encoding="utf-8") == drawn, (

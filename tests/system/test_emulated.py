@@ -107,6 +107,7 @@ def test_recordings_on_credit_are_equal_and_the_processor_is_measured() -> None:
 
 
 @needs_board
+@pytest.mark.slow("what keeps a machine safe is seen at once")
 def test_a_killed_host_leaves_the_output_off_in_time() -> None:
     """In real time: within the watchdog and one period of the last bytes heard."""
     watchdog = 0.4

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 import sewfast
 
 ORDER = """
@@ -68,6 +70,7 @@ def test_every_unit_has_its_place() -> None:
     assert sorted(ORDER.split()) == sorted({m.split(".")[0] for m in MODULES})
 
 
+@pytest.mark.slow("a change of structure is seen at once")
 def test_imports_point_down() -> None:
     place = {unit: i for i, unit in enumerate(ORDER.split())}
     up = {(m, u) for m, u in _arrows() if u not in place or place[u] > place[m.split(".")[0]]}
