@@ -1026,9 +1026,11 @@ def causes(
     """What has changed in a machine, from a run (u, counts) and earlier ones, all from rest.
 
     ``motor`` (gain [RPM/u], lag and delay [s], friction and bias [u]) is fitted to the earlier runs or, without any, to this
-    one; ``unsure`` is its rms error on the earlier runs over their rms speed, NaN without any, ``backwards`` that
-    of a motor that turns against its command, on this run; ``error`` is the rms error of its speed on this one, ``size`` the rms speed [RPM]. ``findings`` are changes, the
-    best first, each with its value, its time [s], the error with it [RPM] and the motor until then.
+    one; ``unsure`` is its rms error on the earlier runs over their rms speed, ``together`` what this run adds to their
+    errors if one motor is fitted to all, as an rms over the run [RPM], both NaN without earlier ones; ``backwards`` is the
+    relative error of a motor that turns against its command, on this run; ``error`` is the rms error of its speed on this
+    one, ``size`` the rms speed, ``rounding`` the part of a count [RPM]. ``findings`` are changes, the best first, each with
+    its value, its time [s], the error with it [RPM] and the motor until then.
     """
 
 @final

@@ -36,6 +36,8 @@ TIES = 1.05
 """Changes with an error of up to this multiple of the least are equal: the likelier is taken."""
 MOST = 12
 """Runs that are looked at, the last ones of a series: each takes some tenths of a second."""
+SETTLED = 3.0
+"""Time constants after which a step has settled, to 95 %."""
 STRONG = 3.0
 """Gain is too large if the largest command reaches this many times the machine's own limit."""
 
@@ -183,11 +185,13 @@ def _idle(runs: Sequence[Recording]) -> Cause:
             runs[-1].name, None, 0.0,
         )  # fmt: skip
     stood = max(u for r, u in zip(runs, largest, strict=True) if np.ptp(r.counts) == 0.0)
-    return Cause(
-        "dead zone",
-        f"the first {stood:.3g} V move nothing; check friction, a brake that is on, the dead band "
-        "of the drive", runs[-1].name, None, stood,
-    )  # fmt: skip
+    return dead_zone(stood, runs[-1].name)
+
+
+def dead_zone(volt: float, run: str) -> Cause:
+    """The cause of a machine that small commands do not move."""
+    text = f"the first {volt:.3g} V move nothing; check friction, a brake that is on, the dead band"
+    return Cause("dead zone", f"{text} of the drive", run, None, volt)
 
 
 def turns_at_rest(r: Recording) -> Cause | None:
@@ -198,6 +202,13 @@ def turns_at_rest(r: Recording) -> Cause | None:
     if not abs(counted) >= TURNS:
         return None
     return turning(60.0 * counted / (r.counts_per_rev * (end - 1) * r.Ts), r.name)
+
+
+def unsettled(r: Recording) -> Cause | None:
+    """The cause of a step that was held for long and did not settle, if a motor explains it."""
+    look = _Look.at(r, (), math.inf, math.inf)
+    is_motor = look.found["error"] <= UNSURE * look.found["size"]
+    return look.integrates() if is_motor and look.is_unsettled(SETTLED) else None
 
 
 def turning(rpm: float, run: str) -> Cause:
@@ -262,7 +273,9 @@ class _Look:
             if equal:
                 change = next(name for name in _NAMED if name in equal)
                 _, value, at, error, motor = equal[change]
-                return error, self.changed(change, value, at, motor)
+                # no change where one motor explains all runs as well
+                if not found["together"] <= error:
+                    return error, self.changed(change, value, at, motor)
         return None
 
     def changed(self, change: str, value: float, at: float, motor: dict[str, float]) -> Cause:
@@ -283,7 +296,7 @@ class _Look:
         r, motor = self.recording, self.found["motor"]
         largest = float(np.max(np.abs(r.u), initial=0.0))
         travel = float(np.ptp(r.counts)) / r.counts_per_rev
-        gain, lag = motor["gain"], motor["lag"]
+        gain = motor["gain"]
         unlike = self.found["error"] / max(self.found["size"], 1e-9)
         name: str
         if travel == 0.0:
@@ -300,12 +313,7 @@ class _Look:
         elif unlike > UNSURE:
             return None
         elif self.is_unsettled():
-            name, value = "integrates", gain / lag
-            text = (
-                f"the speed grows by {value:.4g} RPM/s per V and does not settle: the command is a "
-                "torque without friction, or an acceleration; command it as a speed or a voltage, "
-                "or give the machine friction"
-            )
+            return self.integrates()
         elif self.is_too_fast() and gain * self.volt > STRONG * self.speed:
             value = gain * self.volt / self.speed
             name = "gain too large"
@@ -318,9 +326,19 @@ class _Look:
             return None
         return Cause(name, text, self.name, None, float(value))
 
-    def is_unsettled(self) -> bool:
-        """Whether the motor still speeds up as at first at the end of the run."""
-        return bool(self.found["motor"]["lag"] > 2.0 * len(self.recording) * self.recording.Ts)
+    def is_unsettled(self, lags: float = 0.5) -> bool:
+        """Whether the run is shorter than this many time constants of its motor."""
+        return bool(lags * self.found["motor"]["lag"] > len(self.recording) * self.recording.Ts)
+
+    def integrates(self) -> Cause:
+        """The cause of a speed that grows for as long as the run lasts."""
+        value = float(self.found["motor"]["gain"] / self.found["motor"]["lag"])
+        text = (
+            f"the speed grows by {value:.4g} RPM/s per V and does not settle: the command is a "
+            "torque with little friction, or an acceleration; command it as a speed or a voltage, "
+            "or give the machine friction"
+        )
+        return Cause("integrates", text, self.name, None, value)
 
     def is_too_fast(self) -> bool:
         """Whether the run reached the machine's own limit of speed."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import _core
-from ..causes import Cause
+from ..causes import Cause, dead_zone, unsettled
 from ..control.machine import Machine
 from ..dataset import FloatArray
 from ..errors import DataError, FitError
@@ -53,17 +53,19 @@ def first_motion(machine: Machine, demands: Demands) -> Motion:
     command does not reach a fair speed.
     """
     levels: list[tuple[float, float]] = []
-    stalls = 0
+    stood, stalls = 0.0, 0
     for share in SHARES:
         u = share * demands.u_max
         recording = machine.excite(_pulse(u, machine.Ts), f"motion_{100 * share:g}")
         speed = _judged(recording, u, may_stall=stalls < STALLS and share < STALLING)
         if speed is None:
-            stalls += int(np.ptp(recording.counts) >= MOVED * machine.counts_per_rev)
+            has_moved = bool(np.ptp(recording.counts) >= MOVED * machine.counts_per_rev)
+            stalls += int(has_moved)
+            stood = stood if has_moved else u
             continue
         levels.append((u, speed))
         if speed >= ENOUGH * demands.speed:
-            return _motion(levels)
+            return _motion(levels, stood)
     require(
         bool(levels),
         f"expected the machine to move at {demands.u_max:g} V at the latest, its encoder counted "
@@ -123,12 +125,10 @@ def _judged(recording: Recording, u: float, *, may_stall: bool) -> float | None:
     return float(speed) if speed > 0.0 and turns[-1] >= MOVED else None
 
 
-def _motion(levels: list[tuple[float, float]]) -> Motion:
-    """The line through the last two levels, or through the origin and the only one."""
+def _motion(levels: list[tuple[float, float]], stood: float) -> Motion:
+    """The line through the last two levels, or from the largest command that moved nothing."""
     u, speed = levels[-1]
-    if len(levels) == 1:
-        return Motion(speed / u, 0.0)
-    before, slower = levels[-2]
+    before, slower = levels[-2] if len(levels) > 1 else (stood, 0.0)
     gain = max((speed - slower) / (u - before), speed / u)
     return Motion(gain, max(0.0, u - speed / gain))
 
@@ -162,16 +162,16 @@ def step_response(machine: Machine, demands: Demands, motion: Motion) -> Fopdt:
                 room = min(1.0, demands.top / max(at_worst, 1e-3 * demands.top))
                 u = motion.threshold + room * (u - motion.threshold)
             continue
-        _checked(fopdt, demands)
+        _checked(fopdt, demands, motion.threshold, u)
         return fopdt
     raise Refusal(
         f"expected a speed that settles within {DURATIONS[-1]:g} s at {u:.3g} V, it did not "
         f"({reason}); see what varies: a changing load, a controller inside the drive, a "
-        "machine that integrates"
-    ) from reason
+        "machine that integrates", cause=unsettled(recording),
+    ) from reason  # fmt: skip
 
 
-def _checked(fopdt: Fopdt, demands: Demands) -> None:
+def _checked(fopdt: Fopdt, demands: Demands, threshold: float, u: float) -> None:
     require(
         fopdt.K > 0.0 and fopdt.fit_percent >= LEAST_FIT,
         f"expected a step response of first order with dead time (fit of {LEAST_FIT:g} % or more, "
@@ -179,16 +179,18 @@ def _checked(fopdt: Fopdt, demands: Demands) -> None:
         "be reached",
     )
     needed = (demands.top - fopdt.offset) / fopdt.K
+    without = demands.top * (u - threshold) / (fopdt.K * u + fopdt.offset)
+    cause = Cause(
+        "out of reach",
+        f"{demands.u_max:g} V reach {fopdt.K * demands.u_max + fopdt.offset:.4g} RPM; lower "
+        "speed, or raise u_max if motor and machine bear it", "step", None, needed,
+    )  # fmt: skip
     require(
         needed <= demands.u_max,
         f"expected the top speed and a quarter more, {demands.top:.4g} RPM, to need less than "
         f"u_max = {demands.u_max:g} V, the step response says {needed:.3g} V",
-        Cause(
-            "out of reach",
-            f"{demands.u_max:g} V reach {fopdt.K * demands.u_max + fopdt.offset:.4g} RPM; lower "
-            "speed, or raise u_max if motor and machine bear it", "step", None, needed,
-        ),
-    )  # fmt: skip
+        cause if without > demands.u_max else dead_zone(threshold, "step"),
+    )
 
 
 # --- Signals for a machine of which only a first order with dead time is known --------------------

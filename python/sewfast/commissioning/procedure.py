@@ -240,8 +240,10 @@ def commission(
         try:
             return _carry_out(recorded, asked, cost, journal)
         except (Refusal, LinkError) as stop:
-            # one that no run shows was seen between them
-            between = stop.cause if getattr(stop, "recording", None) is None else None
+            # one of a device without a recording was seen between the runs; a refusal that knows
+            # why, as a reference out of reach, does not know what put it there
+            seen_between = isinstance(stop, LinkError) and stop.recording is None
+            between = stop.cause if seen_between else None
             cause = journal.cause or between or _cause(recorded) or stop.cause
             if cause is not None:
                 stop.explain(cause)

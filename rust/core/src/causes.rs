@@ -108,6 +108,9 @@ pub struct Causes {
     pub backwards: f64,
     /// Rms error of the speed of the run without a change \[RPM\].
     pub error: f64,
+    /// What the run adds to the errors of earlier ones if one motor is fitted to all, as an rms over the run \[RPM\]; NaN
+    /// without earlier ones.
+    pub together: f64,
     /// Rms of the speed itself \[RPM\].
     pub size: f64,
     /// The part of the error that comes from rounding to counts \[RPM\].
@@ -159,6 +162,14 @@ pub fn causes(
     let earlier = if known.is_empty() { whole } else { &known };
     let motor = fitted(earlier, &LAGS, 1.0, monitor)?;
     let without = blocks.squares(&motor, None);
+    // one motor for all runs that fits as well as a change does needs none
+    let together = if known.is_empty() {
+        f64::NAN
+    } else {
+        let all: Vec<Blocks> = known.iter().chain(whole).cloned().collect();
+        let one = fitted(&all, &LAGS, 1.0, monitor)?;
+        (squares(&all, &one) - squares(&known, &motor)).max(0.0)
+    };
     let mut tried = Vec::new();
     if known.is_empty() {
         for place in places(blocks.len(), OWN_PLACES) {
@@ -199,6 +210,7 @@ pub fn causes(
         unsure: unexplained(&known, &motor),
         backwards: unexplained(whole, &backwards),
         error: rms(without),
+        together: rms(together),
         size: rms(blocks.energy()),
         // a block's speed is the difference of two roundings of variance 1/12
         rounding: blocks.per_count / 6.0_f64.sqrt(),
@@ -206,10 +218,14 @@ pub fn causes(
     })
 }
 
+/// Sum of the squares of a motor's errors on runs.
+fn squares(runs: &[Blocks], motor: &Motor) -> f64 {
+    runs.iter().map(|r| r.squares(motor, None)).sum()
+}
+
 /// Rms error of a motor on runs as a share of their rms speed; NaN if nothing moves.
 fn unexplained(runs: &[Blocks], motor: &Motor) -> f64 {
-    let sum = |of: &dyn Fn(&Blocks) -> f64| runs.iter().map(of).sum::<f64>();
-    (sum(&|r| r.squares(motor, None)) / sum(&|r| r.energy())).sqrt()
+    (squares(runs, motor) / runs.iter().map(Blocks::energy).sum::<f64>()).sqrt()
 }
 
 /// `many` numbers evenly from 0 to below `end`, without repetition.
@@ -600,6 +616,8 @@ impl Candidate {
             // more than the largest command would only be a shaft that stands
             Change::Friction => (0.0..=blocks.largest).contains(&value),
             Change::Inertia => value > 0.05,
+            // a decoder makes 1, 2 or 4 counts of a line
+            Change::Counts => value.abs() <= 4.0,
             _ => true,
         };
         if is_possible {

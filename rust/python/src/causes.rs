@@ -54,6 +54,7 @@ fn causes<'py>(
     let all = PyDict::new(py);
     all.set_item("motor", motor_dict(py, &found.motor)?)?;
     all.set_item("unsure", found.unsure)?;
+    all.set_item("together", found.together)?;
     all.set_item("backwards", found.backwards)?;
     all.set_item("error", found.error)?;
     all.set_item("size", found.size)?;
