@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from sewfast import Controller, DataError, Gains, Recording, cause_of, record, run
-from sewfast.commissioning import SteppedBench
+from sewfast import Controller, DataError, Gains, Recording, cause_of, commission, record, run
+from sewfast.commissioning import Refusal, SteppedBench
 from sewfast.errors import LinkError
 
 TS, PER_TURN = 1e-3, 4096.0
@@ -140,6 +140,34 @@ def test_a_machine_that_was_never_as_thought_is_named_from_one_run() -> None:
 def test_a_machine_that_did_what_it_always_did_has_no_cause() -> None:
     before = [record(rig(Motor()), np.repeat([0.0, 3.0, 6.0, 2.0], 500), name="steps")]
     assert cause_of(looped(Motor()), before, volt=10.0) is None
+
+
+@pytest.mark.parametrize(
+    ("motor", "name", "said"),
+    [
+        (Motor(0.0, friction=4.0), "dead zone", "the first 3.2 V"),
+        (Motor(0.0, command=40.0, inertia=400.0), "integrates", "RPM/s per V"),
+        (Motor(0.0, command=0.3), "out of reach", "or raise u_max"),
+    ],
+    ids=["friction", "integrates", "weak"],
+)
+def test_a_step_that_is_refused_has_a_cause(motor: Motor, name: str, said: str) -> None:
+    """Only of a motor that is weak is the limit the cause."""
+    with pytest.raises(Refusal) as refused:
+        commission(rig(motor), speed=1100.0)
+    assert refused.value.stage == "step response"
+    cause = refused.value.cause
+    assert cause is not None
+    assert (cause.name, cause.run) == (name, "step")
+    assert said in cause.text
+    assert ("raise" in str(refused.value)) == (name == "out of reach")
+
+
+def test_one_motor_that_explains_all_runs_needs_no_change() -> None:
+    """At one level friction is a part of the gain; a second level shows it, and is no fault."""
+    stiff = Motor(0.0, friction=3.0)
+    low, high = (record(rig(stiff), np.repeat([0.0, u], 500), name="step") for u in (5.0, 9.0))
+    assert cause_of(high, [low], volt=10.0) is None
 
 
 def test_too_short_a_run_is_refused() -> None:

@@ -180,7 +180,7 @@ class Failing:
     """300 RPM per volt, a time constant of 80 ms."""
 
     what, left = "", math.inf
-    speed = angle = counts = 0.0
+    speed = angle = counts = held = 0.0
     railed = 0
 
     def reset(self) -> None:
@@ -190,6 +190,8 @@ class Failing:
         self.left -= 1
         is_out = self.left < 0
         self.railed += abs(u) >= 19.99
+        self.held = u if not is_out else self.held
+        u = self.held if self.what == "stage" else u
         self.speed += 0.0125 * (
             300.0 * (0.0 if is_out and self.what == "amplifier" else u) - self.speed
         )
@@ -212,6 +214,14 @@ def test_a_loop_without_encoder_or_amplifier_is_ended_and_named(what: str) -> No
     # a quarter of a second without a count, and a block; a motor without amplifier coasts before
     most = {"encoder": 250, "amplifier": 1000}[what] + WATCHED
     assert on.machine.railed <= most  # type: ignore[attr-defined]
+
+
+def test_a_loop_whose_stage_sticks_is_not_out_of_reach() -> None:
+    with short(), pytest.raises(Refusal, match="command within its limits") as refused:
+        commission(Fails("stage"), **SMALL)
+    assert refused.value.cause is not None
+    assert refused.value.cause.name == "stage stuck"
+    assert "raise" not in str(refused.value)
 
 
 @pytest.mark.parametrize("hertz", [3.0, 20.0, 60.0])
