@@ -20,7 +20,7 @@ import pytest
 
 import deployed
 import kinds
-from sewfast import Controller, Ensemble, Gains, LinearOE, Model, _core, deploy
+from sewfast import Controller, Dataset, Ensemble, Gains, LinearOE, Model, _core, deploy, identify
 from sewfast.cli import main
 from sewfast.deployment.precision import combined_run, embedded_members
 from sewfast.errors import FitError, ModelFileError, SettingError
@@ -316,6 +316,36 @@ print("alike")
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True
     )
     assert done.stdout == "alike\n", done.stderr
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", ["oe", "neural_oe"])
+def test_a_deployed_plant_begins_at_its_operating_point(kind: str, tmp_path: Path) -> None:
+    """An oven at 70 degrees under 30 % stays there; it does not heat up from zero."""
+    u = np.repeat([30.0, 60.0, 45.0, 80.0, 20.0, 55.0], [60, 80, 80, 80, 80, 80])
+    y = np.full(len(u), 70.0)
+    for k in range(1, len(u)):
+        y[k] = y[k - 1] + 0.05 * (70.0 + 0.8 * (u[k - 1] - 30.0) - y[k - 1])
+    y += np.random.default_rng(0).normal(scale=0.02, size=len(y))
+    data = Dataset.from_arrays(u, y, Ts=1.0)
+    model = identify(data, model=kind, seed=0, time_budget=3.0)
+    assert model.rest.u == (30.0,)
+    deploy(model, tmp_path, precision="f64", name="oven")
+    (tmp_path / "main.c").write_text(
+        '#include <stdio.h>\n#include "oven.h"\nint main(void) {'
+        " oven_model m; double u = 30.0; int k; oven_init(&m);"
+        ' for (k = 0; k < 50; k++) printf("%.17g\\n", oven_step(&m, &u)); return 0; }'
+    )
+    files = [str(tmp_path / f) for f in ("oven.c", "main.c")]
+    subprocess.run(
+        [deployed.compilers()[0], "-ffp-contract=off", *files, "-o", str(tmp_path / "run")],
+        check=True,
+    )
+    said = subprocess.run([tmp_path / "run"], capture_output=True, check=True).stdout
+    found = np.array(said.split(), dtype=float)
+    # the model errs at the operating point by a part of the noise, which loops leave out
+    assert np.abs(found - model.rest.y).max() < 0.01
+    assert abs(model.rest.y - 70.0) < 0.05
 
 
 # --- Structured text ------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ from ..errors import SettingError
 from ..gains import Gains
 from ..models import Model
 from .precision import (
+    at_rest,
     combined_run,
     controller_step,
     embedded_members,
@@ -332,8 +333,9 @@ def _whole(
         half = count // 2
         middle = f"y[{half}]" if count % 2 else f"R(0.5) * (y[{half - 1}] + y[{half}])"
         combine = code.template(f"{combined}.c", COUNT=str(count), MIDDLE=middle)
-    rest = code.literals(np.concatenate([m.core.rest_state() for m in members]), " " * 8)
-    return combine + code.template("model.c", BEGINS=begins, REST=rest, STEP=step)
+    states, held = at_rest(members)
+    rest, before = (code.literals(v, " " * 8) for v in (np.concatenate(states), held))
+    return combine + code.template("model.c", BEGINS=begins, REST=rest, HELD=before, STEP=step)
 
 
 def _model_test(

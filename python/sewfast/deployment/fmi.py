@@ -49,6 +49,8 @@ class _System:
     title: str
     Ts: float
     inputs: Sequence[tuple[str, str]]
+    starts: Sequence[float]
+    """The inputs until they are set: those of a plant at rest."""
     output: tuple[str, str]
     direct: bool
     """Whether the output depends on the inputs of the same sample."""
@@ -90,9 +92,9 @@ def _of(what: Model | Controller, name: str) -> _System:
     if isinstance(what, Controller):
         u, y = what.gains.u_unit, what.gains.y_unit
         return _System(
-            name, "PID controller", what.Ts, [("r", y), ("y", y), ("feedforward", u)], ("u", u),
-            False, f"{name}_pid", f"return {name}_step_with(system, u[0], u[1], u[2]);",
-            "return now->system.u;",
+            name, "PID controller", what.Ts, [("r", y), ("y", y), ("feedforward", u)],
+            (0.0, 0.0, 0.0), ("u", u), False, f"{name}_pid",
+            f"return {name}_step_with(system, u[0], u[1], u[2]);", "return now->system.u;",
         )  # fmt: skip
     inputs = list(zip(what.input_names, what.input_units, strict=True))
     names = [*what.input_names, what.output_name, "time"]
@@ -103,8 +105,8 @@ def _of(what: Model | Controller, name: str) -> _System:
         )  # fmt: skip
     direct = any(e.orders["nk"] == 0 for e in embedded_members(what, "f64")[1])
     return _System(
-        name, what.title, what.Ts, inputs, (what.output_name, what.output_unit), direct,
-        f"{name}_model", f"return {name}_step(system, u);",
+        name, what.title, what.Ts, inputs, what.rest.u, (what.output_name, what.output_unit),
+        direct, f"{name}_model", f"return {name}_step(system, u);",
         f"{name}_model copy = now->system;\n    return advance(&copy, now->u);",
     )  # fmt: skip
 
@@ -118,6 +120,7 @@ def _functions(system: _System, token: str) -> str:
         NAME=system.name,
         TOKEN=token,
         INPUTS=str(len(system.inputs)),
+        STARTS=code.literals(system.starts),
         TS=code.literal(system.Ts),
         KIND=system.kind,
         ADVANCE=f"    {system.advance}\n",
@@ -147,10 +150,10 @@ def _description(system: _System, token: str) -> str:
         '    <Float64 name="time" valueReference="0" causality="independent" '
         'variability="continuous"/>',
     ]
-    for i, (name, unit) in enumerate(system.inputs):
+    for i, ((name, unit), start) in enumerate(zip(system.inputs, system.starts, strict=True)):
         lines.append(
             f'    <Float64 name={quoteattr(name)} valueReference="{i + 1}" causality="input" '
-            f'variability="discrete" start="0"{_with_unit(unit)}/>'
+            f'variability="discrete" start="{start:.17g}"{_with_unit(unit)}/>'
         )
     name, unit = system.output
     lines += [

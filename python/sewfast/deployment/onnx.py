@@ -17,7 +17,7 @@ from ..control import Controller
 from ..dataset import FloatArray
 from ..errors import SettingError, not_installed
 from ..models import Model
-from .precision import embedded_members
+from .precision import at_rest, embedded_members
 
 OPSET = 17
 IR = 9
@@ -71,17 +71,18 @@ def initial_state(
     ----------
     model : Model
     state : array, optional
-        The state of `Model.simulate`; by default the model is at rest.
+        The state of `Model.simulate`; by default the model is at rest (`Model.rest`).
     held : array, shape (n_inputs,), optional
-        Constant inputs before the first sample, in their units; 0 by default.
+        Constant inputs before the first sample, in their units; by default those at rest.
 
     Returns
     -------
     array, shape (1, n)
     """
     members, embedded, _ = embedded_members(model, "f64")
-    first = np.concatenate([m.core.rest_state() for m in members]) if state is None else state
-    before = np.zeros(len(model.input_names)) if held is None else np.asarray(held, dtype=float)
+    states, inputs = at_rest(members)
+    first = np.concatenate(states) if state is None else state
+    before = inputs if held is None else np.asarray(held, dtype=float)
     parts, at = [], 0
     for e in embedded:
         na = e.orders["na"]

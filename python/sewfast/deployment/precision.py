@@ -56,6 +56,11 @@ def excitation(model: Model, samples: int) -> FloatArray:
     return np.ascontiguousarray(np.stack(columns, axis=1))
 
 
+def at_rest(members: list[Model]) -> tuple[list[FloatArray], FloatArray]:
+    """The states of a plant's models at its operating point, and the inputs that hold it there."""
+    return [m.rest_state() for m in members], np.array(members[0].rest.u)
+
+
 def combined_run(
     members: list[Model],
     embedded: list[_core.EmbeddedModel],
@@ -64,10 +69,10 @@ def combined_run(
     precision: str,
 ) -> FloatArray:
     """The free run from rest, as the C computes it."""
-    held = np.zeros(u.shape[1])
+    states, held = at_rest(members)
     runs = [
-        e.run(u, m.core.rest_state(), held, precision=precision)
-        for m, e in zip(members, embedded, strict=True)
+        e.run(u, state, held, precision=precision)
+        for state, e in zip(states, embedded, strict=True)
     ]
     if precision == "f64":
         stacked = np.array(runs)

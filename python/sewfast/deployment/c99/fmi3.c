@@ -49,7 +49,9 @@ static Status say(const Component *c, Status status, const char *message)
 
 static void begin(State *now)
 {
+    static const double starts[] = {@STARTS};
     memset(now, 0, sizeof *now);
+    memcpy(now->u, starts, sizeof starts);
     @NAME_init(&now->system);
 }
 

@@ -7,8 +7,10 @@ void @_init(@_model *model)
     static const @_real rest[@@_STATES] = {
         @REST
     };
-    static const @_real zero[@@_INPUTS] = {0};
-    @_begin(model, rest, zero);
+    static const @_real held[@@_INPUTS] = {
+        @HELD
+    };
+    @_begin(model, rest, held);
 }
 
 @_real @_step(@_model *model, const @_real *u)

@@ -5,7 +5,7 @@
 @MEMORIEStypedef struct @_model {
 @FIELDS} @_model;
 
-/* At rest, with inputs of zero before. */
+/* At the operating point of the recording; at rest without inputs where none is known. */
 void @_init(@_model *model);
 
 /* Before the first sample: past outputs in their unit, the newest first, or states, @@_STATES numbers;
