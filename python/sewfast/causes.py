@@ -274,7 +274,7 @@ class _Look:
                 change = next(name for name in _NAMED if name in equal)
                 _, value, at, error, motor = equal[change]
                 # no change where one motor explains all runs as well
-                if not found["together"] <= error:
+                if not found["together"] <= TIES * error:
                     return error, self.changed(change, value, at, motor)
         return None
 

@@ -89,7 +89,6 @@ def out(saved: Path, tmp_path: Path) -> Path:
 # --- whole --------------------------------------------------------------------------------------
 
 
-@pytest.mark.nightly("another page")
 def test_the_page_has_margins_as_predicted_and_as_measured(
     whole: Commissioning, saved: Path, tmp_path: Path
 ) -> None:

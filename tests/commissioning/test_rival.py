@@ -125,6 +125,7 @@ def test_a_rival_that_cannot_be_run_is_refused(rival: Any, match: str) -> None:
 
 
 @pytest.mark.budget
+@pytest.mark.nightly("the same without a rival runs by day")
 def test_a_time_budget_is_kept_with_a_rival() -> None:
     found = tuned(rival=drive(gain=470.0), evaluations=10**6, time_budget=2.0)
     assert found.termination == "time"

@@ -540,7 +540,7 @@ def test_a_budget_too_short_for_a_step_further_gives_the_model_back(kind: Any) -
 
 
 @pytest.mark.budget
-@pytest.mark.nightly("eight seconds of networks", by_day=["auto-1.5", "oe-1.5", "neural_oe-4.0"])
+@pytest.mark.nightly("twelve seconds of networks", by_day=["auto-1.5", "oe-1.5"])
 @pytest.mark.parametrize(
     ("kind", "budget"), [("auto", 1.5), ("oe", 1.5), ("neural_oe", 4.0), ("neural_ss", 8.0)]
 )

@@ -11,7 +11,6 @@ from sewfast.errors import ModelFileError
 from sewfast.report import report
 
 
-@pytest.mark.nightly("a motor and a report of its own")
 def test_a_page_shows_the_motor_in_its_folder(tmp_path: Path) -> None:
     folder = result_folder.make(tmp_path / "demo")
     u = np.repeat(np.random.default_rng(1).uniform(-8, 8, 20), 286)

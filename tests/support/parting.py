@@ -1,8 +1,8 @@
 """Which tests `make test` leaves to the night: writes tests/night.txt from a measured run.
 
-A test that takes over a second goes if the others reach (nearly) every line of the package that it
-reaches; the most seconds for the fewest lines go first, until the day has lost `LINES`. What is
-marked `slow` stays. The run that `make parting` measures holds every test of the day and of
+A test that takes over half a second goes if the others reach (nearly) every line of the package
+that it reaches; the most seconds for the fewest lines go first, until the day has lost `LINES`.
+What is marked `slow` stays. The run that `make parting` measures holds every test of the day and of
 the list, with the lines that each of them reaches (`--cov-context=test`).
 """
 
@@ -16,14 +16,14 @@ from pathlib import Path
 
 LIST = Path(__file__).parents[1] / "night.txt"
 HEAD = """\
-# Left to `make nightly`, written by `make parting`: tests of over a second, of whose lines the
-# others reach all but a few. A family leaves its quickest case. To keep one, mark it `slow`.
+# Left to `make nightly`, written by `make parting`: tests of over half a second, of whose
+# lines the others reach all but a few. A family leaves its quickest case; `slow` keeps a test.
 """
-LEAST = 1.0
+LEAST = 0.5
 """Seconds from which a test, or what goes of a family, is worth a line of the list."""
-LINES = 250
+LINES = 40
 """Lines of the package, of 35,000, that no test of the day may reach any more."""
-PROMISES = 0.4
+PROMISES = 0.2
 """Seconds that a test of the day may cost whatever it reaches."""
 
 
