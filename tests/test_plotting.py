@@ -51,6 +51,7 @@ def loop(plant: Any) -> sewfast.ClosedLoopRun:
     return sewfast.run(sewfast.paper_controller(), plant, 500.0 * np.ones(200))
 
 
+@cache
 def results() -> dict[str, tuple[Any, int]]:
     """Every result that draws itself, and how many panels it has."""
     held = bent_data(400, noise=0.05)
@@ -70,7 +71,6 @@ def results() -> dict[str, tuple[Any, int]]:
 NAMES = ["data", "summary", "validation", "card", "run", "orders", "delay", "margins"]
 
 
-@pytest.mark.nightly("every result", by_day=["data", "validation", "run", "margins"])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_result_draws_itself(name: str, tmp_path: Path) -> None:
     result, count = results()[name]

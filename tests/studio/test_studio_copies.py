@@ -1,0 +1,72 @@
+"""What a page offers to copy is Python that compiles and commands that the command line knows."""
+
+from __future__ import annotations
+
+import ast
+import shlex
+from typing import Any
+
+import pytest
+
+from sewfast.cli.parser import build_parser
+from sewfast.studio import driving, requests
+
+PLACES = {
+    "virtual": driving.Place("virtual:3", limits={"volt": 20.0, "speed_rpm": 3000.0}),
+    "serial": driving.Place("/dev/my port", baud=9600, watchdog=0.25, limits={"volt": 12.0}),
+}
+ASKED: dict[str, dict[str, Any]] = {
+    "record": {"signal": "pulses", "seed": 2, "scale": 0.5, "file": "a run.csv"},
+    "run": {
+        "controller": "it's.json", "reference": "trapezoid", "seed": 0, "scale": 1.5,
+        "file": "b.csv",
+    },
+    "commission": {"seed": 1, "members": 2, "evaluations": 50},
+}  # fmt: skip
+STEP = requests.Step("-odd.csv", ("u",), "y", resample=0.01, model="oe", seed=4)
+
+
+def called(script: str, name: str) -> ast.Call:
+    """The one call of `sewfast.NAME` in a script."""
+    calls = [n for n in ast.walk(ast.parse(script)) if isinstance(n, ast.Call)]
+    (found,) = (c for c in calls if ast.unparse(c.func) == f"sewfast.{name}")
+    return found
+
+
+def known(commands: str, name: str) -> Any:
+    """The options of the one line that calls `sewfast NAME`."""
+    (line,) = (w for w in map(shlex.split, commands.splitlines()) if w[:2] == ["sewfast", name])
+    return build_parser().parse_args(line[1:])
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("kind", ASKED)
+def test_work_on_a_drive(kind: str, place: str) -> None:
+    asked, where = ASKED[kind], PLACES[place]
+    copy = driving.copies(kind, where, asked)
+    call = ast.unparse(called(copy["python"], kind))
+    if "file" in asked:
+        assert f"file={asked['file']!r}" in call
+    if kind == "run":
+        assert f"{asked['controller']!r}" in copy["python"]
+    options = known(copy["commands"], kind)
+    assert options.on == ("./drive.port" if where.is_virtual else where.port)
+    if kind == "commission":
+        assert (options.seed, options.members, options.evaluations) == (1, 2, 50)
+
+
+def test_a_commissioning_of_a_virtual_machine() -> None:
+    asked = requests.Commission("virtual", 1, 2, 50)
+    assert "evaluations=50" in ast.unparse(called(asked.python(), "commission"))
+    assert known(asked.commands(), "commission").members == 2
+
+
+@pytest.mark.parametrize("name", ["look", "bode", "identify", "validate"])
+def test_steps(name: str) -> None:
+    columns = {"inputs": ["u"], "output": "y"}
+    copy = requests.script(STEP, name, columns, None, None)
+    assert ast.unparse(called(copy, "read")).startswith("sewfast.read('-odd.csv', inputs=['u']")
+    if name != "look":
+        called(copy, name)
+    said = requests.commands(STEP, name, columns, None, None)
+    assert all("./-odd.csv" in shlex.split(line) for line in said.splitlines() if name in line)
