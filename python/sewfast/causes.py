@@ -29,15 +29,13 @@ ALIKE, UNSURE = 0.05, 0.1
 """Shares of the speed by which a motor of its own errs at most on a run that can be an earlier one,
 and on one that shows what the machine always was."""
 LOST = 0.1
-"""Shares of motion that count as none."""
+"""Shares of motion, and of the largest command, that count as none."""
 TURNS = 5
 """Counts without a command that are a motion, and no trembling at an edge of the encoder."""
 TIES = 1.05
 """Changes with an error of up to this multiple of the least are equal: the likelier is taken."""
 MOST = 12
 """Runs that are looked at, the last ones of a series: each takes some tenths of a second."""
-SETTLED = 3.0
-"""Time constants after which a step has settled, to 95 %."""
 STRONG = 3.0
 """Gain is too large if the largest command reaches this many times the machine's own limit."""
 
@@ -205,10 +203,10 @@ def turns_at_rest(r: Recording) -> Cause | None:
 
 
 def unsettled(r: Recording) -> Cause | None:
-    """The cause of a step that was held for long and did not settle, if a motor explains it."""
+    """The cause of a step that was held for long and is not half done, if a motor explains it."""
     look = _Look.at(r, (), math.inf, math.inf)
     is_motor = look.found["error"] <= UNSURE * look.found["size"]
-    return look.integrates() if is_motor and look.is_unsettled(SETTLED) else None
+    return look.integrates() if is_motor and look.is_unsettled(1.0) else None
 
 
 def turning(rpm: float, run: str) -> Cause:

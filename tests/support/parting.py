@@ -2,8 +2,9 @@
 
 A test that takes over half a second goes if the others reach (nearly) every line of the package
 that it reaches; the most seconds for the fewest lines go first, until the day has lost `LINES`.
-What is marked `slow` stays. The run that `make parting` measures holds every test of the day and of
-the list, with the lines that each of them reaches (`--cov-context=test`).
+What is marked `slow` or `nightly` stays as it is. The run that `make parting` measures holds every
+test of the day and of the list, with the lines that each reaches (`--cov-context=test`). What a
+process that a test starts reaches is known only as a whole: it counts as reached whoever goes.
 """
 
 from __future__ import annotations

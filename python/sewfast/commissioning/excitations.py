@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import _core
-from ..causes import Cause, dead_zone, unsettled
+from ..causes import LOST, Cause, dead_zone, unsettled
 from ..control.machine import Machine
 from ..dataset import FloatArray
 from ..errors import DataError, FitError
@@ -180,6 +180,7 @@ def _checked(fopdt: Fopdt, demands: Demands, threshold: float, u: float) -> None
     )
     needed = (demands.top - fopdt.offset) / fopdt.K
     without = demands.top * (u - threshold) / (fopdt.K * u + fopdt.offset)
+    is_lost = without <= demands.u_max and threshold > LOST * demands.u_max
     cause = Cause(
         "out of reach",
         f"{demands.u_max:g} V reach {fopdt.K * demands.u_max + fopdt.offset:.4g} RPM; lower "
@@ -189,7 +190,7 @@ def _checked(fopdt: Fopdt, demands: Demands, threshold: float, u: float) -> None
         needed <= demands.u_max,
         f"expected the top speed and a quarter more, {demands.top:.4g} RPM, to need less than "
         f"u_max = {demands.u_max:g} V, the step response says {needed:.3g} V",
-        cause if without > demands.u_max else dead_zone(threshold, "step"),
+        dead_zone(threshold, "step") if is_lost else cause,
     )
 
 

@@ -23,7 +23,7 @@ from ..control import Controller
 from ..errors import SettingError
 from ..models import Model
 from . import c99
-from .precision import embedded_members
+from .precision import at_rest, embedded_members
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Date of all files within, so that the same model gives the same bytes."""
@@ -103,9 +103,11 @@ def _of(what: Model | Controller, name: str) -> _System:
             name="model", expected="names of inputs and output that differ and are not time",
             received=", ".join(names[:-1]), remedy="rename the columns and identify again",
         )  # fmt: skip
-    direct = any(e.orders["nk"] == 0 for e in embedded_members(what, "f64")[1])
+    members, embedded, _ = embedded_members(what, "f64")
+    direct = any(e.orders["nk"] == 0 for e in embedded)
+    _, starts = at_rest(members)
     return _System(
-        name, what.title, what.Ts, inputs, what.rest.u, (what.output_name, what.output_unit),
+        name, what.title, what.Ts, inputs, starts.tolist(), (what.output_name, what.output_unit),
         direct, f"{name}_model", f"return {name}_step(system, u);",
         f"{name}_model copy = now->system;\n    return advance(&copy, now->u);",
     )  # fmt: skip

@@ -57,7 +57,12 @@ def excitation(model: Model, samples: int) -> FloatArray:
 
 
 def at_rest(members: list[Model]) -> tuple[list[FloatArray], FloatArray]:
-    """The states of a plant's models at its operating point, and the inputs that hold it there."""
+    """The states of a plant's models at its operating point, and the inputs that hold it there.
+
+    Models of several recordings have none in common: they begin at rest without inputs.
+    """
+    if len({m.rest.u for m in members}) > 1:
+        return [m.core.rest_state() for m in members], np.zeros(len(members[0].rest.u))
     return [m.rest_state() for m in members], np.array(members[0].rest.u)
 
 
