@@ -203,7 +203,7 @@ def turns_at_rest(r: Recording) -> Cause | None:
 
 
 def unsettled(r: Recording) -> Cause | None:
-    """The cause of a step that was held for long and is not half done, if a motor explains it."""
+    """The cause of a long step that is far from settled, if a motor explains it."""
     look = _Look.at(r, (), math.inf, math.inf)
     is_motor = look.found["error"] <= UNSURE * look.found["size"]
     return look.integrates() if is_motor and look.is_unsettled(1.0) else None
