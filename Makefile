@@ -233,7 +233,7 @@ budgets: $(DEV)
 # every test of the day and of the list, with the lines that each reaches; budgets take the time that they have
 PARTED := $(CURDIR)/target/parting
 parting: $(VENV)/bench.stamp ## writes tests/night.txt: which tests of over half a second are left to the night (quarter of an hour)
-	rm -rf $(PARTED) && mkdir -p $(PARTED)
+	rm -rf $(PARTED) target/seconds && mkdir -p $(PARTED)
 	for part in '$(COMPUTES)' alone; do SEWFAST_ALL_DAY=1 COVERAGE_FILE=$(PARTED)/lines $(PYTEST) -m "$$part" --cov --cov-append --cov-context=test \
 	  --cov-config=tests/support/coverage.ini --cov-report= || exit 1; done
 	$(BIN)/python tests/support/parting.py target/seconds $(PARTED)/lines

@@ -72,9 +72,8 @@ SLOW = 10.0
 """Seconds from which a test of `make test` needs `@pytest.mark.slow("reason")`."""
 LEFT = pytest.StashKey[list[str]]()
 LISTED = (ROOT / "tests" / "night.txt").read_text(encoding="utf-8").splitlines()
-NIGHT = frozenset(
-    line for line in LISTED if not line.startswith("#") and "SEWFAST_ALL_DAY" not in os.environ
-)
+ALL_DAY = "SEWFAST_ALL_DAY" in os.environ
+NIGHT = frozenset(line for line in LISTED if not line.startswith("#") and not ALL_DAY)
 """What is left to the night because its lines are reached by day as well (`make parting`)."""
 
 
@@ -166,7 +165,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
                 seconds[report.nodeid] += report.duration
             if getattr(report, "may_go", False):
                 can_go[report.nodeid] += report.duration
-    if config.option.markexpr in PARTS:
+    if ALL_DAY and config.option.markexpr in PARTS:  # what `make parting` reads
         kept = ROOT / "target" / "seconds" / f"{config.option.markexpr}.json"
         kept.parent.mkdir(parents=True, exist_ok=True)
         kept.write_text(json.dumps(can_go), encoding="utf-8")

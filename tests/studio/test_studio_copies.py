@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import shlex
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -64,9 +65,11 @@ def test_a_commissioning_of_a_virtual_machine() -> None:
 @pytest.mark.parametrize("name", ["look", "bode", "identify", "validate"])
 def test_steps(name: str) -> None:
     columns = {"inputs": ["u"], "output": "y"}
-    copy = requests.script(STEP, name, columns, None, None)
+    # as the studio does: the filter of resampling looks ahead
+    step = replace(STEP, resample=None) if name == "bode" else STEP
+    copy = requests.script(step, name, columns, None, None)
     assert ast.unparse(called(copy, "read")).startswith("sewfast.read('-odd.csv', inputs=['u']")
     if name != "look":
         called(copy, name)
-    said = requests.commands(STEP, name, columns, None, None)
-    assert all("./-odd.csv" in shlex.split(line) for line in said.splitlines() if name in line)
+    said = requests.commands(step, name, columns, None, None)
+    assert "./-odd.csv" in known(said, name).data
