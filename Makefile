@@ -75,7 +75,7 @@ night-computing: $(DEV)
 	$(PYTEST) --nightly -m '$(COMPUTES)'
 
 night-waiting: $(DEV)
-	$(PYTEST) --nightly -m alone
+	$(WAITING) --nightly
 
 night-budgets: $(DEV)
 	$(ONE_BY_ONE) --nightly -m budget
@@ -215,6 +215,7 @@ firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian:
 # that compute until their time is over: they take every processor, and one by one
 ONE_BY_ONE := $(BIN)/python -m pytest --hypothesis-seed=$(SEED)
 PYTEST := $(ONE_BY_ONE) -n 2 --dist worksteal
+WAITING := $(ONE_BY_ONE) -n 3 --dist worksteal -m alone
 COMPUTES := not alone and not budget
 python-test: ## pytest, with the snippets of the documentation and every example
 	$(MAKE) --no-print-directory computing
@@ -225,7 +226,7 @@ computing: $(DEV)
 	$(PYTEST) -m '$(COMPUTES)'
 
 waiting: $(DEV)
-	$(PYTEST) -m alone
+	$(WAITING)
 
 budgets: $(DEV)
 	$(ONE_BY_ONE) -m budget

@@ -341,7 +341,7 @@ def test_what_was_second_is_kept_and_pickled_with_the_model() -> None:
 
 @pytest.mark.slow("the one full search by day that ends in a linear model")
 def test_a_linear_truth_stays_linear() -> None:
-    kinds = [identify(linear_data(700, seed=s, noise=0.5), seed=s).kind for s in SEEDS]
+    kinds = [identify(linear_data(350, seed=s, noise=0.5), seed=s).kind for s in SEEDS]
     assert set(kinds) == {"oe"}
 
 
@@ -562,8 +562,13 @@ def test_a_budget_leaves_a_model_of_the_kind_and_says_what_it_cut(kind: Any, bud
     assert validate(model, data).simulation.fit_percent > 50.0
 
 
+KINDS = ("auto", "oe", "iv", "neural_oe", "neural_ss")
+BY_DAY = [f"{budget}-{kind}" for budget in (1e-3, 0.1) for kind in KINDS]
+
+
 @pytest.mark.budget
-@pytest.mark.parametrize("kind", ["auto", "oe", "iv", "neural_oe", "neural_ss"])
+@pytest.mark.nightly("budgets between the least one and one in which fits begin", by_day=BY_DAY)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("budget", [1e-3, 0.03, 0.1, 0.3])
 def test_a_budget_too_short_gives_the_kind_or_says_so(kind: Any, budget: float) -> None:
     data = bent_data(20_000, noise=0.05)
