@@ -45,9 +45,9 @@ dev: $(DEV) ## builds and installs what the checks need (--jobs=2: in parallel)
 # compilers side by side: one that optimises a crate keeps one processor busy
 SYNC := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
 test: ## every check of the day; ends with pytest's summary, which names what is left to `make nightly`
-	$(MAKE) --no-print-directory --jobs=2 $(SYNC) dev rust-units board
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) dev $(PASSED)/rust-units-$(SEED) board
 # package first: clippy sets pyo3 up in another way than maturin, and each compiles it anew after the other
-	$(MAKE) --no-print-directory --jobs=2 $(SYNC) package rust-rest rust-lint python-lint no-std c-test
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) package $(PASSED)/rust-rest-$(SEED) rust-lint python-lint no-std c-test
 	$(MAKE) --no-print-directory computing
 # tests that wait leave processors to the checks of types
 	$(MAKE) --no-print-directory --jobs=2 waiting types stubs
@@ -75,7 +75,7 @@ night-computing: $(DEV)
 	$(PYTEST) --nightly -m '$(COMPUTES)'
 
 night-waiting: $(DEV)
-	$(WAITING) --nightly
+	$(PYTEST) --nightly -m alone
 
 night-budgets: $(DEV)
 	$(ONE_BY_ONE) --nightly -m budget
@@ -104,6 +104,12 @@ stubs: $(DEV)
 # the seed of every property, in Rust and in Python, comes from the commit: a build that passed passes again, and the next
 # commit tries others
 SEED ?= $(shell printf '%d' "0x$$(git rev-parse HEAD 2>/dev/null | cut -c1-8 | grep . || echo 1)")
+
+# `make test` runs Rust's tests anew where their sources or the seed have changed: else they would do the same again
+PASSED := target/passed
+$(PASSED)/%-$(SEED): $(shell find rust tests/golden -type f) Cargo.toml Cargo.lock
+	$(MAKE) --no-print-directory $*
+	mkdir -p $(PASSED) && touch $@
 
 rust-test: rust-units rust-rest ## unit, property and documentation tests of the crates (SEED=N; by default of the commit)
 
@@ -215,7 +221,6 @@ firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian:
 # that compute until their time is over: they take every processor, and one by one
 ONE_BY_ONE := $(BIN)/python -m pytest --hypothesis-seed=$(SEED)
 PYTEST := $(ONE_BY_ONE) -n 2 --dist worksteal
-WAITING := $(ONE_BY_ONE) -n 3 --dist worksteal -m alone
 COMPUTES := not alone and not budget
 python-test: ## pytest, with the snippets of the documentation and every example
 	$(MAKE) --no-print-directory computing
@@ -226,7 +231,7 @@ computing: $(DEV)
 	$(PYTEST) -m '$(COMPUTES)'
 
 waiting: $(DEV)
-	$(WAITING)
+	$(PYTEST) -m alone
 
 budgets: $(DEV)
 	$(ONE_BY_ONE) -m budget
