@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import unicodedata
 from typing import Any, TypeVar
 
@@ -50,7 +51,8 @@ class SewfastError(Exception):
         self.cause = cause
         if expected is not None:
             message = f"expected {expected}"
-            message = f"{name}: {message}" if name else message
+            # a line break in a file's name must not break the message
+            message = f"{printable(name)}: {message}" if name else message
             message += f", received {received}" if received else ""
             message += f"; {remedy}" if remedy else ""
             found: tuple[str | None, ...] = (name or None, expected, received, remedy)
@@ -149,14 +151,22 @@ def unreadable(kind: type[Kind], path: object, error: BaseException) -> Kind:
     )
 
 
+_REMEDIES = {
+    errno.EISDIR: "name a file in it",
+    errno.EINVAL: "choose another name",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ENOSPC: "free some space or write elsewhere",
+    errno.EDQUOT: "free some space or write elsewhere",
+}
+
+
 def unwritable(
-    kind: type[Kind],
-    path: object,
-    error: BaseException,
-    remedy: str = "choose a folder that exists and is writable",
+    kind: type[Kind], path: object, error: BaseException, remedy: str | None = None
 ) -> Kind:
-    """The error for a file that cannot be written."""
+    """The error for a file that cannot be written; by default with a remedy for its cause."""
     received = getattr(error, "strerror", None) or str(error)
+    number = getattr(error, "errno", None) or 0
+    remedy = remedy or _REMEDIES.get(number, "choose a folder that exists and is writable")
     return kind(
         name=f"{path}", expected="a file that can be written", received=received, remedy=remedy
     )

@@ -12,8 +12,8 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Callable, Collection, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -51,11 +51,45 @@ def replace_files(contents: Mapping[Any, bytes]) -> None:
     """Write several files together: none is renamed before the last one is written. Raises
     `OSError` as `replace_file`, with the name of the file that failed; then no file is changed.
     """
+    with _staged(contents) as staged:
+        for temporary, target in staged:
+            temporary.replace(target)
+            LOG.debug("%s: written", target)
+
+
+def require_writable(path: str | os.PathLike[str], kind: type[SewfastError] = SettingError) -> None:
+    """Raise before long work if its result could not be written; a temporary file shows it."""
+    try:
+        with _staged({path: b"\n"}):
+            pass
+    except OSError as error:
+        raise unwritable(kind, path, error) from error
+
+
+@contextmanager
+def making(folder: Path) -> Iterator[None]:
+    """Make a folder and those above it; if the block fails, remove those that are still empty.
+    Raises `OSError` if it cannot be made.
+    """
+    new = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        for place in new:  # inner folders first
+            with suppress(OSError):
+                place.rmdir()
+        raise
+
+
+@contextmanager
+def _staged(contents: Mapping[Any, bytes]) -> Iterator[list[tuple[Path, Path]]]:
+    """Temporary files with the contents and the names for them; what is left of them is deleted."""
     staged: list[tuple[Path, Path]] = []
     try:
         for path, content in contents.items():
             try:
-                staged.append(_names(path))
+                staged.append(names(path))
                 with staged[-1][0].open("xb") as file:
                     note(*staged[-1], file.fileno())
                     file.write(content)
@@ -63,24 +97,24 @@ def replace_files(contents: Mapping[Any, bytes]) -> None:
                     os.fsync(file.fileno())
             except OSError as error:
                 raise OSError(error.errno, error.strerror, os.fspath(path)) from error
-        for temporary, target in staged:
-            temporary.replace(target)
-            LOG.debug("%s: written", target)
+        yield staged
     finally:
         for temporary, _ in staged:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
 
 
-def _names(path: str | os.PathLike[str]) -> tuple[Path, Path]:
-    """A free temporary name in the folder of a file, and the file's final name."""
+def names(path: str | os.PathLike[str]) -> tuple[Path, Path]:
+    """A free temporary name in the folder of a file, and the file's final name.
+    Raises `OSError` if `path` is a folder, a device or a pipe, which must not be replaced.
+    """
     if "\0" in os.fspath(path):
         raise OSError(errno.EINVAL, "a name cannot hold the character 0")
     target = Path(path).resolve()
     if target.is_dir():
         raise OSError(errno.EISDIR, os.strerror(errno.EISDIR))
     if target.exists() and not target.is_file():
-        raise OSError(errno.EINVAL, "what has that name is no file")
+        raise OSError(errno.EINVAL, "a pipe or a device")
     return target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp"), target
 
 

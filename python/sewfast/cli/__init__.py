@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import io
 import os
 import sys
 import traceback
@@ -16,6 +17,9 @@ from . import interrupts, project
 from .drive import is_port
 from .output import DONE, FAULT, INTERRUPTED, REFUSED, logging_to_stderr
 from .parser import build_parser
+
+_UNUSABLE = (errno.EACCES, errno.ELOOP, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EPERM, errno.EROFS)
+"""What is wrong with a name or a place, wherever it is used first, and not with sewfast."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -37,6 +41,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _carried_out(args: argparse.Namespace) -> int:
     """One command: its exit code, or that of the exception that ended it."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        # a file's name can hold bytes that are no text; they are printed as they are
+        sys.stdout.reconfigure(errors="surrogateescape")
     try:
         if args.out_of is not None and args.out is None:
             args.out = args.out_of(args)
@@ -54,6 +61,12 @@ def _carried_out(args: argparse.Namespace) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as e:
+        if e.errno in _UNUSABLE and e.filename is not None:
+            refused = SettingError(
+                name=f"{e.filename}", expected="a file or a folder that can be used",
+                received=e.strerror, remedy="choose another one",
+            )  # fmt: skip
+            return _say(f"sewfast {args.name}: {refused}", REFUSED)
         if e.errno not in (errno.ENOSPC, errno.EDQUOT):
             return _fault(args, e)
         # the buffered rest must not raise again when the interpreter flushes it

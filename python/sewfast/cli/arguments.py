@@ -158,21 +158,26 @@ def require_plot(path: Path | None) -> None:
 
 def require_place(path: Path | None, suffixes: tuple[str, ...], *, option: str = "-o") -> None:
     """Refuse an output file that cannot be written, before the work.
-    Raises `SettingError` for an extension without a format, or a folder that does not exist.
+    Raises `SettingError` for an extension without a format, a folder that does not exist or cannot
+    be written to, and for what is no file.
     """
     if path is None:
         return
     if path.suffix.lower() not in suffixes:
         raise SettingError(
-            f"{option} {path}: expected a file ending in {', '.join(suffixes)}, received "
-            f"{path.suffix or 'none'!r}"
-        )
+            name=f"{option} {path}", expected=f"a file ending in {', '.join(suffixes)}",
+            received=f"{path.suffix or 'none'!r}",
+        )  # fmt: skip
     if not path.parent.is_dir():
         raise SettingError(
             name=f"{option} {path}", expected="a folder that exists", received="none",
-            remedy=f"create {path.parent}",
+            remedy=f"create {path.parent}, or name another one",
         )  # fmt: skip
     if path.is_dir():
         raise SettingError(
-            f"{option} {path}: expected a file, received a folder; name a file in it"
-        )
+            name=f"{option} {path}", expected="a file", received="a folder",
+            remedy="name a file in it",
+        )  # fmt: skip
+    from ..storage import require_writable  # loads NumPy
+
+    require_writable(path)

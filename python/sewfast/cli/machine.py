@@ -401,6 +401,7 @@ def add_physics(commands: Commands) -> None:
 
 
 def physics_command(args: argparse.Namespace) -> None:
+    from .. import storage
     from ..dataset.faults import sound
     from ..greybox import physics
     from ..greybox.exports import BOARDS, Target
@@ -417,6 +418,8 @@ def physics_command(args: argparse.Namespace) -> None:
             name="--winding", expected=f"line or q with --export {target}", received="nothing",
             remedy="line: volts and amperes between two terminals; q: amplitudes along the q axis",
         )  # fmt: skip
+    if target is not None:
+        storage.require_writable(place)
     data, found = sound(_motor_data(args))
     for fault in found:
         note(fault.warning)
@@ -432,8 +435,6 @@ def physics_command(args: argparse.Namespace) -> None:
     if args.out is not None:
         motor.save(args.out)
     if text:
-        from .. import storage
-
         storage.replace(place, text)
     if args.model is not None:
         motor.to_model().save(args.model)

@@ -20,6 +20,7 @@ from ..recordfile.reader import RecordedFile, read_header, read_recording
 from ..recordfile.writer import ENDING, require_replaceable
 from ..recording import Recording
 from ..report.commissioned import file_name
+from ..storage import making, require_writable
 
 STAGES = (
     "first motion",
@@ -138,9 +139,12 @@ class Checkpoint:
 
 
 def prepare(folder: Path) -> None:
-    """Create the folder, before the machine moves. Raises `DataError` if it cannot be created."""
+    """Create the folder, before the machine moves. Raises `DataError` if it cannot be created, or
+    nothing can be written into it.
+    """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        with making(folder):
+            require_writable(folder / "report.html", DataError)
     except OSError as error:
         raise DataError(
             name=str(folder), expected="a folder that can be made", received=error.strerror,

@@ -118,13 +118,7 @@ def fleet(
     place = None if out is None else Path(out)
     if place is not None:
         require_ending(place)
-        if place.is_dir():
-            raise SettingError(f"{place}: expected a file to write to, got a folder; name a file")
-        if not place.parent.is_dir():
-            raise SettingError(
-                f"{place}: expected a folder to write to, got {place.parent}, which does not "
-                "exist; create it"
-            )
+        storage.require_writable(place)
     journal = Journal(None if place is None else place, settings)
     rows = {job.file: row for job in jobs if (row := journal.known(job)) is not None}
     waiting = [job for job in jobs if job.file not in rows]
