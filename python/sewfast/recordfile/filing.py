@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import queue
-import secrets
 import threading
 import time
 import zlib
@@ -15,6 +14,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from ..errors import DataError, SettingError, SewfastError, unwritable
+from ..storage import names
+from ..storage import require_writable as require_replaceable
 from ..written import staged
 from . import format
 from .format import Assembler, Message, Topic, opening
@@ -23,6 +24,7 @@ from .header import Header, bearable
 # --- Sink: a file that grows by whole pieces ------------------------------------------------------
 
 
+ROOM = "room for the recording"
 _BATCH = 1 << 16
 _LOCKED = 0x7FFF_0000
 """The byte to lock on Windows, beyond any recording: others cannot read locked bytes there."""
@@ -48,21 +50,13 @@ def marked(path: Path) -> Mark | None:
 
 def require_writable(path: Path, *, overwrite: bool) -> None:
     """Raise the errors that `Sink` would raise, without changing anything."""
-    if path.exists() and not path.is_dir():
-        if not overwrite:
-            raise exists(path)
-        _try(path, path, os.O_WRONLY)
+    if not path.is_file():
+        require_replaceable(path, DataError)
         return
-    if path.is_dir():
-        raise _folder(path)
-    probe = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    _try(path, probe, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
-    probe.unlink(missing_ok=True)
-
-
-def _try(path: Path, opened: Path, flags: int) -> None:
+    if not overwrite:
+        raise exists(path)
     try:
-        file = os.open(opened, flags, 0o666)
+        file = os.open(path, os.O_WRONLY)
     except OSError as e:
         raise unwritable(DataError, path, e) from e
     try:
@@ -139,6 +133,8 @@ class Sink:
         self.size = 0
         self.crc = 0
         flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
+        # without O_NONBLOCK, it would wait for somebody to read a pipe
+        flags |= getattr(os, "O_NONBLOCK", 0)
         try:
             # without O_EXCL two writers could open the same new file
             self._file = os.open(path, flags | (0 if overwrite else os.O_EXCL), 0o666)
@@ -194,20 +190,29 @@ def batched(pieces: Iterable[bytes]) -> Iterator[bytes]:
 
 
 @contextmanager
-def replacing(target: Path) -> Iterator[Path]:
+def replacing(path: Path) -> Iterator[Path]:
     """A temporary name beside a file, renamed to the file if the block succeeds.
     Raises `DataError` if the file cannot be written.
     """
-    if target.is_dir():
-        raise _folder(target)
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    temporary = path
     try:
-        yield temporary
-        temporary.replace(target)
+        temporary, target = names(path)
+        try:
+            yield temporary
+            temporary.replace(target)
+        finally:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
     except OSError as e:
-        raise unwritable(DataError, target, e, "choose a folder that exists and has room") from e
-    finally:
-        temporary.unlink(missing_ok=True)
+        raise unwritable(DataError, path, e) from e
+    except DataError as e:
+        if e.name != str(temporary):
+            raise
+        # nothing is left of the temporary file that the message is about
+        remedy = "free some space or write elsewhere" if e.expected == ROOM else e.remedy
+        raise DataError(
+            name=str(path), expected=e.expected, received=e.received, remedy=remedy
+        ) from e
 
 
 # --- Filing: the thread that owns a recording's file ----------------------------------------------
@@ -298,7 +303,7 @@ class Filing:
             return error
         reason = getattr(error, "strerror", None) or repr(error)
         return DataError(
-            name=str(self._path), expected="room for the recording", received=reason,
+            name=str(self._path), expected=ROOM, received=reason,
             remedy=f"the file is whole up to sample {self._first} (end excluded, "
             f"{self._sink.size} bytes); free some space and record again",
         )  # fmt: skip
@@ -327,7 +332,7 @@ class Filing:
             self._sink.close()
             self._path.unlink(missing_ok=True)
             self._opened = None
-            raise unwritable(DataError, self._path, e, "free some space or write elsewhere") from e
+            raise unwritable(DataError, self._path, e) from e
 
     def _run(self) -> None:
         try:
