@@ -498,16 +498,16 @@ def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> li
     place = Path(folder) / FOLDER
     contents: dict[Path, bytes] = {}
     try:
-        place.mkdir(parents=True, exist_ok=True)
-        for name, figure in drawn.items():
-            with style():
-                text = svg(figure, f"analysis-{name}", ALT[name])
-                if png:
-                    content = io.BytesIO()
-                    figure.savefig(content, dpi=150)
-                    contents[place / f"{name}.png"] = content.getvalue()
-            contents[place / f"{name}.svg"] = text.encode()
-        storage.replace_files(contents)
+        with storage.making(place):
+            for name, figure in drawn.items():
+                with style():
+                    text = svg(figure, f"analysis-{name}", ALT[name])
+                    if png:
+                        content = io.BytesIO()
+                        figure.savefig(content, dpi=150)
+                        contents[place / f"{name}.png"] = content.getvalue()
+                contents[place / f"{name}.svg"] = text.encode()
+            storage.replace_files(contents)
         target = Path(folder) / NUMBERS
         values = {k: v for k, v in a.to_json().items() if k not in ("format", "version")}
         storage.write(target, "sewfast.analysis", 1, {**values, "figures": list(drawn)})

@@ -353,13 +353,14 @@ def init_command(args: argparse.Namespace) -> None:
         )  # fmt: skip
     texts = {
         place: _TOML.format(columns=columns, units=units),
-        folder / "README.md": _README.format(name=folder.resolve().name),
+        folder / "README.md": _README.format(name=printable(folder.resolve().name)),
     }
+    from ..storage import making, replace_files  # loads NumPy
+
     try:
-        (folder / "recordings").mkdir(parents=True, exist_ok=True)
-        made = [path for path in texts if not path.exists()]
-        for path in made:
-            path.write_text(texts[path], encoding="utf-8")
+        with making(folder / "recordings"):
+            made = [path for path in texts if not path.exists()]
+            replace_files({path: texts[path].encode() for path in made})
     except OSError as e:
         raise unwritable(SettingError, folder, e) from e
     load(place)  # check that it can be read

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from pathlib import Path
 from ..control.controller import Controller, SampledController, pid_of
 from ..errors import ModelFileError, SettingError
 from ..models import Model
-from ..storage import replace_files
+from ..storage import making, replace_files
 from . import c99, fmi, onnx, structured_text
 
 TARGETS = ("c99", "st", "fmi", "onnx")
@@ -139,24 +139,19 @@ def _bytes(content: str | bytes) -> bytes:
 
 def _write(target: Path, contents: Mapping[Path, bytes]) -> None:
     """Write all files or none: a header next to another controller's source would compile."""
-    made: list[Path] = []
     try:
         if target.exists() and not target.is_dir():
             raise SettingError(
                 name="folder", expected="a folder", received=f"the file {target}",
                 remedy="name another one",
             )  # fmt: skip
-        for folder in dict.fromkeys(path.parent for path in contents):
-            made += [place for place in (folder, *folder.parents) if not place.exists()]
-            folder.mkdir(parents=True, exist_ok=True)
-        replace_files(contents)
-    except BaseException as error:
-        for folder in sorted(made, reverse=True):  # inner folders first
-            with suppress(OSError, ValueError):
-                folder.rmdir()
-        # a name with the character 0 raises a ValueError
-        if isinstance(error, SettingError) or not isinstance(error, OSError | ValueError):
-            raise
+        with ExitStack() as folders:
+            for folder in dict.fromkeys(path.parent for path in contents):
+                folders.enter_context(making(folder))
+            replace_files(contents)
+    except SettingError:
+        raise
+    except (OSError, ValueError) as error:  # a name with the character 0 raises a ValueError
         raise ModelFileError(
             name=str(getattr(error, "filename", None) or target),
             expected="a folder that can be written to",

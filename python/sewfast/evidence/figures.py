@@ -14,7 +14,7 @@ import numpy as np
 from ..dataset import FloatArray, labelled
 from ..errors import SettingError
 from ..plotting import DPI, Drawing, Panel, lettered, stacked, style, thin
-from ..storage import replace_file
+from ..storage import making, replace_files
 from .card import ReportCard
 from .correlations import ResidualTest
 
@@ -66,23 +66,21 @@ def save(card: ReportCard, folder: str | os.PathLike[str]) -> list[Path]:
     """Write every figure as a PNG into a folder, which is created if needed.
     Raises `SettingError` if matplotlib is not installed or the folder cannot be written to.
     """
-    written = []
-    drawn = figures(card)
+    contents: dict[Path, bytes] = {}
+    for name, figure in figures(card).items():
+        content = io.BytesIO()
+        with style():
+            figure.savefig(content, dpi=DPI)
+        contents[Path(folder) / f"{name}.png"] = content.getvalue()
     try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        for name, figure in drawn.items():
-            path = Path(folder) / f"{name}.png"
-            content = io.BytesIO()
-            with style():
-                figure.savefig(content, dpi=DPI)
-            replace_file(path, content.getvalue())
-            written.append(path)
+        with making(Path(folder)):
+            replace_files(contents)
     except OSError as e:
         raise SettingError(
             f"{folder}: expected a folder to write figures to, received {e.strerror!r}; "
             "choose another"
         ) from e
-    return written
+    return [*contents]
 
 
 def residual_drawing(card: ReportCard) -> Drawing:
