@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import LinkError, SettingError
 from .arguments import Commands, add_command, add_view
 from .interrupts import patient
-from .output import print_json, print_rows
+from .output import REFUSED, print_json, print_rows, suggested
 
 if TYPE_CHECKING:
     from ..control.machine import Machine
@@ -257,7 +257,7 @@ def _require_untripped(port: str, drive: Drive) -> None:
     if status.state == "tripped":
         raise LinkError(
             f"{port}: expected a drive that is ready, it has tripped: {status.reason}; find out "
-            f"why, then `sewfast clear {port}`"
+            f"why, then `{suggested('clear', port)}`"
         )
 
 
@@ -404,7 +404,7 @@ def add_device(commands: Commands) -> None:
     )  # fmt: skip
 
 
-def device_command(args: argparse.Namespace) -> None:
+def device_command(args: argparse.Namespace) -> int | None:
     from ..link.virtual import VirtualDevice
     from ..recordfile.writer import require_replaceable
 
@@ -431,6 +431,7 @@ def device_command(args: argparse.Namespace) -> None:
     ):
         _serve(device, as_json=args.json)
     _say_result(device, as_json=args.json)
+    return None if device.problem is None else REFUSED
 
 
 def _serve(device: VirtualDevice, *, as_json: bool) -> None:

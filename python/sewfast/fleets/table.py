@@ -286,12 +286,15 @@ def load_fleet(path: str | os.PathLike[str]) -> Fleet:
     require_ending(place)
     try:
         if place.suffix.lower() == ".parquet":
-            rows = _arrow()[1].read_table(place).to_pylist()
+            content = io.BytesIO(storage.file_bytes(place, SettingError))
+            rows = _arrow()[1].read_table(content).to_pylist()
         elif place.suffix.lower() == ".json":
             rows = json.loads(storage.file_bytes(place, SettingError))["rows"]
         else:
             text = storage.file_bytes(place, SettingError).decode("utf-8-sig")
             rows = list(csv.DictReader(io.StringIO(text, newline="")))
+            if not text.strip():
+                raise ValueError("an empty file")
         return Fleet(tuple(_read(row) for row in rows))
     except SettingError:
         raise

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..errors import LinkError, SettingError
+from ..storage import file_bytes
 
 BOARDS = {"mps2-an386": 0x21000000, "mps2-an500": 0x60000000}
 """QEMU's boards, a Cortex-M4 and a Cortex-M7, with the address of the memory shared with us."""
@@ -332,12 +333,7 @@ def _examined(firmware: Path) -> tuple[str, int, int]:
     board.
     """
     remedy = "build one by `make firmware` in a source checkout"
-    try:
-        raw = firmware.read_bytes()
-    except OSError as e:
-        raise SettingError(
-            name=str(firmware), expected="a firmware", received=repr(e.strerror)
-        ) from e
+    raw = file_bytes(firmware, SettingError)
     if len(raw) < 52 or raw[:6] != b"\x7fELF\x01\x01" or raw[18:20] != b"\x28\x00":
         raise SettingError(
             name=str(firmware), expected="a firmware for ARM (ELF)", received="another file",

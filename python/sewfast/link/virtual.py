@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from .._core import DeviceServer
-from ..errors import LinkError, SettingError
+from ..errors import LinkError, SettingError, unwritable
 from ..gains import real
 from ..machine import VirtualMachine
+from ..storage import require_writable
 from .ports import Unique
 
 __all__ = ["VirtualDevice"]
@@ -258,7 +259,8 @@ def _require_switches(**values: object) -> None:
 
 def _require_place(name: str, place: object) -> None:
     """Refuse a file that cannot be created, before creating anything. Raises `SettingError` for
-    anything but a file name, and `LinkError` if its folder does not exist.
+    anything but a file name, and `LinkError` if its folder does not exist or a log file cannot be
+    written.
     """
     if place is None:
         return
@@ -269,6 +271,16 @@ def _require_place(name: str, place: object) -> None:
             name=os.fspath(place), expected=f"a folder that exists for {name}",
             received=f"none at {Path(place).parent}", remedy="create it, or name another one",
         )  # fmt: skip
+    if name == "link":
+        return
+    if Path(place).is_file() or not Path(place).exists():
+        require_writable(place, LinkError)
+        return
+    try:
+        # without O_NONBLOCK, it would wait for somebody to read a pipe
+        os.close(os.open(place, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0)))
+    except OSError as e:
+        raise unwritable(LinkError, place, e) from e
 
 
 def _require_free(link: Path) -> None:
