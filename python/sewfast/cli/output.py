@@ -32,7 +32,7 @@ def note(text: str) -> None:
 
 
 def suggested(*words: object) -> str:
-    """A command to type: names that hold spaces in quotes, and none that looks like an option."""
+    """A command to type: names that hold spaces in quotes, no `Path` that looks like an option."""
     safe = (f"./{w}" if isinstance(w, Path) and str(w).startswith("-") else str(w) for w in words)
     return shlex.join(["sewfast", *safe])
 

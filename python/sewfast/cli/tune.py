@@ -244,7 +244,7 @@ def tune_command(args: argparse.Namespace) -> int | None:
         getattr(e.best, "picked", e.best).save(args.out)
         print(
             f"interrupted; kept the best so far in {args.out}, which nobody has judged: look at "
-            f"its margins first ({suggested('analyse', args.out, args.model[0])})",
+            f"its margins first ({suggested('analyse', args.out, Path(args.model[0]))})",
             file=sys.stderr,
         )
         return 130
@@ -478,7 +478,7 @@ def _show_gains(args: argparse.Namespace, controller: SampledController) -> None
         )
     if args.plot is not None:
         print(f"written to {args.plot}")
-    print(f"written to {args.out}; try it: {suggested('run', args.out, args.model[0])}")
+    print(f"written to {args.out}; try it: {suggested('run', args.out, Path(args.model[0]))}")
 
 
 def forms_of(controller: Controller) -> list[Gains]:

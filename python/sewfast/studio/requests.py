@@ -242,7 +242,8 @@ class Commission:
     def commands(self) -> str:
         """The same for a shell in the project folder."""
         effort = f"--members {self.members} --evaluations {self.evaluations} --seed {self.seed}"
-        return f"sewfast commission --on {self.machine} {effort} --out {COMMISSIONED}\n"
+        on = shlex.quote(self.machine)
+        return f"sewfast commission --on {on} {effort} --out {COMMISSIONED}\n"
 
 
 def carry_out(
