@@ -112,7 +112,7 @@ def names(path: str | os.PathLike[str]) -> tuple[Path, Path]:
         raise OSError(errno.EINVAL, "a name cannot hold the character 0")
     target = Path(path).resolve()
     if target.is_dir():
-        raise OSError(errno.EISDIR, os.strerror(errno.EISDIR))
+        raise OSError(errno.EISDIR, "a folder")
     if target.exists() and not target.is_file():
         raise OSError(errno.EINVAL, "a pipe or a device")
     return target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp"), target
