@@ -509,9 +509,9 @@ def test_settings_are_looked_at_before_any_work(
 
 def test_a_folder_in_place_of_the_table_is_refused(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "table.csv").mkdir()
-    with pytest.raises(SettingError, match="got a folder"):
+    with pytest.raises(SettingError, match="received a folder"):
         fleet(folder, out=tmp_path / "table.csv", workers=0)
-    with pytest.raises(SettingError, match="which does not exist"):
+    with pytest.raises(SettingError, match="a folder that exists"):
         fleet(folder, out=tmp_path / "nix" / "table.csv", workers=0)
 
 
