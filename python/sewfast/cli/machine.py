@@ -441,7 +441,7 @@ def physics_command(args: argparse.Namespace) -> None:
     if args.plot is not None:
         motor.plot(file=args.plot)
     if args.json:
-        print_json(motor.to_dict())
+        print_json({**motor.to_dict(), "notes": [*data.notes, *(f.warning for f in found)]})
         return
     print(motor)
     for path in (args.out, place, args.model, args.plot):

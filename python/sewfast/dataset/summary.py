@@ -169,7 +169,9 @@ class Summary:
         lines = [self._caption()]
         lines += [f"  {name} [{text}]" for name, text, _ in self.experiments[:10]]
         lines += ["", *table(self.columns)]
-        hints = [*self.diagnosis.findings, *self.advice] or ["nothing stands in the way"]
+        hints = [*self.diagnosis.findings, *self.advice]
+        if not hints and not any(note.startswith("warning: ") for note in self.notes):
+            hints = ["nothing stands in the way"]
         lines += ["", *(f"- {hint}" for hint in hints)]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 

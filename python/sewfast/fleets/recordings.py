@@ -210,7 +210,12 @@ def _identified(job: Job, settings: Mapping[str, Any], controller: Controller | 
         fit_percent=float(scores.fit_percent),
         rmse=float(scores.rmse),
         noise=noise,
-        message="; ".join(fault.with_remedy for fault in faults(data)),
+        message="; ".join(
+            [
+                *(fault.with_remedy for fault in faults(data)),
+                *(w for note in data.notes if (w := note.removeprefix("warning: ")) != note),
+            ]
+        ),
         verdict=str(model.training.get("verdict", {}).get("text", "")),
         parameters=hashlib.sha256(model.theta.tobytes()).hexdigest()[:16],
         **quantities,

@@ -32,6 +32,8 @@ _APART = re.compile(r"[+-]?\d{1,3}(?:['’\u00a0\u2009\u202f ]\d{3})+(?=[.,]\d|$
 """Digits in groups of three, separated by marks with no other meaning."""
 _FOOTER = 20
 """Most lines below a table that are left out if they have fewer cells."""
+_COMPARED = 1000
+"""Lines with which the last one is compared."""
 CORRUPT = 0.01
 """Part of the lines that can be corrupt, as serial ports lose characters: they are skipped."""
 
@@ -57,7 +59,7 @@ def read_delimited(path: Path, raw: bytes) -> Table:
     Delimiter (comma, semicolon, tab, bar, space), decimal commas and thousands separators are
     recognised; `#` begins a comment. Empty cells are NaN, moments are seconds from the first one.
     """
-    layout = _layout(path, _decode(path, raw))
+    layout = _whole(_layout(path, _decode(path, raw)))
     fast = _fast_pass(layout)
     if fast is not None:
         first = layout.skipped + 1
@@ -322,6 +324,30 @@ def _checked(layout: _Layout) -> _Layout:
     return layout
 
 
+def _whole(layout: _Layout) -> _Layout:
+    """The layout without a last line that was cut off: it has no line end, and fewer cells or, in
+    its last cell, fewer decimals than all the lines above it.
+    """
+    body, _, last = layout.body.rpartition("\n")
+    above = body.rsplit("\n", _COMPARED)[-_COMPARED:]
+    # as of corrupt lines, at most a hundredth
+    if len(above) < 1.0 / CORRUPT or not last.strip():
+        return layout
+
+    def ending(line: str) -> tuple[int, int]:
+        cells = line.split(None if layout.delimiter == " " else layout.delimiter)
+        whole, mark, decimals = cells[-1].strip().partition(layout.decimal)
+        return len(cells), len(decimals) if whole or mark else -1
+
+    width = len(layout.header)
+    if all(_is_number(c.strip()) or is_moment(c) for c in _cells(last, layout.delimiter)) and (
+        ending(last) < min((e for e in map(ending, above) if e[0] == width), default=(0, 0))
+    ):
+        note = f"warning: {layout.path.name}: the last line is cut off and left out: {short(last)}"
+        return replace(layout, body=body, notes=(*layout.notes, note))
+    return layout
+
+
 def _fast_pass(layout: _Layout) -> list[FloatArray] | None:
     """All cells, by NumPy's parser; None if a cell is not a number or the rows differ in length."""
     body = layout.body.rstrip("\n")
@@ -363,7 +389,8 @@ def _slow_pass(layout: _Layout) -> Table:
                 moments.append(i)
         if column is None:
             k, column = _spoiled(layout, cells)
-            bad[i] = _complaint(layout, lines[k], i, cells[k], _wrong(layout, cells))
+            wrong = _wrong(layout, cells)
+            bad[i] = _complaint(layout, lines[k], i, cells[k], wrong, len(corrupt), len(rows))
         columns.append(column)
     table = from_headers(layout.path, header, columns, bad, lines)
     names = split_units(header)[0]
@@ -373,7 +400,7 @@ def _slow_pass(layout: _Layout) -> Table:
 
 def _spoiled_rows(layout: _Layout, rows: list[list[str]], corrupt: int) -> list[int]:
     """Rows with a cell that is no number in a column of numbers, if they are few."""
-    few = CORRUPT * len(rows) - corrupt
+    few = CORRUPT * (len(rows) + corrupt) - corrupt
     found: set[int] = set()
     for cells in zip(*rows, strict=True):
         if _column(layout, cells) is not None:
@@ -406,7 +433,7 @@ def skipped_lines(path: Path, corrupt: list[tuple[int, str]], left: int) -> tupl
     more = f" and {len(corrupt) - 3} more" if len(corrupt) > 3 else ""
     one = len(corrupt) == 1
     return (
-        f"{path.name}: {len(corrupt)} of {left + len(corrupt)} lines skipped, as "
+        f"warning: {path.name}: {len(corrupt)} of {left + len(corrupt)} lines skipped, as "
         f"{'it has' if one else 'they have'} cells that are missing or no numbers: "
         f"line{'' if one else 's'} {shown}{more}",
     )
@@ -439,7 +466,7 @@ def _rows(
     if len(below) > _FOOTER or any(len(cells) > width for _, cells in below):
         below = []
     corrupt = other[: len(other) - len(below)]
-    if corrupt and len(corrupt) > CORRUPT * len(rows):
+    if corrupt and len(corrupt) > CORRUPT * (len(rows) + len(corrupt)):
         raise _of_other_width(layout, *corrupt[0], len(corrupt), len(rows) + len(corrupt))
     notes: tuple[str, ...] = ()
     if below:
@@ -525,12 +552,16 @@ def _number(cell: str, decimal: str, thousands: str = "") -> float | None:
         return None
 
 
-def _complaint(layout: _Layout, line: int, column: int, cell: str, count: int) -> str:
+def _complaint(
+    layout: _Layout, line: int, column: int, cell: str, count: int, corrupt: int, rows: int
+) -> str:
     hint = "; repair or delete the line"
     if count > 1:
+        others = f" and {corrupt} lines have too few or too many" if corrupt else ""
         hint = (
-            f"; {count} cells of this column are no numbers, and lines with such cells are skipped "
-            f"up to {CORRUPT:.0%}: repair or delete them, or choose another column"
+            f"; {count} cells of this column are no numbers{others}, and of {rows + corrupt} lines "
+            f"up to {CORRUPT:.0%} with such cells would be skipped: repair or delete them, or "
+            "choose another column"
         )
     if "," in cell and layout.decimal == ".":
         hint = "; the file also holds decimal points: write all numbers one way"

@@ -76,14 +76,14 @@ def _of_lines(path: Path, text: str) -> tuple[list[dict[str, Any]], list[int], t
     # a log that is cut off ends within a line
     below = [c for c in corrupt[-1:] if lines and c[0] > lines[-1]]
     corrupt = corrupt[: len(corrupt) - len(below)]
-    if len(corrupt) > CORRUPT * len(rows):
+    if len(corrupt) > CORRUPT * (len(rows) + len(corrupt)):
         number, line = corrupt[0]
         raise DataError(
             name=f"{path}: line {number}", expected="a JSON object of numbers on each line",
             received=f"{short(line)}, and {len(corrupt)} of {len(corrupt) + len(rows)} lines are "
             "like that", remedy=f"repair or delete them; up to {CORRUPT:.0%} would be skipped",
         )  # fmt: skip
-    cut = tuple(f"{path.name}: the last line is cut off and left out" for _ in below)
+    cut = tuple(f"warning: {path.name}: the last line is cut off and left out" for _ in below)
     return rows, lines, (*skipped_lines(path, corrupt, len(rows)), *cut)
 
 

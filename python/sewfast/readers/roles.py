@@ -15,7 +15,7 @@ from ..dataset import is_reference
 from ..errors import DataError
 from ..units import SPEEDS, unit_in_name
 from .containers import Table
-from .timebase import time_column
+from .timebase import numbers_rows, time_column
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,6 @@ _OUTPUTS = (
 """The first sort with a column counts; columns of later sorts were logged beside it."""
 _SUPPLY = re.compile(r"(battery|batt|bat|vbat|supply|bus|akku|batterie|versorgung)(?![a-z])")
 """Names of a drive's supply, which is not a command."""
-_NUMBER = re.compile(
-    r"#|(sample|row|line|record|packet|frame)s?([_ ]?(no|nr|number|index))?|index|idx|no|nr|seq"
-)
-"""Names of a column that numbers the rows."""
 _QUALIFIERS = frozenset(
     re.split(
         " ",
@@ -103,7 +99,7 @@ def roles(
         name for name in table.names
         if name not in (time, counts, *named) and len(table[name]) == length
         and _moves(table, name) and not is_reference(name) and _stem(name) != "speed_true"
-        and not _SUPPLY.match(_stem(name)) and not _counts_rows(table, name)
+        and not _SUPPLY.match(_stem(name)) and not numbers_rows(table, name)
     ]  # fmt: skip
     given = table.resolve(inputs[0]) if inputs else _only(left, "u") or _first(table, left, _INPUTS)
     if counts is not None:
@@ -142,14 +138,6 @@ def recognised(
 def _moves(table: Table, name: str) -> bool:
     known = table[name][np.isfinite(table[name])]
     return len(known) > 0 and bool(known.min() < known.max())
-
-
-def _counts_rows(table: Table, name: str) -> bool:
-    if _NUMBER.fullmatch(name.lower()) is None:
-        return False
-    with np.errstate(invalid="ignore"):  # between two infinities
-        steps = np.diff(table[name])
-    return bool((steps == steps[0]).all())
 
 
 def _stem(name: str) -> str:

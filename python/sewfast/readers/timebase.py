@@ -6,8 +6,8 @@ import datetime
 import itertools
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,11 @@ _TIME = re.compile(
 Keysight's scopes and of LabVIEW, `millis` and `micros` those of an Arduino."""
 _DATE = re.compile(r"date|date[_ ]?time|datum|zeitpunkt|moment")
 """Names of a time column whose cells were dates with times of day."""
+_NUMBER = re.compile(
+    r"#|(sample|row|line|record|packet|frame)s?([_ ]?(no|nr|number|index|count|counter))?|index|"
+    r"idx|no|nr|seq(uence)?|counter|n|k"
+)
+"""Names of a column that numbers the rows, if its numbers do (`numbers_rows`)."""
 _SMALLER = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
 LONG, ABSURD, SHORT = 0.5, 900.0, 1e-5
 """Sample times [s] of a time column without a unit, read as seconds. From `LONG` on, a warning says
@@ -136,28 +141,46 @@ class Grid:
         missing = _means(unknown.astype(np.float64), edges, ends) > TOLERANCE
         return np.where(missing, np.nan, means)
 
-    def note(self, name: str) -> str:
-        """What was done, for the notes."""
+    def note(self, table: Table) -> str:
+        """What was done, for the notes; a warning where rows are missing or doubled."""
         steps = np.diff(self.t)
         gaps = self.gaps
-        text = f"{name}: "
-        if self.exact:
-            text += f"rows are missing in the even time stamps of {self.Ts:g} s"
-        else:
+        missing = len(self.times) - len(self.rows) if self.exact else 0
+        said = []
+        if missing:
+            place = table.row(int(self.rows[1 + np.argmax(steps)]))
+            text = (
+                f"{counted(missing, 'row')} missing in the even time stamps of {self.Ts:g} s, "
+                f"{'' if missing == 1 else 'the longest gap '}before {place}"
+            )
+            if not len(gaps):
+                text += (
+                    ": outputs there are not known (NaN), inputs are held for up to "
+                    f"{math.floor(GAP) - 1} samples"
+                )
+            said.append(text)
+        elif not self.exact:
             inside = steps[steps <= GAP * self.period]
-            text += (
+            said.append(
                 f"time stamps are uneven (steps of {inside.min():.4g} to {inside.max():.4g} s, "
                 f"median {self.period:.4g} s); resampled to Ts = {self.Ts:.6g} s, outputs by "
                 "straight lines between rows, inputs as held and averaged"
             )
         if len(gaps):
-            text += f"; {len(gaps)} gaps, the longest {gaps.max():.4g} s, are not known (NaN)"
-        elif self.exact:
-            text += (
-                ": their outputs are not known (NaN), inputs are held for up to "
-                f"{math.floor(GAP) - 1} samples"
+            said.append(f"{len(gaps)} gaps, the longest {gaps.max():.4g} s, are not known (NaN)")
+        if doubled := self.count - len(self.rows):
+            after = self.rows[np.flatnonzero(np.diff(self.rows, prepend=-1) > 1)[0]]
+            said.append(
+                f"{counted(doubled, 'row')} left out, as the next one has the same time stamp "
+                f"(first before {table.row(int(after))})"
             )
-        return text
+        lost = missing or doubled or len(gaps)
+        return f"{'warning: ' if lost else ''}{table.path.name}: {'; '.join(said)}"
+
+
+def counted(count: int, what: str) -> str:
+    """`1 row is`, `3 rows are`."""
+    return f"1 {what} is" if count == 1 else f"{count} {what}s are"
 
 
 def _means(values: FloatArray, edges: FloatArray, ends: FloatArray) -> FloatArray:
@@ -182,7 +205,69 @@ def _is_time(name: str) -> bool:
     return _TIME.fullmatch(name.lower()) is not None
 
 
+# --- Columns that number the rows -----------------------------------------------------------------
+
+
+def numbers_rows(table: Table, name: str) -> bool:
+    """Whether a column numbers the rows, by its name and as most of its steps are the same."""
+    return _NUMBER.fullmatch(name.lower()) is not None and _step(table[name]) > 0
+
+
+def _step(numbers: FloatArray) -> float:
+    """The step of nine in ten of these whole numbers; 0 if there is none."""
+    if len(numbers) < 3 or not (np.abs(numbers) < 2.0**53).all() or (numbers % 1.0).any():
+        return 0.0
+    steps = np.diff(numbers)
+    usual = float(np.median(steps))
+    return usual if np.mean(steps == usual) >= 0.9 else 0.0
+
+
+def _misnumbered(table: Table, taken: str | None) -> tuple[str, ...]:
+    """Warnings on numbers of rows that are missing, doubled or out of order."""
+    names = [n for n in table.names if n != taken and numbers_rows(table, n)]
+    return tuple(note for n in names[:1] for note in _jumps(table, n))
+
+
+def _jumps(table: Table, name: str) -> Iterator[str]:
+    numbers = table[name]
+    step, steps = _step(numbers), np.diff(numbers)
+    # what wraps goes on with its usual step: an integer, or twice a count of something else
+    span = float(np.ptp(numbers)) + step
+    cyclic = np.sum(steps + span == step) > 1
+    turn = span if cyclic else next((2.0**b for b in (8, 16, 32) if numbers.max() < 2.0**b), 0.0)
+    if (steps + turn == step).any():
+        steps = np.where(steps < -0.5 * turn, steps + turn, steps)
+    back = steps < 0.0
+    faults = [(back, "out of order")] if back.any() else [
+        (steps > step, "missing"), (steps == 0.0, "doubled")
+    ]  # fmt: skip
+    for wrong, what in faults:
+        if len(at := np.flatnonzero(wrong)):
+            k = int(at[0])
+            count = round(float(np.sum(steps[at] / step - 1.0))) if steps[k] > 0.0 else len(at)
+            yield (
+                f"warning: {table.path.name}: {counted(count, 'row')} {what} by the numbers in "
+                f"column {name!r}, at {len(at)} place{'' if len(at) == 1 else 's'}, first "
+                f"{numbers[k + 1]:.15g} after {numbers[k]:.15g} at {table.row(k + 1)}: take a part "
+                "without (--train A:B), or record it again"
+            )
+
+
+# --- Time column -> sample time -------------------------------------------------------------------
+
+
 def time_base(table: Table, given: float | None, column: str | None = None) -> TimeBase:
+    """Sample time and, where its time stamps are uneven, a grid for a table, as `_time_base`.
+    Where the time shows no lost rows, a column that numbers them can, which the notes state.
+    """
+    base = _time_base(table, given, column)
+    if base.grid is not None and base.grid.exact:
+        return base
+    taken = table.resolve(column) if column is not None else time_column(table)
+    return replace(base, notes=(*base.notes, *_misnumbered(table, taken)))
+
+
+def _time_base(table: Table, given: float | None, column: str | None) -> TimeBase:
     """Sample time and, where its time stamps are uneven, a grid for a table.
     `given` is the caller's sample time [s]: checked against even time stamps, the step of the grid
     for uneven ones. Raises `DataError` if time goes back, or even time stamps disagree with `given`
@@ -224,7 +309,7 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
         Ts = found if given is None else _agreed(table, f"column {name!r}", found, given)
         return TimeBase(Ts, None, notes)
     grid = _grid(table, name, t, period, given)
-    return TimeBase(grid.Ts, grid, (*notes, grid.note(table.path.name)))
+    return TimeBase(grid.Ts, grid, (*notes, grid.note(table)))
 
 
 def _agreed(table: Table, source: str, found: float, given: float) -> float:
@@ -318,12 +403,27 @@ def _seconds(table: Table, name: str, unit: float) -> FloatArray:
     same = int(np.sum(steps == 0.0))
     if len(back) or 2 * same > len(steps):
         k = int(back[0] if len(back) else np.flatnonzero(steps == 0.0)[0]) + 1
-        why = "" if len(back) else f" (so are {same} of {len(steps)} steps: too coarse a clock)"
+        why = _why_no_time(table, raw, back)
         raise DataError(
             f"{table.path}: column {name!r}: expected increasing time, received {raw[k]:.9g} after "
             f"{raw[k - 1]:.9g} at {table.row(k)}{why}; sort the rows or split the recording"
         )
     return t
+
+
+def _why_no_time(table: Table, raw: FloatArray, back: NDArray[np.intp]) -> str:
+    """How often time goes back or stands still, and what does so."""
+    steps = np.diff(raw)
+    if len(back):
+        usual = float(np.median(steps))
+        turns = [b for b in (16, 32) if (np.abs(steps[back] + 2.0**b - usual) < GAP * usual).all()]
+        why = f": an integer of {turns[0]} bits that wraps, unwrap it first" if turns else ""
+        return f" ({len(back)} of {len(steps)} steps go back{why})"
+    same = np.flatnonzero(steps == 0.0)
+    columns = [c for c in table.columns.values() if len(c) == len(raw)]
+    twice = all(np.array_equal(c[same], c[same + 1], equal_nan=True) for c in columns)
+    why = "rows written twice" if twice else "too coarse a clock"
+    return f" (so are {len(same)} of {len(steps)} steps: {why})"
 
 
 def _grid(table: Table, name: str, t: FloatArray, period: float, given: float | None) -> Grid:
