@@ -342,3 +342,20 @@ def test_shifts_that_are_none() -> None:
     for wrong in (9, 1.5, True, None):
         with refuses(SettingError, expected="whole number", received=repr(wrong)):
             data.shift_inputs(wrong)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_several_spikes_of_one_size_are_one_fault(seed: int, tmp_path: Path) -> None:
+    """Digits that a serial line lost: none has more power than the others together."""
+    random = np.random.default_rng(seed)
+    u = steps(random, 1500)
+    y = drive(u) + random.normal(size=len(u))
+    at = np.sort(random.choice(np.arange(10, len(u) - 10), 9, replace=False))
+    y[at] = 1e6 * random.choice([-1.0, 1.0], 9)
+    (fault,) = faults(Dataset.from_arrays(u, y, 0.01))
+    assert {d.start for d in fault.dead} == set(at)
+    assert "at 8 other places" in fault.text
+    api.write_table(tmp_path / "x.csv", {"t": 0.01 * np.arange(len(u)), "u": u, "y": y})
+    found = sewfast(tmp_path, "identify", "x.csv", "--model", "oe", "-o", "x.json", "--json").json()
+    assert fault.text in found["training"]["notes"][0]
+    assert found["scores"]["train"]["simulation"]["fit_percent"] > 90.0

@@ -224,7 +224,7 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
 
 def identify_command(args: argparse.Namespace) -> int | None:
     from ..dataset.experiment import in_effect
-    from ..dataset.sensor import alive, dead_stretches
+    from ..dataset.sensor import measuring
 
     require_place(args.out, (".json",))
     require_plot(args.plot)
@@ -239,9 +239,8 @@ def identify_command(args: argparse.Namespace) -> int | None:
         print(f"interrupted; kept the best so far in {args.out}", file=sys.stderr)
         return 130
     model.save(args.out)
-    # scored as identify took them, without dead stretches
-    train = in_effect(train)
-    train = alive(train, dead_stretches(train))
+    # scored as identify took them
+    train = measuring(in_effect(train))
     others = _save_alternatives(args, model) if args.alternatives else []
     scores = _scores(model, train, held)
     if args.plot is not None:

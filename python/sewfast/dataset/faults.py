@@ -281,7 +281,7 @@ class Fault:
     text: str
     remedy: str
     evidence: dict[str, float | str]
-    dead: Dead | None = None
+    dead: tuple[Dead, ...] = ()
 
     @property
     def is_of_plant(self) -> bool:
@@ -306,7 +306,7 @@ def faults(data: Dataset) -> tuple[Fault, ...]:
         return wrap
     if apart := spikes(data):
         rest = faults(alive(data, apart))
-        return (*(_spike_fault(data, spike) for spike in apart), *rest)
+        return (_spike_fault(data, apart), *rest)
     found = (*(_dead_fault(data, dead) for dead in dead_stretches(data)), *_order_fault(data))
     return found or tuple(_change_fault(data)) or tuple(_unstable_fault(data))
 
@@ -354,17 +354,27 @@ def _wraps(data: Dataset) -> Iterator[Fault]:
     )
 
 
-def _spike_fault(data: Dataset, spike: Dead) -> Fault:
+def _spike_fault(data: Dataset, apart: tuple[Dead, ...]) -> Fault:
+    spike = apart[0]
     of = "" if len(data.experiments) == 1 else f" of {data.experiments[spike.experiment].name}"
     span = f"{spike.start}:{spike.stop}"
+    mask = f'data.mask("{span}") (--mask {span})'
+    text = f"{data.output_name} is {spike.value:.6g} in samples {span}{of}"
+    if len(apart) > 1:
+        others = ", ".join(f"{s.start}" for s in apart[1:6]) + (", ..." if len(apart) > 6 else "")
+        text += f", and as far off at {len(apart) - 1} other places ({others})"
+        mask = "with all others that stand out, data.mask(data.mark_outliers()) (--mask outliers)"
     return Fault(
         "spike",
-        f"{data.output_name} is {spike.value:.6g} in samples {span}{of}, far from the samples "
-        "beside it, and has more power there than in all the rest of the record",
-        f'leave it out, data.mask("{span}") (--mask {span}), and check cable, sensor and log',
-        {"first": float(spike.start), "last": float(spike.stop), "value": spike.value},
-        spike,
-    )
+        f"{text}, far from the samples beside it, and has more power there than in all the rest "
+        "of the record",
+        f"leave it out, {mask}, and check cable, sensor and log",
+        {
+            "first": float(spike.start), "last": float(spike.stop), "value": spike.value,
+            "places": float(len(apart)),
+        },
+        apart,
+    )  # fmt: skip
 
 
 def _dead_fault(data: Dataset, dead: Dead) -> Fault:
@@ -380,7 +390,7 @@ def _dead_fault(data: Dataset, dead: Dead) -> Fault:
         + ("" if len(data.experiments) == 1 else ", in their file alone")
         + ", and check cable and sensor",
         {"first": float(dead.start), "last": float(dead.stop), "value": dead.value},
-        dead,
+        (dead,),
     )
 
 
@@ -501,4 +511,4 @@ def sound(data: Dataset) -> tuple[Dataset, tuple[Fault, ...]]:
             name=data.source, expected="an output that answers the input", received=wrong.text,
             remedy=wrong.remedy,
         )  # fmt: skip
-    return alive(data, [f.dead for f in found if f.dead]), found
+    return alive(data, [d for f in found for d in f.dead]), found

@@ -4,8 +4,8 @@
   output is limited to the recorded range, moves; the input has the levels there at which the output
   moves elsewhere, so that friction or a dead zone is no explanation; and a limit of the output was
   not reached by motion, so that a saturation or an end stop is none either.
-- A value that stands out: a few samples, far from those before and after, have more power than the
-  rest of the output.
+- A value that stands out: a few samples, far from those before and after, have more power than all
+  of the output but other such values.
 """
 
 from __future__ import annotations
@@ -195,23 +195,30 @@ def spikes(data: Dataset) -> tuple[Dead, ...]:
 
 
 def _spikes_in(columns: FloatArray) -> Iterator[tuple[int, int]]:
-    y = columns[:, -1]
-    for _ in range(SPIKES):
-        if np.isfinite(y).sum() < 4 * PAST or (stretch := _spike(y)) is None:
-            return
-        first, count = stretch
+    """The most stretches, farthest first, of which the last has more power than all that is left.
+    Several spikes of one size have no more power than the rest together with the others.
+    """
+    y, inputs = columns[:, -1], columns.T[:-1]
+    found: list[tuple[int, int]] = []
+    spikes = 0
+    while len(found) < SPIKES and np.isfinite(y).sum() >= 4 * PAST and (spike := _farthest(y)):
+        first, count, inside, rest = spike
         # the answer to a blow on the input is no spike
-        near = slice(max(0, first - PAST), first + count)
-        if any(
-            (inside := _spike(u)) and near.start <= inside[0] < near.stop for u in columns.T[:-1]
-        ):
-            return
-        yield first, count
+        near = range(max(0, first - PAST), first + count)
+        if any((u := _farthest(c)) and u[0] in near and u[2] > u[3] for c in inputs):
+            break
+        found.append((first, count))
         y[first : first + count] = np.nan
+        # a single one may be all that moves
+        if inside > rest and (rest > 0.0 or len(found) == 1):
+            spikes = len(found)
+    yield from found[:spikes]
 
 
-def _spike(column: FloatArray) -> tuple[int, int] | None:
-    """`SPIKE` samples or fewer about the farthest value, if they have most of the power."""
+def _farthest(column: FloatArray) -> tuple[int, int, float, float] | None:
+    """Start and length of `SPIKE` samples or fewer about the farthest value, with their power and
+    that of all others; None if the column does not come back within them.
+    """
     if not np.isfinite(column).any():
         return None
     apart = np.abs(column - np.nanmedian(column))
@@ -228,7 +235,14 @@ def _spike(column: FloatArray) -> tuple[int, int] | None:
         return None
     power = (apart / apart[k]) ** 2
     inside = float(np.nansum(power[first:last]))
-    return (first, last - first) if inside > float(np.nansum(power)) - inside else None
+    power[first:last] = 0.0
+    return first, last - first, inside, float(np.nansum(power))
+
+
+def measuring(data: Dataset) -> Dataset:
+    """The data without spikes, and then without dead stretches, as `identify` takes them."""
+    data = alive(data, spikes(data))
+    return alive(data, dead_stretches(data))
 
 
 def alive(data: Dataset, dead: Sequence[Dead]) -> Dataset:
