@@ -134,10 +134,23 @@ def in_a_loop_with_dead_time(random: np.random.Generator) -> Columns:
     return u, y + noise
 
 
+def cuts_low_flow(random: np.random.Generator) -> Columns:
+    """A meter that shows nothing below some flow, as many do."""
+    u = steps(random, 4000, 0.0, 10.0)
+    flow = drive(u, pole=0.9) + 3.0 * random.normal(size=4000)
+    return u, np.where(flow < random.uniform(50.0, 400.0), 0.0, flow)
+
+
+def dead_time_from_rest(random: np.random.Generator) -> Columns:
+    u = steps(random, 4000)
+    delay = int(random.integers(60, 250))
+    return u, 20.0 + drive(np.concatenate([np.zeros(delay), u[:-delay]]))
+
+
 SOUND = [
     rests_first, rests_last, stalls, saturates, dead_zone, coarse_thermometer, end_stop, plain,
     noisy_input, in_a_loop, dead_time,
-    in_a_loop_with_dead_time,
+    in_a_loop_with_dead_time, cuts_low_flow, dead_time_from_rest,
 ]  # fmt: skip
 
 
@@ -175,6 +188,19 @@ def test_a_dead_sensor_is_named_by_its_samples(frozen: bool) -> None:
         assert first + length - 1 <= finding.evidence["last"] < first + length + 200, seed
         assert "--mask" in finding.remedy
     assert missed <= len(SEEDS) // 20
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_a_dead_sensor_of_a_plant_that_no_linear_model_describes_is_named(frozen: bool) -> None:
+    """Its sensor has noise elsewhere: the model of the rest need not say anything."""
+    for seed in SEEDS:
+        random = np.random.default_rng(seed)
+        u = np.repeat(random.uniform(-8.0, 8.0, 150), 4)
+        y = np.abs(drive(u, friction=1.0, pole=0.9)) + random.normal(size=600)
+        y[250:450] = y[250] if frozen else 0.0
+        finding = diagnose(Dataset.from_arrays(u, y, 0.01)).find("dead_sensor")
+        assert finding is not None, seed
+        assert (finding.evidence["first"], finding.evidence["last"]) == (250.0, 450.0)
 
 
 def test_identify_leaves_a_dead_stretch_out(tmp_path: Path) -> None:

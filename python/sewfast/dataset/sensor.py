@@ -1,9 +1,10 @@
 """Stretches in which a sensor says nothing: it died, or a few samples stand out.
 
-- A dead sensor: the output keeps one value to the last bit while a linear model of the rest, whose
-  output is limited to the recorded range, moves; the input has the levels there at which the output
-  moves elsewhere, so that friction or a dead zone is no explanation; and a limit of the output was
-  not reached by motion, so that a saturation or an end stop is none either.
+- A dead sensor: the output keeps one value to the last bit, though elsewhere it never does for more
+  than a few samples, or a linear model of the rest, whose output is limited to the recorded range,
+  moves; the input has the levels there at which the output moves elsewhere, so that friction or a
+  dead zone is no explanation; and a limit of the output was not reached by motion, so that a
+  saturation or an end stop is none either.
 - A value that stands out: a few samples, far from those before and after, have more power than all
   of the output but other such values.
 """
@@ -102,6 +103,7 @@ class _Rest:
     y: FloatArray
     theta: FloatArray
     pieces: tuple[tuple[int, int], ...]
+    longest: int
 
     @classmethod
     def of(cls, columns: FloatArray, rest: NDArray[np.bool_]) -> _Rest | None:
@@ -116,10 +118,17 @@ class _Rest:
             return None
         target = np.concatenate([y[a + ORDER : a + n] for a, n in pieces])
         theta = np.asarray(np.linalg.lstsq(X, target, rcond=1e-10)[0])
-        return cls(u, y, theta, pieces)
+        same = (np.diff(y[a : a + n]) == 0.0 for a, n in pieces)
+        longest = 1 + max(count for equal in same for _, count in (*runs(equal), (0, 0)))
+        return cls(u, y, theta, pieces, longest)
 
     def contradicts(self, first: int, count: int) -> bool:
         """Whether the output moves in this stretch, by everything known from the rest."""
+        if not (self._covers(first, count) and self._jumps(first, count)):
+            return False
+        # the last digits of a noisy sensor stand still only before the machine was switched on
+        if first > 0 and self.longest <= ORDER and count > APART * self.longest:
+            return True
         length = min(count, sum(n for _, n in self.pieces) // WINDOWS)
         if length <= 2 * ORDER:
             return False
@@ -128,8 +137,6 @@ class _Rest:
         ])  # fmt: skip
         if len(others) < WINDOWS // 2:
             return False
-        if not (self._covers(first, count) and self._jumps(first, count)):
-            return False
         own = np.arange(first, first + count - length + 1, length)
         errors = self._errors(others, length)
         return bool(np.median(self._errors(own, length)) > APART * errors.max())
@@ -137,12 +144,13 @@ class _Rest:
     def _covers(self, first: int, count: int) -> bool:
         """Whether an input reaches the levels here that it has while the output moves.
         Friction, a dead zone or a closed valve keep an output still at some levels, but not at the
-        middle half of those at which it moves.
+        middle half of those at which it moves, for more than `PAST` samples at either side.
         """
         own = self.u[first : first + count]
         rest = np.concatenate([self.u[a : a + n] for a, n in self.pieces])
         low, high = np.quantile(rest, [0.25, 0.75], axis=0)
-        inside = (own.min(axis=0) <= low) & (own.max(axis=0) >= high)
+        ends = np.sort(own, axis=0)[[min(PAST, count - 1), max(-PAST - 1, -count)]]
+        inside = (ends[0] <= low) & (ends[1] >= high)
         return bool((inside & (np.ptp(own, axis=0) > 0.0)).any())
 
     def _jumps(self, first: int, count: int) -> bool:
