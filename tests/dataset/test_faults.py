@@ -385,3 +385,11 @@ def test_several_spikes_of_one_size_are_one_fault(seed: int, tmp_path: Path) -> 
     found = sewfast(tmp_path, "identify", "x.csv", "--model", "oe", "-o", "x.json", "--json").json()
     assert fault.text in found["training"]["notes"][0]
     assert found["scores"]["train"]["simulation"]["fit_percent"] > 90.0
+
+
+@pytest.mark.parametrize("moves", [1, 2, 5])
+def test_a_copy_of_a_few_steps_is_named_and_a_plant_is_not(moves: int) -> None:
+    """Nothing that is driven settles within the sample of the command."""
+    u = np.repeat(np.arange(moves + 1) % 2, 80).astype(float)
+    assert found(u, 100.0 * u) == ["no_dynamics"]
+    assert found(u, 100.0 * np.append(0.0, u[:-1])) == []

@@ -14,6 +14,7 @@ from effort import FULL
 from sewfast import diagnose
 from sewfast.dataset import Dataset
 from sewfast.dataset.faults import faults
+from sewfast.report.commissioned import _judged
 from sewfast.studio.project import Project, Step
 
 SEEDS = range(HELD, HELD + (12 if FULL else 1))
@@ -118,6 +119,8 @@ def test_every_part_that_judges_a_record_says_the_same(tmp_path: Path) -> None:
         f"{fault.text}: {fault.remedy}"
     ]
     assert "first mend the record" in card.summary
+    # the page of a commissioning prints the card that it stored
+    assert f"{fault.text}: {fault.remedy}" in str(_judged("levels", card.to_json()).rows)
     assert [x for x in model.check(api.read(sound)).lines if x.name == "record"] == []
     model.save(torn.parent / "model.json")
     shown = Project(torn.parent).validate(Step("torn.csv", ("u",), "y"))

@@ -80,8 +80,8 @@ def copied(data: Dataset) -> Copy | None:
         y = np.concatenate([c[delay:, -1] for c in experiments])
         known = np.isfinite(u) & np.isfinite(y)
         u, y = u[known], y[known]
-        # a few steps between two levels are like those of any plant that settles in a sample
-        is_binary = len(np.unique(u[:MOST])) < 3
+        # a few steps between two levels, later, are those of any plant that settles in a sample
+        is_binary = delay > 0 and len(np.unique(u[:MOST])) < 3
         if len(y) < 4 * PAST or (is_binary and np.count_nonzero(np.diff(u)) < PAST):
             continue
         # most records show in their beginning that this is none
