@@ -161,7 +161,18 @@ def cause_among(
             return min(explained, key=lambda change: change[0])[1]
         if own is not None:
             return own
-    return unseen[0] if unseen else None
+    return unseen[0] if unseen else _between(recent, known, volt, speed)
+
+
+def _between(
+    runs: Sequence[Recording], known: Sequence[_Look], volt: float, speed: float
+) -> Cause | None:
+    """What changed in the latest of these runs that differs from those before it."""
+    for i in reversed(range(1, len(runs))):
+        before = [k.recording for k in known if any(k.recording is r for r in runs[:i])]
+        if before and (cause := _Look.at(runs[i], before, volt, speed).change()):
+            return cause
+    return None
 
 
 def _look(recording: Recording, volt: float, speed: float) -> _Look | None:
@@ -418,7 +429,7 @@ _NAMED: dict[str, Callable[[float, str], tuple[str, str]]] = {
     "delay": partial(_text, "delay"),
     "inertia": partial(_text, "inertia"),
     "friction": partial(_text, "friction"),
-    "load": partial(_text, "load"),
     "stuck": partial(_text, "stage stuck"),
+    "load": partial(_text, "load"),
 }
 """The changes of the core, the likelier first."""

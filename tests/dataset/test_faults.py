@@ -267,7 +267,10 @@ def test_a_number_times_an_input_of_two_levels_is_no_plant() -> None:
     random = np.random.default_rng(4)
     u = np.repeat(random.choice([-5.0, 5.0], 150), 20)
     assert found(u, 100.0 * u) == ["no_dynamics"]
-    assert found(np.repeat([0.0, 1.0], 200), np.repeat([0.0, 3.0], 200)) == []
+    step = np.repeat([0.0, 1.0], 200)
+    assert found(step, 3.0 * step) == ["no_dynamics"]
+    # what settles in a sample
+    assert found(step, np.concatenate([[0.0], 3.0 * step[:-1]])) == []
 
 
 # --- columns --------------------------------------------------------------------------------------

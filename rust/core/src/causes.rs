@@ -615,6 +615,8 @@ impl Candidate {
             Change::Delay => value >= 0.0,
             // more than the largest command would only be a shaft that stands
             Change::Friction => (0.0..=blocks.largest).contains(&value),
+            // more than that would have turned the machine before
+            Change::Load => value.abs() <= blocks.largest,
             Change::Inertia => value > 0.05,
             // a decoder makes 1, 2 or 4 counts of a line
             Change::Counts => value.abs() <= 4.0,
