@@ -569,7 +569,7 @@ def test_all_files_are_written_or_none(tmp_path: Path, monkeypatch: pytest.Monke
     there = deploy(CASES["pi"], tmp_path / "there").folder
     (there / "controller_test.c").unlink()
     (there / "controller_test.c").mkdir()
-    refused(there, "controller_test.c", "directory")
+    refused(there, "controller_test.c", "a folder")
     (tmp_path / "file").touch()
     refused(tmp_path / "file" / "below", "below", "directory")
     refused(tmp_path / ("x" * 300), "x", "too long")

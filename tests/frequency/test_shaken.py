@@ -56,10 +56,19 @@ def test_several_speeds_are_one_result(speeds: sewfast.ResponsesOverSpeed) -> No
         speeds[1500.0]
 
 
-@pytest.mark.nightly("a third measurement at several speeds")
-def test_their_files_come_back(speeds: sewfast.ResponsesOverSpeed, tmp_path: Path) -> None:
-    place = tmp_path / "speeds.json"
+def test_their_files_come_back(
+    speeds: sewfast.ResponsesOverSpeed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place, loop = tmp_path / "speeds.json", tmp_path / "controller.json"
     speeds.save(place)
+    controller().save(loop)
+    assert main(["bode", str(place), "--controller", str(loop)]) == 0
+    assert capsys.readouterr().out.startswith(str(speeds))
+    assert main(["bode", str(place), "--controller", str(loop), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert len(shown["shafts"]) == 2
+    margins = speeds.margins(controller())
+    assert [m["Ms"] for m in shown["margins"]] == [m.Ms for m in margins.values()]
     again = load_responses(place)
     assert str(again) == str(speeds)
     for one, other in zip(again, speeds, strict=True):

@@ -24,7 +24,6 @@ from .header import Header, bearable
 # --- Sink: a file that grows by whole pieces ------------------------------------------------------
 
 
-ROOM = "room for the recording"
 _BATCH = 1 << 16
 _LOCKED = 0x7FFF_0000
 """The byte to lock on Windows, beyond any recording: others cannot read locked bytes there."""
@@ -209,7 +208,7 @@ def replacing(path: Path) -> Iterator[Path]:
         if e.name != str(temporary):
             raise
         # nothing is left of the temporary file that the message is about
-        remedy = "free some space or write elsewhere" if e.expected == ROOM else e.remedy
+        remedy = "free some space or write elsewhere" if "is whole" in str(e.remedy) else e.remedy
         raise DataError(
             name=str(path), expected=e.expected, received=e.received, remedy=remedy
         ) from e
@@ -303,7 +302,7 @@ class Filing:
             return error
         reason = getattr(error, "strerror", None) or repr(error)
         return DataError(
-            name=str(self._path), expected=ROOM, received=reason,
+            name=str(self._path), expected="room for the recording", received=reason,
             remedy=f"the file is whole up to sample {self._first} (end excluded, "
             f"{self._sink.size} bytes); free some space and record again",
         )  # fmt: skip
