@@ -555,3 +555,18 @@ def test_a_recording_in_place_of_a_model_is_told_from_a_damaged_one(tmp_path: Pa
     (tmp_path / "run.csv").write_text("t,u,y\n0,1,2\n1,2,3\n")
     for command in (("tune", "run.csv"), ("run", "run.csv", "run.csv")):
         assert "sewfast identify makes a model" in refused(tmp_path, *command)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["--limits", "volt=1"], "expected each of volt, speed, acceleration, current once"),
+        (["--limits", "volt=1,speed=a,acceleration=3,current=5"], "expected numbers"),
+        (["--watchdog", "0"], "expected 1 to 10000 ms"),
+    ],
+)
+def test_limits_are_looked_at_before_a_port_is_opened(
+    given: list[str], words: str, tmp_path: Path
+) -> None:
+    on = ["record", "--signal", "random", "--on", str(tmp_path / "port"), "-o", "run.mcap"]
+    assert words in refused(tmp_path, *on, *given)

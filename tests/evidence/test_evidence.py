@@ -272,6 +272,9 @@ def test_operating_points_are_the_equilibria_and_slopes_of_the_simulation() -> N
     assert all(p.is_stable and p.settled for p in o.points)
     gains = [p.dc_gain[0] for p in o.points]
     assert max(gains) > 5 * min(gains)
+    head, *rows = str(o).splitlines()
+    assert head.split()[:3] == ["u", "y", "gain"]
+    assert [float(row.split()[2]) for row in rows] == pytest.approx(gains, rel=1e-3)
 
 
 def test_the_linearised_model_is_the_linear_model() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import pty
 import socket
@@ -332,6 +333,9 @@ def test_ports_are_listed_by_path(monkeypatch, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "0403:0403" in printed
     assert str(second.problem) in printed
+    assert main(["ports", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert [port["can_open"] for port in listed] == [True, False]
 
 
 def test_the_command_lists_ports(tmp_path):
