@@ -568,5 +568,5 @@ def test_a_recording_in_place_of_a_model_is_told_from_a_damaged_one(tmp_path: Pa
 def test_limits_are_looked_at_before_a_port_is_opened(
     given: list[str], words: str, tmp_path: Path
 ) -> None:
-    on = ["record", "--signal", "random", "--on", str(tmp_path / "port"), "-o", "run.mcap"]
+    on = ["record", "--signal", "random", "--on", "socket://127.0.0.1:1", "-o", "run.mcap"]
     assert words in refused(tmp_path, *on, *given)
