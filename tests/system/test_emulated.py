@@ -170,7 +170,7 @@ def test_the_command_refuses_a_place_that_cannot_be_made(
 def test_what_is_no_firmware_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="source checkout"):
         build_firmware(tmp_path)
-    with pytest.raises(SettingError, match="expected a firmware"):
+    with pytest.raises(SettingError, match="expected a file that can be read"):
         EmulatedBoard(tmp_path / "none.elf")
     other = tmp_path / "other.elf"
     for content in (b"", b"\x7fELF", b"\x7fELF\x02\x01" + bytes(100), bytes(1000)):
