@@ -390,6 +390,19 @@ def test_several_spikes_of_one_size_are_one_fault(seed: int, tmp_path: Path) -> 
     assert found["scores"]["train"]["simulation"]["fit_percent"] > 90.0
 
 
+@pytest.mark.parametrize("blows", [1, 2, 5, 15, 30])
+@pytest.mark.parametrize("pole", [0.0, 0.4])
+def test_answers_to_blows_are_no_spikes(blows: int, pole: float) -> None:
+    """Pulses of one size, of a plant that has settled again after a few samples."""
+    random = np.random.default_rng(blows)
+    u = np.zeros(2000)
+    u[60 * np.arange(1, blows + 1)] = 5.0
+    y = drive(u, pole=pole) + 0.05 * random.normal(size=len(u))
+    assert found(u, y) == []
+    y[1990] = 1e6
+    assert found(u, y) == ["spike"]
+
+
 @pytest.mark.parametrize("moves", [1, 2, 5])
 def test_a_copy_of_a_few_steps_is_named_and_a_plant_is_not(moves: int) -> None:
     """Nothing that is driven settles within the sample of the command."""

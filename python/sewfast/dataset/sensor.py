@@ -11,9 +11,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,6 +192,8 @@ SPIKE = 3
 """Most samples in a row that are a spike and no motion."""
 SPIKES = 20
 """Most spikes of an experiment that are looked for."""
+_Stretch: TypeAlias = tuple[int, int, float, float]
+"""Start and length of a stretch, its power and that of all others."""
 
 
 def spikes(data: Dataset) -> tuple[Dead, ...]:
@@ -206,24 +209,41 @@ def _spikes_in(columns: FloatArray) -> Iterator[tuple[int, int]]:
     """The most stretches, farthest first, of which the last has more power than all that is left.
     Several spikes of one size have no more power than the rest together with the others.
     """
-    y, inputs = columns[:, -1], columns.T[:-1]
-    found: list[tuple[int, int]] = []
-    spikes = 0
-    while len(found) < SPIKES and np.isfinite(y).sum() >= 4 * PAST and (spike := _farthest(y)):
-        first, count, inside, rest = spike
+    *inputs, y = columns.T
+    # an input moves at nothing else than its blows, an output has noise
+    blows = [first for u in inputs for first, *_ in _most(_standing_out(u), least=-1.0)]
+    found = itertools.takewhile(
         # the answer to a blow on the input is no spike
-        near = range(max(0, first - PAST), first + count)
-        if any((u := _farthest(c)) and u[0] in near and u[2] > u[3] for c in inputs):
-            break
-        found.append((first, count))
-        y[first : first + count] = np.nan
-        # a single one may be all that moves
-        if inside > rest and (rest > 0.0 or len(found) == 1):
-            spikes = len(found)
-    yield from found[:spikes]
+        lambda s: not any(blow in range(s[0] - PAST, s[0] + s[1]) for blow in blows),
+        _standing_out(y),
+    )
+    yield from (spike[:2] for spike in _most(found, least=0.0))
 
 
-def _farthest(column: FloatArray) -> tuple[int, int, float, float] | None:
+def _most(found: Iterable[_Stretch], *, least: float) -> list[_Stretch]:
+    """These stretches, up to the last one with more power than all that is left, which is more than
+    `least`; a single one may be all that moves.
+    """
+    stretches, count = [], 0
+    for stretch in found:
+        stretches.append(stretch)
+        *_, inside, rest = stretch
+        if inside > rest and (rest > least or len(stretches) == 1):
+            count = len(stretches)
+    return stretches[:count]
+
+
+def _standing_out(column: FloatArray) -> Iterator[_Stretch]:
+    """The farthest stretch, the farthest of the rest, and so on."""
+    rest = column.copy()
+    for _ in range(SPIKES):
+        if np.isfinite(rest).sum() < 4 * PAST or (stretch := _farthest(rest)) is None:
+            return
+        yield stretch
+        rest[stretch[0] : stretch[0] + stretch[1]] = np.nan
+
+
+def _farthest(column: FloatArray) -> _Stretch | None:
     """Start and length of `SPIKE` samples or fewer about the farthest value, with their power and
     that of all others; None if the column does not come back within them.
     """
