@@ -133,13 +133,15 @@ def cause_among(
     last, moved = runs[-1], [r for r in runs[:-1] if np.ptp(r.counts) > 0.0]
     if np.ptp(last.counts) == 0.0 and moved:
         return _idle(runs)
-    look, recent = _look(last, volt, speed), moved[-MOST:]
+    look = _look(last, volt, speed)
+    recent: list[Recording] = []
     known: list[_Look] = []
     unseen: list[Cause] = []
-    for recording in recent:
+    for recording in moved[-MOST:]:
         earlier = _look(recording, volt, speed)
         if earlier is None:
             continue
+        recent.append(recording)
         if cause := earlier.change(UNSEEN):
             unseen.append(cause)
         elif earlier.found["error"] <= ALIKE * earlier.found["size"]:

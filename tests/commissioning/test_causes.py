@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sewfast import Controller, DataError, Gains, Recording, cause_of, commission, record, run
+from sewfast.causes import cause_among
 from sewfast.commissioning import Refusal, SteppedBench
 from sewfast.errors import LinkError
 
@@ -174,3 +175,9 @@ def test_too_short_a_run_is_refused() -> None:
     lost, counts = np.full(4, np.nan), np.arange(4.0)
     with pytest.raises(DataError, match="three samples"):
         cause_of(Recording(lost, counts, counts, None, TS, PER_TURN, "lost"))
+
+
+def test_a_run_of_two_samples_among_others_is_passed_over() -> None:
+    whole = record(rig(Motor()), np.repeat([0.0, 5.0], 500), name="step")
+    short = Recording(np.ones(2), np.arange(2.0), np.arange(2.0), None, TS, PER_TURN, "short")
+    assert cause_among([whole, short, whole]) is None
