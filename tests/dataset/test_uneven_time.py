@@ -102,7 +102,7 @@ def test_rows_that_are_missing_in_even_time_are_gaps_and_nothing_else_moves(
     assert np.array_equal(np.flatnonzero(np.isnan(e.y)), np.r_[300, 500:560])
     assert np.array_equal(e.y[kept], read_table(tmp_path / "gap.csv")["y"])
     assert np.array_equal(e.u[kept, 0], read_table(tmp_path / "gap.csv")["u"])
-    assert "1 gaps, the longest 0.61 s" in data.notes[0]
+    assert "1 gap of 0.61 s is not known" in data.notes[0]
     assert not data.looks_ahead
     assert [len(x) for x in data.split_at_gaps().experiments] == [300, 199, 440]
     with pytest.raises(DataError, match="split-at-gaps"):
@@ -121,7 +121,7 @@ def test_nothing_is_made_up_inside_a_gap_of_an_uneven_log(tmp_path: Path) -> Non
     assert np.isnan(e.y[inside]).all()
     assert np.isnan(e.u[inside]).all()
     assert np.isfinite(e.y[~inside]).mean() > 0.99
-    assert "1 gaps" in data.notes[0]
+    assert "1 gap of" in data.notes[0]
 
 
 @pytest.mark.parametrize(

@@ -102,7 +102,7 @@ NUMBERED: dict[str, tuple[Callable[[Rows], Rows], str]] = {
 @pytest.mark.parametrize("kind", NUMBERED)
 def test_numbers_of_rows_show_what_even_times_hide(tmp_path: Path, kind: str) -> None:
     spoil, words = NUMBERED[kind]
-    path = write(tmp_path / "x.csv", spoil(numbered()), "seq,u,y")
+    path = write(tmp_path / "x.csv", spoil(numbered()), "seq [-],u,y")
     (note,) = read(path, Ts=0.01).notes
     assert words in note
     assert words in called(tmp_path, "look", path, "--ts", "0.01").out
@@ -128,10 +128,11 @@ def test_numbers_that_wrap_are_no_fault_and_no_input(tmp_path: Path, turn: int) 
     assert (found.input, found.output) == ("u", "speed")
 
 
-@pytest.mark.parametrize("head", ["n,u,y", "packet,u,y"])
+@pytest.mark.parametrize("head", ["n,u,y", "packet,u,y", "n [rpm],u,y"])
 def test_columns_that_count_no_rows_are_left_alone(tmp_path: Path, head: str) -> None:
-    """A speed n, and packets of ten rows."""
+    """A speed n, packets of ten rows, and a ramp with a unit."""
     first = [k // 10 for k in range(N)] if "packet" in head else np.rint(columns(1)[1]).tolist()
+    first = [min(k, 950) for k in range(N)] if "rpm" in head else first
     rows = [f"{x:g},{row.partition(',')[2]}" for x, row in zip(first, numbered(), strict=True)]
     assert read(write(tmp_path / "x.csv", rows, head), inputs="u", output="y", Ts=0.01).notes == ()
 
@@ -179,6 +180,18 @@ def test_a_last_line_that_was_cut_off_is_left_out(tmp_path: Path, cut: int) -> N
     data = read(path)
     assert len(data) == N - 1
     assert "the last line is cut off" in data.notes[0]
+
+
+@pytest.mark.parametrize("last", ["nan", "-inf", "NA"])
+def test_a_last_cell_without_a_number_is_whole(tmp_path: Path, last: str) -> None:
+    data = read(write(tmp_path / "x.csv", [*timed(), f"10.00,0.123,{last}"], end=""))
+    assert len(data) == N + 1
+    assert data.notes == ()
+
+
+def test_a_last_cell_longer_than_any_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(api.DataError, match="line 1002: field larger"):
+        read(write(tmp_path / "x.csv", [*timed(), "9" * 200_000], end=""))
 
 
 def test_a_short_table_is_whole(tmp_path: Path) -> None:

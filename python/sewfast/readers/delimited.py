@@ -336,11 +336,18 @@ def _whole(layout: _Layout) -> _Layout:
 
     def ending(line: str) -> tuple[int, int]:
         cells = line.split(None if layout.delimiter == " " else layout.delimiter)
-        whole, mark, decimals = cells[-1].strip().partition(layout.decimal)
+        end = cells[-1].strip() if cells else ""
+        if end.lstrip("+-").isalpha():  # nan and inf have no decimals
+            return len(cells), len(line)
+        whole, mark, decimals = end.partition(layout.decimal)
         return len(cells), len(decimals) if whole or mark else -1
 
+    try:
+        cells = _cells(last, layout.delimiter)
+    except csv.Error:  # refused later, with its line number
+        return layout
     width = len(layout.header)
-    if all(_is_number(c.strip()) or is_moment(c) for c in _cells(last, layout.delimiter)) and (
+    if _is_numeric(cells) and (
         ending(last) < min((e for e in map(ending, above) if e[0] == width), default=(0, 0))
     ):
         note = f"warning: {layout.path.name}: the last line is cut off and left out: {short(last)}"

@@ -166,7 +166,9 @@ class Grid:
                 f"median {self.period:.4g} s); resampled to Ts = {self.Ts:.6g} s, outputs by "
                 "straight lines between rows, inputs as held and averaged"
             )
-        if len(gaps):
+        if len(gaps) == 1:
+            said.append(f"1 gap of {gaps[0]:.4g} s is not known (NaN)")
+        elif len(gaps):
             said.append(f"{len(gaps)} gaps, the longest {gaps.max():.4g} s, are not known (NaN)")
         if doubled := self.count - len(self.rows):
             after = self.rows[np.flatnonzero(np.diff(self.rows, prepend=-1) > 1)[0]]
@@ -210,7 +212,9 @@ def _is_time(name: str) -> bool:
 
 def numbers_rows(table: Table, name: str) -> bool:
     """Whether a column numbers the rows, by its name and as most of its steps are the same."""
-    return _NUMBER.fullmatch(name.lower()) is not None and _step(table[name]) > 0
+    # `n [rpm]` is a speed
+    named = _NUMBER.fullmatch(name.lower()) and table.unit(name) in ("", "-", "1", "#")
+    return bool(named) and _step(table[name]) > 0
 
 
 def _step(numbers: FloatArray) -> float:
@@ -248,8 +252,8 @@ def _jumps(table: Table, name: str) -> Iterator[str]:
             yield (
                 f"warning: {table.path.name}: {counted(count, 'row')} {what} by the numbers in "
                 f"column {name!r}, at {len(at)} place{'' if len(at) == 1 else 's'}, first "
-                f"{numbers[k + 1]:.15g} after {numbers[k]:.15g} at {table.row(k + 1)}: take a part "
-                "without (--train A:B), or record it again"
+                f"{numbers[k + 1]:.15g} after {numbers[k]:.15g} at {table.row(k + 1)}: use a part "
+                "without such places (--train A:B), or record it again"
             )
 
 
