@@ -110,7 +110,10 @@ def names(path: str | os.PathLike[str]) -> tuple[Path, Path]:
     """
     if "\0" in os.fspath(path):
         raise OSError(errno.EINVAL, "a name cannot hold the character 0")
-    target = Path(path).resolve()
+    try:
+        target = Path(path).resolve()
+    except RuntimeError as error:  # a link to itself, before Python 3.13
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP)) from error
     if target.is_dir():
         raise OSError(errno.EISDIR, "a folder")
     if target.exists() and not target.is_file():

@@ -6,6 +6,7 @@ import errno
 import os
 import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ import pytest
 import sewfast as api
 from cli import call_refused as refused
 from cli import called as sewfast
+from sewfast._core import DeviceServer
 from sewfast.cli.output import suggested
+from sewfast.link import virtual
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pipes and names of POSIX")
 
@@ -77,6 +80,32 @@ def test_any_name_of_a_file_is_written_and_told(folder: Path, name: str) -> None
     assert (folder / f"{name}.json").is_file()
     said = refused(folder, "gains", "--K", "1", "--T", ".1", "--L", ".02", "-o", f"{name}.txt")
     assert len(said.splitlines()) == 1
+
+
+def test_a_link_to_itself_is_refused(folder: Path) -> None:
+    (folder / "n.json").symlink_to("n.json")
+    for words in named("gains", "n"), ["init", "n.json"]:
+        assert "expected a file that can be written" in refused(folder, *words)
+    assert (folder / "n.json").is_symlink()
+
+
+def test_who_reads_a_trace_from_a_pipe_reads_to_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading ends once nobody has the pipe open for writing."""
+    os.mkfifo(pipe := tmp_path / "pipe")
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+
+    def served(*args: Any, **kwargs: Any) -> Any:
+        with pytest.raises(BlockingIOError):  # open, and empty
+            os.read(reader, 1)
+        return DeviceServer(*args, **kwargs)
+
+    monkeypatch.setattr(virtual, "DeviceServer", served)
+    with virtual.VirtualDevice(endpoint="tcp", trace=pipe):
+        pass
+    assert os.read(reader, 1) == b""
+    os.close(reader)
 
 
 def test_a_model_that_looks_like_an_option_is_suggested_as_a_file() -> None:

@@ -351,9 +351,11 @@ def init_command(args: argparse.Namespace) -> None:
             name=str(place), expected="a new file", received="one that exists",
             remedy="change it, or take it away first",
         )  # fmt: skip
+    # realpath, as a link to itself is refused below
+    name = printable(os.path.basename(os.path.realpath(folder)))
     texts = {
         place: _TOML.format(columns=columns, units=units),
-        folder / "README.md": _README.format(name=printable(folder.resolve().name)),
+        folder / "README.md": _README.format(name=name),
     }
     from ..storage import making, replace_files  # loads NumPy
 

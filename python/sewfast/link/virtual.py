@@ -9,6 +9,7 @@ import tempfile
 import warnings
 import weakref
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -109,31 +110,32 @@ class VirtualDevice(Unique):
             raise SettingError(
                 name="address", expected="HOST:PORT", received=repr(address), remedy="port 0 is any"
             )
-        for name, place in (("link", link), ("fault_log", fault_log), ("trace", trace)):
-            _require_place(name, place)
-        if pty and link is not None:
-            _require_free(Path(link))
-        folder = tempfile.mkdtemp(prefix="sewfast-") if pty and link is None else None
-        try:
-            self._server = DeviceServer(
-                plant.core,
-                name=plant.name.split("?")[0],
-                pty=pty,
-                link=Path(folder, "port") if folder is not None else _path(link),
-                address=address,
-                anyone=anyone,
-                fast=fast,
-                baud=baud,
-                faults=_faults_text(faults),
-                seed=seed,
-                once=once,
-                duration=duration,
-                fault_log=_path(fault_log),
-                trace=_path(trace),
-            )
-        except BaseException:
-            _end(None, folder)
-            raise
+        with ExitStack() as pipes:
+            for name, place in (("link", link), ("fault_log", fault_log), ("trace", trace)):
+                _require_place(name, place, pipes)
+            if pty and link is not None:
+                _require_free(Path(link))
+            folder = tempfile.mkdtemp(prefix="sewfast-") if pty and link is None else None
+            try:
+                self._server = DeviceServer(
+                    plant.core,
+                    name=plant.name.split("?")[0],
+                    pty=pty,
+                    link=Path(folder, "port") if folder is not None else _path(link),
+                    address=address,
+                    anyone=anyone,
+                    fast=fast,
+                    baud=baud,
+                    faults=_faults_text(faults),
+                    seed=seed,
+                    once=once,
+                    duration=duration,
+                    fault_log=_path(fault_log),
+                    trace=_path(trace),
+                )
+            except BaseException:
+                _end(None, folder)
+                raise
         self._end = weakref.finalize(self, _end, self._server, folder)
         if anyone and not pty and not _is_loopback(self.port):
             warnings.warn(
@@ -257,10 +259,10 @@ def _require_switches(**values: object) -> None:
             raise SettingError(name=name, expected="True or False", received=repr(value))
 
 
-def _require_place(name: str, place: object) -> None:
+def _require_place(name: str, place: object, pipes: ExitStack) -> None:
     """Refuse a file that cannot be created, before creating anything. Raises `SettingError` for
     anything but a file name, and `LinkError` if its folder does not exist or a log file cannot be
-    written.
+    written. A pipe stays open in `pipes`: who reads it would take its closing for the end.
     """
     if place is None:
         return
@@ -278,7 +280,7 @@ def _require_place(name: str, place: object) -> None:
         return
     try:
         # without O_NONBLOCK, it would wait for somebody to read a pipe
-        os.close(os.open(place, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0)))
+        pipes.callback(os.close, os.open(place, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0)))
     except OSError as e:
         raise unwritable(LinkError, place, e) from e
 
