@@ -154,6 +154,8 @@ def unreadable(kind: type[Kind], path: object, error: BaseException) -> Kind:
 _REMEDIES = {
     errno.EISDIR: "name a file in it",
     errno.EINVAL: "choose another name",
+    errno.ELOOP: "choose another name",
+    errno.ENXIO: "start what reads the pipe first",
     errno.ENAMETOOLONG: "choose a shorter name",
     errno.ENOSPC: "free some space or write elsewhere",
     errno.EDQUOT: "free some space or write elsewhere",

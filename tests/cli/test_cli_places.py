@@ -86,6 +86,7 @@ def test_a_link_to_itself_is_refused(folder: Path) -> None:
     (folder / "n.json").symlink_to("n.json")
     for words in named("gains", "n"), ["init", "n.json"]:
         assert "expected a file that can be written" in refused(folder, *words)
+    assert "choose another name" in refused(folder, *named("gains", "n"))
     assert (folder / "n.json").is_symlink()
 
 
