@@ -653,6 +653,7 @@ def cost_terms(
 ) -> dict[str, float]:
     """tracking, chatter, effort, overshoot [%], rise [ms], lag [ms], saturation, u_max of a run."""
 
+_Lines: TypeAlias = tuple[_F, NDArray[np.complex128], _F, bool]  # rad/s, responses, radii; counted
 _Variable: TypeAlias = tuple[str, tuple[float, float] | None]
 
 class _Limits(TypedDict):
@@ -687,7 +688,7 @@ class _Task(TypedDict):
     aggregate: str
     limits: _Limits
     linear_plants: Sequence[tuple[_F, _F]]
-    measured: Sequence[tuple[_F, NDArray[np.complex128], _F, bool]]
+    measured: Sequence[_Lines]
 
 def tune(
     task: _Task, *, method: str, evaluations: int, seed: int, threads: int, progress: _Progress = None
@@ -760,14 +761,12 @@ def sampled_fopdt(K: float, T: float, L: float, *, Ts: float) -> tuple[_F, _F]:
 def loop_response(path: LoopPath, num: _F, den: _F, omega: _F) -> NDArray[np.complex128]:
     """L, broken at the plant's input, at omega [rad/s]; the plant in powers of z^-1."""
 
-def margins(path: LoopPath, num: _F, den: _F, level: float | None = None) -> dict[str, Any]:
+def margins(path: LoopPath, num: _F, den: _F) -> dict[str, Any]:
     """stable, largest_pole, Ms, Ms_omega, Mt, Mt_omega, gain_margin, gain_reduction, phase_margin_deg,
     delay_margin_s, noise_gain, bandwidth, gain_crossovers, phase_crossovers; omegas, bandwidth and
     crossovers in rad/s.
 
-    An unstable loop has infinite peaks and noise gain, its other margins are NaN. With a ``level`` of |S|
-    ``levels`` has it and where it is first reached [rad/s], then the height of each peak beyond and where that is
-    first exceeded, up to 1.
+    An unstable loop has infinite peaks and noise gain, its other margins are NaN.
     """
 
 def tolerance(
@@ -779,6 +778,26 @@ def tolerance(
     resonance's frequency, then the factor on the gain, the delay [samples] and the factor on the
     frequency with which it is. The first is Ms, or half of that.
     """
+
+@final
+class ProposalTask:
+    """The search for gains and filters of the largest bandwidth; ``path`` has what is not searched.
+
+    ``above``: the fit above the measured ``lines``; ``quiet``: largest noise gain, inf for none.
+    """
+
+    def __new__(
+        cls, path: LoopPath, num: _F, den: _F, *, lines: _Lines, above: _Lines, Ms: float, quiet: float
+    ) -> ProposalTask: ...
+
+    def best(
+        self, starts: Sequence[_F]
+    ) -> tuple[float | None, _F, tuple[tuple[float, float, float, float], float, list[list[float]]]]:
+        """Merit, None if not stable within Ms; the logarithms; Kp, Ti, Td, N; the lag [s]; each filter.
+
+        A start has the logarithms of Kp, Ti, Td, the lag, and of a notch's frequency, depth and width
+        or of frequency and damping of one or two biquads' zeros, then of their poles.
+        """
 
 def effort(u: _F, *, u_min: float, u_max: float) -> dict[str, float]:
     """u_rms, du_rms (change from sample to sample), saturated (share of samples at a limit)."""

@@ -34,7 +34,7 @@ from sewfast.cli import main
 from sewfast.control import forms
 from sewfast.control.margins import loop_response
 from sewfast.control.systems import LinearLoop, response, simulate
-from sewfast.frequency import FrequencyResponse, ShaftFit, proposal, propose
+from sewfast.frequency import FrequencyResponse, ShaftFit, propose
 from sewfast.link import Plan, VirtualDevice, connect
 
 TS = 1e-3
@@ -265,7 +265,6 @@ def test_a_response_alone_or_a_variable_of_no_notch_is_refused() -> None:
         )  # fmt: skip
 
 
-@pytest.mark.nightly("a search for filters; the command's runs in `make test`")
 def test_filters_are_proposed_where_the_shaft_swings() -> None:
     _, measured = two_masses()
     fit = fitted_shaft()
@@ -307,7 +306,7 @@ def test_what_cannot_be_proposed_for_is_refused() -> None:
         rigid.notch()
 
 
-@pytest.mark.skipif(not FULL, reason="two more searches of ten seconds: SEWFAST_SOAK=1")
+@pytest.mark.skipif(not FULL, reason="three more searches of some seconds: SEWFAST_SOAK=1")
 def test_without_a_notch_the_gains_alone_are_proposed_and_a_larger_ms_is_faster() -> None:
     fit = fitted_shaft()
     found = propose(fit, Ms=1.7, u_max=20.0)
@@ -318,12 +317,7 @@ def test_without_a_notch_the_gains_alone_are_proposed_and_a_larger_ms_is_faster(
     assert propose(fit, Ms=2.2).bandwidth_hertz > found.bandwidth_hertz
 
 
-def test_the_command_line_proposes_and_tunes_with_notches(
-    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # a search cut short: how good a proposal becomes is another test's matter
-    monkeypatch.setattr(proposal, "ROUNDS", 1)
-    monkeypatch.setattr(proposal, "STEPS", 30)
+def test_the_command_line_proposes_and_tunes_with_notches(tmp_path: Path, capsys: Any) -> None:
     model, measured = two_masses()
     measured.save(tmp_path / "response.json")
     model.save(tmp_path / "model.json")

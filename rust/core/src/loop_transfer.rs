@@ -18,7 +18,8 @@ use sewfast_control::{Biquad, CAPACITY, Cascade, Refused, Standard};
 
 use crate::{Error, Result};
 
-pub use margins::{Margins, margins, margins_and_levels, peak_sensitivity};
+pub(crate) use margins::weakening;
+pub use margins::{Margins, margins, peak_sensitivity};
 pub use plant::{Measured, Plant};
 pub use tolerance::{Change, Changing};
 

@@ -6,14 +6,16 @@ use pyo3::types::PyDict;
 use sewfast_control::Standard;
 use sewfast_core::Result;
 use sewfast_core::loop_transfer::{self, Change, Changing, Loop, Path, Plant};
+use sewfast_core::proposal::{self, Task};
 
 use crate::control::controller::{Section, cascade};
-use crate::seam::{array1, raise, slice};
+use crate::seam::{array1, raise, slice, watched};
 
 type Values<'py> = PyReadonlyArray1<'py, f64>;
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<LoopPath>()?;
+    module.add_class::<ProposalTask>()?;
     module.add_function(wrap_pyfunction!(sampled_fopdt, module)?)?;
     module.add_function(wrap_pyfunction!(loop_response, module)?)?;
     module.add_function(wrap_pyfunction!(margins, module)?)?;
@@ -78,6 +80,25 @@ fn sampled_fopdt(py: Python<'_>, K: f64, T: f64, L: f64, Ts: f64) -> PyResult<Fr
     ))
 }
 
+/// Frequencies \[rad/s\], responses and radii of a measured plant; whether its output was counted.
+pub type Lines<'py> = (
+    Values<'py>,
+    PyReadonlyArray1<'py, Complex64>,
+    Values<'py>,
+    bool,
+);
+
+/// The measured plant at the sample time of its loop.
+pub fn measured(
+    (omega, response, radius, counted): &Lines<'_>,
+    ts: f64,
+) -> PyResult<loop_transfer::Measured> {
+    let py = omega.py();
+    let (omega, radius) = (slice(omega, "omega")?, slice(radius, "radius")?);
+    let response = response.as_slice()?;
+    loop_transfer::Measured::new(omega, response, radius, *counted, ts).map_err(|e| raise(py, e))
+}
+
 #[pyfunction]
 #[pyo3(signature = (path, num, den, omega))]
 fn loop_response<'py>(
@@ -102,24 +123,20 @@ fn loop_response<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (path, num, den, level=None))]
+#[pyo3(signature = (path, num, den))]
 fn margins<'py>(
     py: Python<'py>,
     path: &LoopPath,
     num: Values<'py>,
     den: Values<'py>,
-    level: Option<f64>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let (num, den) = (slice(&num, "num")?, slice(&den, "den")?);
-    // half a millisecond, that a search asks for thousands of times: on a busy computer a thread of its own waits for longer
-    let (found, levels) = py
+    // half a millisecond: on a busy computer a thread of its own waits for longer
+    let found = py
         .detach(|| {
             let plant = Plant::new(num, den)?;
             let closed = Loop::new(&path.0, &plant)?;
-            Ok(match level {
-                Some(level) => loop_transfer::margins_and_levels(&closed, level),
-                None => (loop_transfer::margins(&closed), Vec::new()),
-            })
+            Ok(loop_transfer::margins(&closed))
         })
         .map_err(|e| raise(py, e))?;
     let dict = PyDict::new(py);
@@ -142,9 +159,6 @@ fn margins<'py>(
     }
     dict.set_item("gain_crossovers", found.gain_crossovers)?;
     dict.set_item("phase_crossovers", found.phase_crossovers)?;
-    if level.is_some() {
-        dict.set_item("levels", levels)?;
-    }
     Ok(dict)
 }
 
@@ -164,4 +178,60 @@ fn tolerance(
     let (robust, worst) = found.map_err(|e| raise(py, e))?;
     let changed = |(most, Change { gain, delay, pitch })| (most, gain, delay, pitch);
     Ok((robust, worst.map(changed)))
+}
+
+/// Gains in standard form with `N`, the lag \[s\], and the numbers of each filter.
+type Proposed = ((f64, f64, f64, f64), f64, Vec<Vec<f64>>);
+
+/// A machine from a frequency response, and what a controller of it has to keep.
+#[pyclass(module = "sewfast._core", frozen)]
+pub struct ProposalTask(Task);
+
+#[pymethods]
+impl ProposalTask {
+    #[new]
+    #[pyo3(signature = (path, num, den, *, lines, above, Ms, quiet))]
+    #[expect(non_snake_case, reason = "the field's names")]
+    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+    fn new(
+        py: Python<'_>,
+        path: &LoopPath,
+        num: Values<'_>,
+        den: Values<'_>,
+        lines: Lines<'_>,
+        above: Lines<'_>,
+        Ms: f64,
+        quiet: f64,
+    ) -> PyResult<Self> {
+        Ok(Self(Task {
+            plant: Plant::new(slice(&num, "num")?, slice(&den, "den")?)
+                .map_err(|e| raise(py, e))?,
+            lines: measured(&lines, path.0.ts)?,
+            above: measured(&above, path.0.ts)?,
+            path: path.0,
+            ms: Ms,
+            quiet,
+        }))
+    }
+
+    #[pyo3(signature = (starts))]
+    fn best<'py>(
+        &self,
+        py: Python<'py>,
+        starts: Vec<Vec<f64>>,
+    ) -> PyResult<(Option<f64>, Bound<'py, PyArray1<f64>>, Proposed)> {
+        let found = watched(py, None, |monitor| self.0.best(&starts, monitor))?;
+        let proposal::Proposed {
+            gains,
+            n,
+            filter_time,
+            filters,
+        } = found.proposed;
+        let gains = (gains.kp, gains.ti, gains.td, n);
+        Ok((
+            found.merit,
+            array1(py, found.x),
+            (gains, filter_time, filters),
+        ))
+    }
 }

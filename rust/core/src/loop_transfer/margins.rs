@@ -195,23 +195,7 @@ pub struct Margins {
 
 /// All margins of a loop; for an unstable one the peaks and the noise gain are infinite, the other margins NaN.
 pub fn margins(closed: &Loop<'_>) -> Margins {
-    margins_on(closed, &Curve::of(closed))
-}
-
-/// The margins, and what `|S|` passes from `level` on \[rad/s\]: that level and where it is first reached, then the height of each
-/// peak beyond and where that is first exceeded, up to 1. A search that pays for a level has no jump where a peak rises above
-/// the first one.
-pub fn margins_and_levels(closed: &Loop<'_>, level: f64) -> (Margins, Vec<(f64, f64)>) {
-    let curve = Curve::of(closed);
-    let levels = passed(closed, &curve.points, level);
-    let per_second = |(level, theta)| (level, theta / closed.path.ts);
-    (
-        margins_on(closed, &curve),
-        levels.into_iter().map(per_second).collect(),
-    )
-}
-
-fn margins_on(closed: &Loop<'_>, curve: &Curve) -> Margins {
+    let curve = &Curve::of(closed);
     let states = States::of(closed);
     let largest_pole = states.as_ref().map_or(f64::NAN, States::largest_pole);
     // NaN where there are too many states to ask
@@ -220,11 +204,7 @@ fn margins_on(closed: &Loop<'_>, curve: &Curve) -> Margins {
             largest_pole.partial_cmp(&1.0),
             Some(Ordering::Equal | Ordering::Greater)
         );
-    let noise = || {
-        states
-            .as_ref()
-            .map_or_else(|| noise_on(closed, &curve.points), States::noise_gain)
-    };
+    let noise = || noise_gain(closed, states.as_ref(), curve);
     let ts = closed.path.ts;
     let gain_crossovers = crossings(closed, &curve.points, |l| l.norm_sqr() - 1.0, |_| true);
     let phase_crossovers = phase_crossings(closed, &curve.points);
@@ -252,6 +232,37 @@ fn margins_on(closed: &Loop<'_>, curve: &Curve) -> Margins {
         phase_crossovers: per_second(&phase_crossovers),
         noise_gain: if stable { noise() } else { f64::INFINITY },
     }
+}
+
+/// What a search for bandwidth pays for; of a stable loop.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Weakening {
+    /// `max |S|`.
+    pub ms: f64,
+    /// What `|S|` passes: a level and where it is first reached \[rad/s\], then the height of each peak beyond and where that is first
+    /// exceeded, up to 1. A search that pays for a level has no jump where a peak rises above the first one.
+    pub levels: Vec<(f64, f64)>,
+    /// rms of the command over rms of white noise on the measured output; not computed where nobody asks.
+    pub noise_gain: Option<f64>,
+}
+
+/// How a loop weakens disturbances from `level` on; `None` if it is unstable.
+pub(crate) fn weakening(closed: &Loop<'_>, level: f64, noisy: bool) -> Option<Weakening> {
+    let curve = Curve::of(closed);
+    if curve.unstable != Some(0) {
+        return None;
+    }
+    let per_second = |(level, theta)| (level, theta / closed.path.ts);
+    let levels = passed(closed, &curve.points, level);
+    Some(Weakening {
+        ms: peak(closed, &curve.points, sensitivity).0,
+        levels: levels.into_iter().map(per_second).collect(),
+        noise_gain: noisy.then(|| noise_gain(closed, States::of(closed).as_ref(), &curve)),
+    })
+}
+
+fn noise_gain(closed: &Loop<'_>, states: Option<&States>, curve: &Curve) -> f64 {
+    states.map_or_else(|| noise_on(closed, &curve.points), States::noise_gain)
 }
 
 /// `max |S|`, infinite where the loop is unstable; without the other margins.

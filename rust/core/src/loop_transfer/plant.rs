@@ -169,10 +169,7 @@ impl Measured {
     /// The largest `|S|` that the circles allow, infinite where one reaches -1. That the loop is stable is taken for granted.
     pub fn peak_sensitivity(&self, path: &Path) -> f64 {
         let largest = |most: f64, (at, plant, radius): &(Place, Complex<f64>, f64)| {
-            let mut feedback = path.response(at);
-            if !self.counted {
-                feedback *= path.encoder_response(at);
-            }
+            let feedback = self.feedback(path, at);
             let distance = (feedback * plant + 1.0).norm() - feedback.norm() * radius;
             let sensitivity = if distance > 0.0 {
                 1.0 / distance
@@ -182,6 +179,22 @@ impl Measured {
             most.max(sensitivity)
         };
         self.lines.iter().fold(0.0, largest)
+    }
+
+    /// The largest `|L|`.
+    pub(crate) fn largest_gain(&self, path: &Path) -> f64 {
+        let gains = self.lines.iter();
+        gains
+            .map(|(at, plant, _)| (self.feedback(path, at) * plant).norm())
+            .fold(0.0, f64::max)
+    }
+
+    fn feedback(&self, path: &Path, at: &Place) -> Complex<f64> {
+        let feedback = path.response(at);
+        if self.counted {
+            return feedback;
+        }
+        feedback * path.encoder_response(at)
     }
 }
 

@@ -223,7 +223,12 @@ fn levels_are_passed_one_after_the_other() {
             .map(|i| size(omega * f64::from(i) / 4_000.0))
             .fold(0.0, f64::max)
     };
-    let (found, levels) = margins_and_levels(&closed, 0.5);
+    let (found, weak) = (margins(&closed), weakening(&closed, 0.5, true).unwrap());
+    assert_eq!(
+        (weak.ms, weak.noise_gain),
+        (found.ms.0, Some(found.noise_gain))
+    );
+    let levels = weak.levels;
     assert_eq!(levels[0].0, 0.5);
     assert!(levels.len() > 1, "{levels:?}");
     for pair in levels.windows(2) {

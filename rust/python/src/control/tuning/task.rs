@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use numpy::{Complex64, PyReadonlyArray1};
 use pyo3::prelude::*;
 use sewfast_control::AnyDesign;
 use sewfast_core::closed_loop::{Varied, encoder, white_noise};
@@ -14,6 +13,7 @@ use sewfast_core::{Error, Monitor, Result, loop_transfer as linear};
 
 use super::super::controller::AnyGiven;
 use super::super::{AnyPlant, Model, Values};
+use crate::loop_transfer::{Lines, measured};
 use crate::seam::{raise, slice};
 
 /// A variable by its name, with its bounds unless they are the usual ones.
@@ -139,24 +139,6 @@ impl OwnedMost {
     }
 }
 
-/// Frequencies \[rad/s\], responses and radii of a measured plant; whether its output was counted.
-type Lines<'py> = (
-    Values<'py>,
-    PyReadonlyArray1<'py, Complex64>,
-    Values<'py>,
-    bool,
-);
-
-fn measured(given: &[Lines<'_>], ts: f64) -> PyResult<Vec<linear::Measured>> {
-    let of = |(omega, response, radius, counted): &Lines<'_>| {
-        let py = omega.py();
-        let (omega, radius) = (slice(omega, "omega")?, slice(radius, "radius")?);
-        let response = response.as_slice()?;
-        linear::Measured::new(omega, response, radius, *counted, ts).map_err(|e| raise(py, e))
-    };
-    given.iter().map(of).collect()
-}
-
 /// Numerator and denominator in powers of `z^-1`.
 type Fraction<'py> = (Values<'py>, Values<'py>);
 
@@ -204,7 +186,11 @@ impl Given {
             recovery: limits.recovery.as_ref().map(OwnedMost::new),
             load: limits.load.as_ref().map(OwnedMost::new),
             loops: loops(&asked.linear_plants)?,
-            measured: measured(&asked.measured, start.ts())?,
+            measured: asked
+                .measured
+                .iter()
+                .map(|lines| measured(lines, start.ts()))
+                .collect::<PyResult<_>>()?,
         })
     }
 
