@@ -799,6 +799,21 @@ class ProposalTask:
         or of frequency and damping of one or two biquads' zeros, then of their poles.
         """
 
+def shaft_response(theta: _F, hertz: _F, *, Ts: float, counted: bool) -> NDArray[np.complex128]:
+    """Response of a machine with shafts under a held command: speed at the samples, or its mean between them.
+
+    ``theta``: logarithms of K, a1, a2, the delay [samples], then of w_r, z_r, w_a, z_a of each shaft.
+    """
+
+def shaft_fraction(theta: _F, *, Ts: float) -> tuple[_F, _F]:
+    """num, den in powers of z^-1 of the same machine's speed at the samples."""
+
+def fit_shaft(
+    start: _F, hertz: _F, value: NDArray[np.complex128], sigma: _F, *, Ts: float, counted: bool,
+    evaluations: int,
+) -> tuple[float, _F, _F]:
+    """Sum of squares, theta and covariance; infinite and NaN without a finite residual at the start."""
+
 def effort(u: _F, *, u_min: float, u_max: float) -> dict[str, float]:
     """u_rms, du_rms (change from sample to sample), saturated (share of samples at a limit)."""
 

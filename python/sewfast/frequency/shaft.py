@@ -8,8 +8,8 @@ With the electrical and mechanical lag `1 + a1 s + a2 s^2`, the motor's speed un
 The motor stands still at the antiresonance w_a, where the load oscillates on the shaft alone, and
 both oscillate against each other at the resonance w_r; the ratio of the two frequencies gives that
 of the inertias (Ellis 2012, Control System Design Guide, chapter 16). The measured quantity is not
-G but its response to a held command, as counted by the encoder; the fit computes that exactly, by
-partial fractions.
+G but its response to a held command, as counted by the encoder; the core (`rust/core/src/shaft.rs`)
+computes and fits that exactly, by partial fractions.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import _core
 from ..arrays import FloatArray
 from ..control.biquad import Biquad
 from ..errors import DataError, FitError
-from ..identification.least_squares import least_squares
 from ..models import LinearOE
 from ..tables import html_of
 from .response import Complex, FrequencyResponse
@@ -48,8 +48,8 @@ ROUNDS = 12
 """Iterations of a rational fit, each weighted by the one before."""
 DELAYS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
 """Delays tried for a start [samples]."""
-FASTEST, SLOWEST, FAST = 1e-2, 1e4, 0.3
-"""Least lag [samples], longest lag [periods of the lowest frequency], least lag of a start."""
+FAST = 0.3
+"""Least lag of a start [samples]."""
 BEGIN, FINISH = 12, 4
 """Evaluations for every start, and the number of best ones that are followed to the end."""
 LIFTED = 50.0
@@ -122,7 +122,7 @@ class ShaftFit:
 
     def at(self, hertz: Any) -> Complex:
         """The fitted response of the measured quantity, at `hertz`."""
-        f = np.atleast_1d(np.asarray(hertz, dtype=np.float64))
+        f = np.ascontiguousarray(hertz, dtype=np.float64)
         return _sampled(self._theta, f, self.response.Ts, self.response.from_counts)
 
     def to_model(self) -> LinearOE:
@@ -241,15 +241,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
     return ShaftFit(parameters, math.sqrt(cost / freedom), response, theta, beyond)
 
 
-# --- The sampled response: partial fractions ------------------------------------------------------
-
-
-def _numerator(theta: FloatArray) -> FloatArray:
-    """Numerator of G without its delay; theta: logarithms, except the delay."""
-    num: FloatArray = np.exp(theta[:1])
-    for wr, _, wa, za in _shafts(theta):
-        num = np.convolve(num, [1.0, 2.0 * za * wa, wa * wa]) * (wr / wa) ** 2
-    return num
+# --- The sampled response -------------------------------------------------------------------------
 
 
 def _shafts(theta: FloatArray) -> FloatArray:
@@ -275,60 +267,16 @@ def _mark(number: int) -> str:
     return "" if number == 1 else f"_{number}"
 
 
-def _terms(theta: FloatArray, *, counted: bool) -> tuple[int, float, Complex, Complex]:
-    """Whole samples of delay, its fraction, and poles with their residues, for the speed, or for
-    its integral if it is counted. The factors are quadratics, so their roots need no eigenvalue
-    problem.
-    """
-    a1, a2 = np.exp(theta[1:3])
-    shafts = _shafts(theta)
-    half = np.concatenate([[0.5 * a1 / a2], shafts[:, 1] * shafts[:, 0]])
-    square = np.concatenate([[1.0 / a2], shafts[:, 0] ** 2])
-    root = np.sqrt((half * half - square).astype(np.complex128))
-    # the smaller of two real poles comes from their product, as the difference would lose digits
-    large = -(half + np.where(root.real < 0.0, -root, root))
-    poles = np.concatenate([large, square / large, [0.0] if counted else []])
-    apart = poles[:, None] - poles
-    np.fill_diagonal(apart, 1.0)
-    residues = np.polyval(_numerator(theta), poles) / (a2 * apart.prod(axis=1))
-    delay = max(float(theta[3]), 0.0)
-    whole = math.floor(delay)
-    return whole, delay - whole, poles, residues
-
-
-def _held(p: Complex, part: float, Ts: float) -> tuple[Complex, Complex]:
-    """Contributions of this and the previous command to the poles' states at the sample's end."""
-    still = p == 0.0  # the limit of an integrator
-    per = np.where(still, 1.0, p)
-    now, whole = np.exp(p * (1.0 - part) * Ts), np.exp(p * Ts)
-    return (
-        np.where(still, (1.0 - part) * Ts, (now - 1.0) / per),
-        np.where(still, part * Ts, (whole - now) / per),
-    )
-
-
 def _sampled(theta: FloatArray, hertz: FloatArray, Ts: float, counted: bool) -> Complex:
     """Response of the measured quantity: speed at the samples, or its mean between them."""
-    whole, part, poles, residues = _terms(theta, counted=counted)
-    step = np.exp(-2j * np.pi * hertz * Ts)
-    now, before = _held(poles, part, Ts)
-    made = np.outer(residues * before, step) + (residues * now)[:, None]
-    total: Complex = (made / (1.0 - np.outer(np.exp(poles * Ts), step))).sum(axis=0)
-    total *= step ** (whole + 1)
-    return total * (1.0 - step) / Ts if counted else total
+    found: Complex = _core.shaft_response(theta, hertz, Ts=Ts, counted=counted)
+    return found
 
 
 def sampled_model(theta: FloatArray, Ts: float, u_unit: str, y_unit: str) -> LinearOE:
     """G under a held command, at the samples; theta: logarithms, except the delay in samples."""
-    whole, part, continuous, residues = _terms(theta, counted=False)
-    poles = np.exp(continuous * Ts)
-    num: Any = np.zeros(len(poles) + 2, dtype=np.complex128)
-    for j, held in enumerate(zip(*_held(continuous, part, Ts), strict=True)):
-        others = np.poly(np.delete(poles, j))
-        num[1:] += residues[j] * np.convolve(held, np.atleast_1d(others))
-    den = np.atleast_1d(np.poly(poles)).real
-    delayed = np.concatenate([np.zeros(whole), num.real])
-    return LinearOE.from_tf(delayed, den, Ts, input_units=(u_unit,), output_unit=y_unit)  # type: ignore[no-any-return]
+    num, den = _core.shaft_fraction(theta, Ts=Ts)
+    return LinearOE.from_tf(num, den, Ts, input_units=(u_unit,), output_unit=y_unit)  # type: ignore[no-any-return]
 
 
 # --- The search -----------------------------------------------------------------------------------
@@ -341,11 +289,6 @@ class _Task:
     sigma: FloatArray
     Ts: float
     counted: bool
-
-    def residuals(self, theta: FloatArray) -> FloatArray:
-        with np.errstate(all="ignore"):
-            error = (_sampled(theta, self.hertz, self.Ts, self.counted) - self.value) / self.sigma
-        return np.concatenate([error.real, error.imag])
 
 
 def _task_of(response: FrequencyResponse) -> tuple[_Task, float]:
@@ -389,24 +332,11 @@ def _smoothed(variance: FloatArray) -> FloatArray:
 def _solved(
     task: _Task, start: FloatArray, evaluations: int = 200
 ) -> tuple[float, FloatArray, FloatArray]:
-    low, high = np.full(len(start), -40.0), np.full(len(start), 40.0)
-    low[3], high[3] = 0.0, 50.0
-    # a lag far below a sample, or far above all measured periods, has no effect on the residuals: a
-    # search that gets there stays there
-    low[1:3] = np.array([1.0, 2.0]) * math.log(FASTEST * task.Ts)
-    slowest = max(SLOWEST / task.hertz[0], task.Ts)
-    high[1:3] = np.array([1.0, 2.0]) * math.log(slowest)
-    begin = np.clip(start, low, high)
-    try:
-        found = least_squares(
-            task.residuals, begin, "3-point", bounds=(low, high), max_nfev=evaluations
-        )  # fmt: skip
-    except DataError:  # no finite residual at the start
-        return math.inf, start, np.zeros((len(start), len(start)))
-    covariance = found.covariance
-    if covariance is None:
-        covariance = np.full((len(start), len(start)), math.nan)
-    return 2.0 * found.cost, *_in_order(found.x, covariance)
+    cost, theta, covariance = _core.fit_shaft(
+        start, task.hertz, task.value, task.sigma, Ts=task.Ts, counted=task.counted,
+        evaluations=evaluations,
+    )  # fmt: skip
+    return cost, *_in_order(theta, covariance)
 
 
 def _rigid_starts(task: _Task) -> list[FloatArray]:

@@ -38,6 +38,7 @@ pub mod proposal;
 pub mod random;
 pub mod rules;
 pub mod search;
+pub mod shaft;
 pub mod signals;
 pub mod simd;
 mod simplex;

@@ -3,6 +3,7 @@
 mod causes;
 mod control;
 mod device;
+mod frequency;
 mod greybox;
 mod guard;
 mod host_loop;
@@ -28,6 +29,7 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     greybox::register(module)?;
     control::register(module)?;
     loop_transfer::register(module)?;
+    frequency::register(module)?;
     link::register(module)?;
     causes::register(module)?;
     guard::register(module)?;

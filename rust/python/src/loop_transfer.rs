@@ -6,16 +6,14 @@ use pyo3::types::PyDict;
 use sewfast_control::Standard;
 use sewfast_core::Result;
 use sewfast_core::loop_transfer::{self, Change, Changing, Loop, Path, Plant};
-use sewfast_core::proposal::{self, Task};
 
 use crate::control::controller::{Section, cascade};
-use crate::seam::{array1, raise, slice, watched};
+use crate::seam::{array1, raise, slice};
 
 type Values<'py> = PyReadonlyArray1<'py, f64>;
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<LoopPath>()?;
-    module.add_class::<ProposalTask>()?;
     module.add_function(wrap_pyfunction!(sampled_fopdt, module)?)?;
     module.add_function(wrap_pyfunction!(loop_response, module)?)?;
     module.add_function(wrap_pyfunction!(margins, module)?)?;
@@ -24,7 +22,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
 
 /// The feedback path of a controller: what of it lies in the loop. Gains in standard form.
 #[pyclass(module = "sewfast._core", frozen)]
-pub struct LoopPath(Path);
+pub struct LoopPath(pub Path);
 
 #[pymethods]
 impl LoopPath {
@@ -178,60 +176,4 @@ fn tolerance(
     let (robust, worst) = found.map_err(|e| raise(py, e))?;
     let changed = |(most, Change { gain, delay, pitch })| (most, gain, delay, pitch);
     Ok((robust, worst.map(changed)))
-}
-
-/// Gains in standard form with `N`, the lag \[s\], and the numbers of each filter.
-type Proposed = ((f64, f64, f64, f64), f64, Vec<Vec<f64>>);
-
-/// A machine from a frequency response, and what a controller of it has to keep.
-#[pyclass(module = "sewfast._core", frozen)]
-pub struct ProposalTask(Task);
-
-#[pymethods]
-impl ProposalTask {
-    #[new]
-    #[pyo3(signature = (path, num, den, *, lines, above, Ms, quiet))]
-    #[expect(non_snake_case, reason = "the field's names")]
-    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-    fn new(
-        py: Python<'_>,
-        path: &LoopPath,
-        num: Values<'_>,
-        den: Values<'_>,
-        lines: Lines<'_>,
-        above: Lines<'_>,
-        Ms: f64,
-        quiet: f64,
-    ) -> PyResult<Self> {
-        Ok(Self(Task {
-            plant: Plant::new(slice(&num, "num")?, slice(&den, "den")?)
-                .map_err(|e| raise(py, e))?,
-            lines: measured(&lines, path.0.ts)?,
-            above: measured(&above, path.0.ts)?,
-            path: path.0,
-            ms: Ms,
-            quiet,
-        }))
-    }
-
-    #[pyo3(signature = (starts))]
-    fn best<'py>(
-        &self,
-        py: Python<'py>,
-        starts: Vec<Vec<f64>>,
-    ) -> PyResult<(Option<f64>, Bound<'py, PyArray1<f64>>, Proposed)> {
-        let found = watched(py, None, |monitor| self.0.best(&starts, monitor))?;
-        let proposal::Proposed {
-            gains,
-            n,
-            filter_time,
-            filters,
-        } = found.proposed;
-        let gains = (gains.kp, gains.ti, gains.td, n);
-        Ok((
-            found.merit,
-            array1(py, found.x),
-            (gains, filter_time, filters),
-        ))
-    }
 }

@@ -1,0 +1,137 @@
+//! Bindings of what is made from a measured frequency response: a machine with shafts, and the search for gains and filters.
+
+use numpy::{Complex64, PyArray1, PyArray2, PyReadonlyArray1};
+use pyo3::prelude::*;
+use sewfast_core::loop_transfer::Plant;
+use sewfast_core::proposal::{self, Task};
+use sewfast_core::shaft;
+
+use crate::loop_transfer::{Lines, LoopPath, measured};
+use crate::seam::{array1, array2, raise, slice, watched};
+
+type Values<'py> = PyReadonlyArray1<'py, f64>;
+
+pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<ProposalTask>()?;
+    module.add_function(wrap_pyfunction!(shaft_response, module)?)?;
+    module.add_function(wrap_pyfunction!(shaft_fraction, module)?)?;
+    module.add_function(wrap_pyfunction!(fit_shaft, module)?)
+}
+
+#[pyfunction]
+#[pyo3(signature = (theta, hertz, *, Ts, counted))]
+#[expect(non_snake_case, reason = "the field's names")]
+fn shaft_response<'py>(
+    py: Python<'py>,
+    theta: Values<'py>,
+    hertz: Values<'py>,
+    Ts: f64,
+    counted: bool,
+) -> PyResult<Bound<'py, PyArray1<Complex64>>> {
+    let (theta, hertz) = (slice(&theta, "theta")?, slice(&hertz, "hertz")?);
+    let found = shaft::response(theta, hertz, Ts, counted).map_err(|e| raise(py, e))?;
+    Ok(PyArray1::from_vec(py, found))
+}
+
+/// Numerator and denominator in powers of z^-1.
+type Fraction<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>);
+
+#[pyfunction]
+#[pyo3(signature = (theta, *, Ts))]
+#[expect(non_snake_case, reason = "the field's names")]
+fn shaft_fraction<'py>(py: Python<'py>, theta: Values<'py>, Ts: f64) -> PyResult<Fraction<'py>> {
+    let (num, den) = shaft::fraction(slice(&theta, "theta")?, Ts).map_err(|e| raise(py, e))?;
+    Ok((array1(py, num), array1(py, den)))
+}
+
+/// Sum of squares, parameters, covariance.
+type Fitted<'py> = (f64, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
+
+#[pyfunction]
+#[pyo3(signature = (start, hertz, value, sigma, *, Ts, counted, evaluations))]
+#[expect(non_snake_case, reason = "the field's names")]
+#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+fn fit_shaft<'py>(
+    py: Python<'py>,
+    start: Values<'py>,
+    hertz: Values<'py>,
+    value: PyReadonlyArray1<'py, Complex64>,
+    sigma: Values<'py>,
+    Ts: f64,
+    counted: bool,
+    evaluations: usize,
+) -> PyResult<Fitted<'py>> {
+    let start = slice(&start, "start")?;
+    let lines = shaft::Lines {
+        hertz: slice(&hertz, "hertz")?,
+        value: value.as_slice()?,
+        sigma: slice(&sigma, "sigma")?,
+        ts: Ts,
+        counted,
+    };
+    let found = watched(py, None, |monitor| {
+        shaft::fit(lines, start, evaluations, monitor)
+    })?;
+    let n = found.theta.len();
+    Ok((
+        2.0 * found.cost,
+        array1(py, found.theta),
+        array2(py, found.covariance, n)?,
+    ))
+}
+
+/// Gains in standard form with `N`, the lag \[s\], and the numbers of each filter.
+type Proposed = ((f64, f64, f64, f64), f64, Vec<Vec<f64>>);
+
+/// A machine from a frequency response, and what a controller of it has to keep.
+#[pyclass(module = "sewfast._core", frozen)]
+pub struct ProposalTask(Task);
+
+#[pymethods]
+impl ProposalTask {
+    #[new]
+    #[pyo3(signature = (path, num, den, *, lines, above, Ms, quiet))]
+    #[expect(non_snake_case, reason = "the field's names")]
+    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+    fn new(
+        py: Python<'_>,
+        path: &LoopPath,
+        num: Values<'_>,
+        den: Values<'_>,
+        lines: Lines<'_>,
+        above: Lines<'_>,
+        Ms: f64,
+        quiet: f64,
+    ) -> PyResult<Self> {
+        Ok(Self(Task {
+            plant: Plant::new(slice(&num, "num")?, slice(&den, "den")?)
+                .map_err(|e| raise(py, e))?,
+            lines: measured(&lines, path.0.ts)?,
+            above: measured(&above, path.0.ts)?,
+            path: path.0,
+            ms: Ms,
+            quiet,
+        }))
+    }
+
+    #[pyo3(signature = (starts))]
+    fn best<'py>(
+        &self,
+        py: Python<'py>,
+        starts: Vec<Vec<f64>>,
+    ) -> PyResult<(Option<f64>, Bound<'py, PyArray1<f64>>, Proposed)> {
+        let found = watched(py, None, |monitor| self.0.best(&starts, monitor))?;
+        let proposal::Proposed {
+            gains,
+            n,
+            filter_time,
+            filters,
+        } = found.proposed;
+        let gains = (gains.kp, gains.ti, gains.td, n);
+        Ok((
+            found.merit,
+            array1(py, found.x),
+            (gains, filter_time, filters),
+        ))
+    }
+}
