@@ -809,10 +809,14 @@ def shaft_fraction(theta: _F, *, Ts: float) -> tuple[_F, _F]:
     """num, den in powers of z^-1 of the same machine's speed at the samples."""
 
 def fit_shaft(
-    start: _F, hertz: _F, value: NDArray[np.complex128], sigma: _F, *, Ts: float, counted: bool,
-    evaluations: int,
-) -> tuple[float, _F, _F]:
-    """Sum of squares, theta and covariance; infinite and NaN without a finite residual at the start."""
+    hertz: _F, value: NDArray[np.complex128], sigma: _F, *, Ts: float, counted: bool,
+    resonance: bool | None,
+) -> tuple[float, _F, _F, float | None]:
+    """Sum of squares, theta, covariance, and the frequency of a resonance above the lines [Hz].
+
+    ``sigma``: standard deviation of real and imaginary part. ``resonance``: whether there is a shaft; None: if it
+    explains clearly more. The sum of squares is infinite if nothing converges.
+    """
 
 def effort(u: _F, *, u_min: float, u_max: float) -> dict[str, float]:
     """u_rms, du_rms (change from sample to sample), saturated (share of samples at a limit)."""

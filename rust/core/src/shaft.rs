@@ -18,6 +18,7 @@
 //! with `q = 1/z` and a delay of `whole + part` samples. Derivatives are exact: poles and residues are computed with theirs ([`Dual`]).
 
 mod dual;
+mod search;
 
 use nalgebra::Complex;
 
@@ -25,6 +26,8 @@ use crate::least_squares::{Residuals, Settings, Solution, solve};
 use crate::linear::polynomial;
 use crate::{Error, Monitor, Result};
 use dual::Dual;
+
+pub use search::{Fitted, search};
 
 /// Parameters of a rigid machine, and of each shaft.
 const RIGID: usize = 4;
@@ -283,12 +286,7 @@ impl Residuals for Fit<'_> {
 ///
 /// # Errors
 /// `ErrorKind::Setting` for numbers of parameters or lines that do not fit, or a start that is not finite; `ErrorKind::Fit` on a stop.
-pub fn fit(
-    lines: Lines<'_>,
-    start: &[f64],
-    evaluations: usize,
-    monitor: &Monitor,
-) -> Result<Solution> {
+fn fit(lines: Lines<'_>, start: &[f64], evaluations: usize, monitor: &Monitor) -> Result<Solution> {
     check(start, lines.ts)?;
     let count = lines.hertz.len();
     let positive = |v: &[f64]| v.iter().all(|x| *x > 0.0 && x.is_finite());

@@ -44,24 +44,26 @@ fn shaft_fraction<'py>(py: Python<'py>, theta: Values<'py>, Ts: f64) -> PyResult
     Ok((array1(py, num), array1(py, den)))
 }
 
-/// Sum of squares, parameters, covariance.
-type Fitted<'py> = (f64, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
+/// Sum of squares, parameters, covariance; frequency of a resonance above the lines.
+type Fitted<'py> = (
+    f64,
+    Bound<'py, PyArray1<f64>>,
+    Bound<'py, PyArray2<f64>>,
+    Option<f64>,
+);
 
 #[pyfunction]
-#[pyo3(signature = (start, hertz, value, sigma, *, Ts, counted, evaluations))]
+#[pyo3(signature = (hertz, value, sigma, *, Ts, counted, resonance))]
 #[expect(non_snake_case, reason = "the field's names")]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
 fn fit_shaft<'py>(
     py: Python<'py>,
-    start: Values<'py>,
     hertz: Values<'py>,
     value: PyReadonlyArray1<'py, Complex64>,
     sigma: Values<'py>,
     Ts: f64,
     counted: bool,
-    evaluations: usize,
+    resonance: Option<bool>,
 ) -> PyResult<Fitted<'py>> {
-    let start = slice(&start, "start")?;
     let lines = shaft::Lines {
         hertz: slice(&hertz, "hertz")?,
         value: value.as_slice()?,
@@ -69,14 +71,13 @@ fn fit_shaft<'py>(
         ts: Ts,
         counted,
     };
-    let found = watched(py, None, |monitor| {
-        shaft::fit(lines, start, evaluations, monitor)
-    })?;
+    let (found, beyond) = watched(py, None, |monitor| shaft::search(lines, resonance, monitor))?;
     let n = found.theta.len();
     Ok((
-        2.0 * found.cost,
+        found.cost,
         array1(py, found.theta),
         array2(py, found.covariance, n)?,
+        beyond,
     ))
 }
 

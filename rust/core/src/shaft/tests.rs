@@ -110,6 +110,48 @@ fn what_is_no_machine_is_refused() {
     assert!(fit(lines(&[1.0], &[1.0]), &motor(0.0), 10, &stopped).is_err());
 }
 
+/// What a search finds in an exact response whose lines are known to .5 %.
+fn found(theta: &[f64], resonance: Option<bool>) -> (Fitted, Option<f64>) {
+    let hertz: Vec<f64> = (1..=150).map(|k| 2.0 * f64::from(k)).collect();
+    let value = response(theta, &hertz, TS, true).unwrap();
+    let sigma: Vec<f64> = value.iter().map(|v| 0.005 * v.norm()).collect();
+    let lines = Lines {
+        hertz: &hertz,
+        value: &value,
+        sigma: &sigma,
+        ts: TS,
+        counted: true,
+    };
+    search(lines, resonance, &Monitor::default()).unwrap()
+}
+
+#[test]
+fn the_search_finds_as_many_shafts_as_there_are() {
+    let rigid = motor(1.3);
+    let one = [motor(1.3), shaft(60.0, 45.0).to_vec()].concat();
+    let two = [one.clone(), shaft(150.0, 110.0).to_vec()].concat();
+    for theta in [rigid, one.clone(), two] {
+        let (machine, beyond) = found(&theta, None);
+        assert_eq!((machine.theta.len(), beyond), (theta.len(), None));
+        for (x, exact) in machine.theta.iter().zip(&theta) {
+            assert!((x - exact).abs() < 1e-3, "{:?} {theta:?}", machine.theta);
+        }
+    }
+    // in any order of the shafts, and without any where none is asked for
+    let swapped = [motor(1.3), shaft(150.0, 110.0).to_vec(), one[4..].to_vec()].concat();
+    let machine = found(&swapped, None).0;
+    assert!((machine.theta[4] - one[4]).abs() < 1e-3);
+    assert_eq!(found(&one, Some(false)).0.theta.len(), 4);
+}
+
+#[test]
+fn a_resonance_above_the_lines_is_seen_by_its_flank() {
+    let theta = [motor(1.3), shaft(380.0, 260.0).to_vec()].concat();
+    let (machine, beyond) = found(&theta, None);
+    assert_eq!(machine.theta.len(), 4);
+    assert!((beyond.unwrap() / 380.0 - 1.0).abs() < 0.1, "{beyond:?}");
+}
+
 proptest! {
     #[test]
     fn derivatives_are_those_of_differences(
