@@ -206,6 +206,11 @@ pub(crate) fn poles(a: &[f64]) -> Vec<Complex<f64>> {
 
 /// Coefficients `a` of the polynomial with these roots, which come in conjugate pairs.
 pub(crate) fn polynomial(roots: &[Complex<f64>]) -> Vec<f64> {
+    monic(roots).iter().skip(1).map(|c| c.re).collect()
+}
+
+/// All coefficients of the polynomial with these roots; the first is 1.
+pub(crate) fn monic(roots: &[Complex<f64>]) -> Vec<Complex<f64>> {
     let mut coefficients = vec![Complex::new(1.0, 0.0)];
     for root in roots {
         coefficients.push(Complex::new(0.0, 0.0));
@@ -214,7 +219,7 @@ pub(crate) fn polynomial(roots: &[Complex<f64>]) -> Vec<f64> {
             coefficients[i] -= root * lower;
         }
     }
-    coefficients[1..].iter().map(|c| c.re).collect()
+    coefficients
 }
 
 /// The denominator with every root inside the unit circle: those outside are mirrored at it.

@@ -23,7 +23,7 @@ mod search;
 use nalgebra::Complex;
 
 use crate::least_squares::{Residuals, Settings, Solution, solve};
-use crate::linear::polynomial;
+use crate::linear::{monic, polynomial};
 use crate::{Error, Monitor, Result};
 use dual::Dual;
 
@@ -193,15 +193,8 @@ pub fn fraction(theta: &[f64], ts: f64) -> Result<(Vec<f64>, Vec<f64>)> {
     let decays: Vec<_> = machine.modes.iter().map(|m| m.decay.value).collect();
     let mut num = vec![Complex::new(0.0, 0.0); decays.len() + 2];
     for (k, mode) in machine.modes.iter().enumerate() {
-        let mut others = vec![Complex::new(1.0, 0.0)];
-        for (_, &decay) in decays.iter().enumerate().filter(|&(i, _)| i != k) {
-            others.push(Complex::new(0.0, 0.0));
-            for i in (1..others.len()).rev() {
-                let lower = others[i - 1];
-                others[i] -= decay * lower;
-            }
-        }
-        for (i, c) in others.into_iter().enumerate() {
+        let others = [&decays[..k], &decays[k + 1..]].concat();
+        for (i, c) in monic(&others).into_iter().enumerate() {
             num[i + 1] += c * mode.now.value;
             num[i + 2] += c * mode.before.value;
         }
