@@ -158,7 +158,8 @@ fn product(a: &[Dual], b: &[Dual]) -> Vec<Dual> {
 fn check(theta: &[f64], ts: f64) -> Result<()> {
     let shaped =
         theta.len() >= RIGID && theta.len() <= MOST && (theta.len() - RIGID).is_multiple_of(SHAFT);
-    if !shaped || !(ts > 0.0 && ts.is_finite()) || !(theta[3] <= f64::from(u16::MAX)) {
+    let soon = |delay: f64| delay <= f64::from(u16::MAX);
+    if !(shaped && ts > 0.0 && ts.is_finite() && soon(theta[3])) {
         return Err(Error::setting(format!(
             "expected 4, 8 or 12 parameters of a machine and a sample time above 0 s, got {} and {ts} s",
             theta.len()
@@ -222,6 +223,22 @@ pub struct Lines<'a> {
     pub counted: bool,
 }
 
+impl Lines<'_> {
+    fn check(&self) -> Result<()> {
+        let count = self.hertz.len();
+        let positive = |v: &[f64]| v.iter().all(|x| *x > 0.0 && x.is_finite());
+        let whole = count > 0 && self.value.len() == count && self.sigma.len() == count;
+        if !whole || !positive(self.hertz) || !positive(self.sigma) {
+            return Err(Error::setting(format!(
+                "expected a response and a standard deviation above 0 at each of {count} frequencies above 0 Hz, got {} and {}",
+                self.value.len(),
+                self.sigma.len()
+            )));
+        }
+        Ok(())
+    }
+}
+
 struct Fit<'a> {
     lines: Lines<'a>,
     back: Vec<Complex<f64>>,
@@ -278,22 +295,9 @@ impl Residuals for Fit<'_> {
 /// The parameters that fit the lines best, from a start and after at most so many evaluations.
 ///
 /// # Errors
-/// `ErrorKind::Setting` for numbers of parameters or lines that do not fit, or a start that is not finite; `ErrorKind::Fit` on a stop.
+/// `ErrorKind::Setting` for another number of parameters or a start that is not finite; `ErrorKind::Fit` on a stop.
 fn fit(lines: Lines<'_>, start: &[f64], evaluations: usize, monitor: &Monitor) -> Result<Solution> {
     check(start, lines.ts)?;
-    let count = lines.hertz.len();
-    let positive = |v: &[f64]| v.iter().all(|x| *x > 0.0 && x.is_finite());
-    if lines.value.len() != count
-        || lines.sigma.len() != count
-        || !positive(lines.hertz)
-        || !positive(lines.sigma)
-    {
-        return Err(Error::setting(format!(
-            "expected a response and a standard deviation above 0 at each of {count} frequencies above 0 Hz, got {} and {}",
-            lines.value.len(),
-            lines.sigma.len()
-        )));
-    }
     let n = start.len();
     let (mut lower, mut upper) = (vec![-LARGEST; n], vec![LARGEST; n]);
     (lower[3], upper[3]) = (0.0, LATEST);

@@ -58,12 +58,14 @@ pub struct Fitted {
 /// `resonance`: whether there is a shaft; none: it is accepted if it explains clearly more. A second shaft has to satisfy the same.
 ///
 /// # Errors
-/// As [`fit`].
+/// `ErrorKind::Setting` for no lines, other numbers of values or deviations, or a frequency or deviation that is not above 0;
+/// `ErrorKind::Fit` on a stop.
 pub fn search(
     lines: Lines<'_>,
     resonance: Option<bool>,
     monitor: &Monitor,
 ) -> Result<(Fitted, Option<f64>)> {
+    lines.check()?;
     let search = Search { lines, monitor };
     let starts = search.rigid_starts();
     let rigid = starts.iter().map(|x| search.solved(x, TO_THE_END));

@@ -99,15 +99,18 @@ fn what_is_no_machine_is_refused() {
     };
     for (hertz, sigma) in [
         (&[1.0, 2.0][..], &[1.0][..]),
+        (&[], &[]),
         (&[-1.0], &[1.0]),
         (&[1.0], &[0.0]),
     ] {
-        let found = fit(lines(hertz, sigma), &motor(0.0), 10, &Monitor::default());
-        assert!(found.is_err());
+        assert!(search(lines(hertz, sigma), None, &Monitor::default()).is_err());
     }
+    // one line is no machine, and no panic
+    let (machine, beyond) = search(lines(&[1.0], &[1.0]), None, &Monitor::default()).unwrap();
+    assert_eq!((machine.theta.len(), beyond), (4, None));
     let stopped = Monitor::default();
     stopped.request_stop();
-    assert!(fit(lines(&[1.0], &[1.0]), &motor(0.0), 10, &stopped).is_err());
+    assert!(search(lines(&[1.0], &[1.0]), None, &stopped).is_err());
 }
 
 /// What a search finds in an exact response whose lines are known to .5 %.
