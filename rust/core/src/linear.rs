@@ -191,17 +191,18 @@ impl Lagged for LinearModel {
 /// Roots of `z^n + a_1 z^(n-1) + .. + a_n`, the eigenvalues of its companion matrix; NaN where they overflow.
 pub(crate) fn poles(a: &[f64]) -> Vec<Complex<f64>> {
     let n = a.len();
+    if n == 0 {
+        return Vec::new();
+    }
     let companion = DMatrix::from_fn(n, n, |row, column| match (row, column) {
         (0, j) => -a[j],
         (i, j) => f64::from(u8::from(i == j + 1)),
     });
     // without a limit the QR iteration never ends on coefficients whose squares overflow
-    companion
-        .try_schur(f64::EPSILON, 200 * n.max(1))
-        .map_or_else(
-            || vec![Complex::new(f64::NAN, f64::NAN); n],
-            |schur| schur.complex_eigenvalues().iter().copied().collect(),
-        )
+    companion.try_schur(f64::EPSILON, 200 * n).map_or_else(
+        || vec![Complex::new(f64::NAN, f64::NAN); n],
+        |schur| schur.complex_eigenvalues().iter().copied().collect(),
+    )
 }
 
 /// Coefficients `a` of the polynomial with these roots, which come in conjugate pairs.
