@@ -120,16 +120,17 @@ impl Search<'_> {
         response(theta, hertz, ts, counted)
     }
 
-    /// Sum of squares per degree of freedom.
-    fn usual(&self, cost: f64, parameters: usize) -> f64 {
-        cost / (2 * self.lines.hertz.len())
-            .saturating_sub(parameters)
-            .max(1) as f64
+    /// Sum of squares per degree of freedom; infinite where none is left, as such a fit says nothing about errors.
+    fn usual(&self, fitted: &Fitted) -> f64 {
+        match (2 * self.lines.hertz.len()).saturating_sub(fitted.theta.len()) {
+            0 => f64::INFINITY,
+            free => fitted.cost / free as f64,
+        }
     }
 
     /// Whether the shaft explains clearly more, relative to its own remaining error.
     fn is_better(&self, shaft: &Fitted, rigid: &Fitted) -> bool {
-        rigid.cost - shaft.cost > CLEAR * self.usual(shaft.cost, RIGID + SHAFT)
+        rigid.cost - shaft.cost > CLEAR * self.usual(shaft)
     }
 
     /// Starts with a corner where the gain has fallen to .7, and lags beyond it.
@@ -166,7 +167,7 @@ impl Search<'_> {
             return Ok(starts);
         };
         let model = self.at_lines(&shaft.theta)?;
-        let usual = self.usual(shaft.cost, shaft.theta.len()).max(1e-300);
+        let usual = self.usual(shaft).max(1e-300);
         let Lines { value, sigma, .. } = self.lines;
         let off: Vec<f64> = (0..value.len())
             .map(|k| ((value[k] - model[k]) / sigma[k]).norm_sqr() / usual)
