@@ -1,4 +1,4 @@
-//! A controller and a plant in closed loop, with encoder, feedback filter and limits inside the loop.
+//! A controller and a plant in closed loop, with encoder, feedback filter and limits. Begin reading at `Run::through`.
 
 pub(crate) mod batch;
 mod kernel_plant;
@@ -16,7 +16,7 @@ use crate::{Error, Monitor, Result};
 use batch::{Controllers, InLanes, LaneController};
 use kernel_plant::{AnyOrder, ScalarPlant, SecondOrder};
 
-/// What a controller can be closed around: one input, one output, stepped sample by sample.
+/// A plant that a controller can be closed around: one input, one output, stepped sample by sample.
 pub trait Plant {
     /// Back to rest; position back to zero.
     fn reset(&mut self);
@@ -26,11 +26,11 @@ pub trait Plant {
     fn position(&self) -> f64;
     /// Holds `u` for one sample time.
     fn advance(&mut self, u: f64);
-    /// The encoder that the plant brings along; `None` where it has none.
+    /// The encoder that the plant brings along; `None` if it has none.
     fn encoder(&self) -> Option<&Encoder> {
         None
     }
-    /// The plant as kernels know it; `None` for one that only steps itself.
+    /// The plant as kernels know it; `None` if it can only step itself.
     fn known(&self) -> Option<KernelPlant<'_>> {
         None
     }
@@ -53,13 +53,13 @@ pub fn encoder(counts_per_unit: f64, phase: f64) -> Result<Option<Encoder>> {
     Ok((counts_per_unit > 0.0).then(|| Encoder::new(counts_per_unit, phase)))
 }
 
-/// The counter of the plant's encoder, or else of the loop's, a time `since` from now at the present output; `None`
+/// Counts of the plant's encoder, else of the loop's, extrapolated by the time `since` at the present output; `None`
 /// without an encoder.
 #[inline(always)]
 fn counts(plant: &(impl Plant + ?Sized), encoder: Option<&Encoder>, since: f64) -> Option<f64> {
     let encoder = plant.encoder().or(encoder)?;
-    // -Ts before the first sample: the counter is taken to have run at this output until now, so that the first difference
-    // is its speed and not 0.
+    // With `since` = -Ts, before the first sample: the counter is assumed to have run at this output until now. The
+    // first difference then gives the output's speed, not 0.
     let position = plant.position() + since * plant.output();
     Some(encoder.count(position))
 }
@@ -67,13 +67,13 @@ fn counts(plant: &(impl Plant + ?Sized), encoder: Option<&Encoder>, since: f64) 
 /// Reference, feedforward, disturbance and measurement noise of a run, sample by sample.
 #[derive(Clone, Copy, Debug)]
 pub struct Signals<'a> {
-    /// What the output shall be \[y\].
+    /// The output that is asked for \[y\].
     pub reference: &'a [f64],
-    /// A command that is added before the limits \[u\].
+    /// A command added before the limits \[u\].
     pub feedforward: Option<&'a [f64]>,
-    /// A command that is added behind the limits, unseen by the controller \[u\].
+    /// A command added after the limits, unseen by the controller \[u\].
     pub disturbance: Option<&'a [f64]>,
-    /// Added to what is measured, and so not part of the true output \[y\].
+    /// Added to the measurement, so not part of the true output \[y\].
     pub noise: Option<&'a [f64]>,
 }
 
@@ -111,32 +111,32 @@ impl<'a> Signals<'a> {
         Ok(())
     }
 
-    /// The command that is added at sample `k` before the limits.
+    /// The command added at sample `k` before the limits.
     #[inline(always)]
     fn feedforward_at(&self, k: usize) -> Option<f64> {
         self.feedforward.map(|added| at(added, k))
     }
 
-    /// The command that is added at sample `k` behind the limits.
+    /// The command added at sample `k` after the limits.
     #[inline(always)]
     fn disturbance_at(&self, k: usize) -> Option<f64> {
         self.disturbance.map(|added| at(added, k))
     }
 
-    /// What is added to the measurement of sample `k`.
+    /// The noise added to the measurement of sample `k`.
     #[inline(always)]
     fn noise_at(&self, k: usize) -> Option<f64> {
         self.noise.map(|added| at(added, k))
     }
 }
 
-/// White noise of a standard deviation, the same for a seed on every platform.
+/// White noise of a given standard deviation; a seed gives the same numbers on every platform.
 pub fn white_noise(deviation: f64, samples: usize, seed: u64) -> Vec<f64> {
     let mut random = Random::stream(seed, NOISE);
     (0..samples).map(|_| deviation * random.normal()).collect()
 }
 
-/// The stream of a seed from which noise is drawn: it is independent of the search's own numbers.
+/// The stream from which noise is drawn: independent of the random numbers of the search.
 const NOISE: u64 = 0x6e6f_6973_6531;
 
 #[inline(always)]
@@ -162,7 +162,7 @@ pub enum Outcome {
     /// The whole reference was run.
     #[default]
     Completed,
-    /// The output left the finite numbers, or all bounds, at this sample; the record ends before it.
+    /// The output was not finite, or beyond all bounds, at this sample; the record ends before it.
     Diverged(usize),
     /// A stop was requested; the record ends before this sample.
     Interrupted(usize),
@@ -171,10 +171,10 @@ pub enum Outcome {
 /// No drive's output is that large in any unit.
 // Not infinity: a loop that grows by 10 % a sample takes 7,000 samples to get there, and its squares overflow half way.
 const RUNAWAY: f64 = 1e15;
-/// Samples between two looks at a stop request, a few milliseconds of work.
+/// Samples between two checks for a stop request: a few milliseconds of work.
 const WATCHED: usize = 2048;
 
-/// The record of a run; entry `k` is what was measured and decided at sample `k`.
+/// The record of a run; entry `k` is the sample `k`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Run {
     /// Command after the limits.
@@ -199,11 +199,10 @@ impl Run {
         }
     }
 
-    /// Runs the loop from rest over `reference` into this record, whose memory is used again.
+    /// Runs the loop from rest over `reference` into this record and reuses its memory.
     ///
-    /// The output is measured by the plant's encoder, else by `encoder`, else ideally. Where kernels know the plant, it and the
-    /// controller stay as they were.
-    /// Order at a sample: measure, filter, control, limit, apply.
+    /// The output is measured by the plant's encoder, else by `encoder`, else ideally. If kernels know the plant,
+    /// `plant` and `controller` stay unchanged. Order within a sample: measure, filter, control, limit, apply.
     pub fn record(
         &mut self,
         plant: &mut (impl Plant + ?Sized),
@@ -216,7 +215,7 @@ impl Run {
         self.record_with(plant, controller, signals, encoder, monitor);
     }
 
-    /// [`record`](Self::record) with signals from outside beside the reference; where they are shorter, 0 stands for the rest.
+    /// [`record`](Self::record) with further signals beside the reference; a shorter signal continues with 0.
     pub fn record_with(
         &mut self,
         plant: &mut (impl Plant + ?Sized),
@@ -226,8 +225,8 @@ impl Run {
         monitor: &Monitor,
     ) {
         match plant.known() {
-            // The whole loop inside one kernel: controller, encoder and plant are compiled for one processor, with no
-            // call from sample to sample.
+            // The whole loop in one kernel: controller, encoder and plant are compiled for one processor, with no call
+            // per sample.
             Some(known) => simd::run(ScalarLoop {
                 run: self,
                 known,
@@ -236,8 +235,8 @@ impl Run {
                 encoder,
                 monitor,
             }),
-            // Plants that only step themselves (the virtual machine, a state-space model): compiled for the baseline
-            // here, with kernels of their own inside.
+            // Plants that only step themselves (the virtual machine, a state-space model): this loop is compiled for
+            // the baseline, and such a plant has kernels of its own inside.
             None => self.fill(plant, controller, signals, encoder, monitor),
         }
     }
@@ -251,9 +250,9 @@ impl Run {
         encoder: Option<&Encoder>,
         monitor: &Monitor,
     ) {
-        // Room for all at once: a call to make more, even one that never comes, empties the registers at every sample.
-        // Compiled into its two callers: into the kernel of `ScalarLoop` with that one's registers, and for plants that
-        // step themselves.
+        // All memory at once: a call that could grow a vector, even if it never happens, spills the registers at every
+        // sample. Inlined into both callers: the kernel of `ScalarLoop`, which has that processor's registers, and the
+        // path for plants that step themselves.
         let samples = signals.reference.len();
         self.u.resize(samples, 0.0);
         self.y.resize(samples, 0.0);
@@ -265,7 +264,7 @@ impl Run {
         self.outcome = outcome;
     }
 
-    /// Runs through the reference, for which there is room; gives the samples that were run and how it ended.
+    /// Runs over the reference, for which the record has room; returns the number of samples run and how the run ended.
     #[inline(always)]
     fn through(
         &mut self,
@@ -276,14 +275,14 @@ impl Run {
         monitor: &Monitor,
     ) -> (usize, Outcome) {
         let samples = signals.reference.len();
-        // Slices as long as the loop, for the compiler: every k is within them.
+        // Slices of the loop's length: the compiler then knows that every k is in bounds.
         let commands = &mut self.u[..samples];
         let (outputs, feedback) = (&mut self.y[..samples], &mut self.feedback[..samples]);
         plant.reset();
         controller.reset();
         let ts = controller.ts();
-        // A difference of counters over Ts and counts per unit is the mean speed of the last sample time: an encoder
-        // gives no more.
+        // The difference of the counts, divided by Ts and the counts per unit, is the mean speed over the last sample
+        // time. An encoder gives no more.
         let scale = plant.encoder().or(encoder).map(Encoder::counts_per_unit);
         let per_speed = ts * scale.unwrap_or(1.0);
         let mut before = counts(plant, encoder, -ts);
@@ -296,31 +295,30 @@ impl Run {
             let measured = signals
                 .noise_at(k)
                 .map_or(measured, |added| measured + added);
-            // The counter itself is kept and not the position: what an encoder has rounded off once is not measured
-            // later either.
+            // The count is kept, not the position: an encoder does not recover later what it has rounded off.
             before = now;
-            // Written so that NaN ends the run. What is measured counts, too: with many counts a unit the counter overflows
-            // where the output does not.
+            // Written so that NaN ends the run. The measurement is tested too: with many counts per unit the counter
+            // overflows before the output does.
             if !(y.abs() < RUNAWAY && measured.is_finite()) {
                 return (k, Outcome::Diverged(k));
             }
-            // A power of two, so a mask; a look is an atomic read.
+            // A power of two makes the remainder a mask; a check is an atomic read.
             if k % WATCHED == 0 && monitor.stopped() {
                 return (k, Outcome::Interrupted(k));
             }
-            // The command is held until the next sample: it acts on y(k+1) at the earliest, which is why a plant has a
-            // delay of 1 or more.
+            // The command is held until the next sample, so it acts on y(k+1) at the earliest: a plant has a delay of 1
+            // or more.
             let u = controller.decide(k == 0, r, measured, signals.feedforward_at(k));
             commands[k] = u;
             outputs[k] = y;
             feedback[k] = controller.filtered();
-            // Behind the controller and its limits, so that neither the anti-windup nor the record sees it.
+            // After the controller and its limits: neither the anti-windup nor the record sees the disturbance.
             plant.advance(signals.disturbance_at(k).map_or(u, |added| u + added));
         }
         (samples, Outcome::Completed)
     }
 
-    /// The largest `|u|`; 0 of an empty record.
+    /// The largest `|u|`; 0 for an empty record.
     pub fn largest_command(&self) -> f64 {
         self.u.iter().fold(0.0, |most, u| f64::max(most, u.abs()))
     }
@@ -328,10 +326,10 @@ impl Run {
 
 // --- A loop that runs alone, in the arithmetic of a lane ---
 //
-// The controller is the lanes' own code with one number in place of eight ([`Constant`]): one law, one order of operations. It knows at
-// compile time what the general controller asks at every sample, and takes 43 ns where that takes 53 (`closed_loop` of the kernels' example,
-// Zen 4, 16 %; with an encoder's moving average of 8 it gains nothing). A schedule, or whatever else a lane cannot hold, goes through the
-// general controller.
+// The controller is the lanes' own code with one number in place of eight ([`Constant`]): one law, one order of
+// operations. It knows at compile time what the general controller has to test at every sample, and takes 43 ns instead
+// of 53 (`closed_loop` of the kernels' example, Zen 4, 16 %; no gain with an encoder's moving average of 8). A
+// schedule, and whatever else a lane cannot hold, uses the general controller.
 
 /// What a loop asks of its controller.
 trait LoopController {
@@ -340,9 +338,9 @@ trait LoopController {
     /// Sample time \[s\].
     fn ts(&self) -> f64;
     /// From reference and measured output to the command.
-    // `first` is the loop's to say: lanes keep no flag of their own, and the general controller does not need it.
+    // The loop passes `first`: lanes keep no flag of their own, and the general controller does not need it.
     fn decide(&mut self, first: bool, r: f64, measured: f64, feedforward: Option<f64>) -> f64;
-    /// The feedback after its filter, at the last sample.
+    /// The filtered feedback of the last sample.
     fn filtered(&self) -> f64;
 }
 
@@ -356,7 +354,7 @@ impl LoopController for AnyController<f64> {
     }
 
     fn decide(&mut self, _first: bool, r: f64, measured: f64, feedforward: Option<f64>) -> f64 {
-        // Two calls, as adding 0 is not nothing: -0 + 0 is 0, and a lane without feedforward adds none either.
+        // Two calls, because adding 0 changes -0: -0 + 0 is 0. A lane without feedforward adds nothing either.
         match feedforward {
             None => self.step(r, measured),
             Some(added) => self.step_with(r, measured, added),
@@ -368,10 +366,10 @@ impl LoopController for AnyController<f64> {
     }
 }
 
-/// A controller with constant gains as a lane computes it: what it does not have is not computed, and all of it is
-/// compiled into its caller.
+/// A controller with constant gains as a lane computes it: parts that it does not have are not computed, and all of it
+/// is inlined into the caller.
 struct Constant<'a> {
-    // Kept for a reset: numbers under way are no settings.
+    // Kept for a reset: `numbers` holds the running states.
     controller: &'a PidController<f64>,
     numbers: Controllers<f64>,
 }
@@ -381,7 +379,7 @@ impl<'a> Constant<'a> {
     fn new(controller: &'a PidController<f64>) -> Self {
         Self {
             controller,
-            // One lane of one: `Arithmetic for f64` loads the first of eight equal numbers.
+            // One lane of one: `Arithmetic for f64` loads the first of the eight numbers, which are equal.
             numbers: Controllers::new(&[controller]),
         }
     }
@@ -425,7 +423,7 @@ impl Kernel for ScalarLoop<'_> {
 
     #[inline(always)]
     fn run<V: F64x8>(self) {
-        // Three ways to the same bits, so that what is chosen shows in the time only (16 % and 6.7 %, see above and
+        // All three branches give the same bits; the choice only changes the time (16 % and 6.7 %, see above and
         // `kernel_plant`).
         let constant = self.controller.pid().filter(|pid| pid.fits(pid));
         if let Some(pid) = constant {
@@ -438,7 +436,7 @@ impl Kernel for ScalarLoop<'_> {
             }
         } else {
             let plant = ScalarPlant::<V, AnyOrder>::new(self.known);
-            // A copy: the caller's controller stays as it was, as the plant does.
+            // A copy: the caller's controller stays unchanged, as does the plant.
             let mut controller = self.controller.clone();
             self.around(plant, &mut controller);
         }
@@ -448,8 +446,8 @@ impl Kernel for ScalarLoop<'_> {
 impl ScalarLoop<'_> {
     #[inline(always)]
     fn around(self, mut plant: impl Plant, controller: &mut impl LoopController) {
-        // Compiled once for each pair of plant and controller: `fill` is inlined with both, and what one of them does
-        // not have leaves no trace.
+        // Compiled once per pair of plant and controller: `fill` is inlined with both, so parts that they do not have
+        // cost nothing.
         let (signals, encoder) = (self.signals, self.encoder);
         self.run
             .fill(&mut plant, controller, signals, encoder, self.monitor);
@@ -475,8 +473,8 @@ pub fn closed_loop(
 /// Runs `controller` on `plant` under `signals`, from rest.
 ///
 /// # Errors
-/// `ErrorKind::Data` for signals that are empty, not finite or of different lengths. A loop that diverges or is stopped is
-/// an [`Outcome`], not an error.
+/// `ErrorKind::Data` for signals that are empty, not finite or of different lengths. A loop that diverges or is stopped
+/// is an [`Outcome`], not an error.
 pub fn closed_loop_with(
     plant: &mut (impl Plant + ?Sized),
     controller: &mut AnyController<f64>,

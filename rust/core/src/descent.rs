@@ -1,6 +1,6 @@
 //! The one loop of every least-squares fit: linearise, test, try damped steps until one lowers the cost.
 //!
-//! What a linearisation is and how its damping follows success and failure is a [`Method`]: normal equations with
+//! The [`Method`] says what a linearisation is and how damping follows success and failure: normal equations with
 //! Marquardt's factors ([`crate::lm`]), or a triangle with a trust region ([`crate::least_squares`]).
 //!
 //! ```text
@@ -15,8 +15,8 @@
 //!     settled?                     no progress any more
 //! ```
 //!
-//! The loop owns the outcome (theta, cost, trace), the method its linearisation and its damping; `keep` tells it that the point whose cost
-//! was taken last is the one to linearise at, so that nothing is simulated twice.
+//! The loop owns the outcome (theta, cost, trace); the method owns its linearisation and its damping. `keep` tells the
+//! method to linearise at the point of its last cost, so nothing is simulated twice.
 
 use crate::Monitor;
 
@@ -41,14 +41,14 @@ pub enum Termination {
     RankDeficient,
     /// The gradient is zero where the cost curves downwards.
     Saddle,
-    /// The start, or the Jacobian where the iteration stands, is not finite.
+    /// The start, or the Jacobian at the present point, is not finite.
     NotFinite,
     /// A stop was requested.
     Interrupted,
 }
 
 impl Termination {
-    /// The name that files and Python carry.
+    /// The name used in files and in Python.
     pub fn name(self) -> &'static str {
         match self {
             Self::SmallGradient => "small_gradient",
@@ -94,7 +94,7 @@ impl Termination {
         }
     }
 
-    /// True where a test for a minimum has ended the iteration.
+    /// True if a test for a minimum ended the iteration.
     pub fn is_converged(self) -> bool {
         matches!(
             self,
@@ -110,9 +110,9 @@ pub struct Outcome {
     pub theta: Vec<f64>,
     /// Their cost.
     pub cost: f64,
-    /// Jacobians taken by the loop.
+    /// Jacobians computed by the loop.
     pub iterations: usize,
-    /// Steps that were tried, accepted or not.
+    /// Steps tried, accepted or not.
     pub trials: usize,
     /// How it ended.
     pub termination: Termination,
@@ -120,7 +120,7 @@ pub struct Outcome {
     pub trace: Vec<f64>,
 }
 
-/// What a method has for the loop next.
+/// What a method proposes next.
 pub(crate) enum Proposal {
     /// The trial is filled in.
     Trial,
@@ -130,7 +130,7 @@ pub(crate) enum Proposal {
     End(Termination),
 }
 
-/// What is known of the trial.
+/// The verdict on a trial.
 pub(crate) enum Verdict {
     Accepted,
     Rejected,
@@ -138,33 +138,32 @@ pub(crate) enum Verdict {
     End(Termination),
 }
 
-/// A problem together with a linearisation and a damping policy. Every loop over proposals must end by the method.
+/// A problem with a linearisation and a damping policy. `Method` must make sure that every loop over proposals ends.
 pub(crate) trait Method {
     fn parameters(&self) -> usize;
 
-    /// Cost at `theta`; none where it is not finite, not allowed or a stop was requested.
+    /// Cost at `theta`; `None` if it is not finite or not allowed, or if a stop was requested.
     fn cost(&mut self, theta: &[f64]) -> Option<f64>;
 
-    /// Cost at `theta`, where it is below `before`; none may be told as soon as it cannot be.
+    /// Cost at `theta` if it is below `before`; may return `None` as soon as it cannot be.
     fn trial_cost(&mut self, theta: &[f64], _before: f64) -> Option<f64> {
         self.cost(theta)
     }
 
-    /// The point of the last cost becomes the present one.
-    // Costs and Jacobians share a simulation: the method is told which of the points it has simulated is to be
-    // linearised.
+    /// Makes the point of the last cost the present one.
+    // Costs and Jacobians share a simulation: this tells the method which simulated point to linearise.
     fn keep(&mut self) {}
 
-    /// Linearises at the present point; false where that is not finite.
+    /// Linearises at the present point; false if the result is not finite.
     fn linearise(&mut self, theta: &[f64]) -> bool;
 
-    /// Whether the derivatives at the present point are of no use; those of the point before it are then present again.
+    /// Whether the derivatives at the present point are of no use; the method has then restored those of the point before.
     fn takes_back(&mut self) -> bool {
         false
     }
 
     /// The tests that end the iteration; they may refine the outcome.
-    // Before a step: at a minimum none is worth its simulations. `settled`, behind it, sees what the step gained.
+    // Before a step: at a minimum a step is not worth its simulations. `settled`, after the step, sees what it gained.
     fn finished(&mut self, outcome: &mut Outcome) -> Option<Termination>;
 
     fn propose(&mut self, theta: &[f64], trial: &mut [f64]) -> Proposal;
@@ -192,11 +191,11 @@ pub(crate) fn descend(
         iterations: 0,
         trials: 0,
         termination: Termination::NotFinite,
-        // A limit of a million iterations asks for no room that is not used.
+        // A limit of a million iterations must not reserve memory that is never used.
         trace: Vec::with_capacity(max_iterations.min(1000) + 1),
     };
-    // A start without a finite cost has no direction to go: it is an outcome and no error, as one of many starts may be
-    // so.
+    // A start without a finite cost has no direction to go. That is an outcome, not an error: it may be one of many
+    // starts.
     match method.cost(&outcome.theta) {
         Some(cost) if cost.is_finite() => outcome.cost = cost,
         _ => {
@@ -222,24 +221,24 @@ fn iterate(
 ) -> Termination {
     // One vector for all trials: an iteration allocates nothing.
     let mut trial = vec![0.0; method.parameters()];
-    // For methods that take a step back once its derivatives are known.
+    // For methods that take a step back after seeing its derivatives.
     let (mut last, mut last_cost) = (outcome.theta.clone(), outcome.cost);
     for _ in 0..max_iterations {
-        // Once an iteration: a rejected trial costs none.
+        // Once per iteration: a rejected trial needs no Jacobian.
         let finite = method.linearise(&outcome.theta);
         if finite && method.takes_back() {
-            // Its step was accepted by its cost, but its sensitivities are of no use to go on from.
+            // The step's cost was accepted, but its sensitivities are of no use to go on from.
             outcome.theta.copy_from_slice(&last);
             outcome.cost = last_cost;
         } else {
             last.copy_from_slice(&outcome.theta);
             last_cost = outcome.cost;
         }
-        // Asked behind the Jacobian, which ends early on a request and is then of no use.
+        // Checked after the Jacobian: a stop request ends its computation early and leaves it unusable.
         if monitor.stopped() {
             return Termination::Interrupted;
         }
-        // The Jacobian can overflow where the run did not: the point stays the best one.
+        // The Jacobian can overflow even if the run did not: the point stays the best one.
         if !finite {
             return Termination::NotFinite;
         }
@@ -249,14 +248,14 @@ fn iterate(
             return end;
         }
         let before = outcome.cost;
-        // Ended without an accepted step: theta is the best point, but a refused trial has been simulated since.
+        // No step was accepted: theta is the best point, but a rejected trial has been simulated since.
         if let Some(end) = improve(method, outcome, &mut trial, monitor) {
             return end;
         }
         outcome.trace.push(outcome.cost);
         monitor.report_cost(outcome.cost);
         accepted(&outcome.theta, outcome.cost);
-        // Last, so that the step that shows the end is part of the outcome.
+        // Last, so that the outcome includes the step that ended the iteration.
         if let Some(end) = method.settled(before, outcome.cost) {
             return end;
         }
@@ -264,32 +263,32 @@ fn iterate(
     Termination::MaxIterations
 }
 
-/// Tries steps until one is accepted; says why where none is.
+/// Tries steps until one is accepted; returns why if none is.
 fn improve(
     method: &mut impl Method,
     outcome: &mut Outcome,
     trial: &mut [f64],
     monitor: &Monitor,
 ) -> Option<Termination> {
-    // It ends by the method: `Marquardt` gives up after `MOST_REJECTIONS`.
+    // `Marquardt` ends this loop after `MOST_REJECTIONS`.
     loop {
         if monitor.stopped() {
             return Some(Termination::Interrupted);
         }
         match method.propose(&outcome.theta, trial) {
-            // No step with this damping, and so no trial either.
+            // No step with this damping, so no trial either.
             Proposal::Again => continue,
             Proposal::End(end) => return Some(end),
             Proposal::Trial => {}
         }
         outcome.trials += 1;
-        // With the cost to beat: a simulation may stop as soon as its partial sum is above.
+        // The cost to beat is passed on: a simulation may stop as soon as its partial sum exceeds it.
         let cost = method.trial_cost(trial, outcome.cost);
         match method.judge(outcome.cost, cost) {
             Verdict::Rejected => {}
             Verdict::End(end) => return Some(end),
             Verdict::Accepted => {
-                // A verdict is given on a cost; without one there is none to accept.
+                // A step is accepted by its cost; without one there is nothing to accept.
                 outcome.cost = cost.unwrap_or(outcome.cost);
                 outcome.theta.copy_from_slice(trial);
                 method.keep();

@@ -1,6 +1,6 @@
-//! Loops of many controllers around one plant, side by side in the processor's registers.
+//! Loops of many controllers around one plant, side by side in the processor's registers. Begin reading at `turn`.
 //!
-//! A search asks what each of many controllers does on the same plant and reference. Their loops never meet: a lane is a loop.
+//! A search judges many controllers on the same plant and reference. Their loops are independent, so each gets a lane.
 //!
 //! ```text
 //!   lane        0    1    2  ..  7      one F64x8: u, y, integral, .. of eight loops
@@ -8,23 +8,23 @@
 //!   BatchLoop   up to 4 groups          one pass over the reference, sample by sample
 //! ```
 //!
-//! One group alone would mostly wait: a sample is a chain of some 230 cycles (encoder, filter, controller, network), in which the
-//! units have work for some 130. So groups take turns half a round apart: while group g decides, the plants of the group that
-//! decided half a round ago step, and the parts of a decision (`Decision`, three stages) stand between the hidden units of that step:
+//! One group alone would mostly wait: a sample is a dependency chain of some 230 cycles (encoder, filter, controller, network), in which
+//! the units have work for some 130. So groups take turns half a round apart. While group g decides, the plants of the group that decided
+//! half a round ago step; the three stages of a `Decision` are interleaved with the hidden units of that step:
 //!
 //! ```text
 //!   4 groups, one sample:   decide 0 | step 2'     decide 1 | step 3'     decide 2 | step 0     decide 3 | step 1
 //!                           (' of the sample before)
 //! ```
 //!
-//! Measured on 64 candidates (`candidates` and `candidates_encoded` of the kernels' example, Zen 4, least of 60 calls, variant taken
-//! out): taking turns 11 to 14 % with encoder and filter, 0 % without; a regressor of known length (`N` = 4) 14 to 17 %; averages of one
-//! length 4 to 6 %.
+//! Measured on 64 candidates (`candidates` and `candidates_encoded` of the kernels' example, Zen 4, least of 60 calls,
+//! each variant removed in turn): taking turns saves 11 to 14 % with encoder and filter, 0 % without; a regressor of
+//! known length (`N` = 4) 14 to 17 %; averages of one length 4 to 6 %.
 //!
-//! Ownership: `BatchLoop` borrows plant, controllers and signals; a group owns the states of its eight loops for the run; notes are
-//! the caller's, one for a group.
+//! Ownership: `BatchLoop` borrows plant, controllers and signals; a group owns the states of its eight loops for the
+//! run; the caller owns the notes, one per group.
 //!
-//! A lane does the operations of a loop that runs alone, in the same order: on one level it gives the bits of
+//! A lane does the operations of a single loop in the same order: on the same level it gives the bits of
 //! [`Run::record`](super::Run::record).
 
 mod controllers;
@@ -41,10 +41,10 @@ use crate::speed::Encoder;
 pub(super) use controllers::Controllers;
 pub(crate) use controllers::{InLanes, LaneController, WithKind, are_of_a_kind, of_a_kind};
 
-/// Loops that run side by side at most: four groups, of which one computes while others wait for their results.
+/// Most loops side by side: four groups, of which one computes while the others wait for results.
 pub(crate) const MOST: usize = 4 * LANES;
 
-/// What takes note of the samples of a group of lanes.
+/// Receives the samples of a group of lanes.
 pub(crate) trait Notes {
     /// Reference, command after the limits, true output and filtered feedback of a sample.
     fn put<V: F64x8>(&mut self, k: usize, r: f64, u: V, y: V, feedback: V);
@@ -53,7 +53,7 @@ pub(crate) trait Notes {
 /// The loops of some controllers around one plant, from rest.
 pub(crate) struct BatchLoop<'a, C> {
     pub known: KernelPlant<'a>,
-    /// At least one, all of which fit in lanes and have one sample time; at most [`MOST`].
+    /// From 1 to [`MOST`]; all fit in lanes and have the same sample time.
     pub controllers: &'a [&'a C],
     pub signals: Signals<'a>,
     /// The encoder; `None` for ideal feedback.
@@ -62,12 +62,12 @@ pub(crate) struct BatchLoop<'a, C> {
 }
 
 impl<C: InLanes> BatchLoop<'_, C> {
-    /// Runs them; `notes` has an entry for every eight controllers. How each run ended stands in its place.
+    /// Runs the loops; `notes` has an entry for every eight controllers. Entry i of the result is how run i ended.
     ///
-    /// Notes of a lane after its end mean nothing.
+    /// Notes of a lane after its end are meaningless.
     pub fn run(self, notes: &mut [impl Notes]) -> [Outcome; MOST] {
-        // The usual model has its loops over the regressor unrolled. One more constant would be a copy of the whole
-        // batch for each kind of controller, level and kind of notes.
+        // For the usual model the loops over the regressor are unrolled. Each further constant would add a copy of the
+        // whole batch for each kind of controller, level and notes.
         if (self.known.lags.na, self.known.lags.regressors()) == (2, 4) {
             simd::run(Grouped::<_, _, 4>(self, notes))
         } else {
@@ -76,7 +76,7 @@ impl<C: InLanes> BatchLoop<'_, C> {
     }
 }
 
-/// Groups of loops around a plant; `N` is 4 for two outputs and two inputs in its regressor, 0 for any.
+/// Groups of loops around a plant; `N` is 4 for two outputs and two inputs in its regressor, 0 for any number.
 struct Grouped<'a, 'b, C, S, const N: usize>(BatchLoop<'a, C>, &'b mut [S]);
 
 impl<C: InLanes, S: Notes, const N: usize> Kernel for Grouped<'_, '_, C, S, N> {
@@ -85,7 +85,7 @@ impl<C: InLanes, S: Notes, const N: usize> Kernel for Grouped<'_, '_, C, S, N> {
     #[inline(always)]
     fn run<V: F64x8>(self) -> Self::Output {
         let Self(lanes, notes) = self;
-        // on the heap, so that one pointer finds all of a group
+        // on the heap: one pointer then reaches all of a group
         let mut groups = Vec::with_capacity(notes.len());
         for g in 0..notes.len() {
             groups.push(Loops::<V, C::Lanes<V>>::new(&lanes, g));
@@ -101,7 +101,7 @@ impl<C: InLanes, S: Notes, const N: usize> Kernel for Grouped<'_, '_, C, S, N> {
                 let now = Now { k, r, g, signals };
                 turn::<_, _, _, N>(&mut groups, notes, &mut ends, now);
             }
-            // All have run away, as in a search that begins with wild gains: the rest of the reference is saved.
+            // All have diverged, as happens when a search begins with wild gains: skip the rest of the reference.
             if ends.running == 0 {
                 return ends.outcomes;
             }
@@ -119,8 +119,8 @@ struct Now<'a> {
     signals: &'a Signals<'a>,
 }
 
-/// A group decides, while the plants of the group that decided half a round ago take their step: both have time until what
-/// comes out is asked for. A group alone does one after the other.
+/// One group decides while the plants of the group that decided half a round ago step: each has time until its result
+/// is needed. A single group does one after the other.
 #[inline(always)]
 fn turn<V: F64x8, C: LaneController<V>, S: Notes, const N: usize>(
     groups: &mut [Loops<'_, V, C>],
@@ -131,8 +131,8 @@ fn turn<V: F64x8, C: LaneController<V>, S: Notes, const N: usize>(
     //   groups   4         3         2        1
     //   g        0 1 2 3   0 1 2     0 1      0
     //   due      2 3 0 1   2 0 1     1 0      0: decides and steps at once
-    // The due group decided half a round ago, for the lower half of g in the sample before, in which case there is
-    // nothing to step at k = 0. Each group so steps once between two of its decisions.
+    // The due group decided half a round ago. For the lower half of g that was in the sample before, so at k = 0 there
+    // is nothing to step. Each group thus steps once between two of its decisions.
     let half = groups.len() / 2;
     let begun = now.k > 0 || now.g >= half;
     let due = if now.g < half {
@@ -140,12 +140,12 @@ fn turn<V: F64x8, C: LaneController<V>, S: Notes, const N: usize>(
     } else {
         now.g - half
     };
-    // Disjoint borrows: the decision of one group and the step of another are interleaved, and neither may be thought to
-    // change the other.
+    // Disjoint borrows: one group's decision and another's step are interleaved, and the compiler must know that
+    // neither changes the other.
     if let Ok([loops, due]) = groups.get_disjoint_mut([now.g, due]) {
         let mut decision = Decision::new(loops, notes, ends, now);
         if begun {
-            // The plants' step leads and the decision fills its gaps: tanh has the divisions, the longest waits.
+            // The plants' step leads and the decision fills its gaps: tanh has the divisions, which are the longest waits.
             due.plants.advance::<V, N>(due.applied, &mut decision);
         }
         decision.finish();
@@ -170,10 +170,10 @@ impl Ends {
         }
     }
 
-    /// Those of `lanes` that ran until now have ended.
+    /// Marks those of `lanes` that were running as ended.
     #[inline(always)]
     fn note(&mut self, lanes: u64, outcome: Outcome) {
-        // The first end counts. A lane that has ended computes on, as leaving it out would cost all others a selection in
+        // Only the first end counts. A lane that has ended computes on: masking it would cost all lanes a selection in
         // every operation.
         let ended = lanes & self.running;
         if ended != 0 {
@@ -191,14 +191,14 @@ impl Ends {
 struct Loops<'a, V, C> {
     plants: BatchPlant<'a>,
     controllers: C,
-    /// With counts per sample and unit of speed.
+    /// With counts per unit of speed in one sample.
     encoder: Option<(&'a Encoder, f64)>,
     /// Counters at the last sample.
-    // Between two turns of a group these are memory and another group has the registers: 4 groups hold some 30 values
-    // each.
+    // Between two turns of a group these are in memory while another group has the registers: 4 groups hold some 30
+    // values each.
     before: V,
     measured: V,
-    /// What reaches the plants.
+    /// The commands that reach the plants.
     applied: V,
 }
 
@@ -214,18 +214,18 @@ impl<'a, V: F64x8, C: LaneController<V>> Loops<'a, V, C> {
             plants: BatchPlant::new(lanes.known),
             controllers: K::in_lanes::<V>(own),
             encoder,
-            // The plant rests at position 0 and speed 0, so that the counter a sample ago was the same.
+            // The plant rests at position 0 and speed 0, so one sample ago the counter was the same.
             before: encoder.map_or(zero, |(encoder, _)| encoder.counts(zero)),
             measured: zero,
             applied: zero,
         }
     }
 
-    /// Measures; gives the lanes whose outputs have left all bounds.
+    /// Measures the outputs; returns the lanes whose outputs are beyond all bounds.
     #[inline(always)]
     fn measure(&mut self, signals: &Signals<'_>, k: usize) -> u64 {
         let y: V = self.plants.output();
-        // As `Run::through` tests it, bit by bit of a mask; NaN is not below.
+        // The test of `Run::through`, one bit per lane; NaN is not below.
         let mut sound = y.abs().are_less(V::splat(RUNAWAY));
         self.measured = y;
         if let Some((encoder, per_speed)) = self.encoder {
@@ -237,7 +237,7 @@ impl<'a, V: F64x8, C: LaneController<V>> Loops<'a, V, C> {
         if let Some(added) = signals.noise_at(k) {
             self.measured = self.measured.add(V::splat(added));
         }
-        // Bits beyond the controllers of the last group name no loop: `Ends::running` begins without them.
+        // The last group's bits beyond its controllers belong to no loop: `Ends::running` begins with them cleared.
         u64::from(!sound)
     }
 
@@ -248,7 +248,7 @@ impl<'a, V: F64x8, C: LaneController<V>> Loops<'a, V, C> {
         let u = self
             .controllers
             .decide(k == 0, r, signals.feedforward_at(k));
-        // As in `Run::through`, the command as the controller decided on it; the disturbance comes behind.
+        // As in `Run::through`, the command as decided; the disturbance is added afterwards.
         notes.put(k, r, u, y, self.controllers.filtered());
         self.applied = match signals.disturbance_at(k) {
             None => u,
@@ -257,8 +257,8 @@ impl<'a, V: F64x8, C: LaneController<V>> Loops<'a, V, C> {
     }
 }
 
-/// What one group of loops does in a sample but for its plants' steps, in stages: a processor goes on with another group's
-/// plants while a stage waits for its numbers.
+/// All that a group of loops does in a sample except its plants' steps, in stages: while a stage waits for its numbers,
+/// the processor goes on with another group's plants.
 struct Decision<'a, 'b, V, C, S> {
     loops: &'a mut Loops<'b, V, C>,
     notes: &'a mut S,
@@ -284,7 +284,7 @@ impl<'a, 'b, V: F64x8, C: LaneController<V>, S: Notes> Decision<'a, 'b, V, C, S>
         }
     }
 
-    /// What is left to do.
+    /// Runs the remaining stages.
     #[inline(always)]
     fn finish(&mut self) {
         while self.stage < STAGES {
@@ -300,12 +300,12 @@ impl<V: F64x8, C: LaneController<V>, S: Notes> Meanwhile for Decision<'_, '_, V,
     #[inline(always)]
     fn go(&mut self) {
         let Now { k, r, g, signals } = self.now;
-        // Three chains: the encoder and its division; average, lag and observer; controller, limits and sums. Beside a network
-        // of one group of hidden units two of them stand within its step, beside more all three; beside a linear model,
-        // whose step is short, none.
+        // Three chains: the encoder and its division; average, lag and observer; controller, limits and sums. In the
+        // step of a network with one group of hidden units two of them are interleaved, with more groups all three; a
+        // linear model's step is too short for any.
         match self.stage {
             0 => {
-                // A group's lanes have its place among the bits of all.
+                // Shift the group's lanes to their place among the bits of all loops.
                 let runaway = self.loops.measure(signals, k) << (LANES * g);
                 self.ends.note(runaway, Outcome::Diverged(k));
             }
@@ -326,13 +326,13 @@ pub(crate) struct Sums {
     pub command: f64,
     /// Of the squared change of `u` from sample to sample.
     pub change: f64,
-    /// Samples between the limits.
+    /// Samples within the limits.
     pub inside: f64,
     /// Largest `|u|`.
     pub largest: f64,
 }
 
-/// Sums over eight runs, and their outputs where they are kept.
+/// Sums over eight runs, and their outputs if they are kept.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Tally {
     low: Lanes,
@@ -343,7 +343,7 @@ pub(crate) struct Tally {
     inside: Lanes,
     largest: Lanes,
     last: Lanes,
-    /// Outputs of all samples, or of none.
+    /// Outputs of all samples, or empty.
     pub y: Vec<Lanes>,
 }
 
@@ -366,10 +366,10 @@ impl Default for Tally {
 }
 
 impl Tally {
-    /// Begins anew, for runs of these controllers whose outputs of so many samples are kept.
+    /// Starts over for runs of these controllers; `kept` is the number of samples whose outputs are kept.
     pub fn begin(&mut self, controllers: &[&impl InLanes], kept: usize) {
-        // The room of the last run is used again: a search calls this for every group of candidates, and 8 numbers a
-        // sample are 256 kB at 4,000 samples.
+        // Reuse the memory of the last run: a search calls this for every group of candidates, and 8 numbers a sample
+        // are 256 kB at 4,000 samples.
         let mut y = std::mem::take(&mut self.y);
         y.resize(kept, Lanes::ZERO);
         *self = Self {
@@ -381,7 +381,7 @@ impl Tally {
         }
     }
 
-    /// The outputs of a lane, where they were kept.
+    /// The outputs of a lane, if they were kept.
     pub fn copy_outputs(&self, lane: usize, y: &mut Vec<f64>) {
         y.clear();
         y.extend(self.y.iter().map(|group| group.0[lane]));
@@ -406,13 +406,12 @@ impl Notes for Tally {
         // The first command is no change: before it the loop was at rest, not at 0.
         let last = if k == 0 { u } else { V::load(&self.last.0) };
         let change = u.sub(last);
-        // Products and sums apart, not fused: the sums of a lane are those of its loop on every level, sample after
-        // sample.
+        // Multiply and add, not fused: on every level a lane's sums then equal those of its loop, sample by sample.
         let off = V::splat(r).sub(y);
         add(&mut self.error, off.mul(off));
         add(&mut self.command, u.mul(u));
         add(&mut self.change, change.mul(change));
-        // Samples are counted as 1.0: exact up to 2^53, and no second kind of register.
+        // Samples are counted as 1.0: exact up to 2^53, and no integer registers are needed.
         let below = u.if_less(V::load(&self.high.0), V::splat(1.0), zero);
         add(
             &mut self.inside,

@@ -1,12 +1,12 @@
 //! Plants that kernels know, and their steps in registers.
 //!
-//! A lagged model in a loop is its regressor and its position. One loop alone ([`ScalarPlant`]) holds them as numbers, the lanes of a
-//! network being its hidden units; eight loops ([`BatchPlant`]) hold them as [`Lanes`], a lane being a loop. Both do the same operations
-//! in the same order, so that a controller is worth the same wherever it is judged.
+//! A lagged model in a loop is its regressor and its position. A single loop ([`ScalarPlant`]) holds them as numbers,
+//! and the lanes of a network are its hidden units. Eight loops ([`BatchPlant`]) hold them as [`Lanes`], one loop per
+//! lane. Both do the same operations in the same order, so a controller gets the same cost from either.
 //!
-//! Why a plant is known to a kernel at all: through [`Plant`] alone, one call a sample that the compiler cannot see through, a loop takes
-//! 61 to 64 ns a sample instead of 43 (`closed_loop` of the kernels' example, Zen 4). [`SecondOrder`], two outputs and two inputs in
-//! registers, takes 43 where [`AnyOrder`] takes 46 (6.7 %).
+//! Why kernels know plants at all: through [`Plant`] alone, a call per sample that the compiler cannot inline, a loop
+//! takes 61 to 64 ns a sample instead of 43 (`closed_loop` of the kernels' example, Zen 4). [`SecondOrder`], two
+//! outputs and two inputs in registers, takes 43 and [`AnyOrder`] 46 (6.7 %).
 
 use std::marker::PhantomData;
 
@@ -15,32 +15,32 @@ use crate::lagged::{Form, Lags};
 use crate::neural::Meanwhile;
 use crate::simd::{F64x8, Lanes};
 
-/// A plant whose equations kernels know: a lagged model, its output multiplied, its input held back.
+/// A plant whose equations kernels know: a lagged model with a gain on its output and extra delay on its input.
 #[derive(Clone, Copy, Debug)]
 pub struct KernelPlant<'a> {
     pub(super) form: &'a Form,
     pub(super) lags: Lags,
     pub(super) ts: f64,
     pub(super) gain: f64,
-    /// Samples by which the input is held back beyond the model's own delay.
+    /// Samples of input delay in addition to the model's own.
     pub(super) delay: usize,
 }
 
 impl KernelPlant<'_> {
     /// Samples between a command and its first appearance in the regressor.
     fn lead(&self) -> usize {
-        // The model's nk = 1 is the sample that every loop has: a command decided at k is in the regressor of y(k+1). So
-        // a model of delay nk around which more is held back waits for this many samples before.
+        // The model's nk = 1 is the sample that every loop has: a command decided at k is in the regressor of y(k+1).
+        // Only delay beyond that has to be waited for.
         self.delay + self.lags.nk - 1
     }
 }
 
-/// One plant inside a kernel, where the whole loop is compiled for one processor; `R` holds its regressor.
+/// One plant inside a kernel that compiles the whole loop for one processor; `R` holds its regressor.
 pub(super) struct ScalarPlant<'a, V, R> {
     known: KernelPlant<'a>,
     regressor: R,
     position: f64,
-    // The level in the type: `Plant` has no room for it, and the step of a network has to know in which registers it is.
+    // The level is in the type: `Plant` has no room for it, and a network's step has to know its registers.
     level: PhantomData<V>,
 }
 
@@ -65,7 +65,7 @@ impl<V: F64x8, R: Regressor> Plant for ScalarPlant<'_, V, R> {
 
     #[inline(always)]
     fn output(&self) -> f64 {
-        // The gain of a variation multiplies what is measured and not what is fed back: the model's own past outputs
+        // The gain of a variation multiplies the measured output, not the fed-back one: the model's own past outputs
         // stay in its range.
         self.known.gain * self.regressor.newest()
     }
@@ -80,7 +80,7 @@ impl<V: F64x8, R: Regressor> Plant for ScalarPlant<'_, V, R> {
         let before = self.regressor.newest();
         self.regressor.take(u);
         let y = self.regressor.output::<V>(self.known.form);
-        // The trapezoid of two outputs, as between samples the output is taken to run straight.
+        // Trapezoidal rule: between samples the output is taken to change linearly.
         self.position += self.known.ts * (before + y) / 2.0;
         self.regressor.put(y);
     }
@@ -91,11 +91,11 @@ pub(super) trait Regressor {
     fn at_rest(known: &KernelPlant<'_>) -> Self;
     /// The newest output.
     fn newest(&self) -> f64;
-    /// Takes a command in.
+    /// Shifts a command in.
     fn take(&mut self, u: f64);
     /// The next output.
     fn output<V: F64x8>(&self, form: &Form) -> f64;
-    /// Takes that output in.
+    /// Shifts that output in.
     fn put(&mut self, y: f64);
 }
 
@@ -131,10 +131,10 @@ impl Regressor for AnyOrder {
         shift(&mut self.inputs, u);
         //   inputs   u(k) u(k-1) .. u(k-lead) .. u(k-lead-nb+1)      newest first
         //   phi      y(k) .. y(k-na+1) | u(k-lead) .. u(k-lead-nb+1)
-        // The whole input part is copied and not shifted: with nb = 2 that is two numbers.
+        // The whole input part is copied, not shifted: with nb = 2 that is two numbers.
         let inputs = &mut self.phi[self.past..];
         let due = &self.inputs[self.lead..][..inputs.len()];
-        // By hand, as `copy_from_slice` is a call of memcpy for a length that is not known, which would empty the
+        // A loop by hand: for a length unknown at compile time `copy_from_slice` calls memcpy, which spills the
         // registers.
         let mut i = due.len();
         while i > 0 {
@@ -157,11 +157,11 @@ impl Regressor for AnyOrder {
     }
 }
 
-/// Two outputs and two inputs, the newest of them the last command: they stay in registers.
+/// Two outputs and two inputs, the newest input being the last command: all stay in registers.
 pub(super) struct SecondOrder([f64; 4]);
 
 impl SecondOrder {
-    /// Whether a plant has that many, and no more delay.
+    /// Whether a plant has exactly that many, and no extra delay.
     pub fn takes(known: &KernelPlant<'_>) -> bool {
         (known.lags.na, known.lags.regressors(), known.lead()) == (2, 4, 0)
     }
@@ -180,9 +180,9 @@ impl Regressor for SecondOrder {
 
     #[inline(always)]
     fn take(&mut self, u: f64) {
-        // phi = [y(k), y(k-1), u(k), u(k-1)]: the command is the newest input, as nothing is held back. An array by
-        // value, which the compiler splits into four registers; a slice would be memory, written and read again within
-        // the chain.
+        // phi = [y(k), y(k-1), u(k), u(k-1)]: the command is the newest input, as there is no extra delay. The compiler
+        // splits an array by value into four registers; a slice would be memory, written and read back within the
+        // dependency chain.
         self.0 = [self.0[0], self.0[1], u, self.0[2]];
     }
 
@@ -203,7 +203,7 @@ impl Regressor for SecondOrder {
 /// Puts a value in front of a few others.
 #[inline(always)]
 fn shift(newest_first: &mut [f64], value: f64) {
-    // By hand, for the same reason: `rotate_right` and `copy_within` are calls.
+    // By hand for the same reason: `rotate_right` and `copy_within` are calls.
     let mut i = newest_first.len();
     while i > 1 {
         i -= 1;
@@ -216,12 +216,12 @@ fn shift(newest_first: &mut [f64], value: f64) {
 pub(super) struct BatchPlant<'a> {
     pub known: KernelPlant<'a>,
     /// Past outputs, newest first, then the inputs of the regressor.
-    // Entry by entry, eight loops each: `phi[c].0[i]` is entry c of loop i, so that a weight is spread and multiplies
-    // all loops at once.
+    // Entry by entry, eight loops each: `phi[c].0[i]` is entry c of loop i. A broadcast weight then multiplies all
+    // loops at once.
     phi: Vec<Lanes>,
-    /// Inputs that are still to reach the regressor, the next one at `next`.
-    // A ring, as delays can be long and only one entry is due; a regressor is short, and shifting it keeps its places
-    // known to the compiler.
+    /// Inputs that have not reached the regressor yet, the next one at `next`.
+    // A ring, because delays can be long and only one entry is due. The regressor is short: shifting it keeps its
+    // indices known to the compiler.
     waiting: Vec<Lanes>,
     next: usize,
     position: Lanes,
@@ -249,13 +249,13 @@ impl<'a> BatchPlant<'a> {
         V::splat(self.known.gain).mul(V::load(&self.position.0))
     }
 
-    /// Holds a command in each lane for one sample time; `N` is 4 for two outputs and two inputs in the regressor, 0 for any.
-    /// Other work may be done meanwhile.
+    /// Holds a command in each lane for one sample time; `N` is 4 for two outputs and two inputs in the regressor, 0
+    /// for any number. `meanwhile` is other work to interleave.
     #[inline(always)]
     pub fn advance<V: F64x8, const N: usize>(&mut self, u: V, meanwhile: &mut impl Meanwhile) {
         let due = self.delayed(u);
-        // Known at compile time for the usual model: the network's loops over phi are unrolled, and its weights are
-        // addressed without a multiplication.
+        // For the usual model these are compile-time constants: the network's loops over phi are unrolled, and its
+        // weights are addressed without a multiplication.
         let (na, n) = if N == 4 {
             (2, 4)
         } else {
@@ -263,14 +263,14 @@ impl<'a> BatchPlant<'a> {
         };
         let phi = &mut self.phi[..n];
         push_eight(&mut phi[na..], due);
-        // Read before the step and kept in a register: the position needs both ends of the sample.
+        // Read before the step and kept in a register: the position needs the output at both ends of the sample.
         let newest = V::load(&phi[0].0);
         let y = match self.known.form {
             Form::Linear(model) => model.next_in_lanes::<V>(phi),
             Form::Network(network) => network.next_in_lanes::<V, N>(phi, meanwhile),
         };
         let moved = V::splat(self.known.ts).mul(newest.add(y));
-        // A product with 1/2 is as exact as the quotient of the scalar loop, and spares the divider, which tanh needs.
+        // Times 1/2 gives the same bits as the scalar loop's division by 2 and spares the divider, which tanh needs.
         let moved = moved.mul(V::splat(0.5));
         V::load(&self.position.0)
             .add(moved)

@@ -6,10 +6,10 @@ use crate::neural_ss::{NeuralSS, Shape, Stepper};
 use crate::speed::Encoder;
 use crate::{Error, Result};
 
-/// A lagged model as a plant: its regressor is kept from sample to sample.
+/// A lagged model as a plant; it keeps its regressor from sample to sample.
 #[derive(Clone, Debug)]
 pub struct LaggedPlant<'a, M> {
-    // Both ways of the same model: `form` in the data's units, which kernels know, and `model` itself where it has none.
+    // Two forms of the same model: `form` in the data's units, which kernels know, and `model` itself if it has no such form.
     model: &'a M,
     form: Option<Form>,
     /// Past outputs, newest first, then the inputs of the regressor.
@@ -49,7 +49,7 @@ impl<'a, M: Lagged> LaggedPlant<'a, M> {
             model,
             form: model.form(),
             phi: vec![0.0; lags.regressors()],
-            // From the command that is decided now to the oldest that the regressor holds.
+            // From the newest command to the oldest one in the regressor.
             inputs: vec![0.0; lags.nk + lags.nb - 1],
             lags,
             position: 0.0,
@@ -77,13 +77,13 @@ impl<M: Lagged> Plant for LaggedPlant<'_, M> {
         let Lags { na, nk, .. } = self.lags;
         push(&mut self.inputs, u);
         self.phi[na..].copy_from_slice(&self.inputs[nk - 1..]);
-        // The form where there is one, here too: a plant that is stepped by itself and one inside a kernel then differ
-        // by rounding and not by how the scaling is applied.
+        // `form` is used here too, if there is one: a plant stepped by itself and one inside a kernel then differ by
+        // rounding only, not by how the scaling is applied.
         let y = match &self.form {
             Some(form) => form.output(&self.phi),
             None => self.model.output(&self.phi),
         };
-        // Between samples the output runs straight, so an encoder sees the mean of both ends.
+        // Trapezoidal rule: between samples the output is taken to change linearly.
         self.position += self.ts * (self.phi[0] + y) / 2.0;
         push(&mut self.phi[..na], y);
     }
@@ -131,7 +131,7 @@ impl StatePlant {
                 "expected a sample time above 0, got {ts}"
             )));
         }
-        // The stepper begins where the model rests at input 0, which need not be output 0.
+        // The stepper begins at the model's rest for input 0, which need not be output 0.
         Ok(Self {
             stepper: Stepper::new(model)?,
             position: 0.0,
@@ -157,7 +157,7 @@ impl Plant for StatePlant {
     fn advance(&mut self, u: f64) {
         let before = self.output();
         self.stepper.advance(&[u]);
-        // Between samples the output runs straight, so an encoder sees the mean of both ends.
+        // Trapezoidal rule: between samples the output is taken to change linearly.
         self.position += self.ts * (before + self.output()) / 2.0;
     }
 }
@@ -165,7 +165,7 @@ impl Plant for StatePlant {
 /// Longest extra delay of a [`Varied`] plant, in samples.
 const LONGEST_DELAY: usize = 16;
 
-/// Another plant with its gain scaled and its input delayed: what a tuned controller must bear.
+/// Another plant with its gain scaled and its input delayed: a variation that a tuned controller must tolerate.
 #[derive(Clone, Debug)]
 pub struct Varied<P> {
     plant: P,
@@ -176,7 +176,7 @@ pub struct Varied<P> {
 }
 
 impl<P: Plant> Varied<P> {
-    /// `plant` with its output multiplied by `gain` and its input held back by `delay` samples.
+    /// `plant` with its output multiplied by `gain` and its input delayed by `delay` samples.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for a gain that is not above 0 or a delay above 16 samples.
@@ -200,7 +200,7 @@ impl<P: Plant> Varied<P> {
         if self.delay == 0 {
             return u;
         }
-        // A ring of `delay` entries: what is read is `delay` samples old, and its place is the newest one's.
+        // A ring of `delay` entries: the entry read is `delay` samples old, and the newest takes its place.
         let due = std::mem::replace(&mut self.pending[self.next], u);
         self.next = (self.next + 1) % self.delay;
         due
@@ -219,7 +219,7 @@ impl<P: Plant> Plant for Varied<P> {
     }
 
     fn position(&self) -> f64 {
-        // The integral of the scaled output, so that an encoder counts what it would on the other machine.
+        // The integral of the scaled output: an encoder counts what it would count on that machine.
         self.gain * self.plant.position()
     }
 
@@ -232,12 +232,12 @@ impl<P: Plant> Plant for Varied<P> {
         self.plant.encoder()
     }
 
-    /// Of a plant that is itself varied or held back, the product of the gains and the sum of the delays.
+    /// For nested variations, the product of the gains and the sum of the delays.
     fn known(&self) -> Option<KernelPlant<'_>> {
         let known = self.plant.known()?;
         Some(KernelPlant {
-            // Handed through to the kernels, which apply it to all lanes: a search over variations is as fast as over
-            // one plant.
+            // Passed on to the kernels, which apply it to all lanes: a search over variations is as fast as over one
+            // plant.
             gain: self.gain * known.gain,
             delay: self.delay + known.delay,
             ..known

@@ -1,4 +1,4 @@
-//! Controllers, one in each lane; or a single one.
+//! Controllers in lanes, one in each; the same code with one number in place of eight runs a single controller.
 
 use sewfast_control::{
     AnyController, BIQUADS, Biquad, Controller, Numbers, PidController, STATES, StateDesign,
@@ -9,33 +9,33 @@ use crate::simd::{Arithmetic, LANES};
 
 /// A kind of controller that runs in lanes.
 pub(crate) trait InLanes: Controller<f64> {
-    /// Eight of them, or a single one.
+    /// Eight of them, or one.
     type Lanes<V: Arithmetic>: LaneController<V>;
 
-    /// Whether this one can, beside the `first`.
+    /// Whether this one can share lanes with `first`.
     fn fits(&self, first: &Self) -> bool;
 
-    /// The first eight of `controllers`, at rest; missing ones are the first again.
+    /// The first eight of `controllers`, at rest; missing ones repeat the first.
     fn in_lanes<V: Arithmetic>(controllers: &[&Self]) -> Self::Lanes<V>;
 }
 
-/// What a loop asks of the controllers in its lanes: in two parts, between which other work can be done.
+/// What a loop asks of the controllers in its lanes, in two parts so that other work can run between them.
 pub(crate) trait LaneController<V> {
     /// Takes measured outputs.
-    // In two because of `Decision`: filters go on while the plants of another group step.
+    // Split for `Decision`: filters run while the plants of another group step.
     fn take(&mut self, first: bool, measured: V);
-    /// From the reference and what was taken to the commands.
+    /// From the reference and the measurement to the commands.
     fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V;
     /// The feedback after its filter, at the last sample.
     fn filtered(&self) -> V;
 }
 
-/// Work on controllers of one kind, whichever it is.
+/// Work on controllers of one kind, generic over the kind.
 pub(crate) trait WithKind {
-    /// What comes out.
+    /// The result.
     type Output;
 
-    /// Does it.
+    /// Does the work.
     fn with<C: InLanes>(self, controllers: &[&C]) -> Self::Output;
 }
 
@@ -63,14 +63,14 @@ pub(crate) fn are_of_a_kind(controllers: &[&AnyController<f64>]) -> bool {
     of_a_kind(controllers, Nothing).is_some()
 }
 
-/// The controllers within, where each has one that fits in lanes.
+/// The controllers as type `C`, if each of them is one and fits in lanes.
 fn all<'a, C: InLanes>(
     controllers: &[&'a AnyController<f64>],
     within: impl Fn(&'a AnyController<f64>) -> Option<&'a C>,
 ) -> Option<Vec<&'a C>> {
     let first = within(controllers.first()?)?;
     let fitting = |c: &&'a AnyController<f64>| within(c).filter(|c| c.fits(first));
-    // `Option<Vec>`: one that does not fit sends all of them to the scalar loop, which has the same bits.
+    // `Option<Vec>`: a single one that does not fit sends all of them to the scalar loop, which gives the same bits.
     controllers.iter().map(fitting).collect()
 }
 
@@ -88,12 +88,12 @@ impl InLanes for PidController<f64> {
     }
 }
 
-/// A derivative term below this is nothing: in a loop at rest it would fade on for ever among numbers so small that processors
-/// take a hundred times as long over them.
-// Measured as a loop at rest that was slower threefold. What is dropped is beyond every digit of a command.
+/// A derivative term below this is set to 0: in a loop at rest it would decay for ever through subnormal numbers, for
+/// which processors take a hundred times as long.
+// Found as a loop at rest that ran three times slower. The dropped value is below every digit of a command.
 const FADED: f64 = 1e-280;
 
-/// Eight cascades of biquads with as many sections each, and what they remember of feedback and reference.
+/// Eight cascades of equally many biquads, with their states for feedback and reference.
 struct Cascades<V> {
     count: usize,
     /// `c0`, `c1`, `a1` and `-a2` of each section.
@@ -103,7 +103,7 @@ struct Cascades<V> {
 }
 
 impl<V: Arithmetic> Cascades<V> {
-    /// Of the first eight controllers; missing ones are the first again.
+    /// Those of the first eight controllers; missing ones repeat the first.
     #[inline(always)]
     fn new(controllers: &[&PidController<f64>]) -> Self {
         let of = |i: usize| controllers.get(i).unwrap_or(&controllers[0]).design();
@@ -128,21 +128,21 @@ impl<V: Arithmetic> Cascades<V> {
         }
     }
 
-    /// The next sample of the feedback; the first one finds it at rest there.
+    /// The next sample of the feedback; on the first sample the filters are at rest there.
     #[inline(always)]
     fn feedback(&mut self, first: bool, y: V) -> V {
         let sections = &self.sections[..self.count];
         Self::step(sections, &mut self.of_y, first.then_some(y), y)
     }
 
-    /// The next sample of the reference; the first one finds it at rest at the output `y`.
+    /// The next sample of the reference; on the first sample the filters are at rest at the output `y`.
     #[inline(always)]
     fn reference(&mut self, first: bool, y: V, r: V) -> V {
         let sections = &self.sections[..self.count];
         Self::step(sections, &mut self.of_r, first.then_some(y), r)
     }
 
-    /// The next sample of a signal, which was at rest at `before` if this is its first.
+    /// The next sample of a signal; `before` is the value at which it was at rest, given with the first sample.
     #[inline(always)]
     fn step(sections: &[[V; 4]], memory: &mut [[V; 3]; BIQUADS], before: Option<V>, x: V) -> V {
         let mut x = x;
@@ -150,7 +150,7 @@ impl<V: Arithmetic> Cascades<V> {
             if let Some(level) = before {
                 *state = [level, V::splat(0.0), V::splat(0.0)];
             }
-            // `Memory::step` of the crate `sewfast_control`; -(a2 d) and (-a2) d are the same bits
+            // `Memory::step` of the crate `sewfast_control`; -(a2 d) and (-a2) d have the same bits
             let [last, s1, s2] = *state;
             let change = x.sub(last);
             let d = c0.mul(change).add(s1);
@@ -161,18 +161,18 @@ impl<V: Arithmetic> Cascades<V> {
     }
 }
 
-/// Eight of [`PidController`] with constant gains: the same operations in the same order.
+/// Eight [`PidController`]s with constant gains: the same operations in the same order.
 pub(crate) struct Controllers<V> {
     average: Averages<V>,
     lag: V,
-    /// `1 - a`, `b`, and 1 where there is an observer; `None` where no lane has one.
-    // `None` in these three is a branch that all samples take alike: a stage that no lane has is not computed. Where
-    // some have it, the others compute it with numbers that leave no trace (no ramp: an infinite change), or choose.
+    /// `1 - a`, `b`, and 1 if there is an observer; `None` if no lane has one.
+    // `None` in these three is a branch that goes the same way at every sample: a stage that no lane has is not computed. If only some
+    // lanes have it, the others compute it with neutral numbers (no ramp: an infinite change), or select.
     observer: Option<[V; 3]>,
-    /// Largest change of the reference in one sample; `None` where no lane has a ramp.
+    /// Largest change of the reference in one sample; `None` if no lane has a ramp.
     ramp: Option<V>,
-    // Behind a pointer: arrays that are indexed would keep all of this out of registers, also where there are none (5 % more
-    // instructions in a loop without).
+    // Boxed: indexed arrays would keep the whole struct out of registers, even without biquads (5 % more instructions
+    // then).
     biquads: Option<Box<Cascades<V>>>,
     kp: V,
     ki: V,
@@ -185,15 +185,15 @@ pub(crate) struct Controllers<V> {
     conditional: V,
     low: V,
     high: V,
-    /// Largest change of the command in one sample; `None` where no lane has a limit.
+    /// Largest change of the command in one sample; `None` if no lane has a limit.
     change: Option<V>,
     lagged: V,
     observed: V,
     innovation: V,
     r: V,
     /// The derivative's input at the last sample; NaN before the first.
-    // `e - beta r` as it was, where the scalar law keeps e and r and forms it again: the same bits from the same
-    // operations, and one value less to hold.
+    // This stores `e - beta r`; the scalar law stores e and r and forms it again. Same operations, same bits, one value
+    // less to hold.
     input: V,
     derivative: V,
     integral: V,
@@ -203,13 +203,13 @@ pub(crate) struct Controllers<V> {
 }
 
 impl<V: Arithmetic> Controllers<V> {
-    /// The first eight of `controllers`, at rest; missing ones are the first again.
+    /// The first eight of `controllers`, at rest; missing ones repeat the first.
     #[inline(always)]
     pub fn new(controllers: &[&PidController<f64>]) -> Self {
         let lane = |i: usize| *controllers.get(i).unwrap_or(&controllers[0]);
         let number = |i: usize| lane(i).numbers();
-        // `dyn` and not generic: this runs once a candidate, and a copy for each of sixteen settings would be most of the
-        // code.
+        // `dyn`, not generic: this runs once per candidate, and a copy for each of the sixteen settings would be most
+        // of the code.
         let each = |of: &dyn Fn(Numbers<f64>) -> f64| {
             V::load(&std::array::from_fn(|i| number(i).map_or(f64::NAN, of)))
         };
@@ -253,7 +253,7 @@ impl<V: Arithmetic> Controllers<V> {
             input: nan,
             derivative: zero,
             integral: zero,
-            // As `Pid::reset`: slew counts from 0 or the limit next to it.
+            // As `Pid::reset`: the slew limit starts from 0 or from the limit nearest to it.
             u: zero.at_least_each(low).at_most_each(high),
             filtered: zero,
         }
@@ -288,7 +288,7 @@ impl<V: Arithmetic> Controllers<V> {
     #[inline(always)]
     fn filter(&mut self, first: bool, x: V) -> V {
         let x = self.average.step(first, x);
-        // `first` is one flag for all lanes, since all begin at the same sample: a branch and no selection.
+        // `first` is one flag, as all lanes begin at the same sample: a branch instead of a selection.
         let from = if first { x } else { self.lagged };
         self.lagged = from.add(self.lag.mul(x.sub(from)));
         let Some([keep, gain, on]) = self.observer else {
@@ -305,8 +305,8 @@ impl<V: Arithmetic> Controllers<V> {
         // as `sewfast_control::observer` derives it.
         let innovation = keep.mul(left).add(y.sub(from));
         let speed = from.add(gain.mul(innovation));
-        // A lane without an observer has keep = gain = 0 and would hold its first value: it passes its input on by
-        // choice.
+        // A lane without an observer has keep = gain = 0 and would hold its first value: a selection passes its input
+        // on.
         self.observed = on.if_equal(V::splat(1.0), speed, y);
         self.innovation = on.if_equal(V::splat(1.0), innovation, V::splat(0.0));
         self.observed
@@ -330,13 +330,13 @@ impl<V: Arithmetic> Controllers<V> {
         //   u = Kp (e - alpha r) + I + D + feedforward
         //   I = I + (Kp Ts/Ti) e
         //   D = pole D + kd ((e - beta r) - (e - beta r) before)
-        // in the order of operations of `Pid::step_by`, and no product fused: on every level, alone and on a device, the
-        // same bits.
+        // in the order of operations of `Pid::step_by`, without fused products: the bits are the same on every level,
+        // in a single loop and on a device.
         let e = r.sub(y);
         let input = e.sub(self.beta.mul(r));
         let change = input.sub(self.input);
-        // NaN is not equal to itself, so that the first sample has no change; a selection, because `sound` below can put
-        // one lane back.
+        // NaN is not equal to itself, so the first sample has no change. A selection, because `sound` below can reset a
+        // single lane.
         let change = self.input.if_equal(self.input, change, zero);
         let derivative = self.pole.mul(self.derivative).add(self.kd.mul(change));
         let integral = self.integral.add(self.ki.mul(e));
@@ -346,19 +346,19 @@ impl<V: Arithmetic> Controllers<V> {
             None => wanted,
             Some(added) => wanted.add(V::splat(added)),
         };
-        // Limits first, slew after: the last command was within the limits, and so is all between it and a value within.
+        // Limits first, slew after: the last command was within the limits, so every value between it and a limited one is, too.
         let mut u = limited(wanted, self.low, self.high);
         if let Some(change) = self.change {
             u = limited(u, self.u.sub(change), self.u.add(change));
         }
         let fading = derivative.abs().if_less(V::splat(FADED), zero, derivative);
         let new = [u, self.kept(integral, u.sub(wanted)), fading, input];
-        // 0 where both are finite, else NaN
-        // x 0 is 0 for finite x, else NaN: two products and a sum instead of two comparisons and an AND.
+        // 0 if both are finite, else NaN
+        // x * 0 is 0 for finite x, else NaN: two products and a sum instead of two comparisons and an AND.
         let sound = wanted.mul(zero).add(input.mul(zero));
         let old = [self.u, self.integral, self.derivative, self.input];
         [self.u, self.integral, self.derivative, self.input] =
-            // Hardly ever not: four selections are saved for a branch that is foretold.
+            // Almost always true: a predicted branch saves four selections.
             if sound.abs().are_less(V::splat(1.0)) == V::ALL {
                 new
             } else {
@@ -372,20 +372,20 @@ impl<V: Arithmetic> Controllers<V> {
         self.u
     }
 
-    /// The integral to keep when the limits moved the command by `excess`.
+    /// The integral to keep if the limits moved the command by `excess`.
     #[inline(always)]
     fn kept(&self, integral: V, excess: V) -> V {
         let zero = V::splat(0.0);
-        // excess = u - wanted is negative at the upper limit, and the integral's change then positive where it pushes
-        // on: their product is negative. Conditional integration holds the integral there; back-calculation moves it by
-        // Ts/Tt of the excess.
+        // At the upper limit excess = u - wanted is negative, and the integral's change is positive if it pushes
+        // further: their product is negative. Conditional integration then holds the integral; back-calculation moves
+        // it by Ts/Tt of the excess.
         let pushes_on = integral.sub(self.integral).mul(excess);
         let held = pushes_on.if_less(zero, self.integral, integral);
         let tracked = integral.add(self.tracking.mul(excess));
         let kept = self.conditional.if_equal(V::splat(1.0), held, tracked);
         let kept = excess.if_equal(zero, integral, kept);
-        // Without integral action there is nothing to wind up, and tracking would make an offset out of the excess that
-        // no error takes back.
+        // Without integral action nothing winds up, and tracking would turn the excess into an offset that no error
+        // removes.
         self.ki.if_equal(zero, integral, kept)
     }
 }
@@ -403,10 +403,10 @@ impl InLanes for StateFeedback<f64> {
     }
 }
 
-/// Eight of [`StateFeedback`]: the same operations in the same order.
+/// Eight [`StateFeedback`]s: the same operations in the same order.
 pub(crate) struct StateLanes<V> {
-    // Vectors of four whatever the plant's order: states that are not used have zeros, and the code no loop over a
-    // number of its own. What is used costs 16 products a sample.
+    // Vectors of four for every order of plant: unused states are zero, so the code needs no loop of variable length.
+    // That costs 16 products a sample.
     a: [V; STATES],
     b: [V; STATES],
     k: [V; STATES],
@@ -414,21 +414,21 @@ pub(crate) struct StateLanes<V> {
     rest: [V; STATES],
     kr: V,
     ki: V,
-    /// In samples.
+    /// [samples]
     lead: V,
-    /// Largest change of the reference in one sample; `None` where no lane has a ramp.
+    /// Largest change of the reference in one sample; `None` if no lane has a ramp.
     ramp: Option<V>,
     low: V,
     high: V,
-    /// Largest change of the command in one sample; `None` where no lane has a limit.
+    /// Largest change of the command in one sample; `None` if no lane has a limit.
     change: Option<V>,
-    /// States as predicted for the next sample; once a measurement was taken, as corrected by it.
+    /// States predicted for the next sample; after a measurement, corrected by it.
     x: [V; STATES],
     q: V,
     r: V,
     u: V,
     measured: V,
-    /// The output as observed.
+    /// The observed output.
     observed: V,
 }
 
@@ -472,12 +472,12 @@ impl<V: Arithmetic> StateLanes<V> {
 impl<V: Arithmetic> LaneController<V> for StateLanes<V> {
     #[inline(always)]
     fn take(&mut self, first: bool, measured: V) {
-        // Nothing is asked of the measurement: the loop ends where it is not finite (`Loops::measure`), while the
-        // controller of a device has to go on.
+        // The measurement is not checked: the loop ends if it is not finite (`Loops::measure`), while a device's
+        // controller has to go on.
         if first {
             self.x = self.rest.map(|x| x.mul(measured));
         }
-        // x' = x + l (y - x1): from here to the prediction in `decide` x is the corrected state.
+        // x' = x + l (y - x1): from here until the prediction in `decide`, x is the corrected state.
         let innovation = measured.sub(self.x[0]);
         for (x, gain) in self.x.iter_mut().zip(self.l) {
             *x = x.add(gain.mul(innovation));
@@ -495,9 +495,9 @@ impl<V: Arithmetic> LaneController<V> for StateLanes<V> {
         }
         let before = if first { r } else { self.r };
         let ([k1, k2, k3, k4], [x1, x2, x3, x4]) = (self.k, self.x);
-        // In pairs, as the law on a device adds them: a chain of two additions instead of three.
+        // In pairs, as the law on a device adds them: a chain of two additions, not three.
         let fed_back = (k1.mul(x1).add(k2.mul(x2))).add(k3.mul(x3).add(k4.mul(x4)));
-        // The reference as it will be after `lead` samples at its present rate.
+        // The reference extrapolated by `lead` samples at its present rate.
         let aimed = r.add(self.lead.mul(r.sub(before)));
         let wanted = self.kr.mul(aimed).sub(fed_back).add(self.q);
         let wanted = match feedforward {
@@ -509,14 +509,14 @@ impl<V: Arithmetic> LaneController<V> for StateLanes<V> {
             u = limited(u, self.u.sub(change), self.u.add(change));
         }
         let (excess, change) = (u.sub(wanted), self.ki.mul(r.sub(y)));
-        // The integral stands where the error pushes further beyond a limit, as `kept` above has it.
+        // The integral is held if the error pushes further beyond a limit, as in `kept` above.
         let mut q = change.mul(excess).if_less(zero, self.q, self.q.add(change));
         let shifted = [x2, x3, x4, zero];
-        // x(k+1) = A x' + b u in observer form: A has -a in its first column and ones above the diagonal, so that the
-        // product is a shift and one multiplication a state. u as limited: the observer knows what the plant got.
+        // x(k+1) = A x' + b u in observer form: A has -a in its first column and ones above the diagonal, so the product is a shift and
+        // one multiplication per state. u is the limited command: the observer knows what the plant received.
         let mut x: [V; STATES] =
             std::array::from_fn(|i| shifted[i].sub(self.a[i].mul(x1)).add(self.b[i].mul(u)));
-        // 0 where the command is finite, else NaN: then the observer begins again, and the command stays
+        // 0 if the command is finite, else NaN: then the observer starts over and the command is held
         let sound = wanted.mul(zero);
         if sound.abs().are_less(V::splat(1.0)) != V::ALL {
             u = sound.if_equal(zero, u, self.u);
@@ -542,18 +542,18 @@ fn limited<V: Arithmetic>(value: V, low: V, high: V) -> V {
     value.at_least_each(low).at_most_each(high)
 }
 
-/// Eight of [`sewfast_control::filter::MovingAverage`].
+/// Eight [`sewfast_control::filter::MovingAverage`]s.
 struct Averages<V> {
-    /// Room for the longest; beyond a lane's own length there are zeros, which a sum does not feel.
-    // Slot by slot, eight loops each. In the ring's places and not in the order of age, which is the order in which the
-    // scalar average adds them: a sum's last bits depend on it.
+    /// Room for the longest; slots beyond a lane's own length are zero and do not change its sum.
+    // Slot by slot, eight loops each, in the order of the ring, not of age. The scalar average adds in that order, and
+    // the last bits of a sum depend on it.
     slots: Vec<V>,
     lengths: V,
-    /// The length of all, where it is the same.
+    /// The length, if it is the same for all.
     common: bool,
     /// Where the next sample goes.
     next: usize,
-    /// The same by lane, where lengths differ.
+    /// The same per lane, if lengths differ.
     nexts: V,
 }
 
@@ -570,11 +570,11 @@ impl<V: Arithmetic> Averages<V> {
         }
     }
 
-    /// Takes samples, gives the averages; the first fill the memory.
+    /// Takes samples and returns the averages; the first sample fills the memory.
     #[inline(always)]
     fn step(&mut self, first: bool, x: V) -> V {
         if self.common && self.slots.len() == 1 {
-            // the lag that follows makes the same of -0 and of 0
+            // the lag that follows maps -0 and 0 to the same value
             return x;
         }
         if first {
@@ -583,37 +583,37 @@ impl<V: Arithmetic> Averages<V> {
                 self.slots[j] = place.if_less(self.lengths, x, V::splat(0.0));
             }
         }
-        // Formed anew each time: a running sum would drift, here as in the scalar average.
+        // Summed anew each time: a running sum would drift, here as in the scalar average.
         let sum = if self.common {
             self.alike(x)
         } else {
             self.apart(x)
         };
-        // A division as there; 1/n times the sum rounds differently.
+        // A division, as in the scalar average; multiplying by 1/n rounds differently.
         sum.div(self.lengths)
     }
 
-    /// The sum where all have one length.
+    /// The sum if all have one length.
     #[inline(always)]
     fn alike(&mut self, x: V) -> V {
         self.slots[self.next] = x;
         let next = self.next + 1;
         self.next = if next < self.slots.len() { next } else { 0 };
         let mut sum = V::splat(0.0);
-        // One addition after the other, as their order is part of the result; the groups of loops that take turns fill
-        // the waiting. 4 to 6 % of a candidate by this special case.
+        // One addition after the other, as their order is part of the result; the other groups' turns fill the waiting.
+        // This special case saves 4 to 6 % per candidate.
         for j in 0..self.slots.len() {
             sum = sum.add(self.slots[j]);
         }
         sum
     }
 
-    /// The sum where lengths differ.
+    /// The sum if lengths differ.
     #[inline(always)]
     fn apart(&mut self, x: V) -> V {
         let mut sum = V::splat(0.0);
         for j in 0..self.slots.len() {
-            // Each lane has its own place: every slot is offered the sample, and one lane or other takes it.
+            // Each lane has its own position: every slot is offered the sample and only the lanes at that position take it.
             let kept = self.nexts.if_equal(V::splat(j as f64), x, self.slots[j]);
             self.slots[j] = kept;
             sum = sum.add(kept);
