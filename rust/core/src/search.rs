@@ -1,9 +1,9 @@
-//! Searches of the unit box for the least cost, or for a front of least values; none of them knows what it searches.
+//! Searches of the unit box for the least cost, or for a Pareto front; none of them knows what it searches.
 //!
-//! Candidates are judged in batches over threads. Who judges what has no part in the result: a seed gives the same
-//! bits at any number of threads.
+//! Candidates are judged in batches over threads. Which thread judges which candidate does not matter: a seed gives the
+//! same bits at any number of threads.
 //!
-//! To read: [`cma_es`] and [`genetic`] for the least, with the quadratic `model` that both ask, [`nsga2`] for a front.
+//! To read: [`cma_es`] and [`genetic`] for the least cost, with the quadratic `model` that both use; [`nsga2`] for a front.
 
 pub mod cma_es;
 pub mod genetic;
@@ -21,18 +21,18 @@ use crate::{Error, Monitor, Result};
 pub struct Judgement {
     /// Sum of the relative violations of the constraints; 0 for a feasible candidate.
     pub violation: f64,
-    /// What it costs; of a candidate that cannot beat what it has to, what it costs at least.
+    /// Its cost; a lower bound of it if the candidate cannot beat what it has to.
     pub cost: f64,
 }
 
 impl Judgement {
-    /// Of a candidate that cannot be judged at all.
+    /// The judgement of a candidate that cannot be judged at all.
     pub const HOPELESS: Self = Self {
         violation: f64::INFINITY,
         cost: f64::INFINITY,
     };
 
-    /// A feasible candidate's.
+    /// The judgement of a feasible candidate.
     pub fn feasible(cost: f64) -> Self {
         Self {
             violation: 0.0,
@@ -40,7 +40,7 @@ impl Judgement {
         }
     }
 
-    /// Of two feasible candidates the cheaper is less, of two infeasible ones that with the smaller violation.
+    /// The less is the better: of two feasible candidates the cheaper, of two infeasible ones the one with the smaller violation.
     pub fn order(&self, other: &Self) -> Ordering {
         self.violation
             .total_cmp(&other.violation)
@@ -55,10 +55,10 @@ impl Judgement {
 
 /// What is searched: a function over the unit box.
 pub trait Problem: Sync {
-    /// What one thread needs to judge candidates.
+    /// The memory that one thread needs to judge candidates.
     type Memory: Send;
 
-    /// Coordinates of a point.
+    /// Number of coordinates of a point.
     fn dimensions(&self) -> usize;
 
     /// Fresh memory for a thread.
@@ -69,13 +69,13 @@ pub trait Problem: Sync {
         1
     }
 
-    /// Whether its costs are those that count, and not of a part of the work.
+    /// Whether its costs are the final ones, not those on a part of the work.
     fn is_whole(&self) -> bool {
         true
     }
 
-    /// How good each candidate is, whatever the others are; the work on one may end as soon as it cannot beat what it has
-    /// to any more, or on a stop.
+    /// How good each candidate is, independent of the others. The work on one may end as soon as it cannot beat its
+    /// `to_beat` any more, or on a stop.
     fn judge(
         &self,
         memory: &mut Self::Memory,
@@ -93,7 +93,7 @@ pub struct Options {
     pub seed: u64,
     /// Threads.
     pub threads: usize,
-    /// A population has come together when its costs lie within this share of the best.
+    /// A population has converged when its costs lie within this share of the best.
     pub tolerance: f64,
 }
 
@@ -114,7 +114,7 @@ impl Options {
 pub enum Termination {
     /// All evaluations were used.
     Evaluations,
-    /// All candidates had come together.
+    /// All candidates had converged.
     Converged,
     /// A stop was requested; the best so far is returned.
     Interrupted,
@@ -131,7 +131,7 @@ impl Termination {
     }
 }
 
-/// The best point and the story of its search.
+/// The best point and how the search found it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Found {
     /// The best point.
@@ -144,20 +144,20 @@ pub struct Found {
     pub termination: Termination,
 }
 
-/// A point to be judged, and what it has to beat to be of any use.
+/// A point to judge, and the judgement it has to beat to be of use.
 #[derive(Clone, Debug)]
 pub struct Candidate {
     /// Where it is.
     pub point: Vec<f64>,
-    /// What it has to beat.
+    /// The judgement it has to beat.
     pub to_beat: Judgement,
 }
 
-/// A way to search: it is asked for candidates and told how good they are.
+/// A search strategy: it is asked for candidates and told how good they are.
 trait Strategy {
     /// The next candidates, 1 to `limit`.
     fn ask(&mut self, limit: usize) -> Vec<Candidate>;
-    /// What they were worth.
+    /// Learns their judgements.
     fn tell(&mut self, candidates: Vec<Candidate>, judgements: &[Judgement]);
     /// Whether more candidates would be of no use.
     fn converged(&self) -> bool;
@@ -179,7 +179,7 @@ fn run<P: Problem>(
     proceed(problem, strategy, begun, options, monitor)
 }
 
-/// Goes on with a search that has begun, as [`run`]; the evaluations are those of both.
+/// Continues a search that has begun, as [`run`]; the evaluations count for both.
 fn proceed<P: Problem>(
     problem: &P,
     strategy: &mut impl Strategy,
@@ -224,8 +224,8 @@ fn proceed<P: Problem>(
     }
 }
 
-/// `work` on the items, up to `together` at once and no more than leave something for every memory; the results are in
-/// the items' order.
+/// `work` on the items, up to `together` at once, but few enough that every memory gets some; the results are in the
+/// items' order.
 pub(crate) fn several<M: Send, I: Sync, R: Send>(
     memories: &mut [M],
     items: &[I],
@@ -238,8 +238,7 @@ pub(crate) fn several<M: Send, I: Sync, R: Send>(
     results.into_iter().flatten().collect()
 }
 
-/// `work` on every item, by as many threads as there are memories; the results are in the items' order, whichever thread
-/// computed them.
+/// `work` on every item, with one thread per memory; the results are in the items' order, independent of the threads.
 pub(crate) fn each<M: Send, I: Sync, R: Send>(
     memories: &mut [M],
     items: &[I],

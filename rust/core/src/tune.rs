@@ -1,9 +1,9 @@
 //! Tuning of controllers by simulated closed loops.
 //!
-//! A candidate's cost is taken over every plant and every reference, with encoder, filter and limits in the loop;
-//! [`search`](crate::search) finds the least, or the front of what can be had ([`pareto`]).
+//! A candidate's cost is taken over every plant and every reference, with encoder, filter and limits in the loop.
+//! [`search`](crate::search) finds the least cost, or a Pareto front ([`pareto`]).
 //!
-//! To read: `variable` (what is searched), `cost` (what a run costs, what it must keep to), `load` (steps of the load), `bench`
+//! To read: `variable` (what is searched), `cost` (what a run costs, and its constraints), `load` (load steps), `bench`
 //! (the runs of one thread), `front`.
 
 mod bench;
@@ -31,27 +31,27 @@ use variable::{designed, moved, place};
 /// What is tuned, on what.
 #[derive(Clone, Debug)]
 pub struct Task<'a, P> {
-    /// Plants that one controller has to serve, each with the same weight.
+    /// Plants that one controller has to serve, all with the same weight.
     pub plants: &'a [P],
-    /// References that it has to follow, each with the same weight.
+    /// References to follow, all with the same weight.
     pub references: &'a [&'a [f64]],
-    /// A command that is added behind the limits along each reference \[u\], as long as that; empty for none at all.
+    /// A command added after the limits along each reference \[u\], as long as the reference; empty for none at all.
     pub disturbances: &'a [&'a [f64]],
-    /// Noise on what is measured of each plant along the references \[y\], as long as the longest; empty for none at all.
+    /// Measurement noise of each plant along the references \[y\], as long as the longest reference; empty for none at all.
     pub noise: &'a [&'a [f64]],
-    /// Load steps that it has to bear, each with the same weight; of their runs only recovery, deviation and `|u|` count.
+    /// Load steps to tolerate, all with the same weight; only recovery, deviation and `|u|` of their runs count.
     pub loads: &'a [LoadStep<'a>],
     /// The encoder of plants that bring none; `None` for ideal feedback.
     pub encoder: Option<Encoder>,
-    /// The controller to begin with; what is not searched is kept.
+    /// The controller to begin with; parameters that are not searched keep its values.
     pub start: AnyDesign<f64>,
     /// What is searched.
     pub variables: &'a [Variable],
-    /// What counts how much.
+    /// The weights of the cost.
     pub cost: Cost,
     /// How the plants' costs become one.
     pub aggregate: Aggregate,
-    /// What every controller has to keep to.
+    /// Constraints on every controller.
     pub constraints: Constraints<'a>,
 }
 
@@ -75,20 +75,20 @@ pub enum Method {
     CmaEs,
 }
 
-/// The best controller and the story of its search.
+/// The best controller and how the search found it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tuned {
     /// The best controller.
     pub design: AnyDesign<f64>,
-    /// What the search began with: the task's start, moved to the bounds that were asked for.
+    /// The controller at which the search began: the task's start, moved within the given bounds.
     pub start: AnyDesign<f64>,
     /// Its cost.
     pub cost: f64,
-    /// Sum of its relative violations of the constraints; above 0 only where the search was interrupted.
+    /// Sum of its relative violations of the constraints; above 0 only if the search was interrupted.
     pub violation: f64,
-    /// The cost of the start; infinite where it diverges.
+    /// The cost of the start; infinite if it diverges.
     pub start_cost: f64,
-    /// The cost of the best so far after each evaluation, the start's first.
+    /// The best cost so far after each evaluation, the start's first.
     pub trace: Vec<f64>,
     /// Why the search ended.
     pub termination: Termination,
@@ -96,18 +96,18 @@ pub struct Tuned {
     pub weights: Weights,
 }
 
-/// Share of the candidates that are judged on a part of the runs.
+/// Share of the candidates judged on a part of the runs.
 const SCOUTS: f64 = 0.75;
 
-/// Costs that differ by less than this share are equal, when it is asked whether a population has come together.
+/// Costs that differ by less than this share count as equal in the test whether a population has converged.
 pub const TOLERANCE: f64 = 1e-5;
 
-/// Searches the task's variables for the least cost. The result is never worse than the start, which is moved to the
-/// bounds that were asked for where it lies outside.
+/// Searches the task's variables for the least cost. The result is never worse than the start, which is first moved
+/// within the given bounds.
 ///
 /// # Errors
 /// `ErrorKind::Setting` for limits that are not finite or a start, variables, weights, constraints or options out of
-/// range, `ErrorKind::Data` for references that cannot be run, `ErrorKind::Fit` where every controller tried diverges or
+/// range, `ErrorKind::Data` for references that cannot be run, `ErrorKind::Fit` if every controller tried diverges or
 /// violates a constraint.
 pub fn tune<P: Plant + Clone + Send + Sync>(
     task: &Task<'_, P>,
@@ -152,10 +152,10 @@ pub fn tune<P: Plant + Clone + Send + Sync>(
     tuned.checked()
 }
 
-/// Searches on a part of the runs for where the least is, then on all of them for the least itself.
+/// First searches on a part of the runs for the region of the minimum, then on all runs for the minimum itself.
 ///
-/// The runs of different plants along different references say much the same about a controller. On a part in which each
-/// reference has one plant, most of the search costs as little as on one plant.
+/// Runs of different plants along different references say much the same about a controller. In the part each reference
+/// has one plant, so most of the search costs as little as a search on one plant.
 fn staged<P: Plant + Clone + Send + Sync>(
     task: &Task<'_, P>,
     bench: &Bench<P>,
@@ -186,7 +186,7 @@ fn staged<P: Plant + Clone + Send + Sync>(
     let Some(last) = trace.last_mut() else {
         return Ok(scouted);
     };
-    // a stop must not lose what has been found
+    // a stop request must not lose what has been found
     let judge = |design| bench.clone().judge_one(task, &design, &Monitor::default());
     let design = designed(task.variables, &scouted.point, &task.start);
     let judgement = design.map_or(Judgement::HOPELESS, judge);
@@ -199,10 +199,10 @@ fn staged<P: Plant + Clone + Send + Sync>(
     cma_es::refine(&on(Extent::Whole), found, options, monitor)
 }
 
-/// What each design costs, and by how much it violates the constraints; infinite where a run diverges.
+/// What each design costs, and by how much it violates the constraints; infinite if a run diverges.
 ///
 /// # Errors
-/// As [`tune`], but for designs that are of no use.
+/// As [`tune`], except that useless designs are no error.
 pub fn costs<P: Plant + Clone + Send + Sync>(
     task: &Task<'_, P>,
     designs: &[AnyDesign<f64>],
@@ -221,10 +221,10 @@ pub fn costs<P: Plant + Clone + Send + Sync>(
     }))
 }
 
-/// What each plant does at worst under the task's load steps with a design: what others may be measured by.
+/// The worst that each plant does with a design under the task's load steps: a reference for other designs.
 ///
 /// # Errors
-/// As [`tune`]; `ErrorKind::Fit` where a run diverges or on a stop.
+/// As [`tune`]; `ErrorKind::Fit` if a run diverges or on a stop.
 pub fn loaded<P: Plant + Clone>(
     task: &Task<'_, P>,
     design: &AnyDesign<f64>,
@@ -261,21 +261,21 @@ impl Tuned {
 }
 
 impl<'a, P> Task<'a, P> {
-    /// Runs on each plant: the load steps, which are short and tell early what is of no use, then the references.
+    /// Runs on each plant: first the load steps, which are short and expose useless candidates early, then the references.
     fn runs(&self) -> usize {
         self.loads.len() + self.references.len()
     }
 
-    /// What acts on a plant's run from outside.
+    /// The external signals of a plant's run.
     fn signals(&self, plant: usize, run: usize) -> Signals<'a> {
         match self.loads.get(run) {
-            // Without noise: a recovery is the last time beyond a band, and of noise that is one of its peaks.
+            // Without noise: recovery is the last time beyond a band, and with noise that would be one of its peaks.
             Some(load) => load.signals(),
             None => self.along(plant, run - self.loads.len()),
         }
     }
 
-    /// A reference with what disturbs it, and what disturbs its measurement.
+    /// A reference with its disturbance and its measurement noise.
     fn along(&self, plant: usize, reference: usize) -> Signals<'a> {
         let r = self.references[reference];
         let noise = self.noise.get(plant);
@@ -286,10 +286,10 @@ impl<'a, P> Task<'a, P> {
         }
     }
 
-    /// How many of a plant's runs weigh as much as one on all plants; `None` for a run that is not in this extent.
+    /// How many of a plant's runs weigh as much as one on all plants; `None` for a run outside this extent.
     ///
-    /// In a part, every plant bears its load steps, as most constraints are about them, and one plant follows each reference.
-    /// Plants are a model's variations, one model after the other: steps of the golden ratio meet several of both.
+    /// In a part, every plant bears its load steps, as most constraints concern them, and one plant follows each
+    /// reference. Plants are variations of models, model by model: strides of the golden ratio reach several of both.
     fn share(&self, extent: Extent, plant: usize, run: usize) -> Option<f64> {
         let Some(reference) = run.checked_sub(self.loads.len()) else {
             return Some(1.0);
@@ -379,14 +379,14 @@ impl<'a, P> Task<'a, P> {
     }
 }
 
-/// The cost over the box of the variables.
+/// The cost as a function over the box of the variables.
 struct Searched<'a, P> {
     task: &'a Task<'a, P>,
     bench: Bench<P>,
     extent: Extent,
 }
 
-/// The runs on which candidates are judged: all of them, or for each reference that of one plant.
+/// The runs on which candidates are judged: all of them, or one plant's for each reference.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Extent {
     Whole,

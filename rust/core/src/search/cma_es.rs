@@ -1,7 +1,7 @@
-//! CMA-ES with restarts: the covariance matrix adapts to the landscape (Hansen, arXiv 1604.00772), and a search that
-//! has come to its end begins anew with a larger or with a smaller population (BIPOP, Hansen 2009).
+//! CMA-ES with restarts: the covariance matrix adapts to the landscape (Hansen, arXiv 1604.00772). A finished run
+//! starts again with a larger or a smaller population (BIPOP, Hansen 2009).
 //!
-//! The least of a quadratic model of the points judged so far takes part in each generation (Hansen, arXiv 1110.4181, on
+//! The minimum of a quadratic model of the points judged so far joins each generation (Hansen, arXiv 1110.4181, on
 //! injected candidates): in smooth valleys that saves most of the evaluations.
 
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
@@ -12,27 +12,27 @@ use super::{Candidate, Found, Judgement, Options, Problem, Strategy, proceed, ru
 use crate::random::Random;
 use crate::{Monitor, Result};
 
-/// First step about a start, and without one, in shares of the box.
+/// First step around a start, and without a start, in shares of the box.
 const STEP: (f64, f64) = (0.15, 0.3);
 /// First step of a refinement, in shares of the box.
 const SMALL_STEP: f64 = 0.03;
-/// Size of a refinement's generations against the usual one: larger ones follow a rough landscape's slope.
+/// Size of a refinement's generations relative to the usual one: larger generations follow the slope of a rough landscape.
 pub(super) const GENERATION: f64 = 1.4;
-/// A refinement has come to its end when the best improves by less than this share within so many generations.
+/// A refinement ends when the best improves by less than this share within so many generations.
 pub(super) const STALLED: (f64, usize) = (1e-3, 12);
 /// Steps smaller than this share of the box change nothing.
 const SMALLEST_STEP: f64 = 1e-11;
-/// Ratio of the longest to the shortest axis, squared, beyond which the matrix is of no use.
+/// Squared ratio of the longest to the shortest axis beyond which the matrix is of no use.
 const WORST_CONDITION: f64 = 1e14;
-/// A candidate dearer than this many times the last generation's median is not judged to its end.
+/// A candidate that costs more than this many medians of the last generation is not judged to its end.
 const ABANDONED: f64 = 3.0;
-/// Radii within which a model's least is looked for, in standard deviations: about the length of samples' steps in few
-/// dimensions, so that none need clipping.
+/// Radii within which a model's minimum is searched, in standard deviations: about the length of the samples' steps in
+/// few dimensions, so that none need clipping.
 const TRUST: [f64; 2] = [1.5, 3.0];
-/// Most generations without a model's least after all of one's were infeasible.
+/// Most generations without a model's minimum after all of a model's candidates were infeasible.
 const PAUSE: usize = 16;
 
-/// Searches the box, beginning about `start` where there is one.
+/// Searches the box, beginning around `start` if there is one.
 ///
 /// # Errors
 /// `ErrorKind::Setting` without evaluations or threads.
@@ -47,8 +47,8 @@ pub fn search<P: Problem>(
     Ok(run(problem, &mut strategy, options, monitor))
 }
 
-/// Goes on from the best of a search of a part of the problem, by small steps until nothing improves any more. The evaluations
-/// are those of both.
+/// Continues from the best point of a search on a part of the problem, with small steps until nothing improves any
+/// more. The evaluations count for both.
 ///
 /// # Errors
 /// As [`search`].
@@ -136,12 +136,12 @@ impl Restarts {
         let random = &mut self.random;
         let mean = (0..self.dimensions).map(|_| random.uniform()).collect();
         self.now = Evolution::new(mean, step, size as usize);
-        // What an earlier run knows would draw this one to where that has ended.
+        // What an earlier run knows would draw this one to the end of that run.
         self.archive = Archive::default();
     }
 }
 
-/// The default population, `4 + 3 ln n`.
+/// The default population size, `4 + 3 ln n`.
 fn population(dimensions: usize) -> usize {
     4 + (3.0 * (dimensions as f64).ln()) as usize
 }
@@ -166,11 +166,11 @@ impl Strategy for Restarts {
     }
 }
 
-/// Constants of a population of a size (Hansen 2016, Table 1).
+/// Constants for a population size (Hansen 2016, Table 1).
 #[derive(Clone, Debug)]
 struct Weights {
     size: usize,
-    /// Of the best half, they sum to 1.
+    /// Weights of the best half, with sum 1.
     parents: Vec<f64>,
     /// Effective number of parents.
     effective: f64,
@@ -226,9 +226,9 @@ pub(super) struct Evolution {
     /// Best of each generation.
     history: Vec<Judgement>,
     last: Vec<Judgement>,
-    /// How many of this generation, its first, are a model's.
+    /// How many candidates of this generation, the first ones, come from a model.
     promising: usize,
-    /// Generations that a model pauses for, and how many of them are left.
+    /// Generations for which the model pauses, and how many of them are left.
     pause: (usize, usize),
 }
 
@@ -253,7 +253,7 @@ impl Evolution {
         }
     }
 
-    /// From a point on, in the distribution with this covariance, by generations so many times the usual size.
+    /// From a point, with this covariance, in generations `larger` times the usual size.
     pub(super) fn spread(mean: DVector<f64>, covariance: DMatrix<f64>, larger: f64) -> Self {
         let size = larger * population(mean.len()) as f64;
         let mut new = Self::new(mean.as_slice().to_vec(), 1.0, size as usize);
@@ -262,7 +262,7 @@ impl Evolution {
         new
     }
 
-    /// A generation, or what of it is left to be judged: what a model of known points takes for the best, and samples.
+    /// A generation, or as much of it as there are evaluations left: candidates of a model of known points, and samples.
     pub(super) fn ask(
         &mut self,
         limit: usize,
@@ -288,7 +288,7 @@ impl Evolution {
         points.into_iter().map(candidate).collect()
     }
 
-    /// The least of a model of known points, within each radius of trust.
+    /// The minima of a model of known points, one within each trust radius.
     fn promising(&self, known: &Archive) -> Vec<DVector<f64>> {
         let lengths = &self.lengths * self.sigma;
         let about = Ellipsoid {
@@ -312,7 +312,7 @@ impl Evolution {
         point.iter().map(|x| inside(*x)).collect()
     }
 
-    /// Above this a candidate would be among the worst anyway.
+    /// The cost above which a candidate would be among the worst anyway.
     fn to_beat(&self) -> Judgement {
         let median = self.last.get(self.last.len() / 2);
         match median {
@@ -323,7 +323,7 @@ impl Evolution {
         }
     }
 
-    /// The mean moves to the best, the paths remember where to, step size and matrix follow (Hansen 2016, Fig. 6).
+    /// Moves the mean towards the best, updates the paths, then step size and covariance (Hansen 2016, Fig. 6).
     pub(super) fn adapt(&mut self, judgements: &[Judgement]) {
         self.consider(&judgements[..self.promising]);
         let mut order: Vec<usize> = (0..judgements.len()).collect();
@@ -376,8 +376,8 @@ impl Evolution {
         self.decompose();
     }
 
-    /// Moves a mean that has left the box back into it, where known points are its neighbours; mirrored likewise, the
-    /// distribution stays the same.
+    /// Mirrors a mean that has left the box back into it, near the known points. Paths and covariance are mirrored too,
+    /// so the distribution stays the same.
     fn fold(&mut self) {
         for i in 0..self.mean.len() {
             let mirrored = self.mean[i].floor().rem_euclid(2.0) == 1.0;
@@ -391,8 +391,8 @@ impl Evolution {
         }
     }
 
-    /// A model knows nothing of constraints: where its least violates them, it pauses for longer and longer. What runs away
-    /// is no constraint's matter.
+    /// A model knows nothing of constraints: if its minima violate them, it pauses for longer and longer. Candidates
+    /// that diverge do not count: they say nothing about constraints.
     fn consider(&mut self, promising: &[Judgement]) {
         let violates = |j: &Judgement| j.violation > 0.0 && j.violation.is_finite();
         if !promising.is_empty() {
@@ -413,7 +413,7 @@ impl Evolution {
         self.axes = found.eigenvectors;
     }
 
-    /// Whether this run has come to its end: nothing changes any more, or the distribution has degenerated.
+    /// Whether this run has ended: nothing changes any more, or the distribution has degenerated.
     pub(super) fn ended(&self, tolerance: f64) -> bool {
         let (least, most) = (self.lengths.min(), self.lengths.max());
         let degenerate =
@@ -435,7 +435,7 @@ impl Evolution {
         before.violation == now.violation && before.cost - now.cost <= share * now.cost.abs()
     }
 
-    /// The best of the last generations and all of the last one cost the same.
+    /// Whether the best of the last generations and all of the last one cost the same.
     fn flat(&self, tolerance: f64) -> bool {
         let dimensions = self.mean.len() as f64;
         let window = 10 + (30.0 * dimensions / self.weights.size as f64) as usize;

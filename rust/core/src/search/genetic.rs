@@ -1,9 +1,9 @@
 //! A real-coded genetic algorithm with elitism and local refinement.
 //!
 //! Breeding: children come from tournament winners by blend crossover (Eshelman and Schaffer 1993, BLX-.5) and a
-//! mutation that narrows from generation to generation; the best of parents and children survive. Refinement: the best
-//! member moves on in a normal distribution that begins as that of the best quarter and adapts (`cma_es`), helped by a quadratic
-//! model of all that was judged (`model`). When that has come to its end, a new population is bred around the best so far.
+//! mutation that narrows with each generation; the best of parents and children survive. Refinement: an evolution
+//! (`cma_es`) starts at the best member with the distribution of the best quarter, helped by a quadratic model of all
+//! judged points (`model`). When it ends, a new population is bred around the best so far.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -13,27 +13,27 @@ use super::{Candidate, Found, Judgement, Options, Problem, Strategy, run};
 use crate::random::Random;
 use crate::{Monitor, Result};
 
-/// Members of the population for each dimension, and at least.
+/// Members of the population per dimension, and the least number.
 const MEMBERS: (usize, usize) = (4, 20);
-/// Share of the first members that lie near the start, where there is one.
+/// Share of the first members that lie near the start, if there is one.
 const NEAR: f64 = 0.5;
 /// Spread of the members near the start, in shares of the box.
 pub(super) const JITTER: f64 = 0.08;
-/// Spread of a later population's members about the best so far, which itself is not among them: it would draw all
+/// Spread of a later population's members around the best so far. The best itself is not a member: it would draw all
 /// others into its basin.
 const AWAY: f64 = 0.2;
-/// Share of all evaluations for the breeding before a refinement.
+/// Share of all evaluations spent on breeding before a refinement.
 const BRED: f64 = 0.18;
-/// Share of the population whose spread a refinement begins with.
+/// Share of the population whose spread starts a refinement.
 const ELITE: f64 = 0.25;
-/// Least spread that a refinement begins with.
+/// Least spread that starts a refinement.
 const LEAST_SPREAD: f64 = 0.015;
 /// How far blends reach beyond their parents, in shares of the parents' distance.
 const BLEND: f64 = 0.5;
 /// Spread of a mutation at the beginning and at the end of a breeding.
 const MUTATION: (f64, f64) = (0.1, 0.01);
 
-/// Searches the box, beginning about `start` where there is one.
+/// Searches the box, beginning around `start` if there is one.
 ///
 /// # Errors
 /// `ErrorKind::Setting` without evaluations or threads.
@@ -58,15 +58,15 @@ struct Genetic {
     random: Random,
     size: usize,
     dimensions: usize,
-    /// Best first.
+    /// Sorted, best first.
     members: Vec<Member>,
-    /// First members that are still to be judged.
+    /// First members that have not been judged yet.
     unborn: Vec<Vec<f64>>,
-    /// Judged in this breeding.
+    /// Candidates judged in this breeding.
     bred: usize,
     refinement: Option<Evolution>,
     best: Option<Member>,
-    /// What the refinement's model is made of.
+    /// The points of the refinement's model.
     archive: Archive,
     options: Options,
 }
@@ -90,7 +90,7 @@ impl Genetic {
         new
     }
 
-    /// A new population, half of it about a point where there is one.
+    /// A new population, half of it around a point if there is one.
     fn settle(&mut self, about: Option<&[f64]>, spread: f64) {
         let near = about.map_or(0, |_| (NEAR * self.size as f64) as usize);
         if let Some(point) = about {
@@ -133,7 +133,7 @@ impl Genetic {
         child
     }
 
-    /// From the best member on, with the spread of the best quarter about it.
+    /// Starts at the best member, with the spread of the best quarter around it.
     fn refine(&mut self) -> Evolution {
         let elite = ((ELITE * self.members.len() as f64) as usize).max(1);
         let best = DVector::from_column_slice(&self.members[0].point);
@@ -218,13 +218,13 @@ impl Strategy for Genetic {
     }
 }
 
-/// A point beside another one.
+/// A point near another one.
 pub(super) fn jittered(point: &[f64], spread: f64, random: &mut Random) -> Vec<f64> {
     let about = |x: &f64| (x + spread * random.normal()).clamp(0.0, 1.0);
     point.iter().map(about).collect()
 }
 
-/// Points of which each coordinate has one in every slice of the box (Latin hypercube, McKay 1979).
+/// Points with exactly one in every slice of each coordinate (Latin hypercube, McKay 1979).
 pub(super) fn stratified(count: usize, dimensions: usize, random: &mut Random) -> Vec<Vec<f64>> {
     let mut points = vec![vec![0.0; dimensions]; count];
     let mut order: Vec<usize> = (0..count).collect();

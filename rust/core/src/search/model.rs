@@ -1,25 +1,25 @@
-//! A quadratic model of the cost about the centre of a search, fitted to the judged points nearest to it.
+//! A quadratic model of the cost around the centre of a search, fitted to the nearest judged points.
 //!
-//! Nearness is that of the search's own distribution, whose axes and lengths are the model's coordinates; near points
-//! count more (Kern, Hansen and Koumoutsakos 2006, "Local meta-models for optimization using evolution strategies").
+//! Nearness is measured by the search's own distribution, whose axes and lengths define the model's coordinates; near points count more
+//! (Kern, Hansen and Koumoutsakos 2006, "Local meta-models for optimization using evolution strategies").
 
 use nalgebra::{DMatrix, DVector};
 
 use super::{Candidate, Judgement};
 
-/// Points that a model is fitted to, for each of its coefficients.
+/// Points that a model is fitted to, per coefficient.
 const POINTS: usize = 2;
-/// Judged points that are kept, for each of a model's coefficients.
+/// Judged points that are kept, per coefficient of a model.
 const KEPT: usize = 120;
-/// Dimensions up to which a model costs little beside what it saves.
+/// Dimensions up to which a model costs little compared with what it saves.
 const DIMENSIONS: usize = 12;
-/// Squared distance at which points count nothing any more, against the farthest point's.
+/// Squared distance at which a point's weight is 0, relative to the farthest point's.
 const REACH: f64 = 1.05;
-/// Share of the points whose costs are told apart best: those much dearer than they are tell little about the valley.
+/// Quantile of the costs at which a point's weight is halved: much dearer points say little about the valley.
 const CHEAP: f64 = 0.25;
-/// What is added to the diagonal of the normal equations, against its mean.
+/// Added to the diagonal of the normal equations, relative to its mean.
 const RIDGE: f64 = 1e-8;
-/// Doublings until the pull to the centre is strong enough, and halvings to find how strong it has to be.
+/// Doublings until the pull to the centre is strong enough, and halvings to find the strength needed.
 const PULLS: (usize, usize) = (200, 40);
 
 /// Coefficients of a quadratic function.
@@ -27,14 +27,14 @@ fn coefficients(dimensions: usize) -> usize {
     (dimensions + 1) * (dimensions + 2) / 2
 }
 
-/// Feasible points that were judged to their end, the latest last.
+/// Feasible points that were fully judged, the latest last.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Archive {
     points: Vec<(DVector<f64>, f64)>,
 }
 
 impl Archive {
-    /// Keeps the points whose cost is known: of one that could not beat what it had to, only a bound is.
+    /// Keeps the points whose cost is known: a candidate that could not beat `to_beat` has only a bound.
     pub(super) fn keep(&mut self, candidates: &[Candidate], judgements: &[Judgement]) {
         for (candidate, judged) in candidates.iter().zip(judgements) {
             let feasible = judged.violation == 0.0 && judged.cost.is_finite();
@@ -92,7 +92,7 @@ impl Ellipsoid<'_> {
         along.component_div(self.lengths)
     }
 
-    /// What makes `z` of a distance from the centre.
+    /// The matrix that maps a distance from the centre to `z`.
     fn whitening(&self) -> DMatrix<f64> {
         let mut whitening = self.axes.transpose();
         for (mut row, length) in whitening.row_iter_mut().zip(self.lengths) {
@@ -135,8 +135,8 @@ impl Model {
         })
     }
 
-    /// The least within the box and so many standard deviations from the centre: coordinates that leave the box end at
-    /// its edge, and the others follow.
+    /// The minimum within the box and within `radius` standard deviations from the centre. A coordinate that leaves the
+    /// box is fixed at its edge, and the others are solved again.
     pub(super) fn least(&self, radius: f64) -> Option<DVector<f64>> {
         let n = self.centre.len();
         let mut fixed = vec![None; n];
@@ -153,8 +153,8 @@ impl Model {
         }
     }
 
-    /// The best step within a radius, of which some coordinates are given: the least pull to the centre that keeps it
-    /// inside is found by halving (Nocedal and Wright 2006, section 4.3).
+    /// The best step within a radius with some coordinates fixed. Halving finds the least pull to the centre that keeps
+    /// the step inside (Nocedal and Wright 2006, section 4.3).
     fn step(&self, fixed: &[Option<f64>], radius: f64) -> Option<DVector<f64>> {
         let inside = |pull: f64| {
             let step = self.pulled(fixed, pull)?;
@@ -168,7 +168,7 @@ impl Model {
             high *= 2.0;
             inside(high)
         });
-        // Coordinates at the edge may lie beyond the radius by themselves.
+        // Coordinates fixed at the edge may already lie beyond the radius.
         let mut best = doubled.or_else(|| self.pulled(fixed, high))?;
         for _ in 0..PULLS.1 {
             let middle = 0.5 * (low + high);
@@ -180,7 +180,7 @@ impl Model {
         Some(best)
     }
 
-    /// The free coordinates where `(H + pull M) d = -g`; `None` where that is no minimum.
+    /// Solves `(H + pull M) d = -g` for the free coordinates; `None` if that is no minimum.
     fn pulled(&self, fixed: &[Option<f64>], pull: f64) -> Option<DVector<f64>> {
         let free: Vec<usize> = (0..fixed.len()).filter(|&i| fixed[i].is_none()).collect();
         let mut step = DVector::from_iterator(fixed.len(), fixed.iter().map(|f| f.unwrap_or(0.0)));
@@ -195,7 +195,7 @@ impl Model {
     }
 }
 
-/// Coefficients of `1, z, z_i z_j` that fit the costs, near and cheap points before the others.
+/// Coefficients of `1, z, z_i z_j` fitted to the costs; near and cheap points weigh more.
 fn regression(near: &[Near], n: usize) -> Option<DVector<f64>> {
     let mut costs: Vec<f64> = near.iter().map(|p| p.cost).collect();
     costs.sort_by(f64::total_cmp);
@@ -220,7 +220,7 @@ fn regression(near: &[Near], n: usize) -> Option<DVector<f64>> {
     Some(normal.cholesky()?.solve(&right))
 }
 
-/// Places of a matrix on and below its diagonal.
+/// Indices of a matrix on and below its diagonal.
 fn pairs(n: usize) -> impl Iterator<Item = (usize, usize)> {
     (0..n).flat_map(|i| (0..=i).map(move |j| (i, j)))
 }

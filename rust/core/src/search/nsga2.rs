@@ -1,5 +1,5 @@
-//! NSGA-II: a front of points of which none is better than another in everything (Deb, Pratap, Agarwal and Meyarivan
-//! 2002), with simulated binary crossover (Deb and Agrawal 1995) and polynomial mutation.
+//! NSGA-II: a front of points of which none is better than another in every objective (Deb, Pratap, Agarwal and
+//! Meyarivan 2002), with simulated binary crossover (Deb and Agrawal 1995) and polynomial mutation.
 
 use std::cmp::Ordering;
 
@@ -8,12 +8,12 @@ use super::{Options, Termination, several};
 use crate::random::Random;
 use crate::{Error, Monitor, Result};
 
-/// What is searched: several values over the unit box, the smaller the better.
+/// What is searched: several objectives over the unit box, each to be small.
 pub trait Objectives: Sync {
-    /// What one thread needs to judge candidates.
+    /// The memory that one thread needs to judge candidates.
     type Memory: Send;
 
-    /// Coordinates of a point.
+    /// Number of coordinates of a point.
     fn dimensions(&self) -> usize;
 
     /// Fresh memory for a thread.
@@ -24,7 +24,7 @@ pub trait Objectives: Sync {
         1
     }
 
-    /// The values at each point, whatever the others are.
+    /// The values at each point, independent of the other points.
     fn judge(
         &self,
         memory: &mut Self::Memory,
@@ -38,12 +38,12 @@ pub trait Objectives: Sync {
 pub struct Values {
     /// Sum of the relative violations of the constraints; 0 for a feasible candidate.
     pub violation: f64,
-    /// The objectives, as many for every candidate; infinite where the candidate is of no use.
+    /// The objectives, as many for every candidate; infinite if the candidate is useless.
     pub objectives: Vec<f64>,
 }
 
 impl Values {
-    /// Whether these are better than others under constraints: feasible before infeasible, then by dominance.
+    /// Whether these dominate others under constraints: feasible before infeasible, then by dominance.
     pub fn dominate(&self, other: &Self) -> bool {
         match self.violation.total_cmp(&other.violation) {
             Ordering::Less => true,
@@ -61,14 +61,14 @@ impl Values {
 pub struct Member {
     /// Where it is.
     pub point: Vec<f64>,
-    /// What it is worth.
+    /// Its values.
     pub values: Values,
 }
 
-/// The front and how it came about.
+/// The front and how it was found.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Front {
-    /// Points of which none dominates another, by the first objective.
+    /// Points of which none dominates another, sorted by the first objective.
     pub members: Vec<Member>,
     /// Candidates judged.
     pub evaluations: usize,
@@ -79,7 +79,7 @@ pub struct Front {
 /// Distribution indices of crossover and mutation; the larger, the closer children are to their parents.
 const CROSSOVER: f64 = 15.0;
 const MUTATION: f64 = 20.0;
-/// The largest population: ranks compare each with each, and are kept.
+/// The largest population: ranking compares all pairs and stores the result.
 const MOST: usize = 2000;
 /// Probability that parents are crossed at all.
 const CROSSED: f64 = 0.9;
@@ -124,7 +124,7 @@ pub fn search<P: Objectives>(
         });
         used += points.len();
         if monitor.stopped() {
-            // What was judged after the request is not worth what it says.
+            // Judgements made after the stop request are not valid.
             break Termination::Interrupted;
         }
         let children = points.into_iter().zip(values);
@@ -147,13 +147,13 @@ struct Ranked {
 }
 
 impl Ranked {
-    /// Of two members the one with the lower rank is better, of one rank that with more room around it.
+    /// The member with the lower rank is better; within a rank, the one with more room around it.
     fn beats(&self, other: &Self) -> bool {
         self.rank < other.rank || (self.rank == other.rank && self.crowding > other.crowding)
     }
 }
 
-/// The starts, then as many points about them as anywhere.
+/// One half is the starts and points near them, the other lies anywhere in the box.
 fn first(
     starts: &[Vec<f64>],
     count: usize,
@@ -244,7 +244,7 @@ fn mutate(point: &mut [f64], random: &mut Random) {
     }
 }
 
-/// The best `size` by rank, of the last rank those with most room around them.
+/// The best `size` by rank; of the last rank, those with most room around them.
 fn survivors(all: Vec<Member>, size: usize) -> Vec<Ranked> {
     let mut kept = Vec::with_capacity(size);
     for (rank, indices) in ranks(&all).into_iter().enumerate() {
@@ -298,7 +298,7 @@ fn ranks(all: &[Member]) -> Vec<Vec<usize>> {
     found
 }
 
-/// How far each one's neighbours are apart, in shares of the front's extent; infinite at its ends.
+/// How far apart each member's neighbours are, in shares of the front's extent; infinite at its ends.
 fn crowding(all: &[Member], indices: &[usize]) -> Vec<f64> {
     let mut room = vec![0.0; indices.len()];
     let objectives = indices

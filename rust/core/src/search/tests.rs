@@ -55,7 +55,7 @@ fn finds_the_bottom_of_a_sphere_and_of_a_curved_valley() {
 
 #[test]
 fn a_model_of_what_is_known_saves_evaluations() {
-    // Samples alone come to 1e-4 and .5 at the most of genetic searches, to 1e-7 and .5 of CMA-ES.
+    // Samples alone reach at most 1e-4 and .5 with genetic search, 1e-7 and .5 with CMA-ES.
     let sphere = Function::new(6, (-5.0, 5.0), sphere);
     let valley = Function::new(6, (-2.0, 2.0), rosenbrock);
     for (name, search) in SEARCHES {
@@ -66,7 +66,7 @@ fn a_model_of_what_is_known_saves_evaluations() {
     }
 }
 
-/// A model of points all over the box about its middle, and the distribution's lengths.
+/// A model of points all over the box around its middle, and the distribution's lengths.
 fn model(n: usize, cost: impl Fn(&DVector<f64>) -> f64) -> (Model, DVector<f64>) {
     let mut random = Random::new(1);
     let mut known = Archive::default();
@@ -100,7 +100,7 @@ fn a_model_finds_the_least_of_a_quadratic_function() {
 
 #[test]
 fn a_models_least_at_the_edge_of_the_box_draws_the_other_coordinates_along() {
-    // Least at (1.2, .5); where the first is 1, the second is best at .5 + .2 / 2.
+    // Least at (1.2, .5); if the first is fixed at 1, the second is best at .5 + .2 / 2.
     let cost = |x: &DVector<f64>| {
         let (a, b) = (x[0] - 1.2, x[1] - 0.5);
         a * a + b * b + a * b
@@ -164,7 +164,7 @@ fn a_model_is_made_of_feasible_points_that_were_judged_to_their_end() {
 
 #[test]
 fn leaves_local_minima() {
-    // The best local minima beside the global one are worth 1.
+    // The best local minima beside the global one have the cost 1.
     let function = Function::new(3, (-5.12, 4.5), rastrigin);
     for (name, search) in SEARCHES {
         let least = median(search, &function, 20_000);
@@ -183,7 +183,7 @@ fn a_minimum_on_the_edge_is_found() {
 
 #[test]
 fn constraints_hold_and_the_way_to_the_feasible_is_found() {
-    // Least x^2 + y^2 with x + y >= 3: at (1.5, 1.5); of the box -5 .. 5 a quarter is feasible.
+    // Least x^2 + y^2 with x + y >= 3: at (1.5, 1.5); a quarter of the box -5 .. 5 is feasible.
     let function = Function {
         violation: |x| (3.0 - x[0] - x[1]).max(0.0),
         ..Function::new(2, (-5.0, 5.0), |x| x.iter().map(|x| x * x).sum())
@@ -207,7 +207,7 @@ fn constraints_hold_and_the_way_to_the_feasible_is_found() {
 
 #[test]
 fn the_least_at_a_constraint_is_found_in_many_dimensions() {
-    // Least at (1, .., 1), worth 6, where the sum may not be less; there a model points into the infeasible.
+    // Least at (1, .., 1), with cost 6, where the constraint on the sum is active; there a model points into the infeasible.
     let function = Function {
         violation: |x| (6.0 - x.iter().sum::<f64>()).max(0.0),
         ..Function::new(6, (-5.0, 5.0), |x| x.iter().map(|x| x * x).sum())
@@ -308,7 +308,7 @@ fn approaches_the_fronts_of_zitzler_deb_and_thiele() {
             })
             .collect();
         found.sort_by(f64::total_cmp);
-        // Now and then the population leaves one of the five pieces of the third front.
+        // Occasionally the population leaves one of the five pieces of the third front.
         let volume = found[2];
         assert!(
             volume > 0.98 * best && volume <= best,
@@ -479,7 +479,7 @@ impl Zdt {
     }
 }
 
-/// Area that points dominate below (1.1, 1.1).
+/// Area that points dominate, up to (1.1, 1.1).
 pub(super) fn volume(mut points: Vec<[f64; 2]>) -> f64 {
     points.sort_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
     let (mut area, mut lowest) = (0.0, 1.1);

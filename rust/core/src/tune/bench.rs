@@ -1,5 +1,5 @@
-//! One thread's plants and memory: terms and costs of controllers over all plants and references, one run after the other, or
-//! side by side from sums that are taken as they run.
+//! One thread's plants and memory: terms and costs of controllers over all plants and references. Runs go one after the
+//! other, or side by side with sums accumulated as they run.
 
 use sewfast_control::{AnyController, AnyDesign, Controller};
 
@@ -30,7 +30,7 @@ pub(super) struct Bench<P> {
     batch: Batch,
 }
 
-/// Candidates that are best judged at once.
+/// How many candidates are best judged at once.
 pub(super) const TOGETHER: usize = MOST;
 
 impl<P: Plant + Clone> Bench<P> {
@@ -55,7 +55,7 @@ impl<P: Plant + Clone> Bench<P> {
         })
     }
 
-    /// The same, for values of which every term is wanted.
+    /// The same, but with every term computed.
     pub(super) fn with_all_terms(mut self, task: &Task<'_, P>) -> Self {
         self.measures = task.references.iter().map(|r| Measure::all(r)).collect();
         self
@@ -77,9 +77,9 @@ impl<P: Plant + Clone> Bench<P> {
         judged.first().copied().unwrap_or(Judgement::HOPELESS)
     }
 
-    /// How good controllers are, each with what it has to beat; hopeless where a run diverges or on a stop.
+    /// How good controllers are, each with the judgement it has to beat; hopeless if a run diverges or on a stop.
     ///
-    /// The work on one ends as soon as it cannot beat that any more: a cost is then what it costs at least.
+    /// The work on a controller ends as soon as it cannot beat that any more: its cost is then a lower bound.
     pub(super) fn judge(
         &mut self,
         task: &Task<'_, P>,
@@ -107,14 +107,14 @@ impl<P: Plant + Clone> Bench<P> {
                 violation: loops[i] + total.late + task.constraints.of_runs(&total.largest),
                 cost: total.lower_bound(task),
             };
-            // Later runs can only add to either.
+            // Later runs can only increase either.
             !trials[i].1.beats(&judgements[i])
         });
         judgements
     }
 
     /// Terms over all plants and references, as the task aggregates them, and the violation of its constraints; `None`
-    /// where a run diverges or on a stop.
+    /// if a run diverges or on a stop.
     pub(super) fn terms(
         &mut self,
         task: &Task<'_, P>,
@@ -147,8 +147,8 @@ impl<P: Plant + Clone> Bench<P> {
         means.into_iter().zip(designs).map(aggregated).collect()
     }
 
-    /// Runs every controller over the extent's runs on every plant; `take` is told of the controller's place, the plant, the
-    /// run and its terms with their share, `None` where it diverges or on a stop, and says whether to go on with that controller.
+    /// Runs every controller over the extent's runs on every plant. `take` gets the controller's index, the plant, the run and its terms
+    /// with their share (`None` if the run diverges or on a stop), and returns whether to go on with that controller.
     fn each_run(
         &mut self,
         task: &Task<'_, P>,
@@ -173,7 +173,7 @@ impl<P: Plant + Clone> Bench<P> {
         }
     }
 
-    /// The terms of one run with each controller on one plant: side by side where plant and controllers allow it.
+    /// The terms of one run with each controller on one plant: side by side if plant and controllers allow it.
     fn several(
         &mut self,
         task: &Task<'_, P>,
@@ -201,7 +201,7 @@ impl<P: Plant + Clone> Bench<P> {
         }
     }
 
-    /// What each plant does under the load steps, the worst of all of them; `None` where a run diverges or on a stop.
+    /// What each plant does under the load steps, the worst over all of them; `None` if a run diverges or on a stop.
     pub(super) fn loaded(
         &mut self,
         task: &Task<'_, P>,
@@ -223,7 +223,7 @@ impl<P: Plant + Clone> Bench<P> {
         Some(all)
     }
 
-    /// The terms of one run on one plant; `None` where it diverges or on a stop.
+    /// The terms of one run on one plant; `None` if it diverges or on a stop.
     fn run(
         &mut self,
         task: &Task<'_, P>,
@@ -255,7 +255,7 @@ struct Total {
     finished: f64,
     worst: f64,
     own: f64,
-    /// The largest of each term of all runs.
+    /// The largest of each term over all runs.
     largest: Terms,
     /// The largest violation under a load step.
     late: f64,
@@ -299,16 +299,16 @@ impl Mean {
     }
 }
 
-// Runs that go side by side: their terms come from sums that are taken as they run.
+// Runs that go side by side: their terms come from sums accumulated as they run.
 
 /// What several controllers are run on.
 struct Runs<'a> {
     known: KernelPlant<'a>,
     signals: Signals<'a>,
     encoder: Option<&'a Encoder>,
-    /// The load step that the runs are about, else ...
+    /// The load step of the runs, or else ...
     load: Option<&'a LoadStep<'a>>,
-    /// ... what is measured of them.
+    /// ... what is measured in them.
     measure: Option<Measure>,
 }
 
@@ -321,14 +321,14 @@ struct Batch {
 }
 
 impl Batch {
-    /// Whether controllers can be run side by side, and had better be: several of one kind.
+    /// Whether controllers can run side by side and gain by it: several of one kind.
     fn take(controllers: &[&AnyController<f64>]) -> bool {
         let ts = controllers.first().map(|c| c.ts());
         let alike = controllers.iter().all(|c| Some(c.ts()) == ts);
         controllers.len() > 1 && alike && are_of_a_kind(controllers)
     }
 
-    /// The terms of each controller's run; `None` where it diverges or on a stop.
+    /// The terms of each controller's run; `None` if it diverges or on a stop.
     fn terms(
         &mut self,
         runs: &Runs<'_>,
@@ -397,7 +397,7 @@ impl Batch {
         }
     }
 
-    /// Overshoots of all lanes, where nothing else of the outputs' course is asked for.
+    /// Overshoots of all lanes, if nothing else is needed from the course of the outputs.
     fn overshoots(&self, runs: &Runs<'_>, ts: f64, used: usize) -> Vec<Lanes> {
         let Some(Course::Overshoot(edge)) = runs.measure.map(|m| m.course()) else {
             return Vec::new();
@@ -427,7 +427,7 @@ impl WithKind for OfKind<'_, '_> {
     }
 }
 
-/// The terms that sums tell, in the order of operations of [`Measure::of`].
+/// The terms that follow from sums, in the order of operations of [`Measure::of`].
 fn summed(sums: &Sums, samples: usize) -> Terms {
     let n = samples as f64;
     let rms = |sum: f64, n: usize| (sum / n.max(1) as f64).sqrt();
@@ -441,7 +441,7 @@ fn summed(sums: &Sums, samples: usize) -> Terms {
     }
 }
 
-/// [`Edge::overshoot_percent`] after [`smooth`](crate::metrics::smooth), of eight outputs.
+/// [`Edge::overshoot_percent`] after [`smooth`](crate::metrics::smooth), for eight outputs.
 struct Overshoots<'a> {
     y: &'a [Lanes],
     edge: Edge,
@@ -457,7 +457,7 @@ impl Kernel for Overshoots<'_> {
         let falls = edge.high < edge.low;
         let whole = 2 * half + 1;
         let start = V::splat(if falls { f64::INFINITY } else { -f64::INFINITY });
-        // The mean of a whole window grows with its sum: only the largest sum, of a fall the least, has to be divided.
+        // The mean of a full window grows with its sum, so only the largest sum is divided, on a falling edge the least.
         let (mut extreme, mut any) = (start, false);
         let mut highest = V::splat(0.0);
         for k in edge.start..=edge.end {

@@ -1,4 +1,4 @@
-//! What a run costs: terms in the units of the field, and their weights; what a controller must keep to, whatever it costs.
+//! What a run costs: terms in physical units and their weights; and constraints, which come before any cost.
 
 use std::fmt;
 
@@ -9,9 +9,9 @@ use crate::closed_loop::{Run, check_reference};
 use crate::metrics::{Edge, Effort, rmse, smooth};
 use crate::{Error, Result};
 
-/// What counts how much: a weight per unit of each term; docs/CONVENTIONS.md, Tuning.
+/// How much each term counts: a weight per unit; docs/CONVENTIONS.md, Tuning.
 ///
-/// `None` is the default in shares of the references' span `R` (largest minus smallest value).
+/// `None` is the default, a share of the references' span `R` (largest minus smallest value).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cost {
     /// Per unit of `rms(r - y)` \[y\].
@@ -22,13 +22,13 @@ pub struct Cost {
     pub effort: f64,
     /// Per percent of overshoot above its limit, on steps and trapezoids; `R/100`.
     pub overshoot: Option<f64>,
-    /// Overshoot that costs nothing \[%\].
+    /// Overshoot up to which there is no cost \[%\].
     pub overshoot_limit: f64,
     /// Per millisecond of rise time beyond the reference's own, on steps and trapezoids.
     pub rise: f64,
     /// Per millisecond of the output's shift against the reference.
     pub lag: f64,
-    /// Per share 1 of samples at a limit; `.02 R`.
+    /// Per unit share of samples at a limit (1: all); `.02 R`.
     pub saturation: Option<f64>,
     /// Per millisecond of recovery from a load step.
     pub recovery: f64,
@@ -54,7 +54,7 @@ impl Default for Cost {
 }
 
 impl Cost {
-    /// The weights in numbers, for references that span `span` and commands that may span `range`.
+    /// The weights as numbers, for references of range `span` and commands of range `range`.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for weights that are negative or not finite.
@@ -131,7 +131,7 @@ impl Weights {
     }
 }
 
-/// What a run was like, each in the unit stated; 0 where the reference says nothing about it.
+/// What a run was like, each term in the unit stated; 0 if the reference says nothing about it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Terms {
     /// `rms(r - y)` \[y\].
@@ -142,15 +142,15 @@ pub struct Terms {
     pub effort: f64,
     /// Overshoot on the first edge \[% of its step\].
     pub overshoot: f64,
-    /// 10-to-90 % rise time beyond the reference's own \[ms\]; where 90 % is not reached, the whole time there was.
+    /// 10-to-90 % rise time beyond the reference's own \[ms\]; the whole remaining time if 90 % is not reached.
     pub rise: f64,
-    /// Shift of the output against the reference with the least rms difference \[ms\].
+    /// Shift of the output against the reference at which their rms difference is least \[ms\].
     pub lag: f64,
     /// Share of samples at a limit.
     pub saturation: f64,
     /// Time after a load step until the deviation stays within its band \[ms\].
     pub recovery: f64,
-    /// Rms deviation from a load step on \[y\].
+    /// Rms deviation after a load step \[y\].
     pub load: f64,
     /// Largest `|u|` \[u\].
     pub u_max: f64,
@@ -162,7 +162,7 @@ impl Terms {
         self.with(other, f64::max)
     }
 
-    /// This and a share of another.
+    /// The sum of this and a share of another.
     pub(super) fn plus(&self, other: &Self, share: f64) -> Self {
         self.with(other, |a, b| a + share * b)
     }
@@ -183,10 +183,10 @@ impl Terms {
     }
 }
 
-/// Smoothing of the true output before its overshoot is taken [s]; docs/CONVENTIONS.md.
+/// Smoothing of the true output before its overshoot is computed [s]; docs/CONVENTIONS.md.
 pub(super) const SMOOTHING: f64 = 5e-3;
 
-/// Terms of the runs over one reference; terms that nobody asks for are not computed.
+/// Terms of the runs over one reference; terms that are not needed are not computed.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Measure {
     edge: Option<Edge>,
@@ -239,7 +239,7 @@ impl Measure {
         self.shaped(terms, reference, &run.y, ts)
     }
 
-    /// The terms with those that only the course of the output tells.
+    /// The terms, completed by those that depend on the course of the output.
     pub fn shaped(&self, mut terms: Terms, reference: &[f64], y: &[f64], ts: f64) -> Terms {
         if let (Some(edge), true) = (self.edge, self.overshoot || self.rise) {
             let y = smooth(y, ts, SMOOTHING);
@@ -252,7 +252,7 @@ impl Measure {
         terms
     }
 
-    /// What of the course of the output is asked for.
+    /// Which part of the output's course is needed.
     pub fn course(&self) -> Course {
         match self.edge {
             _ if self.lag => Course::All,
@@ -263,7 +263,7 @@ impl Measure {
     }
 }
 
-/// What of the course of an output is asked for.
+/// Which part of an output's course is needed.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Course {
     /// Nothing.
@@ -310,12 +310,12 @@ fn rise(edge: &Edge, reference: &[f64], y: &[f64]) -> f64 {
     }
 }
 
-/// The longest lag that is looked for [s].
+/// The longest lag that is searched [s].
 const LONGEST_LAG: f64 = 0.25;
-/// Samples between the shifts that are tried first.
+/// Samples between the shifts tried first.
 const STRIDE: usize = 8;
 
-/// The shift `s >= 0` with the least `mean((r(k - s) - y(k))^2)`, by a parabola through the best three [samples].
+/// The shift `s >= 0` with the least `mean((r(k - s) - y(k))^2)`, refined by a parabola through the best three [samples].
 fn lag(reference: &[f64], y: &[f64], longest: usize) -> f64 {
     let longest = longest.min(y.len() / 4);
     let apart = |shift: usize| {
@@ -344,20 +344,20 @@ fn lag(reference: &[f64], y: &[f64], longest: usize) -> f64 {
     fine as f64 + aside.clamp(-0.5, 0.5)
 }
 
-/// The largest sensitivity `Ms` of a design's linear loops; infinite for an unstable one.
+/// The largest sensitivity `Ms` of a design's linear loops; infinite if one is unstable.
 pub type Sensitivity<'a> = dyn Fn(&AnyDesign<f64>) -> f64 + Sync + 'a;
 
-/// Limits that are kept before anything is weighed (Deb 2000): infeasible candidates are compared by the sum of their
-/// relative violations.
+/// Constraints come before the cost (Deb 2000): infeasible candidates are compared by the sum of their relative
+/// violations.
 #[derive(Clone, Copy, Default)]
 pub struct Constraints<'a> {
-    /// Largest sensitivity, and where it comes from.
+    /// Largest sensitivity, and the function that computes it.
     pub ms: Option<(f64, &'a Sensitivity<'a>)>,
     /// Largest overshoot on steps and trapezoids \[%\].
     pub overshoot: Option<f64>,
     /// Largest `|u|` \[u\].
     pub u: Option<f64>,
-    /// What each plant may do under the load steps; empty for anything.
+    /// Limits for each plant under the load steps; empty for no limits.
     pub loads: &'a [LoadLimit],
 }
 
@@ -381,7 +381,7 @@ impl Constraints<'_> {
         ];
         let loads = self.loads.iter();
         let loads = loads.flat_map(|l| [("recovery", l.recovery), ("load", l.load)]);
-        // An infinite limit of a plant's load step is none.
+        // An infinite limit on a plant's load step is no limit.
         let loads = loads.filter(|(_, limit)| *limit != f64::INFINITY);
         let loads = loads.map(|(name, limit)| (name, Some(limit), 0.0));
         for (name, limit, least) in limits.into_iter().chain(loads) {
@@ -395,7 +395,7 @@ impl Constraints<'_> {
         Ok(())
     }
 
-    /// Relative violation by the linear loops; infinite for an unstable one.
+    /// Relative violation by the linear loops; infinite if one is unstable.
     pub(super) fn of_loops(&self, design: &AnyDesign<f64>) -> f64 {
         self.ms.map_or(0.0, |(limit, sensitivity)| {
             excess(sensitivity(design), limit)
@@ -409,7 +409,7 @@ impl Constraints<'_> {
         })
     }
 
-    /// Sum of the relative violations by what was the largest of all runs.
+    /// Sum of the relative violations by the largest terms over all runs.
     pub(super) fn of_runs(&self, largest: &Terms) -> f64 {
         let over = |limit: Option<f64>, value| limit.map_or(0.0, |limit| excess(value, limit));
         over(self.overshoot, largest.overshoot) + over(self.u, largest.u_max)

@@ -1,4 +1,4 @@
-//! What can be had: the front of controllers of which none is better than another in everything.
+//! Pareto fronts of controllers: on a front, none is better than another in every objective.
 
 use sewfast_control::AnyDesign;
 
@@ -10,7 +10,7 @@ use crate::search::nsga2::{self, Objectives, Values};
 use crate::search::{Options, Termination};
 use crate::{Error, Monitor, Result};
 
-/// What is to be small.
+/// An objective: a value to be small.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the names are those of the terms of the cost")]
 pub enum Objective {
@@ -55,10 +55,10 @@ impl Objective {
     }
 }
 
-/// Controllers of which none is better than another in everything.
+/// Controllers of which none is better than another in every objective.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Front {
-    /// The controllers, by their first objective.
+    /// The controllers, sorted by their first objective.
     pub designs: Vec<AnyDesign<f64>>,
     /// The objectives of each.
     pub values: Vec<Vec<f64>>,
@@ -68,7 +68,7 @@ pub struct Front {
     pub termination: Termination,
 }
 
-/// Searches for controllers that are small in `objectives`, with a population of `size`; `starts` are among the first.
+/// Searches for controllers with small `objectives`, with a population of `size` that begins with `starts`.
 ///
 /// # Errors
 /// As [`tune`](super::tune); `ErrorKind::Setting` for fewer than two objectives, or `Ms` without a linear loop.

@@ -1,23 +1,23 @@
-//! Load steps: what a loop does when a disturbance comes on while a reference is held.
+//! Load steps: what a loop does when a disturbance sets in while a reference is held.
 
 use super::cost::Terms;
 use crate::closed_loop::{Run, Signals, check_reference};
 use crate::{Error, Result};
 
-/// A reference that is held, and a command behind the limits that comes on [u].
+/// A reference that is held, and a command after the limits that sets in [u].
 #[derive(Clone, Copy, Debug)]
 pub struct LoadStep<'a> {
-    /// What is held \[y\], with the way there.
+    /// The reference \[y\], including the way up to the held value.
     pub reference: &'a [f64],
-    /// What comes on \[u\], at its first value other than 0.
+    /// The disturbance \[u\]; it sets in at its first value other than 0.
     pub disturbance: &'a [f64],
     /// Deviation up to which the output counts as recovered \[y\].
     pub band: f64,
-    /// Samples of the moving mean that deviations are taken of; 1 for none, a turn's where the load varies over the turn.
+    /// Samples of the moving mean over which deviations are taken: 1 for none; one turn, if the load varies over the turn.
     pub mean: usize,
 }
 
-/// What a loop may at most do under the load steps; infinite where it may do anything.
+/// The most that a loop may do under the load steps; infinite for no limit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LoadLimit {
     /// Recovery \[ms\].
@@ -58,7 +58,7 @@ impl<'a> LoadStep<'a> {
         }
     }
 
-    /// When the load comes on [samples].
+    /// When the load sets in [samples].
     fn begin(&self) -> usize {
         let on = self.disturbance.iter().position(|d| *d != 0.0);
         on.unwrap_or(self.disturbance.len())
@@ -69,8 +69,8 @@ impl<'a> LoadStep<'a> {
         self.of(&run.y, run.largest_command(), ts)
     }
 
-    /// The same from the outputs and the largest `|u|`; recovery is the last time that the deviation was beyond the band,
-    /// all the time there was where it stays there.
+    /// The same from the outputs and the largest `|u|`. Recovery is the last time that the deviation was outside the
+    /// band, or all the remaining time if it stays outside.
     pub(super) fn of(&self, y: &[f64], u_max: f64, ts: f64) -> Terms {
         let begin = self.begin();
         let off = |k: usize| y[k] - self.reference[k];

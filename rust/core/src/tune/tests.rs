@@ -303,7 +303,7 @@ fn the_gains_of_a_schedule_are_searched_and_keep_their_speeds() {
 #[test]
 fn constraints_are_kept_and_what_cannot_be_kept_is_said() {
     with_task(start(), |task| {
-        // Stands for the linear loop: the more gain, the more sensitive.
+        // A stand-in for the linear loop: the more gain, the more sensitive.
         let sensitivity = |design: &AnyDesign<f64>| 1.0 + 100.0 * pid_of(design).pid.gains.kp;
         let within = |constraints| Task {
             constraints,
@@ -497,7 +497,7 @@ fn notches_are_searched_and_other_biquads_keep_their_bits() {
         for (v, value) in values {
             assert!(value >= v.low * (1.0 - 1e-9) && value <= v.high * (1.0 + 1e-9));
         }
-        // a design alone costs what it did among others
+        // a single design costs what it cost among others
         let judged = costs(&task, &[tuned.design; 3], 2, &Monitor::default()).unwrap();
         assert!(
             judged
@@ -600,7 +600,7 @@ fn weights_of_state_feedback_are_searched_and_give_their_gains() {
             panic!("{:?}", tuned.design);
         };
         assert_eq!(lqg(found, found.weights).unwrap(), found);
-        // several at once cost what each costs alone
+        // each of several designs costs what it costs alone
         let judged = costs(&task, &[tuned.design; 3], 2, &Monitor::default()).unwrap();
         assert!(
             judged

@@ -1,4 +1,4 @@
-//! What of a controller is searched: variables with their bounds and scales.
+//! The variables of a search: parameters of a controller with their bounds and scales.
 
 use std::f64::consts::PI;
 
@@ -26,7 +26,7 @@ pub enum Parameter {
     FilterTime,
     ObserverTime,
     RRate,
-    /// Of state feedback: what its gains are made from, and its feedforward.
+    /// State feedback: what its gains are designed from, and its feedforward.
     Rho,
     Integral,
     Noise,
@@ -36,7 +36,7 @@ pub enum Parameter {
     KpAt(usize),
     TiAt(usize),
     TdAt(usize),
-    /// Of a biquad that is a notch, counted from 0.
+    /// A biquad that is a notch, counted from 0.
     NotchFrequency(usize),
     NotchDepth(usize),
     NotchWidth(usize),
@@ -62,8 +62,8 @@ const NAMES: [(&str, Parameter); 16] = [
 ];
 
 impl Parameter {
-    /// By its name; gains of a schedule's points are `Kp[0]`, `Ti[0]`, `Td[0]`, `Kp[1]` and so on, those of notches
-    /// `notch_frequency[0]`, `notch_depth[0]`, `notch_width[0]` by the number of the biquad.
+    /// By its name. Gains of a schedule's points are `Kp[0]`, `Ti[0]`, `Td[0]`, `Kp[1]` and so on; notches, by the
+    /// number of the biquad, `notch_frequency[0]`, `notch_depth[0]`, `notch_width[0]`.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for an unknown name.
@@ -100,7 +100,7 @@ impl Parameter {
         }
     }
 
-    /// Its value in a design; NaN where that has no such number.
+    /// Its value in a design; NaN if the design has no such parameter.
     pub fn of(self, design: &AnyDesign<f64>) -> f64 {
         match design {
             AnyDesign::Pid(design) => self.of_pid(design),
@@ -108,7 +108,7 @@ impl Parameter {
         }
     }
 
-    /// NaN for what state feedback does not have.
+    /// NaN for a parameter that state feedback does not have.
     fn of_states(self, design: &StateDesign<f64>) -> f64 {
         match self {
             Self::Rho => design.weights.rho,
@@ -154,7 +154,7 @@ impl Parameter {
         }
     }
 
-    /// The biquad that it belongs to.
+    /// The biquad it belongs to.
     fn section(self) -> Option<usize> {
         match self {
             Self::NotchFrequency(k) | Self::NotchDepth(k) | Self::NotchWidth(k) => Some(k),
@@ -192,7 +192,7 @@ impl Parameter {
             Self::KpAt(k) => points[k].gains.kp = value,
             Self::TiAt(k) => points[k].gains.ti = value,
             Self::TdAt(k) => points[k].gains.td = value,
-            // of a notch, done above; or of state feedback, refused before
+            // a notch's, handled above; or state feedback's, refused before
             _ => {}
         }
     }
@@ -205,7 +205,7 @@ impl Parameter {
     }
 
     /// Wide multiples of the start and of the sample time. A negative alpha or beta weights the reference by more than
-    /// 1: feedforward that a slow feedback leaves room for.
+    /// 1, as feedforward beside a slow feedback.
     fn bounds(self, start: &AnyDesign<f64>) -> Option<(f64, f64)> {
         let (ts, own) = (start.ts(), self.of(start));
         match self {
@@ -232,7 +232,7 @@ impl Parameter {
     }
 }
 
-/// A parameter of the point or the biquad of a number.
+/// Makes the parameter of a point or biquad from its number.
 type Numbered = fn(usize) -> Parameter;
 
 const NUMBERED: [(&str, Numbered); 6] = [
@@ -244,7 +244,7 @@ const NUMBERED: [(&str, Numbered); 6] = [
     ("notch_width", Parameter::NotchWidth),
 ];
 
-/// A notch by what it is made from.
+/// A notch by its design parameters.
 #[derive(Clone, Copy, Debug)]
 struct Notch {
     frequency: f64,
@@ -253,10 +253,10 @@ struct Notch {
 }
 
 impl Notch {
-    /// What [`Biquad::notch`] was given; `None` for another section.
+    /// The arguments of [`Biquad::notch`]; `None` for another section.
     ///
-    /// With `D0 = 1 + D1 + D2` the denominator is `4/D0` at `q = 1` and `4 D2/D0` at `q = -1`; `c0 - c1 = 2 (N2 - D2)/D0` and
-    /// `c0 + c1 = 2 (N1 - D1)/D0` say how far the numerator is from it. A notch has `N2 = D2`.
+    /// With `D0 = 1 + D1 + D2` the denominator is `4/D0` at `q = 1` and `4 D2/D0` at `q = -1`. The numerator differs
+    /// from it by `c0 - c1 = 2 (N2 - D2)/D0` and `c0 + c1 = 2 (N1 - D1)/D0`. A notch has `N2 = D2`.
     fn of(section: &Biquad<f64>, ts: f64) -> Option<Self> {
         let Biquad { c0, c1, a1, a2 } = *section;
         let d0 = 4.0 / (1.0 + a1 + a2);
@@ -288,18 +288,18 @@ pub struct Variable {
     pub high: f64,
     /// Searched by its logarithm.
     logarithmic: bool,
-    /// Whether the bounds were asked for.
+    /// Whether the caller gave the bounds.
     given: bool,
 }
 
 impl Variable {
-    /// A variable of a controller like `start`, between `bounds` or else the usual ones.
+    /// A variable of a controller like `start`, between `bounds` or else the usual bounds.
     ///
-    /// Times and gains are searched by their logarithm where the bounds have one sign, alpha, beta and samples linearly.
+    /// Times and gains are searched by their logarithm if the bounds have one sign; alpha, beta and samples linearly.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for bounds that are not finite or do not grow, a point that the schedule does not have, or no
-    /// bounds where there are no usual ones.
+    /// `ErrorKind::Setting` for bounds that are not finite or do not increase, a point that the schedule does not have,
+    /// or no bounds for a parameter without usual ones.
     pub fn new(
         parameter: Parameter,
         bounds: Option<(f64, f64)>,
@@ -348,7 +348,7 @@ impl Variable {
             .map(drop)
     }
 
-    /// The usual variables of a controller: its gains, alpha and beta, `N` where it has a derivative filter, its notches.
+    /// The usual variables of a controller: its gains, alpha and beta, `N` if it has a derivative filter, its notches.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for a start without usual bounds.
@@ -362,7 +362,7 @@ impl Variable {
             .collect()
     }
 
-    /// The value at a place between 0 and 1.
+    /// The value at a position between 0 and 1.
     fn value(&self, place: f64) -> f64 {
         if self.logarithmic {
             let ratio = self.high / self.low;
@@ -372,14 +372,14 @@ impl Variable {
         }
     }
 
-    /// The place of a value, moved to the bounds where it lies outside.
+    /// The position of a value, clipped to the bounds.
     fn place(&self, value: f64) -> f64 {
         let place = if self.logarithmic {
             (value / self.low).ln() / (self.high / self.low).ln()
         } else {
             (value - self.low) / (self.high - self.low)
         };
-        // A value of 0 or of the other sign has no logarithm; it is nearest to the smaller bound.
+        // A value of 0 or of the other sign has no logarithm; the smaller bound is the nearest.
         let smaller = if self.low.abs() < self.high.abs() {
             0.0
         } else {
@@ -393,7 +393,7 @@ impl Variable {
     }
 }
 
-/// What is searched of state feedback.
+/// The parameters of state feedback that are searched.
 const OF_STATES: [Parameter; 5] = [
     Parameter::Rho,
     Parameter::Integral,
@@ -402,7 +402,7 @@ const OF_STATES: [Parameter; 5] = [
     Parameter::Lead,
 ];
 
-/// Refuses what state feedback does not have.
+/// Refuses a parameter that state feedback does not have.
 fn check_states(parameter: Parameter, start: &StateDesign<f64>) -> Result<()> {
     if !parameter.of_states(start).is_nan() {
         return Ok(());
@@ -414,7 +414,7 @@ fn check_states(parameter: Parameter, start: &StateDesign<f64>) -> Result<()> {
     )))
 }
 
-/// Refuses what a PID does not have, or does not use.
+/// Refuses a parameter that a PID does not have or does not use.
 fn check_pid(parameter: Parameter, start: &Design<f64>) -> Result<()> {
     let (name, absent) = (parameter.name(), parameter.of_pid(start).is_nan());
     if OF_STATES.contains(&parameter) {
@@ -444,7 +444,7 @@ fn check_pid(parameter: Parameter, start: &Design<f64>) -> Result<()> {
     Ok(())
 }
 
-/// Gains, alpha and beta, `N` where there is a derivative filter, notches.
+/// Gains, alpha and beta, `N` if there is a derivative filter, notches.
 fn usual_of_pid(start: &Design<f64>) -> Vec<Parameter> {
     let points = start.schedule.points().len();
     let mut all = match points {
@@ -469,7 +469,7 @@ fn usual_of_pid(start: &Design<f64>) -> Vec<Parameter> {
     all
 }
 
-/// Where a design lies in the box.
+/// The point of the box that belongs to a design.
 pub(super) fn place(variables: &[Variable], design: &AnyDesign<f64>) -> Vec<f64> {
     variables
         .iter()
@@ -477,7 +477,7 @@ pub(super) fn place(variables: &[Variable], design: &AnyDesign<f64>) -> Vec<f64>
         .collect()
 }
 
-/// A start moved to the bounds that were asked for, where it lies outside.
+/// A start clipped to the bounds that the caller gave.
 pub(super) fn moved(variables: &[Variable], start: &AnyDesign<f64>) -> Result<AnyDesign<f64>> {
     let outside = |v: &&Variable| {
         let own = v.parameter.of(start);
@@ -487,7 +487,7 @@ pub(super) fn moved(variables: &[Variable], start: &AnyDesign<f64>) -> Result<An
     designed(&outside, &place(&outside, start), start)
 }
 
-/// The design at a point of the box; what is not searched is the start's.
+/// The design at a point of the box; parameters that are not searched are the start's.
 pub(super) fn designed(
     variables: &[Variable],
     point: &[f64],
@@ -517,7 +517,7 @@ fn designed_states(
             _ => {}
         }
     }
-    // gains whose weights are not searched keep their bits
+    // gains whose weights are not searched stay bit for bit
     Ok(if weights == start.weights {
         design
     } else {
@@ -528,7 +528,7 @@ fn designed_states(
 fn designed_pid(variables: &[Variable], point: &[f64], start: &Design<f64>) -> Result<Design<f64>> {
     let mut design = *start;
     let mut points = start.schedule.points().to_vec();
-    // notches that are not searched keep their bits
+    // notches that are not searched stay bit for bit
     let searched = |k| variables.iter().any(|v| v.parameter.section() == Some(k));
     let sections = start.biquads.sections();
     let mut notches: Vec<_> = (0..sections.len())

@@ -1,9 +1,9 @@
-//! Controllers that are judged side by side.
+//! Controllers judged side by side.
 
 use super::*;
 use crate::random::Random;
 
-/// Controllers of all sorts, some of which diverge or sit at their limits.
+/// Controllers of all kinds, some of which diverge or sit at their limits.
 fn designs(start: &AnyDesign<f64>) -> Vec<AnyDesign<f64>> {
     let mut random = Random::new(5);
     let mut design = || {
