@@ -1,8 +1,8 @@
 //! A motor's equations with unknown parameters, in units of the command, and their sensitivities.
 //!
-//! Nothing but command and speed is needed, so torques are told as the command `x` that makes them (the command that
-//! the winding's resistance takes) and every parameter is one that a record can show. With speed `w` \[rad/s\] and
-//! shaft angle `th`:
+//! Command and speed are the only measurements needed, so torques are expressed as the command `x` that makes them (the
+//! command across the winding's resistance), and every parameter can be identified from a record. With speed `w`
+//! \[rad/s\] and shaft angle `th`:
 //!
 //! ```text
 //! tau dx/dt = v - drop x / sqrt(x^2 + ripple^2) - x - k_e g(th) w,          |x| <= limit
@@ -14,12 +14,12 @@
 //! k_a(th) = k_a + inertia_2c cos 2 th + inertia_2s sin 2 th
 //! ```
 //!
-//! An encoder that runs out of true shows `w (1 + eccentric_c cos th + eccentric_s sin th)`.
+//! An eccentric encoder shows `w (1 + eccentric_c cos th + eccentric_s sin th)`.
 //!
 //!
-//! With a resistance R \[command/A\], a motor constant K and G volts per unit of command, `k_e = K/G`,
-//! `k_a = J R/K`, `k_b = B R/K`, `k_s = T R/K`. Derivatives are carried along with the values, as dual numbers
-//! (Griewank and Walther 2008, chapter 3): one more parameter costs one more column and no more code.
+//! With a resistance R \[command/A\], a motor constant K and G volts per unit of command, `k_e = K/G`, `k_a = J R/K`,
+//! `k_b = B R/K`, `k_s = T R/K`. Derivatives are carried along as dual numbers (Griewank and Walther 2008, chapter 3):
+//! one more parameter adds a column but no code.
 
 mod model;
 mod normal;
@@ -64,7 +64,7 @@ pub const PARAMETERS: [&str; 30] = [
     "torque_ripple_s",
 ];
 
-/// Loads and inertia once and twice per turn.
+/// Loads and inertia, once and twice per turn.
 const FIRST_OVER_THE_TURN: usize = 10;
 const LAST_OVER_THE_TURN: usize = 15;
 const DELAY: usize = 16;
@@ -72,24 +72,24 @@ const LIMIT: usize = 17;
 const UNEVEN: usize = 18;
 const SAG: usize = 19;
 const ECCENTRIC: usize = 20;
-/// The first of two coefficients for each order in [`Run::orders`].
+/// The first of the two coefficients of each order in [`Run::orders`].
 const WAVES: usize = 22;
 
-/// Orders of cogging, and that of the torque ripple.
+/// Number of orders: those of cogging, and one of the torque ripple.
 pub const ORDERS: usize = 4;
 
-/// Whether a parameter belongs to something that varies over the turn.
+/// Whether a parameter describes a variation over the turn.
 fn varies(place: usize) -> bool {
     (FIRST_OVER_THE_TURN..=LAST_OVER_THE_TURN).contains(&place) || place >= ECCENTRIC
 }
 
-/// Newton's steps for the voltage drop at most; the function is monotone and its start is the value before.
+/// Most Newton steps for the voltage drop; the function is monotone, and the start is the previous value.
 const NEWTON: usize = 3;
 
-/// Of the ripple: the step below which one more, which is quadratic, has all digits.
+/// Relative to the ripple: after a step below this, one more step (convergence is quadratic) has all digits.
 const NEWTON_TOLERANCE: f64 = 1e-7;
 
-/// A value with its derivatives by `N` parameters.
+/// A value with its derivatives with respect to `N` parameters.
 #[derive(Clone, Copy, Debug)]
 struct Dual<const N: usize> {
     value: f64,
@@ -106,7 +106,7 @@ impl<const N: usize> Dual<N> {
         }
     }
 
-    /// A function of `self` with this value and slope.
+    /// The result of a function of `self` with this value and slope.
     #[inline(always)]
     fn through(self, value: f64, slope: f64) -> Self {
         Self {
@@ -154,7 +154,7 @@ impl<const N: usize> Dual<N> {
 pub struct Run<'a> {
     /// Values in the order of [`PARAMETERS`]; `limit` may be infinite.
     pub theta: &'a [f64; PARAMETERS.len()],
-    /// Places of the parameters by which derivatives are wanted.
+    /// Indices of the parameters for which derivatives are wanted.
     pub free: &'a [usize],
     /// Sample time \[s\].
     pub sample_time: f64,
@@ -162,20 +162,20 @@ pub struct Run<'a> {
     pub steps: usize,
     /// Speed at the first sample \[rad/s\].
     pub speed: f64,
-    /// Whether the output is the mean speed over the sample before, as a difference of counts shows it.
+    /// Whether the output is the mean speed over the previous sample, as from a difference of counts.
     pub mean: bool,
-    /// Shaft angle at the samples \[rad\]; integrated from zero where it is not known.
+    /// Shaft angle at the samples \[rad\]; integrated from zero if unknown.
     pub angle: Option<&'a [f64]>,
-    /// How often per turn cogging repeats, and the torque ripple; 0 for none.
+    /// Repetitions per turn of cogging, and of the torque ripple; 0 for none.
     pub orders: [u32; ORDERS],
 }
 
-/// What a motor did.
+/// The result of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Found {
     /// Speed \[rad/s\], (N).
     pub speed: Vec<f64>,
-    /// The command that the resistance takes, R i, (N).
+    /// The command across the resistance, R i, (N).
     pub drive: Vec<f64>,
     /// Derivatives of the speed, row by row, (N, free).
     pub speed_by: Vec<f64>,
@@ -186,9 +186,9 @@ pub struct Found {
 /// Speed and drive at every sample, before its command acts.
 ///
 /// # Errors
-/// Setting errors for parameters outside their range, a fit of what varies over the turn without an angle, and too
-/// many parameters; data errors for commands that are not finite or an angle of another length; a fit error where it was
-/// asked to stop.
+/// Setting errors for parameters outside their range, for a fit of variations over the turn without an angle, and for
+/// too many parameters; data errors for commands that are not finite or an angle of another length; a fit error after a
+/// stop request.
 pub fn run(task: Run<'_>, u: &[f64], monitor: &Monitor) -> Result<Found> {
     check(&task, u)?;
     let found = match task.free.len() {
@@ -285,7 +285,7 @@ fn check(task: &Run<'_>, u: &[f64]) -> Result<()> {
     }
 }
 
-/// The parameters, as numbers that carry their derivatives.
+/// The parameters, as dual numbers.
 #[derive(Clone, Debug)]
 struct Equations<const N: usize> {
     k_e: Dual<N>,
@@ -299,18 +299,18 @@ struct Equations<const N: usize> {
     per_w_s: Dual<N>,
     turn: [Dual<N>; LAST_OVER_THE_TURN - FIRST_OVER_THE_TURN + 1],
     limit: Option<Dual<N>>,
-    /// Terms that few motors need: where they are none, they cost nothing.
+    /// Terms that few motors need: `None` costs nothing.
     uneven: Option<Dual<N>>,
     sag: Option<Dual<N>>,
     eccentric: Option<[Dual<N>; 2]>,
     waves: [Option<Wave<N>>; ORDERS],
-    /// What of its way the drive goes in a step, `1 - exp(-h / tau)`.
+    /// Fraction of the way to its goal that the drive covers in a step, `1 - exp(-h / tau)`.
     share: Dual<N>,
-    /// What of the start remains in its mean over a step.
+    /// Weight of the start in the drive's mean over a step.
     memory: Dual<N>,
-    /// What of its goal's change over a step the drive follows beyond a goal that stays at the middle's:
-    /// `1/2 - tau/h + exp(-h/tau) (1/2 + tau/h)`, a half without a lag. Left out, the drive, and a current, at a sample
-    /// would be those of half a step before.
+    /// Response to the goal's change over a step, beyond the response to a goal held at its value in the middle: `1/2 -
+    /// tau/h + exp(-h/tau) (1/2 + tau/h)`, one half without a lag. Without this term drive and current would be those
+    /// of half a step earlier.
     bend: Dual<N>,
     step: f64,
 }
@@ -324,7 +324,7 @@ struct Wave<const N: usize> {
 }
 
 impl<const N: usize> Wave<N> {
-    /// Its mean while the shaft turns by `turned` about `angle`: what repeats several times in a sample cancels.
+    /// Its mean while the shaft turns by `turned` around `angle`: a wave that repeats several times in a sample cancels.
     #[inline(always)]
     fn mean(&self, angle: f64, turned: f64) -> Dual<N> {
         let (s, c) = (self.order * angle).sin_cos();
@@ -338,13 +338,13 @@ impl<const N: usize> Wave<N> {
     }
 }
 
-/// What depends on the angle.
+/// The quantities that depend on the angle.
 #[derive(Clone, Copy, Debug)]
 struct Turn<const N: usize> {
     per_inertia: Dual<N>,
     half_slope: Dual<N>,
     load: Dual<N>,
-    /// Torque per current, and back-EMF per speed, over their means.
+    /// Torque per current, and back-EMF per speed, relative to their means.
     gain: Option<Dual<N>>,
 }
 
@@ -359,7 +359,7 @@ impl<const N: usize> Equations<N> {
         };
         let some = |j: usize| task.theta[j] != 0.0 || task.free.contains(&j);
         let tau = one(3);
-        // a lag far below the step is none; its derivative is nothing then, not infinite
+        // a lag far below the step counts as none; its derivative is then 0, not infinite
         let lag = tau.scaled(1.0 / step);
         let half = Dual::constant(0.5);
         let (share, memory, bend) = if lag.value > 1e-3 {
@@ -404,14 +404,14 @@ impl<const N: usize> Equations<N> {
         }
     }
 
-    /// In a sample in which the shaft turns by `turned` about `angle`.
+    /// For a sample in which the shaft turns by `turned` around `angle`.
     #[inline(always)]
     fn at(&self, angle: f64, turned: f64) -> Turn<N> {
         let (s1, c1) = angle.sin_cos();
         let (s2, c2) = (2.0 * s1 * c1, (c1 - s1) * (c1 + s1));
         let [first_c, first_s, second_c, second_s, c, s] = &self.turn;
         let inertia = self.k_a.plus(c2, c).plus(s2, s);
-        // an inertia is positive, whatever a search tries
+        // an inertia stays positive, whatever a search tries
         let least = 0.05 * self.k_a.value;
         let inertia = if inertia.value > least {
             inertia
@@ -436,7 +436,7 @@ impl<const N: usize> Equations<N> {
         }
     }
 
-    /// What an encoder shows of a speed at an angle.
+    /// The speed that an encoder shows at an angle.
     #[inline(always)]
     fn seen(&self, speed: Dual<N>, angle: f64) -> Dual<N> {
         match &self.eccentric {
@@ -449,7 +449,7 @@ impl<const N: usize> Equations<N> {
         }
     }
 
-    /// Dry friction without its sign, against a motion in this direction.
+    /// The magnitude of dry friction against a motion in this direction.
     #[inline(always)]
     fn dry(&self, speed: &Dual<N>, direction: f64) -> Dual<N> {
         if self.k_t.value == 0.0 && self.k_t.by == [0.0; N] && self.uneven.is_none() {
@@ -467,10 +467,10 @@ impl<const N: usize> Equations<N> {
         self.k_s.plus(1.0, &bump.times(&shape))
     }
 
-    /// The speed after `time` under a drive, with what depends on the speed taken at `middle`.
+    /// The speed after `time` under a drive; terms that depend on the speed are taken at `middle`.
     ///
-    /// Dry friction takes what it can of the speed that it would have without, and stops at nothing: Moreau's scheme
-    /// (Acary and Brogliato 2008), which sticks and breaks away without events.
+    /// Dry friction slows the shaft, at most to standstill: if it could take more than the speed without friction, the
+    /// result is 0. This is Moreau's scheme (Acary and Brogliato 2008), which sticks and breaks away without events.
     #[inline(always)]
     fn moved(
         &self,
@@ -496,8 +496,8 @@ impl<const N: usize> Equations<N> {
         free.plus(-free.value.signum(), &most)
     }
 
-    /// The drive after a step towards `goal`, which changes by `change` in it, and its mean;
-    /// `x + share drop(x) = x_0 + share (goal - x_0) + bend change`.
+    /// The drive after a step towards `goal`, which changes by `change` during the step, and the drive's mean; `x +
+    /// share drop(x) = x_0 + share (goal - x_0) + bend change`.
     #[inline(always)]
     fn driven(&self, from: &Dual<N>, goal: &Dual<N>, change: &Dual<N>) -> (Dual<N>, Dual<N>) {
         let aim = from
@@ -508,7 +508,7 @@ impl<const N: usize> Equations<N> {
         if self.drop.value != 0.0 || self.drop.by != [0.0; N] {
             let (share, drop, ripple) = (self.share.value, self.drop.value, self.ripple.value);
             let mut x = from.value;
-            // one root and one division in a chain that every sample of the run waits for
+            // one root and one division per iteration, in a dependency chain through every sample of the run
             let (most, square) = (share * drop, ripple * ripple);
             for _ in 0..NEWTON {
                 let per_root = 1.0 / (x * x + square).sqrt();
@@ -519,7 +519,7 @@ impl<const N: usize> Equations<N> {
                     break;
                 }
             }
-            // one step more, carrying derivatives, makes them exact: those of an implicit function
+            // one more step, carrying derivatives, makes them exact: those of an implicit function
             let root = (x * x + ripple * ripple).sqrt();
             let by_ripple = -x * ripple / (root * root * root);
             let shape = self.ripple.through(x / root, by_ripple);
@@ -545,7 +545,7 @@ impl<const N: usize> Equations<N> {
         }
     }
 
-    /// Drive and speed after a step at this command, and the speed's mean.
+    /// Drive and speed after a step at this command.
     #[inline(always)]
     fn advanced(
         &self,
@@ -567,7 +567,7 @@ impl<const N: usize> Equations<N> {
     }
 }
 
-/// Samples between two looks at a request to stop: a few milliseconds.
+/// Samples between two checks for a stop request: a few milliseconds.
 const BETWEEN_LOOKS: usize = 1000;
 
 struct Carried<'a, const N: usize>(Run<'a>, &'a [f64], &'a Monitor);
@@ -615,7 +615,7 @@ impl<const N: usize> Kernel for Carried<'_, N> {
             let (now, before) = (at(k, whole), at(k, whole + 1));
             let mut mean = Dual::ZERO;
             for j in 0..task.steps {
-                // the command that is late changes within a step: its mean over the step acts
+                // a delayed command changes within a step: its mean over the step acts
                 let old = part * task.steps as f64 - j as f64;
                 let mut command = Dual::constant(now + old.clamp(0.0, 1.0) * (before - now));
                 if let (Some(place), true) = (late, (0.0..1.0).contains(&old)) {

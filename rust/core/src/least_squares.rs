@@ -1,11 +1,11 @@
-//! Nonlinear least squares with dense Jacobians: `min 1/2 |r(theta)|^2` within bounds, with an end that is checked.
+//! Nonlinear least squares with dense Jacobians: `min 1/2 |r(theta)|^2` within bounds, with a confirmed minimum.
 //!
-//! Levenberg-Marquardt in a trust region on the triangle of the Jacobian ([`triangle`], [`trust`]). Where a test for a
-//! minimum holds it is confirmed ([`confirm`]) before the outcome counts as converged: the Jacobian has full rank, the
-//! Gauss-Newton steps contract and end below the tolerances. These steps are judged by their own size, since the cost
-//! cannot tell points whose parameters differ by less than the square root of rounding.
+//! Levenberg-Marquardt in a trust region on the triangle of the Jacobian ([`triangle`], [`trust`]). If a test for a
+//! minimum holds, the minimum is confirmed ([`confirm`]) before the outcome counts as converged: the Jacobian has full
+//! rank, and the Gauss-Newton steps contract to below the tolerances. These steps are judged by their own size, because
+//! the cost cannot distinguish points whose parameters differ by less than the square root of rounding.
 //!
-//! To read: `point` (where the iteration stands), `triangle` (its factors), `trust` (the steps), `confirm` (the end).
+//! To read: `point` (the present point), `triangle` (the QR factor), `trust` (the steps), `confirm` (the end).
 
 mod confirm;
 mod point;
@@ -65,10 +65,10 @@ pub trait Residuals {
     /// Number of residuals.
     fn len(&self) -> usize;
 
-    /// Fills the residuals at `theta`; false where they cannot be had.
+    /// Fills the residuals at `theta`; false if they cannot be computed.
     fn residuals(&mut self, theta: &[f64], r: &mut [f64]) -> bool;
 
-    /// Fills the derivatives at `theta`, one row per residual; `r` are the residuals there. False where they cannot be had.
+    /// Fills the derivatives at `theta`, one row per residual; `r` are the residuals there. False if they cannot be computed.
     fn jacobian(&mut self, theta: &[f64], r: &[f64], j: &mut [f64]) -> bool;
 }
 
@@ -81,15 +81,15 @@ pub struct Settings {
     pub xtol: f64,
     /// Cosine between the residual and the range of the Jacobian that counts as zero.
     pub gtol: f64,
-    /// Evaluations of the residuals at most; those within a numerical Jacobian are not counted.
+    /// Most evaluations of the residuals; those within a numerical Jacobian are not counted.
     pub max_evaluations: usize,
-    /// Relative error of the Jacobian, 0 where it is exact to rounding: ranks cannot be told any finer.
+    /// Relative error of the Jacobian, 0 if it is exact to rounding: ranks cannot be resolved any finer.
     pub precision: f64,
-    /// Typical sizes of the parameters; none: the largest norms of the Jacobian's columns so far scale them.
+    /// Typical sizes of the parameters; `None`: scaled by the largest norms of the Jacobian's columns so far.
     pub scale: Option<Vec<f64>>,
-    /// Lower bounds; none: minus infinity.
+    /// Lower bounds; `None`: minus infinity.
     pub lower: Option<Vec<f64>>,
-    /// Upper bounds; none: infinity.
+    /// Upper bounds; `None`: infinity.
     pub upper: Option<Vec<f64>>,
 }
 
@@ -108,7 +108,7 @@ impl Default for Settings {
     }
 }
 
-/// The best parameters found, how, and how well the data fix them.
+/// The best parameters found, how the search ended, and how well the data determine them.
 #[derive(Clone, Debug)]
 pub struct Solution {
     /// Best parameters.
@@ -117,7 +117,7 @@ pub struct Solution {
     pub cost: f64,
     /// Residuals there.
     pub residual: Vec<f64>,
-    /// Jacobian there, row by row; NaN where there is none.
+    /// Jacobian there, row by row; NaN if there is none.
     pub jacobian: Vec<f64>,
     /// How it ended.
     pub termination: Termination,
@@ -129,7 +129,7 @@ pub struct Solution {
     pub optimality: f64,
     /// Cosine between the residual and the range of the Jacobian: the relative offset of Bates and Watts (1981).
     pub cosine: f64,
-    /// -1 where the lower bound holds a parameter, 1 where the upper one does, 0 elsewhere.
+    /// -1 if the lower bound holds a parameter, 1 if the upper one does, else 0.
     pub active: Vec<i8>,
     /// `s^2 (J'J)^-1` row by row, `s^2 = |r|^2 / (m - n)`; parameters on a bound count as known.
     pub covariance: Vec<f64>,
@@ -145,7 +145,7 @@ pub struct Solution {
 ///
 /// # Errors
 /// `ErrorKind::Setting` for sizes that do not fit, a start outside the bounds or not finite, bounds that leave no room,
-/// sizes of parameters that are not above zero, and negative tolerances.
+/// typical sizes that are not above zero, and negative tolerances.
 pub fn solve(
     problem: &mut impl Residuals,
     start: Vec<f64>,

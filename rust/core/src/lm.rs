@@ -1,24 +1,24 @@
 //! Levenberg-Marquardt on normal equations, with named outcomes.
 //!
-//! Minimises `1/2 |e(theta)|^2` through `(J'J + mu D) d = J'e`, `J` being the derivative of the model's output and
-//! `e = y - yhat`. A trial costs a simulation; only an accepted one costs a Jacobian. Damping: `mu` times 4 after a
-//! rejected trial, divided by 5 after an accepted one (Levenberg 1944, Marquardt 1963).
+//! Minimises `1/2 |e(theta)|^2` through `(J'J + mu D) d = J'e`, with `J` the derivative of the model's output and `e =
+//! y - yhat`. A trial costs a simulation; only an accepted step costs a Jacobian. `mu` is multiplied by 4 after a
+//! rejected trial and divided by 5 after an accepted one (Levenberg 1944, Marquardt 1963).
 
 use crate::Monitor;
 use crate::descent::{Method, Proposal, Verdict, descend};
 pub use crate::descent::{Outcome, Termination};
 use crate::simd::{self, F64x8, Kernel};
 
-/// What is minimised. `normal_equations` is only called at the parameters of the last successful `cost`, whose
-/// simulation it may reuse.
+/// The problem to minimise. `normal_equations` is only called at the parameters of the last successful `cost` and may
+/// reuse its simulation.
 pub trait Problem {
     /// Number of parameters.
     fn parameters(&self) -> usize;
 
-    /// Cost at `theta`; none where the simulation diverges, leaves its constraints or is stopped.
+    /// Cost at `theta`; `None` if the simulation diverges, leaves its constraints or is stopped.
     fn cost(&mut self, theta: &[f64]) -> Option<f64>;
 
-    /// Cost at `theta`, where it is below `limit`; none may be told as soon as it cannot be.
+    /// Cost at `theta` if it is below `limit`; may return `None` as soon as it cannot be.
     fn cost_below(&mut self, theta: &[f64], limit: f64) -> Option<f64> {
         let _ = limit;
         self.cost(theta)
@@ -34,23 +34,23 @@ pub trait Problem {
         thetas.map(|theta| self.cost_below(theta, limit))
     }
 
-    /// Fills `J'J` (row by row, the lower triangle is enough) and `J'e` at `theta`, scaled as the cost is.
+    /// Fills `J'J` (row by row; the lower triangle is enough) and `J'e` at `theta`, both scaled like the cost.
     fn normal_equations(&mut self, theta: &[f64], jtj: &mut [f64], jte: &mut [f64]);
 }
 
-/// The matrix `D` that `mu` multiplies.
+/// The matrix `D`, which `mu` multiplies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Damping {
-    /// The unit matrix: for parameters of one scale, such as weights of a network.
+    /// The unit matrix: for parameters of similar scale, such as the weights of a network.
     Identity,
-    /// The diagonal of `J'J`: indifferent to the parameters' units.
+    /// The diagonal of `J'J`: independent of the parameters' units.
     Diagonal,
 }
 
 /// When to stop, and how to damp.
 #[derive(Clone, Copy, Debug)]
 pub struct Settings {
-    /// Jacobians at most.
+    /// Most Jacobians.
     pub max_iterations: usize,
     /// Kind of damping.
     pub damping: Damping,
@@ -60,12 +60,12 @@ pub struct Settings {
     pub gradient_tolerance: f64,
     /// Relative step that counts as zero.
     pub step_tolerance: f64,
-    /// Relative reduction of the cost that counts as none, five times in a row.
+    /// Relative reduction of the cost that counts as none if it happens five times in a row.
     pub reduction_tolerance: f64,
-    /// A step after which the trace of `J'J` is larger by more than this factor is taken back.
+    /// A step is taken back if it increases the trace of `J'J` by more than this factor.
     ///
-    /// Where a model has become unstable between kinks that hold it (a friction that overshoots the standstill), its run
-    /// is still finite, and the sensitivities grow without end: they say nothing of the cost any more.
+    /// A model can become unstable between kinks that still bound its run (a friction that overshoots standstill). The
+    /// run is then finite, but the sensitivities grow without bound and say nothing about the cost any more.
     pub most_growth: f64,
 }
 
@@ -83,15 +83,15 @@ impl Default for Settings {
     }
 }
 
-/// Slow iterations in a row that count as the end of progress.
+/// Slow iterations in a row that end the search.
 const PATIENCE: usize = 5;
-/// Rejected trials in a row that count as stalled: `mu` has then grown by more than 1e18.
+/// Rejected trials in a row that count as stalled: `mu` has then grown by a factor above 1e18.
 const MOST_REJECTIONS: usize = 30;
-/// What a rejected trial multiplies the damping by.
+/// Factor on the damping after a rejected trial.
 const RAISE: f64 = 4.0;
-/// What an accepted trial divides it by.
+/// Divisor of the damping after an accepted trial.
 const GAIN: f64 = 5.0;
-/// Damping never falls below this, so that a singular system stays solvable.
+/// Least damping, so that a singular system stays solvable.
 const LEAST_MU: f64 = 1e-14;
 
 /// Minimises `problem` from `start`; `accepted(theta, cost)` sees the start and each accepted step.
@@ -104,7 +104,7 @@ pub fn minimize(
 ) -> Outcome {
     let mut method = Marquardt {
         system: System::new(problem.parameters()),
-        // Asked once: a problem that takes two has the room for two simulations.
+        // Asked once: a problem that takes two costs at once holds two simulations.
         next: Next {
             two: problem.takes_two(),
             ..Next::default()
@@ -124,23 +124,23 @@ pub fn minimize(
     )
 }
 
-/// The step that follows a rejection: where two costs at once take hardly longer than one, it is tried beside the one
-/// before it.
+/// The step that would follow a rejection. If two costs at once take hardly longer than one, it is simulated together
+/// with the present trial.
 ///
-/// After a rejection `J'J` and `J'e` stay and only `mu` grows, by a known factor: the next step is known before the trial at hand is
-/// judged. A free run is a chain that leaves units idle, so two of them take 102 cycles a sample where one takes 76. No decision
-/// changes, for the second cost is looked at only after the first is rejected. It pays by the share of rejections: with 1.1 of them an
-/// iteration, 3 % (median) to 6 % (least of 7) of a training of 100 iterations; where hardly a step is rejected it costs 3 %.
+/// After a rejection `J'J` and `J'e` stay and `mu` grows by a known factor, so the next step is known before the present trial is judged.
+/// A free run is a dependency chain that leaves units idle: one run takes 76 cycles a sample, two together 102. No decision changes, as
+/// the second cost is only used if the first is rejected. The gain depends on the share of rejections: with 1.1 per iteration it is 3 %
+/// (median) to 6 % (least of 7) of a training of 100 iterations; with hardly any rejections it is a loss of 3 %.
 #[derive(Default)]
 struct Next {
     two: bool,
-    /// Its damping; 0 where there is none.
+    /// Its damping; 0 if no step is prepared.
     mu: f64,
     step: Vec<f64>,
     theta: Vec<f64>,
-    /// Its cost, where that has been taken.
+    /// Its cost, if that has been computed.
     cost: Option<Option<f64>>,
-    /// The cost of the trial at hand, where it was tried beside the last one.
+    /// The cost of the present trial, if it was simulated together with the last one.
     known: Option<Option<f64>>,
 }
 
@@ -167,7 +167,7 @@ impl<P: Problem> Method for Marquardt<'_, P> {
     }
 
     fn trial_cost(&mut self, theta: &[f64], before: f64) -> Option<f64> {
-        // This trial was simulated beside the last one, which was rejected.
+        // This trial was simulated together with the last one, which was rejected.
         if let Some(cost) = self.next.known.take() {
             return cost;
         }
@@ -180,7 +180,7 @@ impl<P: Problem> Method for Marquardt<'_, P> {
     }
 
     fn linearise(&mut self, theta: &[f64]) -> bool {
-        // An accepted step: the step that was prepared for its rejection is of another linearisation.
+        // The step was accepted: the step prepared for its rejection belongs to an old linearisation.
         self.next.mu = 0.0;
         let system = &mut self.system;
         self.problem
@@ -190,39 +190,37 @@ impl<P: Problem> Method for Marquardt<'_, P> {
     }
 
     fn takes_back(&mut self) -> bool {
-        // Seen from the derivatives only, and so one Jacobian late: by its cost the step was a good one.
+        // Only the derivatives show it, one Jacobian too late: by its cost the step was good.
         let exploded = self.system.exploded(self.settings.most_growth);
         if exploded {
-            // the step was accepted by its cost: its damping is raised as if it had not been
-            // Divided by GAIN when it was accepted; that, and the rise of a rejection.
+            // The step was accepted by its cost. Undo the division by GAIN, and raise the damping as after a rejection.
             self.mu *= GAIN * RAISE;
         }
         exploded
     }
 
     fn finished(&mut self, outcome: &mut Outcome) -> Option<Termination> {
-        // Of the angle between residual and columns, which has no unit (More 1978): J'e itself would depend on the
-        // scales of all.
+        // The cosine between residual and columns has no unit (More 1978); J'e itself would depend on all scales.
         let cosine = self.system.largest_cosine(outcome.cost);
         (cosine <= self.settings.gradient_tolerance).then_some(Termination::SmallGradient)
     }
 
     fn propose(&mut self, theta: &[f64], trial: &mut [f64]) -> Proposal {
-        // Equal to the bit where the damping was raised once since: both are RAISE times the same number. Anything else
-        // in between, and the prepared step is dropped.
+        // Bitwise equal if the damping was raised exactly once since: both are RAISE times the same number. After any
+        // other change the prepared step is dropped.
         self.next.known = self.next.cost.take().filter(|_| self.next.mu == self.mu);
         self.next.mu = 0.0;
         if self.next.known.is_some() {
             self.system.step.copy_from_slice(&self.next.step);
         } else if !self.system.solve(self.mu, self.settings.damping) {
-            // Not positive definite to the digits at hand: more damping makes it so, as a rejection does.
+            // Not positive definite numerically: more damping makes it so, as after a rejection.
             return match self.reject() {
                 Verdict::End(end) => Proposal::End(end),
                 _ => Proposal::Again,
             };
         }
         let tolerance = self.settings.step_tolerance;
-        // Relative to the parameters, with the tolerance once more for those near 0.
+        // Relative to the parameters; the second `tolerance` is for parameters near 0.
         if length(&self.system.step) <= tolerance * (length(theta) + tolerance) {
             return Proposal::End(Termination::SmallStep);
         }
@@ -236,8 +234,8 @@ impl<P: Problem> Method for Marquardt<'_, P> {
     }
 
     fn judge(&mut self, before: f64, after: Option<f64>) -> Verdict {
-        // Any decrease is accepted, and the factors are fixed: of ten random starts of a network 8 ended near the best cost so,
-        // and 1 with a damping by the ratio of the decrease to the promised one.
+        // Any decrease is accepted, and the factors are fixed: of ten random starts of a network 8 then ended near the
+        // best cost, and only 1 with damping by the ratio of actual to promised decrease.
         if after.is_some_and(|cost| cost < before) {
             self.mu = (self.mu / GAIN).max(LEAST_MU);
             return Verdict::Accepted;
@@ -253,10 +251,10 @@ impl<P: Problem> Method for Marquardt<'_, P> {
 }
 
 impl<P> Marquardt<'_, P> {
-    /// Solves for the step that follows if the one at hand is rejected.
+    /// Solves for the step that follows if the present one is rejected.
     fn prepare_next(&mut self, theta: &[f64]) {
         let mu = RAISE * self.mu;
-        // `system.step` is free: the trial at hand has been written out of it.
+        // `system.step` is free: the present trial has been written out of it.
         if !self.system.solve(mu, self.settings.damping) {
             return;
         }
@@ -285,16 +283,16 @@ fn length(values: &[f64]) -> f64 {
 
 /// The damped normal equations with all buffers of an iteration.
 ///
-/// From `e(theta + d) ~ e - J d` the cost's quadratic model is least where `J'J d = J'e`; `mu D` bends the step from Gauss and Newton's
-/// (mu = 0) to a short one along the gradient (mu large), and keeps a singular system solvable. `J'J` is at hand as a sum over rows
-/// ([`crate::gram`]), n^2 numbers whatever the samples, so a factorisation anew for each mu costs n^3/6, nothing beside a simulation.
+/// With `e(theta + d) ~ e - J d` the quadratic model of the cost is least at `J'J d = J'e`. `mu D` bends the step from the Gauss-Newton
+/// step (mu = 0) to a short one along the gradient (mu large), and keeps a singular system solvable. `J'J` is a sum over rows
+/// ([`crate::gram`]) of n^2 numbers for any number of samples: a new factorisation for each mu costs n^3/6, little beside a simulation.
 struct System {
     size: usize,
-    // The undamped system stays as it is, and each solution is made in `factor`: a rejected step costs a copy and a
+    // The undamped system is kept, and each solution is computed in `factor`: a rejected step costs a copy and a
     // factorisation.
     jtj: Vec<f64>,
     jte: Vec<f64>,
-    /// `J'J` and `J'e` of the last point whose sensitivities had not exploded, where that is asked.
+    /// `J'J` and `J'e` of the last point whose sensitivities had not exploded; empty without that test.
     last: (Vec<f64>, Vec<f64>),
     factor: Vec<f64>,
     step: Vec<f64>,
@@ -312,7 +310,7 @@ impl System {
         }
     }
 
-    /// Whether `J'J` is larger than the last one by more than this factor, which is then put back in its place.
+    /// Whether `J'J` exceeds the last one by more than this factor; if so, the last one is restored.
     fn exploded(&mut self, most_growth: f64) -> bool {
         if most_growth.is_infinite() {
             return false;
@@ -320,10 +318,10 @@ impl System {
         // The trace is the sum of squares of all sensitivities.
         let trace = |jtj: &[f64]| jtj.iter().step_by(self.size + 1).sum::<f64>();
         let (now, before) = (trace(&self.jtj), trace(&self.last.0));
-        // NaN is compared apart: sensitivities may overflow where the run does not.
+        // NaN is tested separately: sensitivities may overflow even if the run does not.
         let exploded = !self.last.0.is_empty() && (now.is_nan() || now > most_growth * before);
         if exploded {
-            // Those of the point that is gone back to: no Jacobian is taken again.
+            // Those of the restored point: no Jacobian is computed again.
             self.jtj.copy_from_slice(&self.last.0);
             self.jte.copy_from_slice(&self.last.1);
         } else {
@@ -334,7 +332,7 @@ impl System {
     }
 
     fn largest_cosine(&self, cost: f64) -> f64 {
-        // J'J and J'e are scaled as the cost is: 2 cost is |e|^2 in that scale.
+        // J'J and J'e are scaled like the cost: in that scale |e|^2 is 2 cost.
         let residual = (2.0 * cost).sqrt();
         let cosine = |i: usize| {
             let column = self.jtj[i * self.size + i].sqrt();
@@ -347,7 +345,7 @@ impl System {
         (0..self.size).map(cosine).fold(0.0, f64::max)
     }
 
-    /// Solves for the step by Cholesky; false where the damped matrix is not positive definite.
+    /// Solves for the step by Cholesky; false if the damped matrix is not positive definite.
     fn solve(&mut self, mu: f64, damping: Damping) -> bool {
         let n = self.size;
         self.factor.copy_from_slice(&self.jtj);
@@ -356,8 +354,8 @@ impl System {
             *diagonal += mu
                 * match damping {
                     Damping::Identity => 1.0,
-                    // mu D = mu diag(J'J): the same step whatever the units of the parameters. A column of zeros gets
-                    // the least positive number, so that its pivot is positive and its step 0/tiny = 0.
+                    // mu D = mu diag(J'J): the same step for any units of the parameters. A column of zeros gets the
+                    // least positive number: its pivot is then positive and its step 0/tiny = 0.
                     Damping::Diagonal => diagonal.max(f64::MIN_POSITIVE),
                 };
         }
@@ -369,7 +367,7 @@ impl System {
     }
 }
 
-/// Replaces the lower triangle of `a` (row by row) by its Cholesky factor; false where `a` is not positive definite.
+/// Replaces the lower triangle of `a` (row by row) by its Cholesky factor; false if `a` is not positive definite.
 pub(crate) fn cholesky(a: &mut [f64], n: usize) -> bool {
     simd::run(Cholesky { a, n })
 }
@@ -386,7 +384,7 @@ impl Kernel for Cholesky<'_> {
     fn run<V: F64x8>(self) -> bool {
         let Self { a, n } = self;
         // Row by row (Cholesky-Banachiewicz): L_ij = (a_ij - sum_k L_ik L_jk)/L_jj. In row order both operands of the
-        // sum are contiguous, which is why it is this variant and not the one by columns.
+        // sum are contiguous; by columns they would not be.
         for i in 0..n {
             let (above, row) = a.split_at_mut(i * n);
             for j in 0..i {
@@ -408,7 +406,7 @@ impl Kernel for Cholesky<'_> {
 /// The sum of products, eight at a time.
 #[inline(always)]
 fn dot<V: F64x8>(a: &[f64], b: &[f64]) -> f64 {
-    // Rows of length j: the rest of up to seven is added at the end, one by one.
+    // Rows have length j: the remaining zero to seven products are added one by one.
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks(), b.as_chunks());
     let sum = a.iter().zip(b).fold(V::splat(0.0), |sum, (a, b)| {
         sum.add_product(V::load(a), V::load(b))
@@ -427,8 +425,8 @@ pub(crate) fn substitute(factor: &[f64], n: usize, x: &mut [f64]) {
             .sum();
         x[i] = (x[i] - dot) / factor[i * n + i];
     }
-    // L' x = b by columns of L', which are rows of L: as soon as x_i is known it is taken off all before it. No
-    // transposed matrix is walked through.
+    // L' x = b by columns of L', which are the rows of L: each x_i is subtracted from all before it as soon as it is
+    // known. The transposed matrix is never traversed.
     for i in (0..n).rev() {
         x[i] /= factor[i * n + i];
         let value = x[i];
@@ -496,7 +494,7 @@ mod tests {
         );
     }
 
-    /// A line that falls towards 3, whose sensitivities explode beyond 2.
+    /// A line that falls towards 3; its sensitivities explode beyond 2.
     struct Cliff;
 
     impl Problem for Cliff {
@@ -526,7 +524,7 @@ mod tests {
             let none = Monitor::default();
             minimize(&mut Cliff, vec![start], &settings, &none, |_, _| {})
         };
-        // the first step leads to 2.997, and 1e9 in its place leads nowhere
+        // the first step leads to 2.997, where J'J = 1e9 allows no further step
         assert!(run(f64::INFINITY, 0.0).theta[0] > 2.99);
         let careful = run(1e3, 0.0);
         assert!(
@@ -534,11 +532,11 @@ mod tests {
             "{careful:?}"
         );
         assert_eq!(careful.iterations, 40);
-        // a start within the explosion has nothing to go back to
+        // a start within the explosion has no point to return to
         assert!(run(1e3, 2.5).theta[0] > 2.4);
     }
 
-    /// The valley, two costs at once; it tells only those below the limit and counts the calls.
+    /// The valley, two costs at once; it returns only costs below the limit and counts the calls.
     struct Twice(usize);
 
     impl Problem for Twice {

@@ -1,14 +1,14 @@
-//! [`GreyBox`]: the motor's equations as a model like any other, and a small network for what they leave.
+//! [`GreyBox`]: the motor's equations as a model, with a small network for what they leave unexplained.
 //!
-//! The network is a load more, a command that the torque lacks: of speed `w` and drive `x`, with `tanh` units,
+//! The network is an additional load, in units of the command. For speed `w` and drive `x`, with `tanh` units,
 //!
 //! ```text
 //! load += command_scale sum_i c_i tanh(b_i + p_i w / speed_scale + q_i x / command_scale)
 //! ```
 //!
-//! held over a sample. States are the speed, the drive and the command before, in units of the scales; an output is that of
-//! the sample that ends, so that it depends on the command `v(k) = u(k - nk)`, `nk` being a sample and the whole samples of
-//! the delay. What depends on the angle of the shaft has no place here: a record of the speed does not say where it begins.
+//! held over a sample. The states are speed, drive and previous command, in units of the scales. An output belongs to the end of its
+//! sample, so it depends on the command `v(k) = u(k - nk)`, where `nk` is one sample plus the whole samples of the delay. Terms that
+//! depend on the shaft angle are excluded: a record of the speed does not say at which angle it begins.
 
 use super::{DELAY, Dual, Equations, ORDERS, PARAMETERS, Run, Turn, check, varies};
 use crate::closed_loop::Plant;
@@ -19,30 +19,30 @@ use crate::model::{ClonePlant, Model, RunAndRows};
 use crate::simd::{self, F64x8, Kernel};
 use crate::{Error, Result};
 
-/// Speed, drive, and the command before.
+/// Speed, drive, previous command.
 const STATES: usize = 3;
-/// States that a measurement tells more about.
+/// States that a measurement corrects: speed and drive.
 const FILTERED: usize = 2;
 /// Weights of a unit: `b`, `p`, `q`, `c`.
 const WEIGHTS: usize = 4;
-/// Units at most: what takes more is no residual of a motor.
+/// Most units: whatever needs more is no residual of a motor.
 pub const MOST_UNITS: usize = 6;
-/// What an initial state costs beside a squared error, in its distance from what the first outputs say.
+/// Weight of an initial state's distance from what the first outputs say, relative to a squared error.
 const PRIOR: f64 = 1e-2;
 const STATE_STEPS: usize = 20;
 
-/// What a grey box is beside its free parameters.
+/// The settings of a grey box apart from theta.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
-    /// Values in the order of [`PARAMETERS`]; those that are free are replaced by theta.
+    /// Values in the order of [`PARAMETERS`]; theta replaces those of the free parameters.
     pub values: [f64; PARAMETERS.len()],
-    /// Places of the free ones.
+    /// Indices of the free parameters.
     pub free: Vec<usize>,
     /// Sample time \[s\].
     pub sample_time: f64,
     /// Integration steps per sample.
     pub steps: usize,
-    /// Whether an output is the mean speed over its sample, as a difference of counts is.
+    /// Whether an output is the mean speed over its sample, as from a difference of counts.
     pub mean: bool,
     /// One unit of the output \[rad/s\].
     pub unit: f64,
@@ -50,13 +50,13 @@ pub struct Frame {
     pub speed_scale: f64,
     /// Scale of command and drive.
     pub command_scale: f64,
-    /// Of the free run, in the output's unit squared.
+    /// Residual variance of the free run, in the output's unit squared.
     pub residual_variance: f64,
-    /// Variance that a sample adds to the states, in squares of the scales.
+    /// Variance that each sample adds to the states, in squares of the scales.
     pub process_noise: f64,
 }
 
-/// A motor and a network for what its equations leave.
+/// A motor, with a network for what its equations leave unexplained.
 #[derive(Clone, Debug)]
 pub struct GreyBox {
     frame: Frame,
@@ -67,7 +67,7 @@ impl GreyBox {
     /// A model from its parameters: the free ones of the motor, then `[b, p, q, c]` of each unit.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for parameters of no motor, scales that are not above 0, or a wrong number of weights.
+    /// `ErrorKind::Setting` for parameters that no motor has, scales that are not above 0, or a wrong number of weights.
     pub fn new(mut frame: Frame, theta: &[f64]) -> Result<Self> {
         let network = theta.get(frame.free.len()..).unwrap_or_default();
         if theta.len() < frame.free.len()
@@ -117,7 +117,7 @@ impl GreyBox {
         Ok(made)
     }
 
-    /// Everything but theta.
+    /// All settings apart from theta.
     pub fn frame(&self) -> &Frame {
         &self.frame
     }
@@ -132,7 +132,7 @@ impl GreyBox {
         1 + self.delay().floor() as usize
     }
 
-    /// In samples.
+    /// The delay \[samples\].
     fn delay(&self) -> f64 {
         self.frame.values[DELAY] / self.frame.sample_time
     }
@@ -166,7 +166,7 @@ impl GreyBox {
         Ok(())
     }
 
-    /// The commands as they act; before the first sample they are held at their first value.
+    /// The acting commands; before the first sample they hold their first value.
     fn acting(&self, u: &[f64]) -> Vec<f64> {
         let nk = self.nk();
         (0..u.len()).map(|k| u[k.saturating_sub(nk)]).collect()
@@ -188,7 +188,7 @@ impl GreyBox {
         finite(found)
     }
 
-    /// The free run with derivatives by `N - STATES` parameters or fewer, then the states.
+    /// The free run with derivatives: by theta, then by the states; at most `N` in all.
     fn carried<const N: usize>(&self, v: &[f64], state: &[f64]) -> RunAndRows {
         simd::run(Carried::<N>(self, v, state))
     }
@@ -212,7 +212,7 @@ impl<const N: usize> Moving<N> {
         }
     }
 
-    /// With derivatives by the states from a place on.
+    /// With derivatives by the states, from index `place` on.
     fn seeded(mut self, model: &GreyBox, place: usize) -> Self {
         self.w.by[place] = model.frame.speed_scale;
         self.x.by[place + 1] = model.frame.command_scale;
@@ -230,19 +230,19 @@ impl<const N: usize> Moving<N> {
     }
 }
 
-/// The step of a sample, in the equations of [`Equations`].
+/// Steps by one sample with [`Equations`].
 #[derive(Clone, Debug)]
 struct Stepper<const N: usize> {
     equations: Equations<N>,
     turn: Turn<N>,
     network: Vec<[Dual<N>; WEIGHTS]>,
     frame: Frame,
-    /// Part of a sample by which a command is late.
+    /// Fraction of a sample in the command's delay.
     part: f64,
 }
 
 impl<const N: usize> Stepper<N> {
-    /// With derivatives by theta, or without.
+    /// With or without derivatives by theta.
     fn new(model: &GreyBox, by_theta: bool) -> Self {
         let frame = &model.frame;
         let step = frame.sample_time / frame.steps as f64;
@@ -273,7 +273,7 @@ impl<const N: usize> Stepper<N> {
         }
     }
 
-    /// What the network takes of the command.
+    /// The network's load, in units of the command.
     #[inline(always)]
     fn residual(&self, w: &Dual<N>, x: &Dual<N>) -> Dual<N> {
         let (speed, drive) = (
@@ -289,7 +289,7 @@ impl<const N: usize> Stepper<N> {
         sum.scaled(self.frame.command_scale)
     }
 
-    /// Moves on by a sample in which `now` comes to act; the mean speed over it and the output that follows.
+    /// Advances by a sample in which `now` comes to act; returns the mean speed over it and the output that follows.
     #[inline(always)]
     fn step(&self, at: &mut Moving<N>, now: &Dual<N>) -> (f64, Dual<N>) {
         let mut turn = self.turn;
@@ -340,7 +340,7 @@ impl<const N: usize> Kernel for Carried<'_, N> {
     }
 }
 
-/// Speed and drive with their covariance, as measured outputs tell (Anderson and Moore 1979, section 8.2).
+/// Speed and drive with their covariance, corrected by measured outputs (extended Kalman filter: Anderson and Moore 1979, section 8.2).
 struct Filter<'a> {
     model: &'a GreyBox,
     stepper: Stepper<STATES>,
@@ -349,7 +349,7 @@ struct Filter<'a> {
 }
 
 impl Filter<'_> {
-    /// What is predicted, its derivatives, and the state that follows with its own.
+    /// The predicted output, the scaled speed and drive that follow, and the state that follows, each with derivatives.
     fn step(&self, v: f64) -> (Dual<STATES>, [Dual<STATES>; FILTERED], Moving<STATES>) {
         let mut at = Moving::at(self.model, &self.state).seeded(self.model, 0);
         let (_, y) = self.stepper.step(&mut at, &Dual::constant(v));
@@ -361,7 +361,7 @@ impl Filter<'_> {
         (y, scaled, at)
     }
 
-    /// One output counts; NaN does not.
+    /// Corrects the state by one output; NaN is skipped.
     fn measure(&mut self, v: f64, y: f64) {
         if y.is_nan() {
             return;
@@ -463,7 +463,7 @@ impl Model for GreyBox {
         finite(found)
     }
 
-    /// Speed and drive by least squares, near what the first outputs say of them.
+    /// Speed and drive by least squares, close to what the first outputs say about them.
     fn estimate_state(&self, u: &[f64], channels: usize, y: &[f64]) -> Result<Vec<f64>> {
         self.check(u, channels, &[0.0; STATES])?;
         let known: Vec<f64> = y.iter().copied().filter(|v| v.is_finite()).collect();
@@ -478,7 +478,7 @@ impl Model for GreyBox {
         let level = frame.unit * first.iter().sum::<f64>() / first.len() as f64;
         let drive = (v[0] - frame.values[0] * level) / frame.command_scale;
         let prior = [level / frame.speed_scale, drive];
-        // a step of the scales is worth what it moves the output by
+        // a step of one scale weighs as much as the output change it makes
         let weight = PRIOR * (frame.speed_scale / frame.unit).powi(2);
         let plain = Self {
             network: self.network.clone(),
@@ -606,12 +606,12 @@ impl GreyBox {
     }
 }
 
-/// A grey box that a loop steps.
+/// A grey box as a plant in a loop.
 #[derive(Clone, Debug)]
 struct GreyBoxPlant {
     stepper: Stepper<0>,
     at: Moving<0>,
-    /// Commands that do not act yet, newest first.
+    /// Commands that have not acted yet, newest first.
     pending: Vec<f64>,
     output: f64,
     position: f64,

@@ -1,38 +1,38 @@
-//! The normal equations of a motor's fit: what a run leaves over, whitened, and its derivatives' products.
+//! The normal equations of a motor's fit, from whitened residuals and their derivatives.
 //!
-//! A row per sample holds the derivatives and, last, simulated less measured; a filter (finite, `filter[l]` for the row
-//! `l` samples before) makes the rows' errors white before they are summed. Samples that are not used are rows of zeros.
+//! Each sample's row holds the derivatives and, last, simulated minus measured. A finite filter (`filter[l]` for the row `l` samples
+//! before) whitens the rows' errors before they are summed. Samples that are not used are rows of zeros.
 
 use super::{Found, Run, run};
 use crate::gram::Gram;
 use crate::simd::{self, F64x8, Kernel};
 use crate::{Error, Monitor, Result};
 
-/// What a run is compared with.
+/// The measurements that a run is compared with.
 #[derive(Clone, Copy, Debug)]
 pub struct Measured<'a> {
     /// Speed \[rad/s\], (N).
     pub speed: &'a [f64],
     /// Whether a sample counts, (N).
     pub used: &'a [bool],
-    /// What the speeds' errors are filtered by.
+    /// The whitening filter of the speed errors.
     pub filter: &'a [f64],
-    /// The motor's current, where it was measured.
+    /// The motor's current, if it was measured.
     pub current: Option<Current<'a>>,
 }
 
-/// Currents, which are the drive over a resistance.
+/// Measured currents; the model's current is the drive over a resistance.
 #[derive(Clone, Copy, Debug)]
 pub struct Current<'a> {
     /// Current \[A\], (N).
     pub samples: &'a [f64],
-    /// What its errors are filtered by.
+    /// The whitening filter of the current errors.
     pub filter: &'a [f64],
     /// Command per ampere.
     pub resistance: f64,
 }
 
-/// A cost and its derivatives by the free parameters, the resistance last where a current is measured.
+/// A cost and its derivatives by the free parameters, then by the resistance if a current is measured.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Normal {
     /// `e'e`.
@@ -173,7 +173,7 @@ mod tests {
         }
     }
 
-    /// The sums of a matrix of rows that is written out.
+    /// The sums, by an explicit matrix of rows.
     #[test]
     fn the_sums_are_those_of_the_rows() {
         let (theta, n) = (theta(), 150);

@@ -1,8 +1,8 @@
-//! Confirmation of a minimum, and its last digits.
+//! Confirmation of a minimum, and its last digits. Begin reading at `polished`.
 //!
-//! Undamped steps from the point in question must get shorter: Gauss-Newton steps `-J^+ r`, or, where the residual is so
-//! large or so curved that these do not contract, Newton steps with a Hessian from differences of the gradient `J'r`, which
-//! must be positive definite. The steps are compared with the parameters and their standard errors, not by the cost.
+//! Undamped steps from the candidate point must get shorter. These are Gauss-Newton steps `-J^+ r` or, if the residual is so large or so
+//! curved that they do not contract, Newton steps with a Hessian from differences of the gradient `J'r`, which must be positive definite.
+//! Steps are measured by the parameters and their standard errors, not by the cost.
 
 use super::Residuals;
 use super::point::{Point, Spread, nonzero};
@@ -11,44 +11,44 @@ use super::trust::TrustRegion;
 use crate::descent::{Method, Outcome, Termination};
 use crate::lm::{cholesky, substitute};
 
-/// A step counts as contracting where it is at most this share of the one before.
+/// A step counts as contracting if it is at most this share of the one before.
 const CONTRACTION: f64 = 0.5;
-/// Largest relative step that may remain where rounding ends the contraction, or a test on the gradient holds.
+/// Largest relative step that may remain when rounding ends the contraction, or when a test on the gradient holds.
 const CONFIRMED: f64 = 1e-6;
-/// Relative step beyond which the point is not near enough to a minimum to tell.
+/// Relative step beyond which the point is too far from a minimum to tell.
 const REACH: f64 = 0.1;
-/// Steps at most.
+/// Most steps.
 const MOST: usize = 30;
-/// Rise of the cost that rounding explains.
+/// Relative rise of the cost that rounding explains.
 const ROUNDING: f64 = 1e-9;
-/// Steps of the differences: in standard deviations along the axes of the confidence ellipsoid, where the gradient's own
-/// rounding asks for more in parts of what all parameters do to the residuals, and never more than a part of a measure.
+/// Size of the steps for differences: `DEVIATIONS` standard deviations of the residuals plus, against rounding of the gradient, `PARTS`
+/// of all parameters' share in the residuals. No parameter moves by more than `DEVIATIONS` of its measure.
 const DEVIATIONS: f64 = 1e-3;
 const PARTS: f64 = 1e-9;
-/// Singular values, relative to the columns, that the coordinates of the Hessian do not stretch any further.
+/// Damping of the coordinates of the Hessian, relative to the columns: smaller singular values are not stretched any further.
 const SOFTNESS: f64 = 1e-6;
 
-/// The next undamped step and its largest component relative to the parameters' measures.
+/// The next undamped step, and its largest component relative to the parameters' measures.
 struct Step {
     free: Vec<f64>,
     error: f64,
 }
 
-/// The Cholesky factor of the Hessian in coordinates `R theta`, in which `J'J` is about the unit matrix: the curvature of
-/// the residuals stands out whatever the condition.
+/// The Cholesky factor of the Hessian in coordinates `R theta`. In these `J'J` is about the unit matrix, so the
+/// curvature of the residuals shows for any condition of `J`.
 struct Hessian {
     triangle: Triangle,
     factor: Vec<f64>,
 }
 
 impl Step {
-    /// A step of no length proves no contraction.
+    /// Strictly shorter: a step of length zero proves no contraction.
     fn is_shorter_than(&self, before: &Self) -> bool {
         self.error < before.error && self.error <= CONTRACTION * before.error
     }
 }
 
-/// What the polish works with: the measures stay those of its start.
+/// The state of the polish; the measures stay those of its start.
 struct Polish {
     theta: Vec<f64>,
     cost: f64,
@@ -72,7 +72,7 @@ impl Polish {
             point.triangle.minimiser(&mut free);
         }
         let relative = |(p, w): (&f64, &f64)| if *p == 0.0 { 0.0 } else { p.abs() / w };
-        // A NaN must not be overlooked, as f64::max would.
+        // Unlike f64::max, this must not skip a NaN.
         let error = free.iter().zip(&self.measures).map(relative);
         let error = error.fold(0.0, |most: f64, e| if e <= most { most } else { e });
         Step { free, error }
@@ -88,8 +88,8 @@ impl Polish {
 }
 
 impl<P: Residuals> TrustRegion<'_, P> {
-    /// The test that holds at a confirmed minimum, where the outcome then is; else the reason to doubt it, the outcome
-    /// as it was.
+    /// `Ok`: the test that holds at the confirmed minimum, to which the outcome has moved. `Err`: the reason to doubt
+    /// it; the outcome is unchanged.
     pub fn confirm(&mut self, outcome: &mut Outcome) -> Result<Termination, Termination> {
         let residual = self.point.residual.clone();
         let found = self.polished(outcome);
@@ -158,7 +158,7 @@ impl<P: Residuals> TrustRegion<'_, P> {
         Err(Termination::Flat)
     }
 
-    /// Rank and covariance where the rank is full.
+    /// Rank and covariance, if the rank is full.
     fn full_spread(&self) -> Result<Spread, Termination> {
         let spread = Spread::new(
             &self.point.triangle,
@@ -173,7 +173,7 @@ impl<P: Residuals> TrustRegion<'_, P> {
         }
     }
 
-    /// True where nothing more is asked for.
+    /// True if the step meets the tolerances.
     fn is_settled(&self, step: &Step) -> bool {
         let settings = self.settings;
         let level = self.point.cosine() <= settings.gtol.max(settings.ftol);
@@ -190,8 +190,8 @@ impl<P: Residuals> TrustRegion<'_, P> {
         }
     }
 
-    /// Takes the step where the next one is shorter; none where it leads nowhere. The point is linearised at the polished
-    /// parameters only where the next step is given and shorter.
+    /// Takes the step if the next one is shorter, and returns the next one; `None` if the step leads nowhere. The point
+    /// is linearised at the polished parameters only if a shorter next step is returned.
     fn advance(&mut self, polish: &mut Polish, step: &Step) -> Result<Option<Step>, Termination> {
         if self.monitor.stopped() {
             return Err(Termination::Interrupted);
@@ -223,7 +223,7 @@ impl<P: Residuals> TrustRegion<'_, P> {
         Ok(Some(next))
     }
 
-    /// Back to the polished parameters after a step that led elsewhere.
+    /// Returns to the polished parameters after a step that led elsewhere.
     fn linearise_again(&mut self, polish: &Polish) -> Result<(), Termination> {
         if self.linearise_point(&polish.theta) {
             return Ok(());
@@ -231,7 +231,7 @@ impl<P: Residuals> TrustRegion<'_, P> {
         Err(Termination::NotFinite)
     }
 
-    /// Differences of the gradient at the polished parameters; `otherwise` where they are not positive definite.
+    /// The Hessian from differences of the gradient at the polished parameters; `otherwise` if it is not positive definite.
     fn hessian(&mut self, polish: &Polish, otherwise: Termination) -> Result<Hessian, Termination> {
         let n = polish.free.len();
         let (residual, gradient) = (self.point.residual.clone(), self.point.gradient.clone());
@@ -266,7 +266,7 @@ impl<P: Residuals> TrustRegion<'_, P> {
         })
     }
 
-    /// Linearises `size` along `axis`, or on the other side where that is not possible; the signed size.
+    /// Linearises at `size` along `axis`, or at `-size` if that is not possible; returns the signed size.
     fn beside(&mut self, polish: &Polish, axis: &[f64], size: f64) -> Result<f64, Termination> {
         for size in [size, -size] {
             let mut theta = polish.theta.clone();
@@ -293,7 +293,7 @@ impl<P: Residuals> TrustRegion<'_, P> {
 }
 
 impl Point {
-    /// The triangle with a touch of damping: at a minimum whose residual is not zero the Jacobian may be singular.
+    /// The triangle with slight damping: at a minimum with a nonzero residual the Jacobian may be singular.
     fn softened(&self) -> Triangle {
         let mut triangle = self.triangle.clone();
         for (a, &j) in self.free.iter().enumerate() {
@@ -306,7 +306,7 @@ impl Point {
         triangle
     }
 
-    /// Length of a small change of the residuals for differences.
+    /// Size of a small change of the residuals, for differences.
     fn typical_change(&self, theta: &[f64]) -> f64 {
         let parts = self
             .free

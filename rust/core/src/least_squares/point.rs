@@ -1,4 +1,4 @@
-//! Where the iteration stands: residuals, Jacobian and what follows from them; what the Jacobian says of the parameters: rank,
+//! The present point: residuals, Jacobian and what follows from them, including rank, condition and covariance of the parameters.
 //! condition, covariance.
 
 use nalgebra::DMatrix;
@@ -6,7 +6,7 @@ use nalgebra::DMatrix;
 use super::Settings;
 use super::triangle::Triangle;
 
-/// Share of the other parameters' part in the residuals below which a parameter is zero.
+/// A parameter whose part in the residuals is below this share of all parameters' part counts as zero.
 const NOTHING: f64 = 1.5e-8;
 
 /// Linearisation at one point; the triangle holds the columns of the free parameters.
@@ -17,9 +17,9 @@ pub(super) struct Point {
     pub gradient: Vec<f64>,
     /// Norms of the Jacobian's columns.
     pub columns: Vec<f64>,
-    /// -1 and 1 where a bound holds a parameter.
+    /// -1 and 1 if a bound holds a parameter, else 0.
     pub active: Vec<i8>,
-    /// Indices of the others.
+    /// Indices of the free parameters.
     pub free: Vec<usize>,
     pub triangle: Triangle,
 }
@@ -43,7 +43,7 @@ impl Point {
         self.residual.iter().map(|r| r * r).sum::<f64>().sqrt()
     }
 
-    /// Gradient, norms, active bounds and triangle from the Jacobian; false where it is not finite.
+    /// Gradient, norms, active bounds and triangle from the Jacobian; false if it is not finite.
     pub fn digest(&mut self, theta: &[f64], settings: &Settings) -> bool {
         let n = theta.len();
         self.gradient.fill(0.0);
@@ -67,7 +67,7 @@ impl Point {
         self.is_linearised
     }
 
-    /// A parameter on a bound is held there while the cost falls towards the outside (the Kuhn-Tucker conditions).
+    /// A parameter on a bound is held there if the cost falls towards the outside (Karush-Kuhn-Tucker conditions).
     fn choose_free(&mut self, theta: &[f64], settings: &Settings) {
         self.free.clear();
         for (j, (&x, &g)) in theta.iter().zip(&self.gradient).enumerate() {
@@ -128,14 +128,14 @@ impl Point {
             .fold(0.0, f64::max)
     }
 
-    /// `s^2`, or none where there are not more residuals than parameters.
+    /// `s^2`; `None` unless there are more residuals than parameters.
     pub fn variance(&self) -> Option<f64> {
         let spare = self.residual.len().checked_sub(self.free.len())?;
         (spare > 0).then(|| self.norm().powi(2) / spare as f64)
     }
 
-    /// What a change of each free parameter is measured against: its value, its standard error (digits beyond it mean
-    /// nothing), and the change that the residuals would not show beside what all parameters do to them.
+    /// The measure for changes of each free parameter: its value, its standard error (digits beyond it mean nothing),
+    /// and the change that is invisible in the residuals beside what all parameters contribute to them.
     pub fn measures(&self, theta: &[f64], inverse: &[f64]) -> Vec<f64> {
         let n = self.free.len();
         let parts = self
@@ -160,7 +160,7 @@ impl Point {
         }
     }
 
-    /// `s^2 (J'J)^-1` over all parameters: zero for those on a bound, NaN where `s` or the Jacobian is not known.
+    /// `s^2 (J'J)^-1` over all parameters: zero for those on a bound, NaN if `s` or the Jacobian is not known.
     pub fn covariance(&self, spread: Option<&Spread>, n: usize) -> Vec<f64> {
         let (Some(spread), Some(variance)) = (spread, self.variance()) else {
             return vec![f64::NAN; n * n];
@@ -183,20 +183,20 @@ impl Point {
 /// Rank, condition and `(J'J)^-1` of the free parameters.
 #[derive(Clone, Debug)]
 pub(super) struct Spread {
-    /// Singular values of `J` with columns of unit length that are above rounding.
+    /// Number of singular values of `J`, with columns of unit length, above rounding.
     pub rank: usize,
-    /// Largest by smallest of these singular values; infinite where the rank is not full.
+    /// Ratio of the largest to the smallest of these singular values; infinite if the rank is not full.
     pub condition: f64,
-    /// `(J'J)^-1` row by row; NaN in rows and columns of parameters that the data do not fix, infinite on their diagonal.
+    /// `(J'J)^-1` row by row; rows and columns of parameters that the data do not determine are NaN, infinite on the diagonal.
     pub inverse: Vec<f64>,
 }
 
-/// Share of a parameter in the null space above which it counts as not fixed.
+/// Share of a parameter in the null space above which the data do not determine it.
 const SHARE: f64 = 1e-6;
 
 impl Spread {
-    /// By singular values of the triangle with its columns scaled to unit length, so that units play no part; `rows` is
-    /// the number of residuals, `precision` the relative error of the Jacobian. None where it is not finite.
+    /// From the singular values of the triangle with its columns scaled to unit length, so that units do not matter. `rows` is the number
+    /// of residuals, `precision` the relative error of the Jacobian. `None` if the triangle is not finite.
     pub fn new(triangle: &Triangle, rows: usize, precision: f64) -> Option<Self> {
         let n = triangle.columns();
         if n == 0 {

@@ -1,4 +1,4 @@
-//! The engine on problems whose answers are known, and on those that have none.
+//! The engine on problems with known answers, and on problems without one.
 
 use super::*;
 
@@ -44,7 +44,7 @@ fn valley() -> impl Residuals {
     }
 }
 
-/// Growth `b1 (1 - exp(-b2 x))` with data of one's own.
+/// Growth `b1 (1 - exp(-b2 x))`; `offset` changes the data.
 fn growth(offset: f64) -> impl Residuals {
     let x = [1.0, 2.0, 3.0, 5.0, 7.0, 10.0];
     let y = [109.0, 149.0, 149.0, 191.0, 213.0, 224.0];
@@ -76,7 +76,7 @@ fn descends_a_valley_to_its_end() {
 
 #[test]
 fn finds_what_the_data_certify() {
-    // NIST's BoxBOD; the first start lies where steps of Gauss and Newton run away.
+    // NIST's BoxBOD; from the first start Gauss-Newton steps diverge.
     for start in [[1.0, 1.0], [100.0, 0.75]] {
         let fit = run(&mut growth(0.0), &start, &Settings::default());
         assert!(fit.termination.is_converged());
@@ -116,7 +116,7 @@ fn does_not_believe_a_stationary_point_that_is_no_minimum() {
 
 #[test]
 fn stays_at_a_minimum_whose_jacobian_is_singular() {
-    // Freudenstein and Roth: no full rank confirms the local minimum, at which the residual is large.
+    // Freudenstein and Roth: the rank is not full, so the local minimum, with its large residual, cannot be confirmed.
     let mut case = Case {
         n: 2,
         m: 2,

@@ -1,7 +1,7 @@
-//! QR by rows: the triangle `R` and `Q'r` of any number of rows, of which only a block is held at a time.
+//! QR by rows: the triangle `R` and `Q'r` of any number of rows, with only one block of rows in memory at a time.
 //!
-//! Householder reflections (Golub and Van Loan, Matrix Computations, 5.2) that fold a block of rows into the triangle
-//! above them. The condition is that of `J`, not its square as in normal equations.
+//! Householder reflections (Golub and Van Loan, Matrix Computations, 5.2) fold each block of rows into the triangle.
+//! The condition is that of `J`; normal equations would square it.
 
 /// Rows folded at a time; a block stays in the caches.
 const BLOCK: usize = 64;
@@ -17,7 +17,7 @@ pub(super) struct Triangle {
 }
 
 impl Triangle {
-    /// Room for `most` columns.
+    /// Allocates for up to `most` columns.
     pub fn new(most: usize) -> Self {
         Self {
             n: most,
@@ -28,14 +28,14 @@ impl Triangle {
         }
     }
 
-    /// Forgets all rows; from now on they have `n` columns.
+    /// Drops all rows; new rows have `n` columns.
     pub fn clear(&mut self, n: usize) {
         self.n = n;
         self.rows[..n * (n + 1)].fill(0.0);
         self.filled = 0;
     }
 
-    /// Becomes a copy of `other`, which must have no more columns than there is room for.
+    /// Becomes a copy of `other`, whose columns must fit into the allocation.
     pub fn copy_from(&mut self, other: &Self) {
         self.clear(other.n);
         let used = other.n * (other.n + 1);
@@ -47,7 +47,7 @@ impl Triangle {
         self.n
     }
 
-    /// Appends a row that `write` fills: `n` values of `J`, then the right-hand side. It comes with old values.
+    /// Appends a row filled by `write`: `n` values of `J`, then the right-hand side. Its old values are not cleared.
     pub fn push(&mut self, write: impl FnOnce(&mut [f64])) {
         let width = self.n + 1;
         write(&mut self.block[self.filled * width..][..width]);
@@ -57,7 +57,7 @@ impl Triangle {
         }
     }
 
-    /// Folds the rows that wait; to be called before anything is read.
+    /// Folds the pending rows; to be called before anything is read.
     pub fn fold(&mut self) {
         let width = self.n + 1;
         let block = &mut self.block[..self.filled * width];
@@ -104,7 +104,7 @@ impl Triangle {
         }
     }
 
-    /// The right-hand side `Q'r`, of which only the part in the range of `J` is kept.
+    /// The right-hand side `Q'r`; only its part in the range of `J` is stored.
     pub fn rhs(&self) -> impl Iterator<Item = f64> + '_ {
         let width = self.n + 1;
         (0..self.n).map(move |i| self.rows[i * width + self.n])
@@ -114,14 +114,14 @@ impl Triangle {
         &self.rows[i * (self.n + 1) + i..i * (self.n + 1) + self.n]
     }
 
-    /// True where no pivot is negligible beside its column: a singular matrix is found so, a nearly singular one not always.
+    /// True if no pivot is negligible relative to its column. Detects singular matrices, but not every nearly singular one.
     pub fn seems_regular(&self) -> bool {
         let column = |j: usize| (0..=j).map(|i| self.at(i, j).powi(2)).sum::<f64>().sqrt();
         let least = f64::EPSILON * self.n as f64;
         (0..self.n).all(|j| self.at(j, j).abs() > least * column(j))
     }
 
-    /// True where no pivot is zero, so that systems can be solved.
+    /// True if no pivot is zero, so that systems can be solved.
     pub fn is_solvable(&self) -> bool {
         (0..self.n).all(|j| self.at(j, j).abs() >= f64::MIN_POSITIVE)
     }

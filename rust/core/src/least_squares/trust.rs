@@ -1,5 +1,5 @@
-//! The trust-region method: scaling, the best step within a radius and bounds, how the radius follows success and failure, tests
-//! that call for confirmation.
+//! The trust-region method: scaling, the best step within a radius and bounds, the radius's response to success and
+//! failure, and the tests that call for confirmation.
 
 use super::point::{Point, nonzero};
 use super::triangle::Triangle;
@@ -7,13 +7,14 @@ use super::{Residuals, Settings};
 use crate::Monitor;
 use crate::descent::{Method, Outcome, Proposal, Termination, Verdict};
 
-/// Relative reduction that the cost cannot show reliably: from here on steps are judged by their size.
+/// Relative reduction that the cost cannot resolve: below it, steps are judged by their size.
 const UNSEEN: f64 = 1e-10;
-/// Confirmations in a row that fail before the failure is believed, and the share of the cost below which the row ends.
+/// Failed confirmations in a row before the failure is believed; the count restarts if the cost falls below `PROGRESS`
+/// times the last one.
 const PATIENCE: usize = 5;
 const PROGRESS: f64 = 0.9;
 
-/// Residuals, where the iteration stands, and the trust region.
+/// Residuals, the present point, and the trust region.
 pub(super) struct TrustRegion<'a, P> {
     pub problem: &'a mut P,
     pub settings: &'a Settings,
@@ -24,20 +25,20 @@ pub(super) struct TrustRegion<'a, P> {
     pub jacobians: usize,
     radius: Radius,
     promise: Promise,
-    /// `D` over all parameters.
+    /// The scaling `D` of all parameters.
     scale: Vec<f64>,
-    /// `D`, step and its image in the free ones.
+    /// `D`, the step and its image, of the free parameters.
     d: Vec<f64>,
     step: Vec<f64>,
     image: Vec<f64>,
     /// `|D theta|` of the free parameters.
     size: f64,
-    /// Scaled length of an undamped step that has just been taken.
+    /// Scaled length of the undamped step just taken, if it was one.
     full_step: Option<f64>,
-    /// A test on cost or step held.
+    /// Whether a test on cost or step held.
     called: bool,
     doubts: usize,
-    /// Cost at the last confirmation that failed.
+    /// Cost at the last failed confirmation.
     doubted: f64,
 }
 
@@ -73,12 +74,12 @@ impl<'a, P: Residuals> TrustRegion<'a, P> {
         }
     }
 
-    /// True where the permitted evaluations are used up.
+    /// True if the permitted evaluations are used up.
     pub fn is_spent(&self) -> bool {
         self.evaluations >= self.settings.max_evaluations
     }
 
-    /// Jacobian and all that follows from it at the present point, without a change of the scaling.
+    /// Computes the Jacobian and all that follows from it at the present point, without changing the scaling.
     pub fn linearise_point(&mut self, theta: &[f64]) -> bool {
         let point = &mut self.point;
         self.jacobians += 1;
@@ -89,7 +90,7 @@ impl<'a, P: Residuals> TrustRegion<'a, P> {
         point.is_linearised
     }
 
-    /// What ended the loop without a minimum is looked at once more: the end may be one that only the cost cannot see.
+    /// A second look at a stalled end: it may be a minimum that the cost alone cannot show.
     pub fn conclude(&mut self, outcome: &mut Outcome) -> Termination {
         let end = outcome.termination;
         if end != Termination::Stalled || !self.point.is_linearised {
@@ -101,8 +102,8 @@ impl<'a, P: Residuals> TrustRegion<'a, P> {
         }
     }
 
-    /// Confirms a minimum, or says why the iteration should end without one; `level`: the residual is orthogonal to every
-    /// column.
+    /// Confirms a minimum, or returns why the iteration should end without one; `None` to go on. `level`: the residual
+    /// is orthogonal to every column.
     fn decide(&mut self, outcome: &mut Outcome, level: bool) -> Option<Termination> {
         match self.confirm(outcome) {
             Ok(minimum) => Some(minimum),
@@ -117,7 +118,7 @@ impl<'a, P: Residuals> TrustRegion<'a, P> {
         }
     }
 
-    /// True where the Gauss-Newton step is so small that the cost may not show it, or smaller than asked for.
+    /// True if the Gauss-Newton step is so small that the cost may not show it, or is below the tolerance.
     fn is_near(&mut self, theta: &[f64]) -> bool {
         let point = &self.point;
         if !point.triangle.seems_regular() {
@@ -133,7 +134,7 @@ impl<'a, P: Residuals> TrustRegion<'a, P> {
         step.iter().zip(&point.free).all(small)
     }
 
-    /// True where the last step was undamped and the next one is less than half as long: the iteration contracts.
+    /// True if the last step was undamped and the next one is at most half as long: the iteration contracts.
     pub fn has_contracted(&mut self) -> bool {
         let step = &mut self.step[..self.point.free.len()];
         self.point.triangle.minimiser(step);
@@ -141,7 +142,7 @@ impl<'a, P: Residuals> TrustRegion<'a, P> {
         self.full_step.is_some_and(|last| next <= 0.5 * last)
     }
 
-    /// Fills the trial; where bounds cut the step, the linear model is asked again what it promises.
+    /// Fills the trial; if bounds cut the step, recomputes what the linear model promises.
     fn place(&mut self, theta: &[f64], trial: &mut [f64]) {
         trial.copy_from_slice(theta);
         let (norm, mut cut) = (self.point.norm(), false);
@@ -190,7 +191,7 @@ impl<P: Residuals> Method for TrustRegion<'_, P> {
             return false;
         }
         if self.settings.scale.is_none() {
-            // The largest norms so far: a column that vanishes must not set its parameter free (More 1978).
+            // The largest norms so far: a column that vanishes must not release its parameter (More 1978).
             for (d, c) in self.scale.iter_mut().zip(&self.point.columns) {
                 *d = d.max(*c);
             }
@@ -231,7 +232,7 @@ impl<P: Residuals> Method for TrustRegion<'_, P> {
     }
 
     fn judge(&mut self, before: f64, after: Option<f64>) -> Verdict {
-        // Beyond ten times the residual the parabola of the radius says nothing.
+        // Beyond ten times the residual the parabola for the radius is meaningless.
         let actual = after
             .filter(|&cost| cost < 100.0 * before)
             .map_or(f64::NEG_INFINITY, |cost| 1.0 - cost / before);
@@ -260,16 +261,16 @@ impl<P: Residuals> Method for TrustRegion<'_, P> {
 
 /// Relative accuracy of `|D p| = radius`.
 const SLACK: f64 = 0.1;
-/// Newton steps for lambda; more are never needed for that accuracy.
+/// Most Newton steps for lambda; that accuracy never needs more.
 const MOST_TRIALS: usize = 30;
-/// The first radius in lengths of the scaled start (More recommends 0.1 to 100).
+/// The first radius, in lengths of the scaled start (More recommends 0.1 to 100).
 const FIRST: f64 = 1.0;
-/// Least share of the promised reduction that a step must bring.
+/// Least share of the promised reduction that an accepted step must bring.
 const LEAST_GAIN: f64 = 1e-4;
 
-/// Radius, damping and the step they give, in the free parameters.
+/// Radius, damping and the resulting step, for the free parameters.
 struct Radius {
-    /// None before the first step.
+    /// `None` before the first step.
     radius: Option<f64>,
     lambda: f64,
     /// `|D p|` of the last step.
@@ -298,12 +299,12 @@ impl Radius {
         }
     }
 
-    /// True where the last step was a full Gauss-Newton step.
+    /// True if the last step was a full Gauss-Newton step.
     fn is_undamped(&self) -> bool {
         self.lambda == 0.0
     }
 
-    /// True where the radius is below `tolerance` times the scaled length of the parameters.
+    /// True if the radius is below `tolerance` times the scaled length of the parameters.
     fn is_below(&self, tolerance: f64, size: f64) -> bool {
         self.radius.is_some_and(|radius| radius <= tolerance * size)
     }
@@ -318,7 +319,7 @@ impl Radius {
     fn step(&mut self, triangle: &Triangle, d: &[f64], p: &mut [f64]) {
         let radius = self.radius.unwrap_or(FIRST);
         let regular = triangle.is_solvable();
-        // A singular system is damped by what rounding leaves of its null space.
+        // A singular system is damped at the level of rounding in its null space.
         let mut lower = if regular {
             0.0
         } else {
@@ -410,7 +411,7 @@ impl Radius {
         self.damped.fold();
     }
 
-    /// What the last step promises, for a residual of length `norm`; `image` is `R p`.
+    /// The reduction promised by the last step, for a residual of length `norm`; `image` is `R p`.
     fn promise(&self, image: &[f64], norm: f64) -> Promise {
         let linear = image.iter().map(|v| (v / norm).powi(2)).sum::<f64>();
         let damping = self.lambda * (self.length / norm).powi(2);
@@ -420,8 +421,8 @@ impl Radius {
         }
     }
 
-    /// Adapts the radius to the reduction that came, relative to the cost (minus infinity where it rose much or is not finite);
-    /// true where the step is good enough.
+    /// Adapts the radius to the actual relative reduction (minus infinity if the cost rose much or is not finite); true
+    /// if the step is good enough.
     fn learn(&mut self, promise: Promise, actual: f64) -> bool {
         let radius = self.radius.unwrap_or(FIRST);
         let radius = if std::mem::take(&mut self.first_trial) {
@@ -447,7 +448,7 @@ impl Radius {
     }
 }
 
-/// Where the parabola through both costs and the slope has its minimum, within 0.1 to 0.5.
+/// The minimum of the parabola through both costs and the slope, clipped to 0.1 to 0.5.
 fn shrinkage(slope: f64, actual: f64) -> f64 {
     if actual >= 0.0 {
         return 0.5;
