@@ -28,7 +28,7 @@ pub struct NeuralOE {
 }
 
 impl NeuralOE {
-    /// A model from its parameters; `limits` are in scaled units, infinite where the output does not saturate.
+    /// A model from its parameters; `limits` are in scaled units, infinite if the output does not saturate.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for a wrong number of parameters or scales, values that are not finite, or limits that
@@ -88,7 +88,7 @@ impl NeuralOE {
         self.network.limits
     }
 
-    /// Free run in the data's units, and its derivatives row by row: by theta, then by the past outputs.
+    /// Free run in the data's units, and its derivatives row by row: with respect to theta, then to the past outputs.
     ///
     /// # Errors
     /// As [`Lagged::simulate`].
@@ -123,7 +123,7 @@ impl NeuralOE {
         Ok((finite(self.restored(scaled))?, rows))
     }
 
-    /// The derivatives of the output by the whole regressor, in the data's units.
+    /// The derivatives of the output with respect to the whole regressor, in the data's units.
     pub(crate) fn slopes(&self, phi: &[f64]) -> Vec<f64> {
         let Lags { na, nb, .. } = self.lags();
         let mut scaled = vec![0.0; phi.len()];
@@ -146,11 +146,11 @@ impl NeuralOE {
     }
 }
 
-/// The rows of a free run in the data's units, in the order of theta and the past outputs.
+/// The rows of a free run in the data's units, in the order of theta, then the past outputs.
 struct Recording {
     gram: Gram,
     columns: Vec<usize>,
-    /// Columns of the past outputs, whose unit is that of the output.
+    /// Columns of the past outputs; they have the unit of the output.
     states: std::ops::Range<usize>,
     y_scale: f64,
     rows: Vec<f64>,
@@ -197,7 +197,7 @@ impl Lagged for NeuralOE {
 
     fn output_and_slope(&self, phi: &[f64], slope: &mut [f64]) -> f64 {
         let Lags { na, nb, .. } = self.lags();
-        // regressors of the usual size need no room of their own
+        // regressors of the usual size need no allocation
         let (mut few, mut many) = ([0.0; 32], Vec::new());
         let scaled = match few.get_mut(..phi.len()) {
             Some(few) => few,
@@ -218,7 +218,7 @@ impl Lagged for NeuralOE {
     fn simulate(&self, u: &[f64], channels: usize, y_past: &[f64]) -> Result<Vec<f64>> {
         let samples = self.lags().check(u, channels, y_past)?;
         if self.scaling.is_moderate() {
-            // in the data's units nothing is scaled but the weights: no copy of the inputs, no second pass over the outputs
+            // with weights in the data's units the signals need no scaling: no copy of the inputs, no second pass over the outputs
             let network = self.in_data_units();
             return finite(free_run::outputs(&network, u, 0, y_past, samples));
         }
@@ -259,7 +259,7 @@ mod tests {
             y_scale,
         };
         let expected = of(scaling(0.0, 1.0, 1.0));
-        // what remains is the rounding of u and y themselves
+        // the remaining error is the rounding of u and y themselves
         for (found, most) in [
             (of(scaling(power(20), 1.0, 1.0)), 1e-8),
             (of(scaling(0.0, power(-700), power(700))), 1e-13),
@@ -337,7 +337,7 @@ mod tests {
 
     #[test]
     fn a_state_that_is_soon_forgotten_comes_back_from_a_clean_record() {
-        // far from the outputs, so that its prior outweighed the few that tell of it
+        // a state far from the outputs: its prior once outweighed the few outputs that depend on it
         for (seed, inputs) in [
             (17_557_077_261_666_588_454, 80),
             (12_707_694_688_172_175_531, 40),

@@ -12,14 +12,14 @@ use crate::{Error, Result};
 
 /// Half the width of the interval that weights and biases of hidden units are drawn from.
 const HIDDEN: f64 = 0.5;
-/// The same for the weights of the output. Both are the best of several pairs on one simulated drive (11 of 12 starts
+/// The same for the weights of the output. Both were the best of several pairs on one simulated drive (11 of 12 starts,
 /// against 7 with .1 for both); on other drives expect two of three.
 const OUTPUT: f64 = 0.02;
 
-/// `b2` and `linear` with which the network, in scaled units, is this linear model.
+/// `b2` and `linear` that make the network, in scaled units, equal to this linear model.
 ///
 /// # Errors
-/// `ErrorKind::Setting` where the model's orders are not those of the shape.
+/// `ErrorKind::Setting` if the model's orders are not those of the shape.
 pub(super) fn bypass(model: &LinearModel, scaling: &Scaling, shape: Shape) -> Result<Vec<f64>> {
     if model.lags() != shape.lags {
         return Err(Error::setting(format!(
@@ -43,12 +43,12 @@ pub(super) fn bypass(model: &LinearModel, scaling: &Scaling, shape: Shape) -> Re
     Ok([constant].into_iter().chain(past).chain(inputs).collect())
 }
 
-/// Hidden units by Nguyen and Widrow (1990) that do not reach the output yet, beside the linear model.
+/// Hidden units by Nguyen and Widrow (1990), with output weights of zero, beside the linear model.
 pub(super) fn beside(bypass: &[f64], shape: Shape, random: &mut Random) -> Vec<f64> {
     let n_phi = shape.lags.regressors();
     let [bias, second, _, _] = shape.offsets();
     let mut theta = vec![0.0; shape.parameters()];
-    // Standardised signals reach about two, where Nguyen and Widrow assume one.
+    // Standardised signals reach about two; Nguyen and Widrow assume one.
     let size = 0.35 * (shape.hidden as f64).powf(1.0 / n_phi as f64);
     for i in 0..shape.hidden {
         let row = &mut theta[i * n_phi..(i + 1) * n_phi];
@@ -66,7 +66,7 @@ pub(super) fn beside(bypass: &[f64], shape: Shape, random: &mut Random) -> Vec<f
     theta
 }
 
-/// Small random weights; the hidden units differ clearly, but reach the output only weakly.
+/// Small random weights: the hidden units differ clearly, but contribute little to the output.
 pub(super) fn small(shape: Shape, random: &mut Random) -> Vec<f64> {
     let [_, second, _, _] = shape.offsets();
     let width = |i: usize| if i < second { HIDDEN } else { OUTPUT };
@@ -75,13 +75,13 @@ pub(super) fn small(shape: Shape, random: &mut Random) -> Vec<f64> {
         .collect()
 }
 
-/// Added to the diagonal, relative to its mean: hidden outputs of small weights are nearly collinear.
+/// Added to the diagonal, relative to its mean: with small weights the hidden outputs are nearly collinear.
 const RIDGE: f64 = 1e-9;
 
 /// `w2` and `b2` by least squares over the measured regressors, for the hidden units that `network` holds.
 ///
-/// A random output layer makes a network whose free run has next to nothing to do with the drive; this one is roughly
-/// an ARX model from the start (extreme learning machine: Huang, Zhu and Siew 2006). None where the system is singular.
+/// With a random output layer the free run has next to nothing to do with the drive; with this one it is roughly an ARX
+/// model from the start (extreme learning machine: Huang, Zhu and Siew 2006). `None` if the system is singular.
 pub(super) fn output_layer(network: &Network, experiments: &[Experiment]) -> Option<Vec<f64>> {
     let (lags, hidden) = (network.shape.lags, network.shape.hidden);
     let n = hidden + 1;

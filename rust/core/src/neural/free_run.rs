@@ -1,7 +1,7 @@
-//! Free runs of networks in the units of their inputs, scaled or the data's, one or two side by side.
+//! Free runs of networks, one or two side by side, in the units of their inputs: scaled or the data's.
 //!
-//! A run waits for itself: each output needs the one before. What does not depend on it, the inputs' share of the hidden
-//! units' arguments, is computed for a block of samples beforehand, and a second run fits into the waiting.
+//! A run waits for itself: each output needs the one before. Terms that do not depend on it, the inputs' part of the hidden units'
+//! arguments, are computed in advance for a block of samples, and a second run fits into the waiting times.
 //!
 //! ```text
 //!   z(k) = [ W1u u(k) + b1 ]                     drive     a block at once, off the chain
@@ -10,10 +10,11 @@
 //!   y(k) = direct(k) + w2' tanh(z(k))              one tanh, one sum of eight lanes
 //! ```
 //!
-//! Networks of one group of hidden units and up to four past outputs keep weights and past outputs in registers ([`together`]); the
-//! others go through memory ([`Chain::alone`]), by which a free run of 8 units takes 12 to 16 % longer and a training 2 to 3 % (Zen 4,
-//! `free_run` with 1 to 4 past outputs and `training_8` of the kernels' example, least and median of 100 and 150). Two runs side by side take 102 cycles a sample where one takes 76 (AVX-512; with AVX2
-//! 117 and 90, on the baseline 234 and 139: docs/PERFORMANCE.md), which pays where Levenberg and Marquardt try two dampings at once.
+//! Networks of one group of hidden units and up to four past outputs keep weights and past outputs in registers
+//! ([`together`]). The others go through memory ([`Chain::alone`]), which makes a free run of 8 units 12 to 16 % and a
+//! training 2 to 3 % longer (Zen 4, `free_run` with 1 to 4 past outputs and `training_8` of the kernels' example, least
+//! and median of 100 and 150). One run takes 76 cycles a sample, two side by side 102 (AVX-512; with AVX2 90 and 117,
+//! on the baseline 139 and 234: docs/PERFORMANCE.md), which pays when Levenberg-Marquardt tries two dampings at once.
 
 use super::network::{self, Network};
 use crate::Monitor;
@@ -21,24 +22,24 @@ use crate::data::weighted_squares;
 use crate::monitor::Limit;
 use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 
-/// Samples whose inputs are prepared at once.
-// A block's share of the inputs is 4 kB for a group of hidden units: written and read again within the first-level
+/// Samples whose inputs are prepared together.
+// The inputs' part of a block is 4 kB per group of hidden units: it is written and read back within the first-level
 // cache.
 const BLOCK: usize = 64;
-/// Blocks between two looks at the monitor.
+/// Blocks between two checks of the monitor.
 // 4,096 samples, a tenth of a millisecond.
 const LOOK: usize = 64;
 
-/// One network's run; what it leaves behind goes where its caller says.
+/// One network's run; its results go into the caller's buffers.
 pub(super) struct Run<'a> {
     pub network: &'a Network,
     /// Past outputs before the first sample, newest first.
     pub state: &'a [f64],
     /// Outputs, one for each sample simulated.
     pub outputs: &'a mut [f64],
-    /// Room for the hidden outputs of all samples, or of none.
+    /// Buffer for the hidden outputs of all samples, or empty.
     pub hidden: &'a mut [Lanes],
-    /// None where it has already failed elsewhere.
+    /// `None` if the run has already failed elsewhere.
     pub limit: Option<Limit>,
 }
 
@@ -47,21 +48,21 @@ pub(super) struct FreeRuns<'a, const RUNS: usize> {
     pub runs: [Run<'a>; RUNS],
     /// Inputs of the whole experiment.
     pub u: &'a [f64],
-    /// The first sample that is simulated.
+    /// The first simulated sample.
     pub first: usize,
-    /// Measured outputs of the simulated samples, NaN where there is none; empty where nothing is measured.
+    /// Measured outputs of the simulated samples, NaN for unknown ones; empty if nothing is measured.
     pub y: &'a [f64],
-    /// Their weights; none where all count alike.
+    /// Their weights; empty if all count alike.
     pub weights: &'a [f64],
-    /// An output of this size has diverged.
+    /// An output of this magnitude has diverged.
     pub bound: f64,
-    /// Asked whether to stop.
+    /// Asked for stop requests.
     pub monitor: Option<&'a Monitor>,
 }
 
 impl<const RUNS: usize> FreeRuns<'_, RUNS> {
-    /// Sums of squared errors, 0 without a measure; none where a run diverges, is stopped, or can no longer stay below
-    /// its limit.
+    /// Sums of squared errors, 0 without measured outputs; `None` if a run diverges, is stopped, or can no longer stay
+    /// below its limit.
     pub fn go(self) -> [Option<f64>; RUNS] {
         simd::run(self)
     }
@@ -84,7 +85,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
         let samples = runs[0].outputs.len();
         let lags = runs[0].network.shape.lags;
         let mut chains = runs.map(Chain::new);
-        // Entry by entry of the regressor, the samples of a block contiguous: the drive reads one number of each.
+        // By entry of the regressor, the samples of a block contiguous: `drive` reads one number of each entry per sample.
         let mut inputs = vec![[0.0; BLOCK]; lags.regressors() - lags.na];
         for start in (0..samples).step_by(BLOCK) {
             let count = BLOCK.min(samples - start);
@@ -94,7 +95,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
             for (entry, values) in inputs.iter_mut().enumerate() {
                 network::input_entry(lags, u, first + start, entry, &mut values[..count]);
             }
-            // Each run has weights of its own, but all have the same inputs, which are gathered once.
+            // Each run has its own weights, but all share the inputs, which are gathered once.
             for chain in chains.iter_mut().filter(|chain| chain.runs) {
                 chain.drive::<V>(&inputs, count);
             }
@@ -104,7 +105,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
                 let weights = weights.get(start..start + count).unwrap_or_default();
                 chain.conclude::<V>(start, (measured, weights), count, bound);
             }
-            // A run that has diverged or can no longer win is left out from the next block on; the other goes on alone.
+            // A run that has diverged or can no longer win is left out from the next block on; the other continues alone.
             if chains.iter().all(|chain| !chain.runs) {
                 break;
             }
@@ -117,7 +118,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
 #[inline(always)]
 fn advance<V: F64x8, const RUNS: usize>(chains: &mut [Chain; RUNS], start: usize, count: usize) {
     let shape = chains[0].run.network.shape;
-    // 0 for what has no kernel with registers of its own.
+    // 0 for shapes without a register kernel.
     let na = if shape.groups() == 1 {
         shape.lags.na
     } else {
@@ -127,7 +128,7 @@ fn advance<V: F64x8, const RUNS: usize>(chains: &mut [Chain; RUNS], start: usize
         && one.runs
         && two.runs
     {
-        // Two runs of three past outputs would keep 20 registers, of four 26, beside what tanh needs.
+        // Two runs with three past outputs would keep 20 registers, with four 26, in addition to those of tanh.
         match na {
             1 => return together::<V, 1, 2>([one, two], start, count),
             2 => return together::<V, 2, 2>([one, two], start, count),
@@ -145,16 +146,15 @@ fn advance<V: F64x8, const RUNS: usize>(chains: &mut [Chain; RUNS], start: usize
     }
 }
 
-/// A run on its way.
+/// A run in progress.
 struct Chain<'a> {
     run: Run<'a>,
-    /// The inputs' share of each group's arguments, and last of the direct way to the output.
+    /// The inputs' part of each group's argument, and last that of the bypass.
     driven: Vec<[Lanes; BLOCK]>,
-    /// The last outputs, the oldest first, and behind them those of the block.
+    /// The last outputs, the oldest first, followed by those of the block.
     outputs: Vec<f64>,
-    /// Squared errors, every eighth.
-    // Eight sums, one for each place in a group of samples, kept from block to block: one sum alone would wait for each
-    // addition.
+    /// Squared errors, summed by position modulo eight.
+    // Eight sums, kept from block to block: a single one would wait for each addition.
     sums: Lanes,
     sum: f64,
     limit: Limit,
@@ -165,7 +165,7 @@ impl<'a> Chain<'a> {
     fn new(run: Run<'a>) -> Self {
         let past = run.state.iter().rev().copied();
         Self {
-            // 8 groups of 64 samples are 32 kB at 64 hidden units: a first-level cache. Room for one direct row more.
+            // At 64 hidden units, 8 groups of 64 samples are 32 kB: a first-level cache. One more row for the bypass.
             driven: vec![[Lanes::ZERO; BLOCK]; run.network.shape.groups() + 1],
             outputs: past.chain([0.0; BLOCK]).collect(),
             sums: Lanes::ZERO,
@@ -176,16 +176,16 @@ impl<'a> Chain<'a> {
         }
     }
 
-    /// The inputs' share of a block.
+    /// Computes the inputs' part of a block.
     #[inline(always)]
     fn drive<V: F64x8>(&mut self, inputs: &[[f64; BLOCK]], count: usize) {
         let network = self.run.network;
         let n_phi = network.shape.lags.regressors();
-        // The direct way is the last of these groups, with b2 for its bias.
+        // The bypass is the last of these groups, with b2 as its bias.
         for (group, driven) in self.driven.iter_mut().enumerate() {
             let bias = V::load(&network.bias[group].0);
             let weights = &network.first[group * n_phi..][..n_phi];
-            // Those of the inputs alone, which stand behind the outputs'.
+            // The inputs' weights only, which follow those of the outputs.
             let weights = &weights[n_phi - inputs.len()..];
             for (k, driven) in driven.iter_mut().enumerate().take(count) {
                 let mut sum = bias;
@@ -205,7 +205,7 @@ impl<'a> Chain<'a> {
         let (groups, n_phi) = (shape.groups(), shape.lags.regressors());
         let (units, direct) = self.driven.split_at(groups);
         //   outputs  | na before the block, oldest first | the block's, as they come |
-        // so that the past of sample k is a slice of it and nothing is moved within a block.
+        // The past of sample k is then a slice of it, and nothing is moved within a block.
         let mut newest = V::splat(self.outputs[na - 1]);
         for k in 0..count {
             let (past, next) = self.outputs.split_at_mut(na + k);
@@ -222,13 +222,13 @@ impl<'a> Chain<'a> {
                 }
             }
             let y = network.limited(sum.sum());
-            // Spread here and not where it is used: every group's argument waits for it.
+            // Broadcast here, not where it is used: every group's argument waits for it.
             newest = V::splat(y);
             next[0] = y;
         }
     }
 
-    /// Hands the block's outputs on and measures them.
+    /// Stores the block's outputs and adds up their errors.
     #[inline(always)]
     fn conclude<V: F64x8>(
         &mut self,
@@ -240,9 +240,8 @@ impl<'a> Chain<'a> {
         let na = self.run.state.len();
         let outputs = &self.outputs[na..na + count];
         self.run.outputs[start..start + count].copy_from_slice(outputs);
-        // NaN is no number below the bound either.
-        // Asked once a block and without a branch: a run that leaves the bound may go on for 64 samples, which nobody
-        // reads.
+        // NaN is not below the bound either. Checked once a block and without a branch: a run that leaves the bound may
+        // continue for up to 64 samples, which nobody reads.
         let sound = outputs
             .iter()
             .fold(true, |sound, y| sound & (y.abs() < bound));
@@ -252,16 +251,16 @@ impl<'a> Chain<'a> {
         } else {
             self.sum += weighted_squares(weights, measured, outputs);
         }
-        // Sums of squares only grow, so that a partial sum beyond the limit decides. With weights they are added one by
-        // one, as hardly any training has them.
+        // Sums of squares only grow, so a partial sum beyond the limit decides. Weighted squares are added one by one,
+        // as hardly any training has weights.
         self.runs &= !self.limit.is_reached(self.sum);
         // The last na outputs are the past of the next block.
         self.outputs.copy_within(count..count + na, 0);
     }
 }
 
-/// The argument of a group: the inputs' share, then the outputs', the newest last as everything else is ready before it
-/// is known. `older` has the oldest first.
+/// The argument of a group: the inputs' part, then the outputs', the newest last, as all other terms are ready before
+/// it is known. `older` has the oldest first.
 #[inline(always)]
 fn argument<V: F64x8>(driven: V, weights: &[Lanes], older: &[f64], newest: V) -> V {
     let mut sum = driven;
@@ -278,8 +277,8 @@ fn together<V: F64x8, const NA: usize, const RUNS: usize>(
     start: usize,
     count: usize,
 ) {
-    // Registers for a block: NA groups of W1, NA of the direct way, w2, NA past outputs spread over the lanes; 3 NA + 1
-    // for a run, beside what tanh needs.
+    // Registers in a block: NA groups of W1, NA of the bypass, w2 and NA broadcast past outputs, 3 NA + 1 per run, in
+    // addition to those of tanh.
     let mut weights = [[V::splat(0.0); NA]; RUNS];
     let mut direct = [[V::splat(0.0); NA]; RUNS];
     let mut second = [V::splat(0.0); RUNS];
@@ -294,8 +293,8 @@ fn together<V: F64x8, const NA: usize, const RUNS: usize>(
             past[r][m] = V::splat(chain.outputs[NA - 1 - m]);
         }
     }
-    // `arguments` is z of the sample at hand, computed a sample before: the loop is turned so that it begins with the
-    // tanh, and ends with what the next one waits for.
+    // `arguments` is z of the present sample, computed one sample before: the loop is rotated to begin with the tanh
+    // and to end with the next sample's argument.
     let mut arguments = [V::splat(0.0); RUNS];
     for (r, chain) in chains.iter().enumerate() {
         let driven = V::load(&chain.driven[0][0].0);
@@ -308,7 +307,7 @@ fn together<V: F64x8, const NA: usize, const RUNS: usize>(
     for k in 0..count.min(BLOCK) {
         for r in 0..RUNS {
             let chain = &mut *chains[r];
-            // h(k), the head of the chain.
+            // h(k), the head of the dependency chain.
             let h = arguments[r].tanh_in_chain();
             if kept {
                 h.store(&mut chain.run.hidden[start + k].0);
@@ -318,19 +317,19 @@ fn together<V: F64x8, const NA: usize, const RUNS: usize>(
             for m in (0..NA).rev() {
                 sum = sum.add_product(direct[r][m], past[r][m]);
             }
-            // behind the last sample of a block nothing follows
+            // there is no sample after the last one of a block
             let driven = V::load(&chain.driven[0][(k + 1) % BLOCK].0);
             let rest = older(driven, &weights[r], &past[r]);
             let mut y;
-            // y and the next z at once, in the order of operations that is shortest on this level.
+            // y and the next z together, in the order of operations that is shortest on this level.
             (y, arguments[r]) = h.fed_back(second[r], sum, rest, weights[r][0]);
-            // A branch that is foretold where the limit is rare. The next argument has already been formed from the
-            // output as it was, and is formed again.
+            // A predicted branch if clipping is rare. The next argument was formed from the unclipped output and is
+            // formed again.
             if limited && chain.run.network.is_clipped(y) {
                 y = chain.run.network.limited(y);
                 arguments[r] = rest.add_product(weights[r][0], V::splat(y));
             }
-            // A register's name changes, nothing is moved.
+            // Only renames registers; nothing is moved.
             for m in (1..NA).rev() {
                 past[r][m] = past[r][m - 1];
             }
@@ -340,7 +339,7 @@ fn together<V: F64x8, const NA: usize, const RUNS: usize>(
     }
 }
 
-/// Adds to the inputs' share of arguments that of all outputs but the newest; `past` begins with the one before it.
+/// Adds the part of all outputs but the newest to the inputs' part of arguments; `past` begins with the second newest.
 #[inline(always)]
 fn older<V: F64x8, const NA: usize>(driven: V, weights: &[V; NA], past: &[V]) -> V {
     let mut sum = driven;
@@ -350,12 +349,12 @@ fn older<V: F64x8, const NA: usize>(driven: V, weights: &[V; NA], past: &[V]) ->
     sum
 }
 
-/// Adds the squared errors of the samples that were measured; the sum of all so far.
+/// Adds the squared errors of the measured samples; returns the sum of all so far.
 #[inline(always)]
 fn squared_errors_on<V: F64x8>(sums: &mut Lanes, y: &[f64], run: &[f64]) -> f64 {
     let mut sum = V::load(&sums.0);
-    // Sample i of a block is lane i mod 8, and blocks are multiples of 8: with a record as a whole the same numbers
-    // would be added in the same order.
+    // Sample i of a block is lane i mod 8, and blocks are multiples of 8: summing the whole record at once would add
+    // the same numbers in the same order.
     let ((y, y_rest), (run, run_rest)) = (y.as_chunks(), run.as_chunks());
     for (y, run) in y.iter().zip(run) {
         sum = square(sum, V::load(y).sub(V::load(run)));
@@ -371,14 +370,14 @@ fn squared_errors_on<V: F64x8>(sums: &mut Lanes, y: &[f64], run: &[f64]) -> f64 
     sum.sum()
 }
 
-/// Adds squares; what was not measured is NaN and adds nothing.
+/// Adds squares; the NaN of an unmeasured sample adds nothing.
 #[inline(always)]
 fn square<V: F64x8>(sum: V, error: V) -> V {
     let error = error.if_equal(error, error, V::splat(0.0));
     sum.add_product(error, error)
 }
 
-/// The outputs of `samples` from `first` on; NaN from where on the run leaves the finite numbers.
+/// The outputs of `samples` from `first` on; NaN from the sample at which the run is no longer finite.
 pub(super) fn outputs(
     network: &Network,
     u: &[f64],
@@ -403,7 +402,7 @@ pub(super) fn outputs(
         bound: f64::INFINITY,
         monitor: None,
     };
-    // The run stopped at the end of the block in which it left the numbers: what was not simulated is zeros still.
+    // The run stopped at the end of the block in which it was no longer finite: the samples after it are still zeros.
     if whole.go()[0].is_none() {
         let end = outputs.iter().position(|y| !y.is_finite());
         outputs[end.unwrap_or(0)..].fill(f64::NAN);

@@ -1,11 +1,11 @@
-//! The network in scaled units: weights in groups of eight hidden units, one step and its slopes.
+//! The network in scaled units: weights in groups of eight hidden units, one step and its derivatives.
 
 use crate::gram::Gram;
 use crate::lagged::{Lagged, Lags};
 use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 use crate::{Error, Result};
 
-/// What fixes the length and the order of the parameter vector.
+/// Determines the length and the order of the parameter vector.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shape {
     /// Orders.
@@ -16,11 +16,11 @@ pub struct Shape {
     pub bypass: bool,
 }
 
-/// More hidden units than this are a slip of the pen.
+/// More hidden units than this are a typing error.
 const MOST_HIDDEN: usize = 1_000;
 
 impl Shape {
-    /// A shape that makes a network.
+    /// A checked shape.
     ///
     /// # Errors
     /// `ErrorKind::Setting` unless `hidden` is from 1 to 1,000.
@@ -60,12 +60,12 @@ impl Shape {
         self.hidden.div_ceil(LANES)
     }
 
-    /// For each entry of theta its column in a sensitivity row. A row holds, for each regressor, then for `b1`, then
-    /// for `w2`, all hidden units, then `b2`, `linear`, the error and the past outputs.
+    /// For each entry of theta its column in a sensitivity row. A row holds all hidden units for each regressor, then
+    /// for `b1`, then for `w2`; then `b2`, `linear`, the error and the past outputs.
     pub(super) fn columns(&self) -> Vec<usize> {
         let (n_phi, hidden) = (self.lags.regressors(), self.hidden);
-        // theta has W1 unit by unit, a row entry by entry of the regressor: so eight columns side by side are eight
-        // units with one scalar factor. All behind W1 stand in the same order in both.
+        // theta has W1 unit by unit, a row has it regressor by regressor: eight adjacent columns are then eight units
+        // with a common scalar factor. After W1 both have the same order.
         let first = (0..hidden).flat_map(|i| (0..n_phi).map(move |c| c * hidden + i));
         let others = n_phi * hidden..self.error_column();
         first.chain(others).collect()
@@ -73,7 +73,7 @@ impl Shape {
 
     /// Column of `b2`.
     pub(super) fn tail(&self) -> usize {
-        // n_phi kinds of columns of W1, then b1 and w2, each with a column for every unit.
+        // W1 has n_phi kinds of columns, then come b1 and w2; each kind has a column for every unit.
         (self.lags.regressors() + 2) * self.hidden
     }
 
@@ -84,8 +84,8 @@ impl Shape {
 
     /// Column of the first past output.
     pub(super) fn state_column(&self) -> usize {
-        // Behind the error: where past outputs are no parameters, the columns that are summed end with the error, and
-        // J'J is as small as theta.
+        // After the error: if past outputs are no parameters, the summed columns end with the error and J'J is as small
+        // as theta.
         self.error_column() + 1
     }
 
@@ -94,12 +94,12 @@ impl Shape {
         (self.state_column() + self.lags.na - self.tail()).div_ceil(LANES)
     }
 
-    /// A buffer for sensitivity rows of this shape, which are written in whole groups; past outputs take part in its
-    /// sums where they are `estimated`.
+    /// A buffer for sensitivity rows of this shape, which are written in whole groups. Past outputs enter its sums if
+    /// they are `estimated`.
     pub(super) fn gram(&self, estimated: bool) -> Gram {
         let states = if estimated { self.lags.na } else { 0 };
-        // Groups are written whole: the last one ends beyond the last column, and so do those of the last kind of hidden
-        // units where there are fewer than eight of them.
+        // Groups are written whole: the last one ends beyond the last column, as do those of the last kind of hidden
+        // units if there are fewer than eight units.
         let written = self.tail() + self.tail_groups() * LANES;
         let units = (self.lags.regressors() + 1) * self.hidden + self.groups() * LANES;
         Gram::with_room(
@@ -115,17 +115,17 @@ impl Shape {
 pub struct Network {
     /// Shape.
     pub shape: Shape,
-    /// Lowest and highest output, infinite where it does not saturate.
+    /// Lowest and highest output; infinite if it does not saturate.
     pub limits: (f64, f64),
     saturates: bool,
-    /// For each group its weights for the regressor; behind the last one, in the first lane, those of the direct way to
-    /// the output, whose bias is the constant.
+    /// For each group its weights for the regressor; after the last one, in the first lane, those of the bypass, whose
+    /// bias is the constant.
     //   first    group 0: | phi_1 | phi_2 | .. | phi_n |   group 1: ..   direct: | linear_1, 0 .. | ..
     //   bias     group 0, group 1, ..                                     direct: | b2, 0 .. |
     //   second   group 0, group 1, ..                                     a lane is a hidden unit
-    // The direct way to the output is a group like others, of which lane 0 alone is not zero: its argument is the sum to
-    // which second times h is added, and `sum` gives the output at once. A missing unit has weights of zero: tanh(0) = 0
-    // adds nothing, and its gradient is written over or not read.
+    // The bypass is stored like a group in which only lane 0 is not zero. Its argument starts the sum to which second
+    // times h is added, so `sum` gives the output at once. A missing unit has zero weights: tanh(0) = 0 adds nothing,
+    // and its gradient is overwritten or never read.
     pub(super) first: Vec<Lanes>,
     pub(super) bias: Vec<Lanes>,
     pub(super) second: Vec<Lanes>,
@@ -147,12 +147,12 @@ impl Network {
         }
     }
 
-    /// Takes the weights from `theta`, which has `shape.parameters()` values.
+    /// Loads the weights from `theta`, which has `shape.parameters()` values.
     pub fn load(&mut self, theta: &[f64]) {
         let n_phi = self.shape.lags.regressors();
         let [bias, second, constant, linear] = self.shape.offsets();
         for i in 0..self.shape.hidden {
-            // Units that are there: the lanes behind them are zero from `zero` on.
+            // Only existing units: the lanes after them are zero since `zero`.
             let (group, lane) = (i / LANES, i % LANES);
             for c in 0..n_phi {
                 self.first[group * n_phi + c].0[lane] = theta[i * n_phi + c];
@@ -171,15 +171,14 @@ impl Network {
         }
     }
 
-    /// The arguments of a group of hidden units for the regressor whose first entry is `newest`, the others those of
-    /// `phi`.
+    /// The arguments of a group of hidden units for the regressor `phi` with its first entry replaced by `newest`.
     ///
-    /// The newest output comes last: everything else is ready before it is known.
+    /// The newest output comes last: all other terms are ready before it is known.
     #[inline(always)]
     fn argument<V: F64x8>(&self, group: usize, newest: f64, phi: &[f64]) -> V {
         let weights = &self.first[group * phi.len()..][..phi.len()];
-        // From the oldest to the newest: inputs stand behind the outputs in phi, so that this order is inputs, older
-        // outputs, newest. In a free run only the last product waits for the last sample.
+        // From the oldest to the newest: inputs come after outputs in phi, so the order is inputs, older outputs,
+        // newest. In a free run only the last product waits for the last sample.
         let older = weights.iter().zip(phi).skip(1).rev();
         let sum =
             |sum: V, (w, value): (&Lanes, &f64)| sum.add_product(V::load(&w.0), V::splat(*value));
@@ -187,8 +186,8 @@ impl Network {
         sum(z, (&weights[0], &newest))
     }
 
-    /// The output for the regressor whose first entry is `newest`, the others those of `phi`; `hidden` receives the
-    /// outputs of each group of hidden units.
+    /// The output for the regressor `phi` with its first entry replaced by `newest`; `hidden` receives the outputs of
+    /// each group of hidden units.
     #[inline(always)]
     pub(crate) fn step<V: F64x8>(
         &self,
@@ -196,7 +195,7 @@ impl Network {
         phi: &[f64],
         mut hidden: impl FnMut(usize, V),
     ) -> f64 {
-        // Lanes are added up once behind all groups, not for each group.
+        // The lanes are summed once, after all groups.
         let mut sum = self.argument::<V>(self.second.len(), newest, phi);
         for (group, second) in self.second.iter().enumerate() {
             let h = self.argument::<V>(group, newest, phi).tanh();
@@ -206,10 +205,11 @@ impl Network {
         self.limited(sum.sum())
     }
 
-    /// The output, held to its limits.
+    /// The output, clipped to its limits.
     #[inline(always)]
     pub(super) fn limited(&self, output: f64) -> f64 {
-        // A branch: limits of infinity would be two operations on a free run's chain, and a branch that is foretold is none.
+        // A branch: clipping to infinite limits would add two operations to the free run's dependency chain, while a
+        // predicted branch is free.
         if self.saturates {
             output.clamp(self.limits.0, self.limits.1)
         } else {
@@ -217,11 +217,11 @@ impl Network {
         }
     }
 
-    /// True where the output lies on a limit, and so has no slope.
+    /// True if the output lies on a limit; its slope is then zero.
     #[inline(always)]
     pub(super) fn is_clipped(&self, output: f64) -> bool {
-        // On the limit counts as beyond it: there the output does not follow the weights any more, and a run that has
-        // been limited lies exactly there.
+        // A value on the limit counts as beyond it: there the output no longer follows the weights, and a clipped run
+        // lies exactly there.
         output <= self.limits.0 || output >= self.limits.1
     }
 
@@ -230,12 +230,12 @@ impl Network {
         self.saturates
     }
 
-    /// A group's outputs `h` and `1 - h^2` to its last digits.
+    /// A group's outputs `h` and `1 - h^2`, the latter exact to its last digits.
     #[inline(always)]
     pub(super) fn unit<V: F64x8>(&self, group: usize, phi: &[f64]) -> (V, V) {
         let argument = self.argument::<V>(group, phi[0], phi);
-        // The exponential of `rise` beside the quotients of tanh: for derivatives that are handed out, where 1 - h^2 has
-        // to keep its digits in saturation. A training has `steep` instead.
+        // `rise` takes an exponential beside the quotients of tanh. It is for derivatives that leave the core, in which
+        // 1 - h^2 must keep its digits in saturation. Training uses `steep`.
         (argument.tanh(), argument.rise())
     }
 
@@ -250,7 +250,7 @@ impl Network {
     }
 }
 
-/// One step: output, hidden outputs and slopes by past outputs where there is room for them.
+/// One step: output, hidden outputs and, if there is room for them, slopes with respect to past outputs.
 struct Once<'a> {
     network: &'a Network,
     phi: &'a [f64],
@@ -274,7 +274,7 @@ impl Kernel for Once<'_> {
                 h.store(&mut hidden.0);
             }
         });
-        // y = limit, whatever the regressor: no slope.
+        // y = limit for any regressor: no slope.
         if network.is_clipped(output) {
             slope.fill(0.0);
             return output;
@@ -282,7 +282,7 @@ impl Kernel for Once<'_> {
         if !slope.is_empty() {
             slope.copy_from_slice(&network.linear[..slope.len()]);
             for (group, second) in network.second.iter().enumerate() {
-                // dy/dphi_c = linear_c + sum over units of w2 (1 - h^2) W1_c, for as many entries as were asked.
+                // dy/dphi_c = linear_c + sum over units of w2 (1 - h^2) W1_c, for as many entries as requested.
                 let steep = V::load(&second.0).mul(network.unit::<V>(group, phi).1);
                 let weights = &network.first[group * phi.len()..];
                 for (slope, w) in slope.iter_mut().zip(weights) {
@@ -313,17 +313,17 @@ impl Lagged for Network {
     }
 }
 
-/// Entry `entry` of the regressor's input part for the samples from `start` on; inputs before the first sample are held
-/// at their first value.
+/// Entry `entry` of the regressor's input part for the samples from `start` on; before the first sample inputs hold
+/// their first value.
 #[inline]
 pub(super) fn input_entry(lags: Lags, u: &[f64], start: usize, entry: usize, out: &mut [f64]) {
     let (channel, lag) = (entry / lags.nb, lags.nk + entry % lags.nb);
-    // Sample k takes u(k - lag); those before sample 0 are the first input.
+    // Sample k takes u(k - lag); before sample 0 that is the first input.
     let held = lag.saturating_sub(start).min(out.len());
     let (before, known) = out.split_at_mut(held);
     before.fill(u[channel]);
     let from = (start + held).saturating_sub(lag);
-    // One input is contiguous, and a copy. Several are interleaved, sample by sample.
+    // A single input is contiguous and can be copied. Several are interleaved sample by sample.
     if lags.channels == 1 {
         known.copy_from_slice(&u[from..from + known.len()]);
         return;
@@ -334,14 +334,14 @@ pub(super) fn input_entry(lags: Lags, u: &[f64], start: usize, entry: usize, out
     }
 }
 
-/// The output `back` samples before each of those from `start` of the run on; `state` holds those before the run, newest
-/// first.
+/// The outputs `back` samples earlier, for the samples of the run from `start` on; `state` holds those before the run,
+/// newest first.
 #[inline]
 pub(super) fn output_entry(run: &[f64], state: &[f64], start: usize, back: usize, out: &mut [f64]) {
     let held = back.saturating_sub(start).min(out.len());
     let (before, known) = out.split_at_mut(held);
     for (i, out) in before.iter_mut().enumerate() {
-        // state[m] is y(first - 1 - m): what stands `back` before sample start + i of the run.
+        // state[m] is y(first - 1 - m), `back` samples before sample start + i of the run.
         *out = state[back - 1 - start - i];
     }
     let from = (start + held).saturating_sub(back);
@@ -350,17 +350,17 @@ pub(super) fn output_entry(run: &[f64], state: &[f64], start: usize, back: usize
 
 // --- In a loop: for eight regressors side by side, and for one ---
 //
-// In [`Network::next_in_lanes`] a lane is a loop, hidden units come one after the other, and a weight is spread over the lanes. In
-// [`Network::next`] there is one loop and a lane is a hidden unit, as in a free run. So eight sums of units side by side stand for the
-// eight lanes of one sum: both add in the same order, and a loop has the same bits in either.
+// In [`Network::next_in_lanes`] a lane is a loop, hidden units come one after the other, and a weight is broadcast. In
+// [`Network::next`] there is one loop and a lane is a hidden unit, as in a free run. The eight partial sums of the
+// former correspond to the eight lanes of the latter's sum: both add in the same order and give the same bits.
 //
-// Loops count by hand: the calls of an iterator that the compiler leaves would empty the wide registers. A regressor of known length
-// (`N` = 4) takes 14 to 17 % off a candidate (Zen 4, `candidates` of the kernels' example).
+// Loops use plain counters: calls that the compiler does not inline, as some of iterators, spill the wide registers. A
+// regressor of known length (`N` = 4) takes 14 to 17 % off a candidate (Zen 4, `candidates` of the kernels' example).
 
 impl Network {
-    /// The outputs for eight regressors, lane by lane; each to the bit what [`next`](Self::next) gives for it.
+    /// The outputs for eight regressors, one per lane; each has the bits that [`next`](Self::next) gives for it.
     ///
-    /// `N` is the number of regressors, 0 for any. Some of other work is done after each hidden unit.
+    /// `N` is the number of regressors, 0 for any. A part of `meanwhile` is done after each hidden unit.
     #[inline(always)]
     pub(crate) fn next_in_lanes<V: F64x8, const N: usize>(
         &self,
@@ -369,22 +369,22 @@ impl Network {
     ) -> V {
         let n = if N == 0 { phi.len() } else { N };
         let phi = &phi[..n];
-        // One sum for each place of a unit in its group, as a register of units has a lane for each: sums[i] of all
-        // groups is lane i of `next`'s sum, and the direct way begins lane 0.
+        // One sum for each position of a unit in its group, like the lanes of a register of units: sums[i] over all
+        // groups is lane i of `next`'s sum. The bypass starts lane 0.
         let mut sums = [V::splat(0.0); LANES];
         sums[0] = self.direct::<V>(phi);
         for group in 0..self.second.len() {
-            // places of the sums that the compiler knows, so that they stay in registers; units that are missing add nothing
+            // the indices of the sums are compile-time constants, so the sums stay in registers; missing units add nothing
             self.four::<V, 0>(group, &phi[..n], &mut sums);
             meanwhile.go();
-            // Units 5 to 8 where there are any: units 1 to 4 of a last group are computed even if fewer are there, since
-            // pairs share a division and have to be the pairs of `next`.
+            // Units 5 to 8, if there are any. Units 1 to 4 of the last group are always computed: pairs share a
+            // division and must be the pairs of `next`.
             if self.shape.hidden - group * LANES > 4 {
                 self.four::<V, 4>(group, &phi[..n], &mut sums);
             }
             meanwhile.go();
         }
-        // Then the lanes are added, as `F64x8::sum` adds those of one register.
+        // Then the sums are added in the order in which `F64x8::sum` adds lanes.
         let output = in_halves(sums);
         if self.saturates {
             output.at_least(self.limits.0).at_most(self.limits.1)
@@ -399,7 +399,7 @@ impl Network {
         let n = if N == 0 { phi.len() } else { N };
         let (phi, groups) = (&phi[..n], self.second.len());
         let mut sum = V::load(&self.bias[groups].0);
-        // Without a bypass its weights are zeros: n products less, here and in `direct`, and so the same bits.
+        // Without a bypass its weights are zero: skipping these n products, here and in `direct`, leaves the bits unchanged.
         if self.shape.bypass {
             sum = together::<V>(sum, &self.first[groups * n..][..n], phi);
         }
@@ -407,13 +407,13 @@ impl Network {
             let z = V::load(&self.bias[group].0);
             let z = together::<V>(z, &self.first[group * n..][..n], phi);
             let second = V::load(&self.second[group].0);
-            // Not `tanh`: the quotient of two, as four units of eight loops have it.
+            // Not `tanh`: this quotient has the operations of four units for eight loops.
             sum = sum.add_product(second, z.tanh_as_of_four());
         }
         self.limited(sum.sum())
     }
 
-    /// Adds what the hidden units from `FIRST` on give, four of one group.
+    /// Adds the contribution of the four hidden units of a group from `FIRST` on.
     #[inline(always)]
     fn four<V: F64x8, const FIRST: usize>(
         &self,
@@ -424,7 +424,7 @@ impl Network {
         let weights = &self.first[group * phi.len()..][..phi.len()];
         let (bias, second) = (&self.bias[group].0, &self.second[group].0);
         let argument = |unit: usize| argument::<V>(bias[unit], weights, unit, phi);
-        // Four arguments, then four tanh: what one unit waits for is filled by the three others, and pairs share a division.
+        // Four arguments, then four tanh: while one unit waits the three others compute, and pairs share a division.
         let z = [
             argument(FIRST),
             argument(FIRST + 1),
@@ -438,7 +438,7 @@ impl Network {
         }
     }
 
-    /// What reaches the output past the hidden units.
+    /// The bypass: its constant and its linear part.
     #[inline(always)]
     fn direct<V: F64x8>(&self, phi: &[Lanes]) -> V {
         let groups = self.second.len();
@@ -450,15 +450,15 @@ impl Network {
     }
 }
 
-/// Work that has nothing to do with a step of the network: a part of it at each call, and none when all is done.
+/// Work independent of the network's step: each call does a part of it, and nothing once all is done.
 ///
-/// A processor holds about a hundred operations that wait for their numbers. Parts that stand between hidden units leave
-/// room for those of the units.
+/// A processor holds about a hundred waiting operations. Parts interleaved with hidden units leave room for the units'
+/// own.
 pub(crate) trait Meanwhile {
     fn go(&mut self);
 }
 
-/// Nothing to do meanwhile.
+/// No other work.
 pub(crate) struct Nothing;
 
 impl Meanwhile for Nothing {
@@ -469,7 +469,7 @@ impl Meanwhile for Nothing {
 /// The argument of one hidden unit for eight regressors, the newest output last.
 #[inline(always)]
 fn argument<V: F64x8>(bias: f64, weights: &[Lanes], unit: usize, phi: &[Lanes]) -> V {
-    // The weights are laid out with units in lanes. Of such a group one number is spread here, so that both ways share
+    // The weights are laid out with units in lanes. One of the group's numbers is broadcast here, so both ways share
     // one layout and one cache line.
     let (mut z, mut c) = (V::splat(bias), phi.len());
     while c > 0 {
@@ -490,7 +490,7 @@ fn together<V: F64x8>(bias: V, weights: &[Lanes], phi: &[f64]) -> V {
     z
 }
 
-/// The sums of [`F64x8::sum`], in its order.
+/// Adds in the order of [`F64x8::sum`].
 #[inline(always)]
 fn in_halves<V: F64x8>(v: [V; LANES]) -> V {
     let even = v[0].add(v[4]).add(v[2].add(v[6]));

@@ -13,21 +13,21 @@ use crate::simd::{self, LANES, Lanes};
 use crate::{Monitor, Record};
 
 /// A free run beyond this many scales has diverged.
-// Scaled outputs are of size 1: no fit begins there, and a run that gets there does not come back. It ends in the block
-// in which it is seen.
+// Scaled outputs are of size 1: no fit begins at such values, and a run that reaches them does not return. It ends with
+// the block in which this is detected.
 const DIVERGED: f64 = 1e4;
 
 /// One experiment in scaled units.
 #[derive(Clone, Debug)]
 pub(super) struct Experiment {
     pub u: Vec<f64>,
-    /// NaN where it was not measured.
+    /// NaN for unmeasured samples.
     pub y: Vec<f64>,
-    /// Weights of the samples; none where all count alike.
+    /// Weights of the samples; empty if all count alike.
     pub weights: Vec<f64>,
     /// First simulated sample.
     pub first: usize,
-    /// Past outputs before it; a guess where they are estimated.
+    /// Past outputs before it; a guess if they are estimated.
     pub state: Vec<f64>,
 }
 
@@ -38,7 +38,7 @@ impl Experiment {
             // Zero in the data's unit: a machine at rest.
             InitialState::Zero => (0, vec![scaling.output(0.0); na]),
             InitialState::Measured => after_measured(&y, na),
-            // From the first measured sample on: a state before a gap would leave no trace in the cost.
+            // From the first measured sample on: a state before a gap would have no effect on the cost.
             InitialState::Estimated => (record.first_measured(), vec![first_level(&y); na]),
         };
         Self {
@@ -50,7 +50,7 @@ impl Experiment {
         }
     }
 
-    /// The past outputs before the first sample: its own, or those that begin at `place` among the parameters.
+    /// The past outputs before the first sample: the experiment's own, or the parameters from `place` on.
     fn state_in<'t>(&'t self, theta: &'t [f64], place: Option<usize>) -> &'t [f64] {
         match place {
             Some(place) => &theta[place..][..self.state.len()],
@@ -58,7 +58,7 @@ impl Experiment {
         }
     }
 
-    /// Simulated samples.
+    /// Number of simulated samples.
     pub fn samples(&self) -> usize {
         self.y.len() - self.first
     }
@@ -68,12 +68,12 @@ impl Experiment {
         self.weights.get(k).copied().unwrap_or(1.0)
     }
 
-    /// Weights of the samples from `from` on; none where all count alike.
+    /// Weights of the samples from `from` on; empty if all count alike.
     fn weights_from(&self, from: usize) -> &[f64] {
         self.weights.get(from..).unwrap_or_default()
     }
 
-    /// Sum of the weights of the samples from `from` on whose output was measured: their number where all count alike.
+    /// Sum of the weights of the measured samples from `from` on: their number if all count alike.
     pub fn weight_from(&self, from: usize) -> f64 {
         let y = &self.y[from..];
         match self.weights_from(from) {
@@ -82,7 +82,7 @@ impl Experiment {
         }
     }
 
-    /// Sum of squared errors of a run over the samples from `from` on, by their weights.
+    /// Weighted sum of squared errors of a run over the samples from `from` on.
     pub fn squares_from(&self, from: usize, run: &[f64]) -> f64 {
         match self.weights_from(from) {
             [] => squared_errors(&self.y[from..], run),
@@ -90,19 +90,19 @@ impl Experiment {
         }
     }
 
-    /// Simulated samples whose output was measured.
+    /// Number of simulated samples whose output was measured.
     pub fn measured(&self) -> usize {
         self.y[self.first..].iter().filter(|y| !y.is_nan()).count()
     }
 }
 
-/// Over the samples that were measured; eight sums side by side, as one alone would wait for each addition.
+/// Over the measured samples, with eight sums side by side, as a single one would wait for each addition.
 fn squared_errors(measured: &[f64], run: &[f64]) -> f64 {
     let square = |(y, run): (&f64, &f64)| {
         let error = y - run;
         if error.is_nan() { 0.0 } else { error * error }
     };
-    // For validation, once an iterate: no kernel, the compiler's own vectors are enough.
+    // For validation, once per iterate: no kernel, the compiler's own vectorisation is enough.
     let (groups, rest) = measured.as_chunks::<LANES>();
     let (runs, rest_run) = run.as_chunks::<LANES>();
     let mut sums = [0.0; LANES];
@@ -115,9 +115,9 @@ fn squared_errors(measured: &[f64], run: &[f64]) -> f64 {
     sums.iter().sum::<f64>() + rest
 }
 
-/// The first sample behind `na` measured ones and those, newest first; the end where there is none.
+/// The first sample after `na` measured ones in a row, and these, newest first; the end of the record if there is none.
 fn after_measured(y: &[f64], na: usize) -> (usize, Vec<f64>) {
-    // `na` measured outputs in a row are a past; the run begins behind them.
+    // `na` measured outputs in a row are a past; the run begins after them.
     let mut pasts = y.windows(na).enumerate();
     match pasts.find(|(_, past)| past.iter().all(|y| !y.is_nan())) {
         Some((k, past)) => (k + na, past.iter().rev().copied().collect()),
@@ -127,31 +127,31 @@ fn after_measured(y: &[f64], na: usize) -> (usize, Vec<f64>) {
 
 /// Mean of the first five measured outputs.
 fn first_level(y: &[f64]) -> f64 {
-    // Five, against noise; a guess, which the fit then moves.
+    // Five, to average noise; a guess that the fit then moves.
     let first = || y.iter().filter(|y| !y.is_nan()).take(5);
     first().sum::<f64>() / first().count() as f64
 }
 
-/// Samples up to which a second run, 72 bytes a sample, is worth its memory.
+/// Most samples for which a second run, at 72 bytes a sample, is worth its memory.
 const MOST_TOGETHER: usize = 16_000_000;
 
-/// Whether a second run beside the first takes hardly any time of its own: where the first one's chain of dependent
-/// operations leaves the processor waiting.
+/// Whether a second run beside the first takes hardly any extra time, because the first one's dependency chain leaves
+/// the processor waiting.
 fn pays(shape: Shape, experiments: &[Experiment]) -> bool {
     let samples: usize = experiments.iter().map(Experiment::samples).sum();
-    // More groups overlap within one run already; more past outputs need more registers than two runs have. On the
-    // baseline a run is bound by the number of its operations (139 cycles, two side by side 234).
+    // More groups already overlap within one run; more past outputs need more registers than two runs have. On the
+    // baseline a run is limited by its number of operations (139 cycles, two side by side 234).
     let short = shape.groups() == 1 && shape.lags.na <= 2 && samples <= MOST_TOGETHER;
     short && simd::level() != Ok(simd::Level::Baseline)
 }
 
-/// A simulation, with what the Jacobian pass takes from it.
+/// A simulation with the data that the Jacobian pass needs.
 struct Attempt {
-    // By which `sensitivities` finds the trial that was accepted: two were simulated, and either may be it.
+    // By it `sensitivities` finds the accepted trial: two may have been simulated, and either may be accepted.
     theta: Vec<f64>,
     network: Network,
     /// Outputs and hidden outputs, experiment by experiment.
-    // Room for the whole record, kept from trial to trial: 8 bytes a sample for outputs, 64 for a group of hidden
+    // Memory for the whole record, kept from trial to trial: per sample 8 bytes for outputs, 64 for a group of hidden
     // outputs.
     runs: Vec<Vec<f64>>,
     hidden: Vec<Vec<Lanes>>,
@@ -172,18 +172,18 @@ impl Attempt {
     }
 }
 
-/// Parameters: theta, then, where they are estimated, the past outputs of each experiment.
+/// Parameters: theta, then, if they are estimated, the past outputs of each experiment.
 pub(super) struct FreeRun<'a> {
     experiments: &'a [Experiment],
     monitor: &'a Monitor,
     shape: Shape,
     estimated: bool,
     decay: f64,
-    /// Measured samples, each by its weight.
+    /// Number of measured samples, each counted by its weight.
     samples: f64,
-    /// The last simulations: one, and the one beside it where two at once pay.
+    /// The last simulations: one or, if two at once pay, two.
     attempts: Vec<Attempt>,
-    // Rows and sums of one experiment: cleared, filled and scattered for each in turn.
+    // Rows and sums of one experiment: cleared, filled and added to the system for each experiment in turn.
     gram: Gram,
     columns: Vec<usize>,
 }
@@ -217,7 +217,7 @@ impl<'a> FreeRun<'a> {
         self.shape
     }
 
-    /// `theta` followed by the experiments' own states where those are parameters.
+    /// `theta` followed by the experiments' own states if those are parameters.
     pub fn start(&self, theta: &[f64]) -> Vec<f64> {
         let states = self
             .experiments
@@ -227,16 +227,16 @@ impl<'a> FreeRun<'a> {
         theta.iter().copied().chain(states.take(kept)).collect()
     }
 
-    /// The part of the cost that is not the squared error: `decay/2 (|W1|^2 + |w2|^2 + .1 |b1|^2)`.
+    /// The weight decay's part of the cost: `decay/2 (|W1|^2 + |w2|^2 + .1 |b1|^2)`.
     pub fn penalty(&self, theta: &[f64]) -> f64 {
         let weighted = |(i, t): (usize, &f64)| self.decay_of(i) * t * t;
         0.5 * theta.iter().enumerate().map(weighted).sum::<f64>()
     }
 
-    /// Weights are held back, the biases less, the linear part and the constant not at all.
+    /// The decay of a parameter: all of it for weights, a part for biases, none for the linear part and the constant.
     fn decay_of(&self, parameter: usize) -> f64 {
         let [bias, second, constant, _] = self.shape().offsets();
-        // Parts of theta by where they begin; linear part and constant are what the data say of a straight line.
+        // By the start of each part of theta; linear part and constant follow the data without decay.
         match parameter {
             i if i < bias => self.decay,
             i if i < second => 0.1 * self.decay,
@@ -245,7 +245,7 @@ impl<'a> FreeRun<'a> {
         }
     }
 
-    /// Share of the last simulation's samples on a limit.
+    /// Share of the last simulation's samples that lie on a limit.
     pub fn clipped_share(&self) -> f64 {
         let Attempt { network, runs, .. } = &self.attempts[0];
         let outputs = runs.iter().flatten();
@@ -253,13 +253,13 @@ impl<'a> FreeRun<'a> {
         clipped as f64 / runs.iter().map(Vec::len).sum::<usize>() as f64
     }
 
-    /// Costs below `limit` of the free runs at several points, whose outputs are stored.
+    /// Costs, below `limit`, of the free runs at several points; their outputs are stored.
     fn simulate<const RUNS: usize>(
         &mut self,
         thetas: [&[f64]; RUNS],
         limit: f64,
     ) -> [Option<f64>; RUNS] {
-        // A limit of None is a run that has failed: it is handed on from experiment to experiment, and its free runs end
+        // A limit of `None` marks a failed run: it is passed on from experiment to experiment, and its free runs end
         // before their first block.
         let mut limits = thetas.map(|theta| {
             Some(Limit {
@@ -270,7 +270,7 @@ impl<'a> FreeRun<'a> {
             })
         });
         for (attempt, theta) in self.attempts.iter_mut().zip(thetas) {
-            // Of theta the first part; the states behind it are read by `state_in`.
+            // Uses the first part of theta; `state_in` reads the states after it.
             attempt.network.load(theta);
             attempt.theta.clear();
             attempt.theta.extend_from_slice(theta);
@@ -298,15 +298,14 @@ impl<'a> FreeRun<'a> {
             }
             .go();
             for (limit, sum) in limits.iter_mut().zip(sums) {
-                // The cost is a sum over experiments: what the first of them cost is taken off what is left for the
-                // next.
+                // The cost is a sum over experiments: the cost of each is subtracted from the limit for the next.
                 *limit = limit.zip(sum).map(|(limit, sum)| limit.after(sum));
             }
         }
         limits.map(|limit| limit.map(|limit| limit.cost(0.0)))
     }
 
-    /// Where an experiment's own state begins among the parameters.
+    /// Index of an experiment's own state among the parameters.
     fn state_at(&self, experiment: usize) -> Option<usize> {
         let lags = self.shape().lags;
         self.estimated
@@ -317,7 +316,7 @@ impl<'a> FreeRun<'a> {
         let (shape, data) = (self.shape(), &self.experiments[experiment]);
         let place = self.state_at(experiment);
         let attempts = &self.attempts;
-        // The contract of `Problem`: only at the parameters of a successful cost, so that the run is there.
+        // By the contract of `Problem` only called at the parameters of a successful cost, so the run is stored.
         let same = attempts.iter().find(|attempt| attempt.theta == theta);
         let attempt = same.unwrap_or(&attempts[0]);
         self.gram.clear();
@@ -356,16 +355,15 @@ impl<'a> FreeRun<'a> {
                 first_state + i - own
             }
         };
-        // theta is shared by all experiments and adds up; the state of each has columns of its own, so that J'J has
-        // blocks of zeros between different experiments.
+        // All experiments share theta, so their sums add up. Each has its own columns for its state: J'J has blocks of
+        // zeros between different experiments.
         let place = |i: usize| if i < own { i } else { i + experiment * na };
         let (sums, width) = self.gram.finish();
-        // The cost is 1/(2N) sum e^2, N being the sum of all experiments' weights.
+        // The cost is 1/(2N) sum e^2, with N the sum of the weights of all experiments.
         let scale = 1.0 / self.samples;
         for i in 0..own + states {
             let a = column(i);
-            // Only the lower triangle of the sums is there, in the order of a row's columns: the larger index is the
-            // row.
+            // Only the lower triangle of the sums exists, in the order of a row's columns: the larger index is the row.
             jte[place(i)] += sums[a.max(error) * width + a.min(error)] * scale;
             for j in 0..=i {
                 let b = column(j);
@@ -399,7 +397,7 @@ impl Problem for FreeRun<'_> {
     }
 
     fn costs_below(&mut self, thetas: [&[f64]; 2], limit: f64) -> [Option<f64>; 2] {
-        // One pass over the inputs with both networks; each run has the bits that it has alone.
+        // One pass over the inputs with both networks; each run has the bits of a single run.
         self.simulate(thetas, limit)
     }
 
@@ -412,7 +410,7 @@ impl Problem for FreeRun<'_> {
         }
         for (i, t) in theta.iter().enumerate() {
             let decay = self.decay_of(i);
-            // The penalty decay/2 t^2 as one more residual sqrt(decay) t each: its J'J is decay, its J'e -decay t.
+            // The penalty decay/2 t^2 is one more residual sqrt(decay) t each: its J'J is decay, its J'e -decay t.
             jtj[i * theta.len() + i] += decay;
             jte[i] -= decay * t;
         }
@@ -428,7 +426,7 @@ mod tests {
 
     #[test]
     fn puts_weights_on_cost_and_normal_equations_alike() {
-        // the usual shape has a kernel of its own
+        // the usual shape has its own kernel
         for (na, nb, hidden) in [(2, 2, 8), (1, 2, 3), (3, 1, 11)] {
             let lags = Lags::new(na, nb, 1, 1).unwrap();
             let shape = Shape::new(lags, hidden, true).unwrap();

@@ -6,18 +6,18 @@ use crate::{Error, Record, Result};
 /// `(u - u_mean)/u_scale` and `(y - y_mean)/y_scale`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scaling {
-    /// What is taken off each input.
+    /// Subtracted from each input.
     pub u_mean: Vec<f64>,
-    /// What each input is then divided by.
+    /// Each input is then divided by it.
     pub u_scale: Vec<f64>,
-    /// What is taken off the output.
+    /// Subtracted from the output.
     pub y_mean: f64,
-    /// What the output is then divided by.
+    /// The output is then divided by it.
     pub y_scale: f64,
 }
 
 impl Scaling {
-    /// Means and standard deviations over all records, of the output where it was measured.
+    /// Means and standard deviations over all records; for the output, over its measured samples.
     pub fn of(records: &[Record]) -> Self {
         let channels = records[0].channels;
         let input = |j: usize| {
@@ -69,7 +69,7 @@ impl Scaling {
         Ok(())
     }
 
-    /// Whether weights may take the scaling in: a mean far beyond its scale would cost digits, a scale beyond all use its sense.
+    /// Whether the weights may absorb the scaling: a mean far beyond its scale would lose digits, and an extreme scale makes no sense.
     pub(crate) fn is_moderate(&self) -> bool {
         let inputs = self.u_mean.iter().zip(&self.u_scale);
         inputs

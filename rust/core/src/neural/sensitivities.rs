@@ -2,8 +2,8 @@
 //!
 //! `d yhat(k)/d theta = d f/d theta + sum_m (d f/d phi_m) d yhat(k-m)/d theta`, zero where the output is clipped.
 //!
-//! The free run is known, so that slopes and gains of a block are computed first, each sample for itself; then a few
-//! groups of columns run through the block with their last rows in registers.
+//! The free run is known, so slopes and gains of a block are computed first, independently for each sample. Then a few
+//! groups of columns pass through the block with their last rows in registers.
 //!
 //! For `y = w2'h + b2 + l'phi`, `h = tanh(W1 phi + b1)` and `r = w2 (1 - h^2)`, unit by unit,
 //!
@@ -13,28 +13,28 @@
 //!   S(k) = df/dtheta(k) + sum_m gain_m(k) S(k-m)
 //! ```
 //!
-//! A row S(k) is laid out so that eight columns are eight hidden units of one kind, and no gain or regressor is looked up by column:
+//! In a row S(k) eight adjacent columns are eight hidden units of one kind, so no gain or regressor is looked up per column:
 //!
 //! ```text
 //!   | W1 by phi_1, all units | W1 by phi_2 .. | b1 | w2 | b2, l | past outputs | error |
 //!     source r, scale phi_1    r, phi_2         r,1  h,1  tail,1
 //! ```
 //!
-//! A `Column` is a group of eight with its source (r, h or tail) and its scale (an entry of phi, or ones). Within a block the
-//! sources and gains are known, so one group at a time passes over all 64 samples with its last `na` values in registers: the rows
-//! are written once and never read back. Known numbers of past outputs keep these values in registers and not in an array: `na` = 2
-//! instead of any number saves 9 % of a training, `na` = 3 as much (12 hidden units 6 %); `na` = 1 saved 3 % and is not there.
+//! A `Column` is a group of eight with its source (r, h or tail) and its scale (an entry of phi, or ones). Within a block sources and
+//! gains are known, so a group passes over all 64 samples with its last `na` values in registers: rows are written once and never read
+//! back. If the number of past outputs is a compile-time constant, these values stay in registers instead of an array: `na` = 2 saves 9 %
+//! of a training, `na` = 3 as much (12 hidden units 6 %); `na` = 1 saved 3 % and was left out.
 
 use super::network::{self, Network, Shape};
 use crate::Monitor;
 use crate::gram::{BLOCK, Gram};
 use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 
-/// What takes the rows and holds the ones before.
+/// Receives the rows and keeps the previous ones.
 pub(super) trait Rows {
-    /// The last `na` rows, the oldest first, and behind them room for the next `count`.
+    /// The last `na` rows, the oldest first, followed by room for the next `count`.
     fn ahead(&mut self, count: usize) -> &mut [f64];
-    /// The next rows have been written; the error is NaN where the output was not measured. Without weights all count
+    /// Called when the next rows are written; the error of an unmeasured output is NaN. Without weights all count
     /// alike.
     fn keep(&mut self, errors: &[f64], weights: &[f64]);
 }
@@ -57,30 +57,30 @@ pub(super) struct Recursion<'a, R> {
     pub first: usize,
     /// Past outputs before it.
     pub state: &'a [f64],
-    /// What the free run left behind; without hidden outputs the slopes are computed to their last digits.
+    /// The results of the free run; without hidden outputs the slopes are computed to their last digits.
     pub run: &'a [f64],
     pub hidden: Option<&'a [Lanes]>,
-    /// Measured outputs of the simulated samples, and their weights; none where all count alike.
+    /// Measured outputs of the simulated samples, and their weights; empty if all count alike.
     pub y: &'a [f64],
     pub weights: &'a [f64],
     pub rows: &'a mut R,
     pub monitor: Option<&'a Monitor>,
 }
 
-/// Blocks between two looks at the monitor.
+/// Blocks between two checks of the monitor.
 const LOOK: usize = 64;
 
 impl<R: Rows> Recursion<'_, R> {
-    /// Runs it.
+    /// Runs the recursion.
     pub fn go(self) {
         let mut block = Block::new(self.network.shape);
-        // Blocks of y, since what has no measured outputs has no rows: its caller gives the run itself for y.
+        // Blocks of y, as only measured outputs have rows: a caller without measurements passes the run itself as y.
         for (i, measured) in self.y.chunks(BLOCK).enumerate() {
             if i % LOOK == 0 && self.monitor.is_some_and(Monitor::stopped) {
                 return;
             }
             let (start, count) = (i * BLOCK, measured.len());
-            // Regressors and errors are copies and differences without a kernel; all that has products is in `Advance`.
+            // Regressors and errors are copies and differences and need no kernel; all products are in `Advance`.
             block.fill(&self, start, count);
             for (k, measured) in measured.iter().enumerate() {
                 block.errors[k] = measured - self.run[start + k];
@@ -101,7 +101,7 @@ impl<R: Rows> Recursion<'_, R> {
     }
 }
 
-/// Eight columns of a row before the past rows are added: a source, times a scale.
+/// Eight columns of a row before the past rows are added: a source times a scale.
 #[derive(Clone, Copy)]
 struct Column {
     at: usize,
@@ -109,20 +109,20 @@ struct Column {
     scale: usize,
 }
 
-/// What the rows of a block are made of, each over the samples of the block.
+/// The ingredients of a block's rows, each over the samples of the block.
 struct Block {
     shape: Shape,
     groups: usize,
     columns: Vec<Column>,
     /// Entries of the regressor, then ones.
-    // Along the samples, as a group of columns passes over them; numbers, which are spread when they are used.
+    // Contiguous over the samples, as a group of columns passes over them; scalars, broadcast when used.
     scales: Vec<[f64; BLOCK]>,
-    /// Slopes of the output by each hidden unit's argument, hidden outputs, and
-    /// `[1, linear's regressor, 0 ..]`: the rows' own part behind the hidden units.
+    /// Slopes of the output with respect to each hidden unit's argument; hidden outputs; and `[1, linear's regressor, 0
+    /// ..]`, the source of the columns after the hidden units.
     //   sources   | r: a group of units each | h: a group each | tail: b2, linear |      `BLOCK` samples each
-    // The kinds of columns of W1 and b1 read the same r; only their scale differs.
+    // The kinds of columns of W1 and b1 share the source r; only their scale differs.
     sources: Vec<[Lanes; BLOCK]>,
-    /// Slopes of the output by each past output.
+    /// Slopes of the output with respect to each past output.
     gains: Vec<[f64; BLOCK]>,
     errors: [f64; BLOCK],
 }
@@ -130,10 +130,10 @@ struct Block {
 impl Block {
     fn new(shape: Shape) -> Self {
         let (groups, n_phi, units) = (shape.groups(), shape.lags.regressors(), shape.hidden);
-        // (first column, source, scale): W1 entry by entry of phi with source r, then b1 as an entry whose scale is 1,
-        // then w2 with source h and scale 1; groups of units within each.
-        // The order is that of the columns, and it matters: the lanes of missing units lie over the first columns of the next
-        // kind, which come later and write over whatever stands there. No lane reads another.
+        // (first column, source, scale): W1 by entry of phi with source r, then b1 as an entry with scale 1, then w2
+        // with source h and scale 1; groups of units within each. Columns must be written in this order: the lanes of
+        // missing units fall on the first columns of the next kind, which is written later and overwrites them. No lane
+        // reads another.
         let parts = (0..=n_phi).map(|c| (c * units, 0, c));
         let parts = parts.chain([((n_phi + 1) * units, groups, n_phi)]);
         let units = parts.flat_map(|(at, source, scale)| {
@@ -153,7 +153,7 @@ impl Block {
         }
     }
 
-    /// The regressors of a block, and what of them reaches the output directly.
+    /// Fills the regressors of a block, and their part in the bypass.
     fn fill<R>(&mut self, recursion: &Recursion<'_, R>, start: usize, count: usize) {
         let (lags, n_phi) = (self.shape.lags, self.shape.lags.regressors());
         // The last scale stays 1.
@@ -166,8 +166,8 @@ impl Block {
                 network::input_entry(lags, recursion.u, start, c - lags.na, entry);
             }
         }
-        // Columns b2 and linear have no weights behind them: their derivative is 1 and phi. The columns behind, of past
-        // outputs and error, are zeros in this source: past outputs live by the recursion alone.
+        // Columns b2 and linear have derivatives 1 and phi. The columns after them, of past outputs and error, are zero
+        // in this source: past outputs enter by the recursion only.
         let direct = if self.shape.bypass { n_phi } else { 0 };
         for tail in 0..=direct {
             let source = &mut self.sources[2 * self.groups + tail / LANES];
@@ -179,7 +179,7 @@ impl Block {
     }
 }
 
-/// What is known of a block from its free run.
+/// The data of a block from its free run.
 struct Step<'a> {
     network: &'a Network,
     run: &'a [f64],
@@ -190,7 +190,7 @@ struct Step<'a> {
 struct Advance<'a> {
     recursion: Step<'a>,
     block: &'a mut Block,
-    /// The past rows and those of the block.
+    /// The past rows, then those of the block.
     rows: &'a mut [f64],
 }
 
@@ -215,20 +215,20 @@ impl Kernel for Advance<'_> {
 }
 
 impl Advance<'_> {
-    /// `NA` past outputs; 0 stands for any number.
+    /// `NA` past outputs; 0 for any number.
     #[inline(always)]
     fn advance<V: F64x8, const NA: usize>(&mut self) {
         for group in 0..self.block.groups {
             self.slopes::<V>(group);
         }
         self.gains::<V>();
-        // Behind slopes and gains, as a clipped sample has neither.
+        // After slopes and gains, as a clipped sample has neither.
         self.clip();
         let mut next = 0;
         while next < self.block.columns.len() {
-            // Groups at once: each has a value and NA past ones in registers, all share the gains, and what one waits for is
-            // filled by the others. Six are two times three and not four and two. With 16 registers there are two, on the
-            // baseline one; two with 32 take 3 % more of a training (Zen 4, `training_8`, least and median of 150).
+            // Several groups at once: each has a value and NA past ones in registers, all share the gains, and each fills the waiting
+            // times of the others. Six are split into three and three, not four and two. With 16 registers it is two groups, on the
+            // baseline one; two groups with 32 registers make a training 3 % longer (Zen 4, `training_8`, least and median of 150).
             next += match (V::TILE_ROWS, self.block.columns.len() - next) {
                 (2, _) | (_, 1) => self.columns::<V, NA, 1>(next),
                 (6, _) | (_, 2) => self.columns::<V, NA, 2>(next),
@@ -238,9 +238,9 @@ impl Advance<'_> {
         }
     }
 
-    /// Slopes and hidden outputs of a group, from stored hidden outputs or else to their last digits.
+    /// Slopes and hidden outputs of a group, from stored hidden outputs or else computed to their last digits.
     ///
-    /// What `1 - h^2` loses where a unit saturates is far below what a sum of squares shows.
+    /// The digits that `1 - h^2` loses in saturation are far below the resolution of a sum of squares.
     #[inline(always)]
     fn slopes<V: F64x8>(&mut self, group: usize) {
         let network = self.recursion.network;
@@ -249,7 +249,7 @@ impl Advance<'_> {
         let (slopes, outputs) = block.sources.split_at_mut(groups);
         let (slopes, outputs) = (&mut slopes[group], &mut outputs[group]);
         let count = self.recursion.run.len().min(BLOCK);
-        // With a trial's hidden outputs this pass has no tanh at all.
+        // With a trial's stored hidden outputs this pass needs no tanh.
         let Some(hidden) = self.recursion.hidden else {
             let mut phi = vec![0.0; block.shape.lags.regressors()];
             for k in 0..count {
@@ -269,7 +269,7 @@ impl Advance<'_> {
         }
     }
 
-    /// The slopes of the output by each past output.
+    /// The slopes of the output with respect to each past output.
     #[inline(always)]
     fn gains<V: F64x8>(&mut self) {
         let (network, groups) = (self.recursion.network, self.block.groups);
@@ -280,14 +280,14 @@ impl Advance<'_> {
             for (group, slopes) in self.block.sources[..groups].iter().enumerate() {
                 let weights = V::load(&network.first[group * n_phi + m].0);
                 for k in 0..count {
-                    // gain_m(k) = linear_m + sum over units of r W1_m; a sum of lanes a sample and past output.
+                    // gain_m(k) = linear_m + sum over units of r W1_m: one sum over lanes per sample and past output.
                     gains[k] += V::load(&slopes[k].0).mul(weights).sum();
                 }
             }
         }
     }
 
-    /// Where the output lies on a limit nothing has a slope.
+    /// Clears the slopes of samples whose output is clipped.
     #[inline(always)]
     fn clip(&mut self) {
         let Step { network, run, .. } = self.recursion;
@@ -295,7 +295,7 @@ impl Advance<'_> {
             return;
         }
         let block = &mut *self.block;
-        // dy = 0 there: no own part, and no way for the past to reach the future through this output.
+        // There dy = 0: no slope of its own, and the past does not reach the future through this output.
         for (k, _) in run
             .iter()
             .enumerate()
@@ -307,19 +307,19 @@ impl Advance<'_> {
         }
     }
 
-    /// `COUNT` groups of columns from the plan's `next` on, through the block; how many they were.
+    /// Passes `COUNT` groups of columns, from the plan's `next` on, through the block; returns `COUNT`.
     #[inline(always)]
     fn columns<V: F64x8, const NA: usize, const COUNT: usize>(&mut self, next: usize) -> usize {
         let (block, count) = (&*self.block, self.recursion.run.len());
         let na = block.shape.lags.na;
         let width = self.rows.len() / (na + count);
-        // Arrays of fixed length by value, and no iterators within the loop: their places are known and the compiler
-        // keeps them in registers.
+        // Fixed-length arrays by value and no iterators within the loop: indices are constants, and the compiler keeps
+        // the values in registers.
         let plan: [Column; COUNT] = std::array::from_fn(|c| block.columns[next + c]);
         let sources = plan.map(|column| &block.sources[column.source]);
         let scales = plan.map(|column| &block.scales[column.scale]);
         let gains: [&[f64; BLOCK]; NA] = std::array::from_fn(|m| &block.gains[m]);
-        // old[m] is S(k-1-m): read once a block from the rows in front of it, then handed on in registers.
+        // old[m] is S(k-1-m): read once per block from the previous rows, then passed on in registers.
         let mut old = [[V::splat(0.0); COUNT]; NA];
         for (m, old) in old.iter_mut().enumerate() {
             let row = &self.rows[(NA - 1 - m) * width..];
@@ -330,8 +330,8 @@ impl Advance<'_> {
         for k in 0..count.min(BLOCK) {
             let (past, row) = self.rows.split_at_mut((na + k) * width);
             for (c, column) in plan.iter().enumerate() {
-                // S(k) = source scale + sum_m gain_m S(k-m), the oldest first: gain_1 S(k-1), which the next sample
-                // waits for, is the last product of the chain.
+                // S(k) = source scale + sum_m gain_m S(k-m), the oldest first: gain_1 S(k-1), for which the next sample
+                // waits, is the last product of the chain.
                 let mut value = V::load(&sources[c][k].0).mul(V::splat(scales[c][k]));
                 // Any number of past outputs: their rows are read back from memory.
                 if NA == 0 {
@@ -348,8 +348,8 @@ impl Advance<'_> {
                 if NA > 0 {
                     old[0][c] = value;
                 }
-                // Unaligned, as kinds of units follow each other without gaps: the row is as short as it can be, and J'J
-                // costs with its square.
+                // Unaligned, as kinds of units follow each other without gaps: the row stays short, and the cost of J'J
+                // grows with its square.
                 value.write(&mut row[column.at..]);
             }
         }

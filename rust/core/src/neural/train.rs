@@ -1,4 +1,4 @@
-//! Training in free run: many starts in parallel, each by Levenberg-Marquardt, chosen by free run.
+//! Training in free run: many starts in parallel, each by Levenberg-Marquardt; the best free run is chosen.
 
 use super::network::{Network, Shape};
 use super::problem::{Experiment, FreeRun};
@@ -35,9 +35,9 @@ pub struct Settings {
     pub nk: usize,
     /// Hidden units.
     pub hidden: usize,
-    /// Gives the network a bypass that starts as this model; without it there is no bypass.
+    /// Gives the network a bypass that starts as this model; `None` for no bypass.
     pub linear: Option<LinearModel>,
-    /// Scaling; means and standard deviations of the training data where there is none.
+    /// Scaling; `None` for the means and standard deviations of the training data.
     pub scaling: Option<Scaling>,
     /// The output saturates at the training output's range, whose width is first multiplied by `1 + saturate`.
     pub saturate: Option<f64>,
@@ -49,26 +49,26 @@ pub struct Settings {
     pub max_iterations: usize,
     /// Number of starts.
     pub starts: usize,
-    /// Parameters in scaled units from which the starts begin, one after the other; drawn where there are none.
+    /// Parameters in scaled units from which the starts begin, one after the other; `None` to draw them.
     pub initial_theta: Option<Vec<f64>>,
     /// Seed of the starts; start `i` draws from stream `i`.
     pub seed: u64,
-    /// Threads; 0 takes as many as the machine has. The result does not depend on it.
+    /// Threads; 0 for as many as the machine has. The result does not depend on it.
     pub threads: usize,
 }
 
-/// A trained network with the story of its training.
+/// A trained network and how it was trained.
 #[derive(Clone, Debug)]
 pub struct NeuralFit {
     /// The chosen model.
     pub model: NeuralOE,
     /// `J = 1/(2N) sum e^2` in scaled units, free run, on the training data, without weight decay.
     pub cost: f64,
-    /// The same on the validation data, where there are any.
+    /// The same on the validation data, if there are any.
     pub validation_cost: Option<f64>,
     /// Iterations of the chosen start.
     pub iterations: usize,
-    /// Steps that it tried.
+    /// Steps tried by it.
     pub trials: usize,
     /// How the chosen start ended.
     pub termination: Termination,
@@ -76,11 +76,11 @@ pub struct NeuralFit {
     pub trace: Vec<f64>,
     /// Which start was chosen.
     pub start: usize,
-    /// What each start was judged by: J on the validation data, else on the training data; infinite for a failed one.
+    /// The score of each start: J on the validation data, else on the training data; infinite for a failed one.
     pub start_costs: Vec<f64>,
-    /// Starts that were dead and drawn again.
+    /// Dead starts that were drawn again.
     pub discarded: usize,
-    /// Whether the chosen model passed the [`guard`](crate::guard) on the training data; false only where no start did.
+    /// Whether the chosen model passed the [`guard`](crate::guard) on the training data; false only if no start did.
     pub sound: bool,
     /// Models of all starts with a finite cost, those that passed the guard first, each part best first.
     pub models: Vec<NeuralOE>,
@@ -88,22 +88,22 @@ pub struct NeuralFit {
     pub initial_states: Vec<Vec<f64>>,
 }
 
-/// First damping, the best of .01, .1 and 1 by training cost on one simulated drive: of 12 random starts 9, 10 and 11
-/// ended within 1.3 of the noise floor there. On other drives expect two of three.
+/// First damping, the best of .01, .1 and 1 by training cost on one simulated drive, where of 12 random starts 9, 10
+/// and 11 ended within 1.3 of the noise floor. On other drives expect two of three.
 const FIRST_MU: f64 = 1.0;
 /// A start with more than this share of its samples on a limit has no slope to learn from.
 const DEAD_SHARE: f64 = 0.9;
 
-/// Trains `settings.starts` networks in free run and chooses by validation J, without validation data by training J.
+/// Trains `settings.starts` networks in free run and chooses by J on the validation data, else on the training data.
 ///
-/// With validation data each start keeps its best iterate on them, and a start that diverges there is never chosen.
-/// A start is dead where its free run is not finite, lies on a limit almost throughout or ends no better than a
-/// constant output; it is drawn again from its own stream, and counted in `discarded`.
+/// With validation data each start keeps its best iterate on them, and a start that diverges there is never chosen. A
+/// start is dead if its free run is not finite, lies on a limit almost throughout or ends no better than a constant
+/// output. It is drawn again from its own stream and counted in `discarded`.
 ///
-/// A start whose model does not pass the guard is chosen only where none does.
+/// A start whose model does not pass the guard is chosen only if none does.
 ///
 /// # Errors
-/// `ErrorKind::Data` and `ErrorKind::Setting` for what cannot be trained; `ErrorKind::Fit` where every start failed.
+/// `ErrorKind::Data` and `ErrorKind::Setting` for data or settings that cannot be trained; `ErrorKind::Fit` if every start failed.
 pub fn fit(
     records: &[Record],
     validation: &[Record],
@@ -118,7 +118,7 @@ pub fn fit(
     training.chosen(results)
 }
 
-/// All that the starts share.
+/// The data that all starts share.
 pub(super) struct Training<'a> {
     pub settings: &'a Settings,
     monitor: &'a Monitor,
@@ -170,7 +170,7 @@ impl<'a> Training<'a> {
         check_starts(&experiments, &validation, lags.na)?;
         if let (Some(linear), InitialState::Estimated) = (linear, settings.initial_state) {
             for (experiment, record) in experiments.iter_mut().zip(records) {
-                // the run begins at the first measured sample, which may lie behind a gap
+                // the run begins at the first measured sample, which may come after a gap
                 let first = experiment.first;
                 let u = &record.u[first * record.channels..];
                 let state =
@@ -227,7 +227,7 @@ impl<'a> Training<'a> {
         )
     }
 
-    /// Parameters with a free run to learn from, and how many draws had none.
+    /// Parameters with a usable free run, and how many draws had none.
     fn drawn(&self, problem: &mut FreeRun, random: &mut Random) -> Option<(Vec<f64>, usize)> {
         starts::drawn(self.monitor, || {
             let theta = match &self.linear {
@@ -240,7 +240,7 @@ impl<'a> Training<'a> {
         })
     }
 
-    /// The draw with an output layer that predicts one step ahead.
+    /// The draw with its output layer fitted to predict one step ahead.
     fn warm(&self, mut theta: Vec<f64>) -> Vec<f64> {
         let mut network = Network::zero(self.shape, self.limits);
         network.load(&theta);
@@ -283,7 +283,7 @@ impl<'a> Training<'a> {
         })
     }
 
-    /// The guard's verdict, whatever the monitor says: what has been trained is to be judged as well.
+    /// The guard's verdict, independent of the monitor: a trained model is judged even after a stop request.
     fn passes(&self, theta: &[f64]) -> bool {
         let linear = self.settings.linear.as_slice();
         let monitor = Monitor::default();
@@ -398,7 +398,7 @@ fn check(settings: &Settings) -> Result<()> {
     }
 }
 
-/// Refuses parameters to start from that are not those of the shape and of every start.
+/// Refuses initial parameters that do not match the shape and the number of starts.
 fn check_initial(settings: &Settings, shape: Shape) -> Result<()> {
     let Some(theta) = &settings.initial_theta else {
         return Ok(());
@@ -438,7 +438,7 @@ fn check_records(records: &[Record], validation: &[Record], shape: Shape) -> Res
     Ok(())
 }
 
-/// Refuses experiments in which no sample is left to simulate to.
+/// Refuses experiments without a sample left to simulate.
 fn check_starts(experiments: &[Experiment], validation: &[Experiment], na: usize) -> Result<()> {
     match experiments
         .iter()
@@ -479,7 +479,7 @@ impl<'t> Referee<'t> {
         }
     }
 
-    /// J over all validation experiments; infinite where one diverges.
+    /// J over all validation experiments; infinite if one diverges.
     fn validation_cost(&self) -> f64 {
         let scores = self.training.validation.iter().map(|e| self.score(e));
         let (sum, samples) = scores.fold((0.0, 0.0), |(sum, n), (s, m)| (sum + s, n + m));
@@ -487,7 +487,7 @@ impl<'t> Referee<'t> {
         if cost.is_nan() { f64::INFINITY } else { cost }
     }
 
-    /// Sum of squared errors and of the weights of the measured samples it is taken over.
+    /// Sum of squared errors, and of the weights of the measured samples in it.
     fn score(&self, experiment: &Experiment) -> (f64, f64) {
         let lags = self.network.shape.lags;
         let estimated = self.training.settings.initial_state == InitialState::Estimated;

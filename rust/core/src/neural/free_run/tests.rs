@@ -84,7 +84,7 @@ fn runs_alone_and_side_by_side_are_the_same_bits_and_those_of_steps_but_for_roun
             for (k, output) in alone.1.iter().enumerate() {
                 shape.lags.write_inputs(&u, k, &mut phi[na..]);
                 let step = network.output(&phi);
-                // a run sums the hidden units in an order of its own
+                // a run adds the hidden units in another order
                 assert!((step - output).abs() < 1e-13, "{na} {hidden} {k}");
                 phi.copy_within(..na - 1, 1);
                 phi[0] = *output;
