@@ -109,13 +109,13 @@ impl NeuralSS {
         &self.scaling
     }
 
-    /// What training knows of states and residuals.
+    /// Statistics of states and residuals from training.
     pub fn statistics(&self) -> &Statistics {
         &self.statistics
     }
 
-    /// The same model with every step going `1/factor` of its way: the steady states stay, what leads there takes a factor
-    /// longer.
+    /// The same model with each step shortened to `1/factor` of itself: the steady states stay, and transients take
+    /// `factor` times as long.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for a factor that is not above 0 and finite.
@@ -166,7 +166,7 @@ impl NeuralSS {
         finite(run.states)
     }
 
-    /// Free run in the data's units, and its derivatives row by row, output by output: by theta, then by the state.
+    /// Free run in the data's units, and its derivatives row by row, output by output: with respect to theta, then to the state.
     ///
     /// # Errors
     /// As [`NeuralSS::simulate`].
@@ -204,8 +204,8 @@ impl NeuralSS {
         Ok((run, dense.rows))
     }
 
-    /// The output `horizon` steps ahead: an extended Kalman filter follows the measured outputs up to sample
-    /// `k - horizon`, from there the model runs free. Outputs that are NaN are not used.
+    /// The output `horizon` steps ahead: an extended Kalman filter follows the measured outputs up to sample `k -
+    /// horizon`, then the model runs free. Outputs that are NaN are not used.
     ///
     /// # Errors
     /// `ErrorKind::Data` for wrong shapes, `ErrorKind::Setting` for a horizon of 0, `ErrorKind::Fit` as in free run.
@@ -225,7 +225,7 @@ impl NeuralSS {
                 "expected a horizon of 1 step or more, got 0; 1 is one-step prediction",
             ));
         }
-        // the first samples, for which too few outputs are known, run free from the state
+        // the first samples have too few known outputs before them and run free from the state
         let first = horizon.min(samples);
         let mut run = self.simulate(&u[..first * channels], channels, state)?;
         let v = self.scaling.delayed_inputs(u, shape.nk);
@@ -239,7 +239,7 @@ impl NeuralSS {
             y: &self.scaling.outputs(y),
             each: |_: usize, _: &[f64], x: &[f64]| filtered.extend_from_slice(x),
         });
-        // no longer than the record, whatever was asked for
+        // no longer than the record, even for a longer horizon
         let mut trajectory = Trajectory::new(&self.network, first + 1);
         let mut scratch = Scratch::new(shape);
         for k in first..samples {
@@ -256,11 +256,11 @@ impl NeuralSS {
         finite(run)
     }
 
-    /// The state at the first sample that is likeliest after these samples (docs/CONVENTIONS.md), in scaled units.
-    /// Outputs that are NaN do not count.
+    /// The most likely state at the first sample, given these samples (docs/CONVENTIONS.md), in scaled units. Outputs
+    /// that are NaN do not count.
     ///
     /// # Errors
-    /// `ErrorKind::Data` for wrong shapes or no samples, `ErrorKind::Fit` where every start leaves the finite numbers.
+    /// `ErrorKind::Data` for wrong shapes or no samples, `ErrorKind::Fit` if every start leaves the finite numbers.
     pub fn estimate_initial_state(
         &self,
         u: &[f64],
@@ -358,7 +358,7 @@ impl NeuralSS {
     }
 }
 
-/// States beyond those of training, in standard deviations from their mean.
+/// How far test states lie from the mean of the training states, in standard deviations.
 const BESIDE: f64 = 3.0;
 
 impl Guarded for NeuralSS {
@@ -404,7 +404,7 @@ impl Guarded for NeuralSS {
 /// Rows in the data's units, in the order of theta.
 struct Dense<'a> {
     columns: Vec<usize>,
-    /// Rows that are not yet kept.
+    /// Rows that have not been kept yet.
     block: Vec<f64>,
     room: usize,
     rows: Vec<f64>,

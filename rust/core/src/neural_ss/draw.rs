@@ -1,4 +1,4 @@
-//! Start parameters: a linear model with a hidden layer that hardly reaches it yet, or a smaller model that has been trained.
+//! Start parameters: a linear model with a hidden layer that hardly affects it yet, or a smaller trained model.
 
 use std::ops::Range;
 
@@ -13,24 +13,24 @@ use crate::linear::LinearModel;
 use crate::random::Random;
 use crate::{Error, Result};
 
-/// First samples of an experiment that do not count, as they hang on the state it starts from: at most this many.
+/// Most first samples of an experiment that do not count, because they depend on its initial state.
 const SETTLING: usize = 200;
-/// Directions in which the states vary less than this, relative to all of them, are scaled as if they varied so much.
+/// Directions in which the states vary less than this, relative to all of them, are scaled as if they varied by it.
 const FLOOR: f64 = 1e-13;
 
-/// Standard deviation of E and G: enough to tell the hidden units apart.
+/// Standard deviation of E and G: enough to distinguish the hidden units.
 const REACH: f64 = 1e-3;
 /// Poles of a start without a linear model: fast and slow ones.
 pub(super) const POLES: (f64, f64) = (0.5, 0.99);
 /// Added to the normal equations of the outputs, relative to their mean.
 const RIDGE: f64 = 1e-9;
 
-/// Half of the starts of an integrator have a unit that switches with the sign of the speed.
+/// Share of an integrator's starts that have a unit which switches with the sign of the speed.
 const SWITCHING: f64 = 0.5;
-/// Slopes of such a unit at rest, in deviations of the speed: friction switches within a small part of them.
+/// Slopes of such a unit at rest, per standard deviation of the speed: friction switches within a small part of it.
 const SLOPES: (f64, f64) = (2.0, 30.0);
 
-// --- A linear model as state equations whose states have unit covariance on the training inputs ---
+// --- A linear model as state equations, with states of unit covariance on the training inputs ---
 
 /// `x+ = A x + B v`, `y = C x + D v + c` in scaled units.
 #[derive(Clone, Debug)]
@@ -91,7 +91,7 @@ impl Realisation {
         let gains = linear.b().chunks_exact(lags.nb).zip(&scaling.u_mean);
         let moved: f64 = gains.map(|(b, u)| b.iter().sum::<f64>() * u).sum();
         let level = (linear.offset() + moved) / held;
-        // An integrator has no level of its own: its state carries it.
+        // An integrator has no level of its own: its state holds it.
         let constant = if held.abs() > 1e-9 {
             scaling.output(0, level)
         } else {
@@ -109,7 +109,7 @@ impl Realisation {
         })
     }
 
-    /// The same with the slowest real mode as last state, its pole moved to 1.
+    /// The same with the slowest real mode as the last state, its pole moved to 1.
     fn integrating(&self) -> Result<Self> {
         let n = self.a.nrows();
         let poles = self.a.complex_eigenvalues();
@@ -127,7 +127,7 @@ impl Realisation {
             ));
         };
         let smallest = singular.singular_values.imin();
-        // right vectors beside the smallest one span what is orthogonal to the mode: states that it does not reach
+        // the other right singular vectors span the orthogonal complement of the mode: states that it does not affect
         let others = (0..n)
             .filter(|&i| i != smallest)
             .map(|i| vt.row(i).into_owned());
@@ -141,7 +141,7 @@ impl Realisation {
         Ok(moved)
     }
 
-    /// In the coordinates `T x`.
+    /// The same system in the coordinates `T x`.
     fn transformed(&self, transform: &DMatrix<f64>) -> Option<Self> {
         let inverse = transform.clone().try_inverse()?;
         Some(Self {
@@ -152,7 +152,7 @@ impl Realisation {
         })
     }
 
-    /// With states of unit covariance on the inputs of these experiments; none where they do not stay finite.
+    /// With states of unit covariance on the inputs of these experiments; `None` if they do not stay finite.
     pub fn normalised(&self, shape: Shape, experiments: &[Experiment]) -> Option<Self> {
         let n = self.a.nrows();
         let covariance = self.covariance(shape, experiments)?;
@@ -174,7 +174,7 @@ impl Realisation {
         finite.then_some(scaled)
     }
 
-    /// Covariance of the states; none where they do not stay finite.
+    /// Covariance of the states; `None` if they do not stay finite.
     fn covariance(&self, shape: Shape, experiments: &[Experiment]) -> Option<DMatrix<f64>> {
         let n = self.a.nrows();
         let (mut sum, mut products, mut count) = (DVector::zeros(n), DMatrix::zeros(n, n), 0.0);
@@ -198,7 +198,7 @@ impl Realisation {
             .then_some(covariance)
     }
 
-    /// The parameters, those of the hidden layer zero.
+    /// The parameters, with a hidden layer of zeros.
     pub fn theta(&self, shape: Shape) -> Vec<f64> {
         let parts = shape.parts();
         let mut theta = vec![0.0; shape.parameters()];
@@ -217,7 +217,7 @@ impl Realisation {
     }
 }
 
-/// The inverse of the symmetric root of a covariance.
+/// The inverse of the symmetric square root of a covariance.
 fn whitening(covariance: DMatrix<f64>) -> Option<DMatrix<f64>> {
     let eigen = covariance.try_symmetric_eigen(f64::EPSILON, 1000)?;
     let floor = (FLOOR * eigen.eigenvalues.sum()).max(f64::MIN_POSITIVE);
@@ -231,8 +231,8 @@ fn whitening(covariance: DMatrix<f64>) -> Option<DMatrix<f64>> {
 
 // --- The start of a network ---
 
-/// The realisation beside hidden units: weights normal with standard deviation `scale/sqrt(nx + nu)`, biases uniform
-/// from -1 to 1, `E` and `G` small.
+/// The realisation beside hidden units: normal weights with standard deviation `scale/sqrt(nx + nu)`, uniform biases
+/// from -1 to 1, small `E` and `G`.
 pub(super) fn beside(
     linear: &Realisation,
     shape: Shape,
@@ -248,7 +248,7 @@ pub(super) fn beside(
     theta
 }
 
-/// Draws the hidden units.
+/// Draws the weights of the hidden units.
 pub(super) fn hide(theta: &mut [f64], shape: Shape, scale: f64, random: &mut Random) {
     let parts = shape.parts();
     let width = scale / (shape.arguments() as f64).sqrt();
@@ -258,10 +258,10 @@ pub(super) fn hide(theta: &mut [f64], shape: Shape, scale: f64, random: &mut Ran
     theta[parts.g].fill_with(|| REACH * random.normal());
 }
 
-/// The first hidden unit becomes a smooth sign of the speed.
+/// Turns the first hidden unit into a smooth sign of the speed.
 ///
-/// A position is the sum of a speed, and what resists a motion is friction: dry friction jumps where the speed changes
-/// its sign, and training hardly ever finds that jump from smooth random units.
+/// A position is the sum of a speed, and motion is resisted by friction. Dry friction jumps when the speed changes its
+/// sign, and training hardly ever finds that jump from smooth random units.
 fn switch(theta: &mut [f64], linear: &Realisation, shape: Shape, random: &mut Random) {
     let parts = shape.parts();
     let slope = random.between(SLOPES.0.ln(), SLOPES.1.ln()).exp();
@@ -274,8 +274,8 @@ fn switch(theta: &mut [f64], linear: &Realisation, shape: Shape, random: &mut Ra
     }
 }
 
-/// Random states that decay at different rates, with the outputs that come nearest to the data; none where these are
-/// not finite.
+/// Random states that decay at different rates, with output equations fitted to the data; `None` if these are not
+/// finite.
 pub(super) fn small(
     shape: Shape,
     experiments: &[Experiment],
@@ -301,12 +301,12 @@ pub(super) fn small(
 }
 
 impl Realisation {
-    /// What the states add to the first output from one sample to the next, beside the input's part.
+    /// The states' part in the change of the first output from one sample to the next.
     fn speed(&self) -> RowDVector<f64> {
         self.c.row(0) * &self.a - self.c.row(0)
     }
 
-    /// With `C`, `D` and `c` by least squares over the states.
+    /// With `C`, `D` and `c` fitted to the outputs by least squares.
     fn with_outputs(mut self, shape: Shape, experiments: &[Experiment]) -> Option<Self> {
         let (nx, width) = (shape.nx, shape.arguments() + 1);
         for p in 0..shape.outputs {
@@ -338,24 +338,24 @@ impl Realisation {
 
 /// Poles of new states: fast and slow ones.
 const NEW_POLES: (f64, f64) = (0.5, 0.98);
-/// Weights by which old states and inputs drive a new one, beside the `sqrt(1 - a^2)` of its pole `a`.
+/// Weights of old states and inputs on a new state, times `sqrt(1 - a^2)` for its pole `a`.
 const DRIVE: f64 = 0.5;
-/// Weights by which what is new acts on what was there.
+/// Weights of new states and units on the old model.
 const NEW_REACH: f64 = 1e-3;
 
-/// Where the rows and the columns of a matrix come to stand.
+/// Maps of the row and column indices of a matrix to their new places.
 type Places<'a> = (&'a dyn Fn(usize) -> usize, &'a dyn Fn(usize) -> usize);
 
 impl NeuralSS {
-    /// This model with `nx` states and `hidden` units: those it has, with all their weights, and new ones.
+    /// This model with `nx` states and `hidden` units: the existing ones with all their weights, and new ones.
     ///
-    /// New states follow the old ones and the inputs with poles from .5 to .98, new hidden units see everything; weights
-    /// of about 1e-3 lead from there to the rest, so that the free run hardly changes and a training has a slope to
-    /// begin with. An integrated state stays the last one, all others keep their places; a state of this model
-    /// corresponds to the one with the new states' means beside it.
+    /// New states follow the old ones and the inputs with poles from .5 to .98; new hidden units see everything. Their
+    /// weights on the rest are about 1e-3: the free run hardly changes, and training has a slope to begin with. An
+    /// integrated state stays the last one, all others keep their places. A state of this model corresponds to the same
+    /// state extended by the new states' means.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for sizes below those it has, or out of range.
+    /// `ErrorKind::Setting` for sizes below the present ones, or out of range.
     pub fn grown(&self, nx: usize, hidden: usize, seed: u64) -> Result<Self> {
         let old = self.shape();
         if nx < old.nx || hidden < old.hidden {
@@ -369,7 +369,7 @@ impl NeuralSS {
         let (from, to) = (old.parts(), new.parts());
         let fresh = old.nx - usize::from(old.integrator)..nx - usize::from(old.integrator);
         let place = |i: usize| if i < fresh.start { i } else { i + fresh.len() };
-        // all is drawn, and what is kept is written over it
+        // everything is drawn, then existing weights overwrite their places
         let mut theta = vec![0.0; new.parameters()];
         let width = 1.0 / (new.arguments() as f64).sqrt();
         for (part, scale) in [
@@ -427,7 +427,7 @@ impl NeuralSS {
             row.fill_with(|| drive * random.normal());
             let of_inputs = row.iter().map(|b| b * b).sum::<f64>();
             statistics.state_mean[state] = mean / (1.0 - pole);
-            // what changes slowly brings it to this size, at which it is to move the output no further than at 1
+            // a slow input brings the state to this size, at which it should move the output no further than at size 1
             let size = (of_states + of_inputs).sqrt() / (1.0 - pole);
             for p in 0..new.outputs {
                 theta[to.c.start + p * nx + state] = NEW_REACH * random.normal() / size.max(1.0);
@@ -437,8 +437,8 @@ impl NeuralSS {
         Self::new(new, self.output(), theta, self.scaling.clone(), statistics)
     }
 
-    /// Multiplies the weights `e` of all units on the old states by `1 - dx+/dx` at the mean state: a slow state sums up
-    /// what moves it, and comes to rest that much further away.
+    /// Multiplies the weights `e` of all units on the old states by `1 - dx+/dx` at the mean state: a slow state sums
+    /// up its inputs and would settle that much further away.
     fn tame(&self, e: &mut [f64], hidden: usize, place: impl Fn(usize) -> usize) {
         let nx = self.shape().nx;
         let (parts, mean) = (self.shape().parts(), &self.statistics.state_mean);
@@ -458,7 +458,7 @@ impl NeuralSS {
         }
     }
 
-    /// Mean and covariance with room for new states, of zero mean and unit variance.
+    /// Mean and covariance, extended by new states of zero mean and unit variance.
     fn grown_statistics(&self, nx: usize, place: impl Fn(usize) -> usize) -> Statistics {
         let (kept, own) = (self.shape().nx, &self.statistics);
         let mut state_mean = vec![0.0; nx];

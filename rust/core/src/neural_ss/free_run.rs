@@ -1,8 +1,8 @@
-//! Free runs in scaled units, one or two side by side, and the model sample by sample for a loop that is closed around it.
+//! Free runs in scaled units, one or two side by side; and the model stepped sample by sample for a closed loop.
 //!
-//! A run waits for its own last state: a tanh and two sums. A second one fits into the waiting. Models of one output, up to four states and
-//! up to 16 hidden units step without leaving the registers: at 2.5 GHz with AVX-512 one run takes 47 ns a sample, by the general step
-//! 50, and two side by side 63 (docs/PERFORMANCE.md).
+//! A run waits for its own last state: a tanh and two sums. A second run fits into the waiting times. Models of one
+//! output, up to four states and up to 16 hidden units step entirely in registers: at 2.5 GHz with AVX-512 one run
+//! takes 47 ns a sample, the general step 50, and two side by side 63 (docs/PERFORMANCE.md).
 
 use super::network::{Network, Scratch, copy, unrolled};
 use super::shape::{Scaling, Shape};
@@ -11,13 +11,13 @@ use crate::monitor::Limit;
 use crate::simd::{self, F64x8, Kernel, Lanes};
 use crate::{Error, Monitor, Result};
 
-/// Samples between two looks at bound and limit.
-// Looked at that often, a run that has diverged costs 64 samples more, and the look nothing.
+/// Samples between two checks of bound and limit.
+// At this rate a diverged run costs at most 64 extra samples, and the check costs nothing.
 const BLOCK: usize = 64;
-/// Samples between two looks at the monitor.
+/// Samples between two checks of the monitor.
 const LOOK: usize = 64 * BLOCK;
 
-/// What a simulation leaves behind, sample by sample.
+/// The results of a simulation, sample by sample.
 #[derive(Clone, Debug)]
 pub(super) struct Trajectory {
     // Sample by sample, as the recursion of the sensitivities reads them: it has no tanh and no step of its own.
@@ -42,10 +42,10 @@ impl Trajectory {
 pub(super) struct Run<'a> {
     pub network: &'a Network,
     pub state: &'a [f64],
-    /// What it leaves behind.
+    /// Receives its results.
     pub run: &'a mut Trajectory,
     pub scratch: &'a mut Scratch,
-    /// None where it has already failed elsewhere.
+    /// `None` if the run has already failed elsewhere.
     pub limit: Option<Limit>,
 }
 
@@ -53,24 +53,24 @@ pub(super) struct Run<'a> {
 pub(super) struct FreeRuns<'a, const RUNS: usize> {
     pub runs: [Run<'a>; RUNS],
     pub v: &'a [f64],
-    /// Measured outputs, NaN where not known; empty where nothing is measured.
+    /// Measured outputs, NaN if unknown; empty if nothing is measured.
     pub y: &'a [f64],
-    /// A weight for each of them; none where all count alike.
+    /// A weight for each of them; empty if all count alike.
     pub weights: &'a [f64],
-    /// No state may be larger.
+    /// Bound on the magnitude of every state.
     pub bound: f64,
     pub monitor: &'a Monitor,
 }
 
 impl<const RUNS: usize> FreeRuns<'_, RUNS> {
-    /// Sums of squared errors, 0 without a measure; none where a run leaves the bound, is stopped, or can no longer
-    /// stay below its limit.
+    /// Sums of squared errors, 0 without measured outputs; `None` if a run leaves the bound, is stopped, or can no
+    /// longer stay below its limit.
     pub fn go(self) -> [Option<f64>; RUNS] {
         simd::run(self)
     }
 }
 
-/// A run by itself, of which nothing is asked but finite states; false where they are not, or it is stopped.
+/// A single run without measured outputs; false if its states are not finite or it is stopped.
 pub(super) fn alone(
     network: &Network,
     v: &[f64],
@@ -107,24 +107,24 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
 }
 
 impl<const RUNS: usize> FreeRuns<'_, RUNS> {
-    /// `NX` states; 0 stands for any number.
+    /// `NX` states; 0 for any number.
     #[inline(always)]
     fn samples<V: F64x8, const NX: usize>(mut self) -> [Option<f64>; RUNS] {
         let inputs = self.runs[0].network.shape.inputs;
         let samples = self.v.len() / inputs;
         let mut sums = [0.0; RUNS];
         for run in &mut self.runs {
-            // The state of the sample to come stands in `next`, before the first as behind every other.
+            // The state of the next sample is in `next`, before the first sample as after every other.
             run.scratch.next.copy_from_slice(run.state);
         }
         for start in (0..samples).step_by(BLOCK) {
-            // 4,096 samples, some tenth of a millisecond.
+            // 4,096 samples, some tenths of a millisecond.
             if start % LOOK == 0 && self.monitor.stopped() {
                 return [None; RUNS];
             }
             let end = samples.min(start + BLOCK);
             let v = &self.v[start * inputs..end * inputs];
-            // All together, or one alone: of two, one can have failed. A limit that is None marks it.
+            // All together, or a single one if the other has failed. A limit of `None` marks a failed run.
             if self.runs.iter().all(|run| run.limit.is_some()) {
                 advance::<V, NX, RUNS>(&mut self.runs, start, v, inputs);
             } else if let Some(run) = self.runs.iter_mut().find(|run| run.limit.is_some()) {
@@ -138,7 +138,7 @@ impl<const RUNS: usize> FreeRuns<'_, RUNS> {
         }
         let mut reached = [None; RUNS];
         for (reached, (run, sum)) in reached.iter_mut().zip(self.runs.iter().zip(sums)) {
-            // A sum that overflowed, where no limit was set to end it, is no cost.
+            // Without a limit an overflowed sum does not end the run, but it is no cost.
             *reached = run.limit.map(|_| sum).filter(|sum| sum.is_finite());
         }
         reached
@@ -154,14 +154,14 @@ fn advance<V: F64x8, const NX: usize, const RUNS: usize>(
     inputs: usize,
 ) {
     let network = runs[0].network;
-    // More groups fill the waiting by themselves, and their hidden outputs do not fit into registers beside the weights'
-    // loads.
+    // More groups fill the waiting times themselves, and their hidden outputs do not fit into registers beside the
+    // loads of the weights.
     match (NX, network.shape.outputs, network.groups()) {
         (1.., 1, 1) => together::<V, NX, 1, RUNS>(runs, start, v, inputs),
         (1.., 1, 2) => together::<V, NX, 2, RUNS>(runs, start, v, inputs),
         _ => {
             for (k, v) in v.chunks_exact(inputs).enumerate() {
-                // Sample by sample in turn, so that two runs overlap here, too.
+                // In turn, sample by sample, so that two runs overlap here, too.
                 for run in &mut *runs {
                     run.step::<V, NX>(start + k, v);
                 }
@@ -178,7 +178,7 @@ fn together<V: F64x8, const NX: usize, const GROUPS: usize, const RUNS: usize>(
     v: &[f64],
     inputs: usize,
 ) {
-    // States as scalars: each is spread over the lanes for the next argument, and sums of lanes give scalars.
+    // States as scalars: each is broadcast for the next argument, and sums over lanes give scalars.
     let mut x = [[0.0; NX]; RUNS];
     for (x, run) in x.iter_mut().zip(&*runs) {
         x.copy_from_slice(&run.scratch.next);
@@ -186,7 +186,7 @@ fn together<V: F64x8, const NX: usize, const GROUPS: usize, const RUNS: usize>(
     for (k, v) in v.chunks_exact(inputs).enumerate() {
         for r in 0..RUNS {
             let Run { network, run, .. } = &mut runs[r];
-            // Places of known length: no index is checked but the sample's.
+            // Slices of known length: only the sample's index is checked.
             let (states, _) = run.states.as_chunks_mut();
             let (hidden, _) = run.hidden.as_chunks_mut();
             states[start + k] = x[r];
@@ -209,14 +209,14 @@ impl Run<'_> {
         let x = &mut self.run.states[k * nx..][..nx];
         let h = &mut self.run.hidden[k * groups..][..groups];
         let s = &mut self.run.sums[k * outputs..][..outputs];
-        // Kept before it is stepped: the trajectory has the state that a sample's output belongs to.
+        // Stored before the step: the trajectory has the state to which a sample's output belongs.
         copy(x, &scratch.next[..nx]);
         scratch.set(x, v);
         self.network
             .step::<V, NX>(&scratch.arguments, h, &mut scratch.next, s);
     }
 
-    /// Measures a block: adds its squared errors, and ends the run where it cannot win.
+    /// Measures a block: adds its squared errors, and ends the run if it cannot win any more.
     fn conclude(
         &mut self,
         start: usize,
@@ -230,7 +230,7 @@ impl Run<'_> {
         let output = self.network.output;
         let (first, behind) = (start * outputs, end * outputs);
         if let Some(y) = y.get(first..behind) {
-            // One sum in the order of the samples: behind the run and off its chain, over numbers that are in the cache.
+            // One sum in the order of the samples: after the run, off its chain, over numbers in the cache.
             let pairs = self.run.sums[first..behind].iter().zip(y);
             match weights.get(first..behind) {
                 None => {
@@ -246,27 +246,27 @@ impl Run<'_> {
             }
         }
         let states = &self.run.states[start * nx..end * nx];
-        // NaN is no number within the bound either.
-        // Any state beyond the bound, not the output alone: a state can grow unseen until the output is lost.
+        // NaN is not within the bound either. Every state is tested, not only the output: a state can grow unseen until
+        // the output is lost.
         let sound = states
             .iter()
             .fold(true, |sound, x| sound & (x.abs() <= bound));
-        // A sum of squares only grows, so that a partial one decides.
+        // A sum of squares only grows, so a partial one decides.
         if !sound || limit.is_reached(*sum) {
             self.limit = None;
         }
     }
 }
 
-/// The model from sample to sample, for a loop that is closed around it.
+/// The model stepped sample by sample, for a closed loop.
 #[derive(Clone, Debug)]
 pub struct Stepper {
     network: Network,
     scaling: Scaling,
     rest: Vec<f64>,
     scratch: Scratch,
-    /// Inputs that are still to act, the oldest at `oldest`: nk rows.
-    // A ring of nk rows in scaled units: what is put in comes out nk samples later.
+    /// Inputs that have not acted yet, the oldest at `oldest`: nk rows.
+    // A ring of nk rows in scaled units: an input comes out nk samples later.
     waiting: Vec<f64>,
     oldest: usize,
 }
@@ -278,7 +278,7 @@ impl Stepper {
     /// `ErrorKind::Setting` for a model without delay.
     pub fn new(model: &NeuralSS) -> Result<Self> {
         let shape = model.shape();
-        // Without delay the output of a sample would need the input that is decided from it.
+        // Without delay the output of a sample would depend on the input decided from it.
         if shape.nk == 0 {
             return Err(Error::setting(
                 "expected a model with a delay nk of 1 or more, got 0: the command is decided after the output is \
@@ -297,7 +297,7 @@ impl Stepper {
         Ok(stepper)
     }
 
-    /// Back to rest, with inputs of zero before.
+    /// Back to rest, after inputs of zero.
     pub fn reset(&mut self) {
         let inputs = self.network.shape.inputs;
         for (i, waiting) in self.waiting.iter_mut().enumerate() {
@@ -305,7 +305,7 @@ impl Stepper {
         }
         self.oldest = 0;
         self.scratch.next.copy_from_slice(&self.rest);
-        // One step ahead: the sums of sample 0 are wanted before its input is.
+        // One step ahead: the sums of sample 0 are needed before its input is known.
         self.advance_state();
     }
 
@@ -315,21 +315,21 @@ impl Stepper {
         self.scaling.restored(p, scaled)
     }
 
-    /// Holds the inputs for one sample time, which brings the next sample.
+    /// Holds the inputs for one sample time and advances to the next sample.
     pub fn advance(&mut self, u: &[f64]) {
         let inputs = self.network.shape.inputs;
         let place = &mut self.waiting[self.oldest * inputs..][..inputs];
         for (j, (waiting, u)) in place.iter_mut().zip(u).enumerate() {
             *waiting = self.scaling.input(j, *u);
         }
-        // The place behind the newest is the oldest.
+        // The entry after the newest is the oldest.
         self.oldest = (self.oldest + 1) % self.network.shape.nk;
         self.advance_state();
     }
 
     fn advance_state(&mut self) {
         let inputs = self.network.shape.inputs;
-        // With the oldest of the inputs that wait: the state goes on by it, and the output of the sample follows.
+        // The oldest pending input acts now: it advances the state, and the output of the sample follows.
         let v = &self.waiting[self.oldest * inputs..][..inputs];
         simd::run(state::Next {
             network: &self.network,

@@ -1,13 +1,13 @@
-//! A start for a position: speed, input and dry friction by least squares, which need no linear model.
+//! A start for a position: speed, input and dry friction by least squares, without a linear model.
 //!
-//! Linear models of a drive that often stands still say little: what keeps it there is no viscous friction. While it
-//! moves,
+//! Linear models say little about a drive that often stands still: what holds it there is not viscous friction. While
+//! it moves,
 //!
 //! `v+ = a v + b u + d - c sign(v)`,
 //!
-//! and three positions, `m` samples apart, tell how the speed changed (the integral form of the equation error, in which
-//! noise counts for less the longer `m` is; Ljung 1999, section 7.3). At rest friction takes what it needs: `v+ = z -
-//! c sat(z/c)` with `z = a v + b u + d`, for which a hidden unit of slope `1/c` stands.
+//! and three positions, `m` samples apart, show how the speed changed. This is the integral form of the equation error:
+//! the longer `m`, the less noise matters (Ljung 1999, section 7.3). At rest friction balances the drive: `v+ = z - c
+//! sat(z/c)` with `z = a v + b u + d`, and a hidden unit of slope `1/c` stands for `sat`.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -16,16 +16,16 @@ use super::problem::Experiment;
 use super::shape::{Shape, root_mean_square};
 use crate::random::Random;
 
-/// Part of its standard deviation that a position moves in the samples of [`pace`].
+/// Part of its standard deviation that a position moves within [`pace`] samples.
 const STROKE: f64 = 0.25;
-/// Samples `m`, in units of the pace: long ones average noise, short ones follow quick motions.
+/// Samples `m`, in units of the pace: long windows average noise, short ones follow quick motions.
 const WINDOWS: (f64, f64) = (0.25, 2.0);
-/// A slower motion, relative to the root mean square of the speed, may be none.
+/// Motion slower than this, relative to the root mean square of the speed, may be noise.
 const SLOW: f64 = 0.05;
-/// Windows with motion for each of the estimated parameters, at least.
+/// Least number of windows with motion per estimated parameter.
 const ENOUGH: usize = 10;
 
-/// Samples in which a position moves by a quarter of its standard deviation; none where it never does.
+/// Samples in which a position moves by a quarter of its standard deviation; `None` if it never does.
 pub(super) fn pace(experiments: &[Experiment]) -> Option<usize> {
     let longest = experiments.iter().map(|e| e.y.len()).max()? / 4;
     let known = experiments
@@ -49,7 +49,7 @@ pub(super) fn pace(experiments: &[Experiment]) -> Option<usize> {
     halves.into_iter().find(|m| moved(*m))
 }
 
-/// `v+ = a v + b u + d - c sign(v)` in scaled units of output and input, a sample.
+/// `v+ = a v + b u + d - c sign(v)` in scaled units of output and input, per sample.
 #[derive(Clone, Debug)]
 pub(super) struct Friction {
     a: f64,
@@ -61,7 +61,7 @@ pub(super) struct Friction {
 }
 
 impl Friction {
-    /// The estimate over windows of a random length; none where nothing moves, or no dry friction shows.
+    /// The estimate over windows of a random length; `None` if nothing moves or no dry friction shows.
     pub fn estimated(
         shape: Shape,
         experiments: &[Experiment],
@@ -116,8 +116,8 @@ impl Friction {
         (brakes && found.iter().all(|v| v.is_finite())).then_some(estimate)
     }
 
-    /// The parameters: the first state is the speed, the last one the position; the first hidden unit is the friction,
-    /// the second one the constant, further states and units hardly reach the rest yet.
+    /// The parameters: the first state is the speed, the last one the position. The first hidden unit is the friction,
+    /// the second one the constant; further states and units hardly affect the rest yet.
     pub fn theta(&self, shape: Shape, scale: f64, random: &mut Random) -> Vec<f64> {
         let (nx, last, speed) = (shape.nx, shape.nx - 1, self.speed);
         let parts = shape.parts();
@@ -130,7 +130,7 @@ impl Friction {
             theta[parts.b.start + state * shape.inputs..][..shape.inputs]
                 .fill_with(|| (1.0 - pole * pole).sqrt() * random.normal());
         }
-        // the next speed moves the speed's state, the position and, in the same sample, the output
+        // the next speed moves the speed state, the position and, in the same sample, the output
         theta[parts.a.start] = self.a;
         theta[parts.a.start + last * nx] = self.a * speed;
         theta[parts.c.start] = self.a * speed;
@@ -155,7 +155,7 @@ impl Friction {
         theta
     }
 
-    /// A unit of output 1 changes the next speed by so much.
+    /// Makes a unit of output 1 change the next speed by `size`.
     fn reach(&self, theta: &mut [f64], shape: Shape, unit: usize, size: f64) {
         let parts = shape.parts();
         theta[parts.e.start + unit] = size / self.speed;
@@ -164,7 +164,7 @@ impl Friction {
     }
 }
 
-/// Means of the inputs by which the speeds of two windows of `m` samples differ: weights rise and fall again.
+/// Triangularly weighted means of the inputs: they drive the difference of the speeds of two windows of `m` samples.
 fn triangular_means(v: &[f64], inputs: usize, m: usize) -> Vec<f64> {
     let samples = v.len() / inputs;
     let summed = |values: &[f64]| {
@@ -201,7 +201,7 @@ mod tests {
         }
     }
 
-    /// A carriage of one input that is pushed to and fro against dry friction, its position in scaled units.
+    /// A carriage with one input, pushed to and fro against dry friction; its position in scaled units.
     fn carriage(a: f64, b: f64, c: f64, d: f64) -> Experiment {
         let (mut speed, mut position) = (0.0, 0.0);
         let v: Vec<f64> = (0..6000)

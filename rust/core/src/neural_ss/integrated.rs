@@ -1,32 +1,32 @@
-//! Where the training of a position begins: at its speed, or at its recent motion.
+//! Where the training of a position begins: at its speed or at its recent motion.
 //!
-//! The free run of an integrator sums up what its speed is wrong by, and a small error of the friction moves all that
-//! follows; the cost has many valleys. Two problems with fewer of them are trained first:
+//! An integrator's free run sums up the errors of its speed, and a small error of the friction shifts all that follows:
+//! the cost has many valleys. Two problems with fewer valleys are trained first:
 //!
-//! - [`Speed`]: a network of the differences of the outputs, behind which the integrator is set. The free run of the speed
-//!   does not drift, and dry friction shows in it. Differences of noisy positions are noisy, `sqrt(2)` times as much in every
-//!   sample, but there are many.
-//! - [`Leak`]: an integrator that leaks, on outputs that leak alike. Behind `H = (1 - q^-1) / (1 - p q^-1)` an error counts
-//!   for some `1/(1 - p)` samples, noise is hardly larger than before (a plain difference would double it), and the same
-//!   parameters run the model: the last state's pole is `p` where it was 1. What is summed up within the output, a small
-//!   part, is not filtered.
+//! - [`Speed`]: a network of the outputs' differences, followed by the integrator. The free run of the speed does not
+//!   drift, and dry friction shows in it. Differences of noisy positions have `sqrt(2)` times the noise in every
+//!   sample, but there are many samples.
+//! - [`Leak`]: a leaking integrator, on outputs that leak alike. After the filter `H = (1 - q^-1) / (1 - p q^-1)` an
+//!   error counts for some `1/(1 - p)` samples, and the noise hardly grows (a plain difference would double it). The
+//!   same parameters run the model, with `p` in place of 1 as the last state's pole. The part summed up within the
+//!   output, a small one, is not filtered.
 //!
-//! The training that follows, with the pole at 1 and the positions as they are, takes the noise for what it is.
+//! The training that follows, with the pole at 1 and the unfiltered positions, weighs the noise correctly.
 
 use super::problem::Experiment;
 use super::shape::{Shape, root_mean_square};
 
-/// Recordings of the speed, and the shape of a network of it.
+/// Recordings of the speed, and the shape of a network for it.
 pub(super) struct Speed {
     pub experiments: Vec<Experiment>,
     pub shape: Shape,
-    /// Root mean square of the speed in units of the position, a sample.
+    /// Root mean square of the speed, in units of the position per sample.
     pub scale: f64,
 }
 
 impl Speed {
-    /// The speed of these positions; none where nothing moves, where the position is the only state, or where less than
-    /// two hidden units are left beside the one that stands for a constant: with one unit, random starts find no friction.
+    /// The speed of these positions. `None` if nothing moves, if the position is the only state, or if fewer than two
+    /// hidden units are left beside the one for the constant: with one unit, random starts find no friction.
     pub fn new(experiments: &[Experiment], position: Shape) -> Option<Self> {
         if position.nx < 2 || position.hidden < 3 {
             return None;
@@ -37,8 +37,8 @@ impl Speed {
             integrator: false,
             ..position
         };
-        // The network of the speed is trained in units of its own, so that its outputs have the size that start weights
-        // and decay are made for.
+        // The network of the speed has its own units: its outputs then have the size for which start weights and decay
+        // are made.
         let mut experiments: Vec<Experiment> = experiments.iter().map(differences).collect();
         let scale = root_mean_square(experiments.iter().flat_map(|e| e.y.iter().copied()));
         if scale <= 0.0 {
@@ -54,10 +54,10 @@ impl Speed {
         })
     }
 
-    /// Parameters and first states of the position whose speed has these ones; positions begin at 0.
+    /// Parameters and first states of the position, from those of its speed; positions begin at 0.
     ///
-    /// With `w` the speed, `p+ = p + w` and `y = p + w`. The last hidden unit becomes the constant part of the speed, as
-    /// state equations have none.
+    /// With `w` the speed, `p+ = p + w` and `y = p + w`. The last hidden unit becomes the constant part of the speed,
+    /// because state equations have none.
     pub fn integrated(&self, speed: &[f64], position: Shape) -> Vec<f64> {
         let (nx, hidden, inputs) = (self.shape.nx, self.shape.hidden, self.shape.inputs);
         let (from, to) = (self.shape.parts(), position.parts());
@@ -66,7 +66,7 @@ impl Speed {
         //   position   p+ = p + w,  y = p + w: the last state p, whose row of [A B E] and the output's row of [C D G] are w's
         //   A' = | A 0 |   B' = | B |   E' = | E 0 |   C' = [C 1]   D' = D   G' = [G c/tanh(1)]
         //        | C 1 |        | D |        | G c/tanh(1) |
-        // with C, D, G and c times `scale`. The unit behind the last has no weights and the bias 1, so that its output is
+        // with C, D, G and c times `scale`. The additional last unit has no weights and the bias 1: its output is
         // tanh(1) at every sample.
         let mut copy = |from: usize, to: usize, count: usize, factor: f64| {
             let values = theta[to..][..count].iter_mut().zip(&speed[from..][..count]);
@@ -83,7 +83,7 @@ impl Speed {
             let (e, own) = (from.e.start + i * hidden, to.e.start + i * position.hidden);
             copy(e, own, hidden, 1.0);
         }
-        // Rows are one number longer: the position is no argument of the hidden units.
+        // Rows are one number longer: the position is no argument of the hidden units, its weight is zero.
         for i in 0..hidden {
             copy(from.wx.start + i * nx, to.wx.start + i * (nx + 1), nx, 1.0);
         }
@@ -109,9 +109,9 @@ impl Speed {
         theta[to.bh.end - 1] = 1.0;
         theta[to.e.end - 1] = constant;
         theta[to.g.end - 1] = constant;
-        // The pole of 1, and the zeros through which the position would act on anything.
+        // Sets the pole to 1, and the weights of the position to zero.
         position.hold(&mut theta);
-        // Behind theta stand the experiments' initial states; each gets a position of 0 at its end.
+        // The experiments' initial states come after theta; each gets a position of 0 at its end.
         for state in speed[from.g.end..].chunks_exact(nx) {
             theta.extend(state.iter().chain([&0.0]));
         }
@@ -119,10 +119,10 @@ impl Speed {
     }
 }
 
-/// Each output less the one before; not known where one of them is not.
+/// Each output minus the previous one; unknown if one of them is.
 fn differences(experiment: &Experiment) -> Experiment {
     let y = &experiment.y;
-    // NaN less anything is NaN: a gap takes the difference behind it along.
+    // NaN minus anything is NaN: a gap removes the difference after it, too.
     let steps = y.iter().zip(y.iter().skip(1)).map(|(y, next)| next - y);
     Experiment {
         y: [f64::NAN].into_iter().take(y.len()).chain(steps).collect(),
@@ -130,10 +130,10 @@ fn differences(experiment: &Experiment) -> Experiment {
     }
 }
 
-/// Time constant of the leak, in samples in which a position moves by a quarter of its standard deviation.
+/// Time constant of the leak, in multiples of the samples in which a position moves by a quarter of its standard deviation.
 const MEMORY: f64 = 2.0;
 
-/// Recordings behind the filter, and the parameters that go with them.
+/// Filtered recordings, with the conversion of the parameters.
 pub(super) struct Leak {
     pub experiments: Vec<Experiment>,
     pole: f64,
@@ -141,9 +141,9 @@ pub(super) struct Leak {
 }
 
 impl Leak {
-    /// The filter for positions of this pace; none where nothing moves.
+    /// The filter for positions of this pace; `None` if nothing moves.
     pub fn new(experiments: &[Experiment], pace: usize) -> Option<Self> {
-        // 1/(1 - p) samples are the time constant; at least two, p = 1/2.
+        // The time constant is 1/(1 - p) samples, at least two: p = 1/2.
         let pole = 1.0 - 1.0 / (MEMORY * pace as f64).max(2.0);
         let mut filtered: Vec<Experiment> = experiments.iter().map(|e| behind(pole, e)).collect();
         let scale = root_mean_square(filtered.iter().flat_map(|e| e.y.iter().copied()));
@@ -160,10 +160,10 @@ impl Leak {
         })
     }
 
-    /// Parameters and states for the filtered outputs: the position begins at 0, as those do.
+    /// Converts parameters and states for the filtered outputs: the position begins at 0, as they do.
     pub fn entered(&self, theta: &mut [f64], shape: Shape) {
         self.scaled(theta, shape, 1.0 / self.scale);
-        // H has no gain at rest: the constant part of the output is gone, c with it.
+        // H has zero gain at rest: the constant part of the output vanishes, and c with it.
         theta[shape.parts().constant].fill(0.0);
         theta[shape.pole()] = self.pole;
         for state in theta[shape.parameters()..].chunks_exact_mut(shape.nx) {
@@ -171,7 +171,7 @@ impl Leak {
         }
     }
 
-    /// The same parameters for the outputs as they are; where their positions begin is left to be found.
+    /// Converts the parameters back for the unfiltered outputs; the initial positions remain to be found.
     pub fn left(&self, theta: &mut [f64], shape: Shape) {
         self.scaled(theta, shape, self.scale);
         theta[shape.pole()] = 1.0;
@@ -179,21 +179,21 @@ impl Leak {
 
     fn scaled(&self, theta: &mut [f64], shape: Shape, factor: f64) {
         let parts = shape.parts();
-        // C, D, c and G stand side by side
+        // C, D, c and G are adjacent
         theta[parts.c.start..parts.g.end]
             .iter_mut()
             .for_each(|t| *t *= factor);
     }
 }
 
-/// The outputs behind the filter, from rest; a gap keeps the position that was last known.
+/// The filtered outputs, from rest; over a gap the last known position is held.
 fn behind(pole: f64, experiment: &Experiment) -> Experiment {
     let (mut last, mut sum) = (None, 0.0);
     let filtered = experiment.y.iter().map(|y| {
         if y.is_nan() {
             return f64::NAN;
         }
-        // z(k) = p z(k-1) + y(k) - y(k-1), the difference over a gap as one jump.
+        // z(k) = p z(k-1) + y(k) - y(k-1); the difference over a gap is one jump.
         sum = pole * sum + (y - last.unwrap_or(*y));
         last = Some(*y);
         sum

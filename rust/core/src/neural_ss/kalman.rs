@@ -7,15 +7,15 @@ use super::state::{Statistics, step_with_slopes};
 use crate::Monitor;
 use crate::simd::{self, F64x8, Kernel};
 
-/// Powers of ten that the process noise is chosen from.
+/// Powers of ten from which the process noise is chosen.
 const EXPONENTS: std::ops::RangeInclusive<i32> = -8..=2;
-/// Where the search begins.
+/// Where the search starts.
 const FIRST_EXPONENT: i32 = -3;
-/// Samples that it looks at: more do not move a power of ten.
+/// Most samples used by it: more do not change a power of ten.
 const MOST_SAMPLES: usize = 20_000;
 
-/// A filter over one record, as a kernel. `each(k, s, x)` sees the sums predicted for sample `k` before its outputs
-/// count, and the state after they did.
+/// A filter over one record, as a kernel. `each(k, s, x)` receives the sums predicted for sample `k`, before its
+/// outputs count, and the state corrected by them.
 pub(super) struct Filter<'a, F> {
     pub network: &'a Network,
     pub prior: &'a Statistics,
@@ -23,9 +23,9 @@ pub(super) struct Filter<'a, F> {
     pub process: f64,
     pub state: &'a [f64],
     pub v: &'a [f64],
-    /// Measured outputs; those that are NaN are not used.
+    /// Measured outputs; NaN is skipped.
     pub y: &'a [f64],
-    // A closure: the search for the noise sums up errors, an estimate keeps states, and neither stores the other's.
+    // A closure: the noise search sums up errors, an estimate keeps states, and neither stores the other's data.
     pub each: F,
 }
 
@@ -49,11 +49,11 @@ impl<F: FnMut(usize, &[f64], &[f64])> Kernel for Filter<'_, F> {
             outputs,
             ..
         } = network.shape;
-        // Q = process P0, with P0 the covariance of the states in training: one number to choose, and the states' scales
-        // are right.
+        // Q = process P0, with P0 the covariance of the states in training: only one number to choose, with the states'
+        // scales right.
         let noise: Vec<f64> = prior.state_covariance.iter().map(|c| process * c).collect();
         let mut memory = Memory {
-            // The first state is as uncertain as one step makes it.
+            // The first state is as uncertain as one step would make it.
             covariance: noise.clone(),
             x: state.to_vec(),
             room: vec![0.0; nx * nx],
@@ -70,8 +70,8 @@ impl<F: FnMut(usize, &[f64], &[f64])> Kernel for Filter<'_, F> {
             // s and ds/dx at the predicted state.
             step_with_slopes::<V>(network, &mut scratch, v);
             predicted.copy_from_slice(&scratch.sums);
-            // Slopes stay those of the prediction while one output after the other counts; `moved` in `measure` takes
-            // the correction of the earlier ones along to first order.
+            // The slopes stay those of the prediction while the outputs are used one by one; `moved` in `measure`
+            // accounts for the earlier corrections to first order.
             for (p, y) in y.iter().enumerate().filter(|(_, y)| !y.is_nan()) {
                 memory.measure(
                     network,
@@ -83,7 +83,7 @@ impl<F: FnMut(usize, &[f64], &[f64])> Kernel for Filter<'_, F> {
                 );
             }
             each(k, &predicted, &memory.x);
-            // A second step, from the corrected state: f and F there.
+            // A second step, from the corrected state: gives f and F there.
             scratch.next.copy_from_slice(&memory.x);
             step_with_slopes::<V>(network, &mut scratch, v);
             memory.advance(&scratch, &noise);
@@ -91,7 +91,7 @@ impl<F: FnMut(usize, &[f64], &[f64])> Kernel for Filter<'_, F> {
     }
 }
 
-/// The state that the last step began at.
+/// The state from which the last step started.
 fn state_before(scratch: &Scratch, nx: usize) -> &[f64] {
     &scratch.arguments[..nx]
 }
@@ -99,14 +99,14 @@ fn state_before(scratch: &Scratch, nx: usize) -> &[f64] {
 struct Memory {
     x: Vec<f64>,
     covariance: Vec<f64>,
-    // F P, the gain's numerator P H' and H: kept from sample to sample, so that a step allocates nothing.
+    // F P, the gain's numerator P H', and H: kept from sample to sample, so a step allocates nothing.
     room: Vec<f64>,
     row: Vec<f64>,
     gain: Vec<f64>,
 }
 
 impl Memory {
-    /// One output counts: the outputs' noises are independent, so that one may come after the other.
+    /// Uses one output: the outputs' noises are independent, so outputs can be used one after the other.
     fn measure(
         &mut self,
         network: &Network,
@@ -122,13 +122,13 @@ impl Memory {
         for (j, row) in self.row.iter_mut().enumerate() {
             *row = steepness * scratch.slope((nx + p) * nx + j);
         }
-        // P H', which both the gain and the new covariance are made of.
+        // P H', needed for both the gain and the new covariance.
         for (i, gain) in self.gain.iter_mut().enumerate() {
             *gain = (0..nx)
                 .map(|j| self.covariance[i * nx + j] * self.row[j])
                 .sum();
         }
-        // S: what is expected of the error's square.
+        // S: the expected square of the error.
         let spread = noise
             + self
                 .row
@@ -136,11 +136,11 @@ impl Memory {
                 .zip(&self.gain)
                 .map(|(r, g)| r * g)
                 .sum::<f64>();
-        // yhat is of the prediction; with the correction by the outputs before it has moved by H (x - x before).
+        // yhat belongs to the prediction; the corrections by earlier outputs have moved it by H (x - x before).
         let moved: f64 = (0..nx).map(|j| self.row[j] * (self.x[j] - before[j])).sum();
         let innovation = (y - value - moved) / spread;
-        // x + K e and P - K S K' = P - (P H')(P H')'/S: symmetric by form, as entries (i, j) and (j, i) are the same
-        // product. R > 0 keeps S off 0.
+        // x + K e and P - K S K' = P - (P H')(P H')'/S, symmetric by construction: entries (i, j) and (j, i) are the
+        // same product. R > 0 keeps S above 0.
         for i in 0..nx {
             self.x[i] += self.gain[i] * innovation;
             for j in 0..nx {
@@ -161,7 +161,7 @@ impl Memory {
             }
         }
         for q in 0..nx {
-            // (F P) F' + Q, one half of it, and that mirrored: rounding cannot make it unsymmetric.
+            // (F P) F' + Q, one half of it, then mirrored: rounding cannot make it unsymmetric.
             for r in 0..=q {
                 let sum: f64 = (0..nx)
                     .map(|j| self.room[q * nx + j] * scratch.slope(r * nx + j))
@@ -173,7 +173,7 @@ impl Memory {
     }
 }
 
-/// The power of ten with the least one-step error on these experiments, by descent from one to the next.
+/// The power of ten with the least one-step error on these experiments, by descent over the exponents.
 pub(super) fn process_noise(
     network: &Network,
     prior: &Statistics,
@@ -181,13 +181,13 @@ pub(super) fn process_noise(
     states: &[Vec<f64>],
     monitor: &Monitor,
 ) -> f64 {
-    // Out of range, or asked to stop: no better than anything.
+    // Infinite if out of range or if a stop was requested.
     let error = |exponent: i32| match EXPONENTS.contains(&exponent) && !monitor.stopped() {
         true => one_step_error(network, prior, experiments, states, 10f64.powi(exponent)),
         false => f64::INFINITY,
     };
     let (mut at, mut least) = (FIRST_EXPONENT, error(FIRST_EXPONENT));
-    // The error has one valley over the power of ten: down from the first guess, then up from the best so far.
+    // Over the power of ten the error has a single valley: go down from the first guess, then up from the best so far.
     for direction in [-1, 1] {
         loop {
             let next = error(at + direction);
@@ -200,7 +200,7 @@ pub(super) fn process_noise(
     10f64.powi(at)
 }
 
-/// Sum of squared one-step errors, in the measure of the outputs' residuals.
+/// Sum of squared one-step errors, each relative to its output's residual variance.
 fn one_step_error(
     network: &Network,
     prior: &Statistics,
@@ -228,7 +228,7 @@ fn one_step_error(
                 for (p, s) in s.iter().enumerate() {
                     let error = y[k * outputs + p] - network.output.value(*s);
                     if !y[k * outputs + p].is_nan() {
-                        // Outputs of different units count alike: each in the variance of its residuals.
+                        // Outputs of different units count alike: each relative to the variance of its residuals.
                         sum += error * error / prior.residual_variance[p];
                     }
                 }

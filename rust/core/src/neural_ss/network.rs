@@ -6,14 +6,14 @@
 //!   s  = C x + D v + c + G h
 //! ```
 //!
-//! [`Network::step`] takes any sizes; [`Network::step_small`] one output and sizes that the compiler knows: a run takes 10 % longer without it
-//! (`state_space_run` of the kernels' example, Zen 4, least and median of 200), a training as long.
+//! [`Network::step`] takes any sizes. [`Network::step_small`] takes one output and sizes known at compile time: without it a run takes 10
+//! % longer (`state_space_run` of the kernels' example, Zen 4, least and median of 200), a training the same time.
 
 use super::output::OutputFunction;
 use super::shape::Shape;
 use crate::simd::{F64x8, LANES, Lanes};
 
-/// The weights laid out for the kernels: hidden units in groups of eight, missing ones with weights of zero.
+/// The weights laid out for the kernels: hidden units in groups of eight, missing units with weights of zero.
 #[derive(Clone, Debug)]
 pub(super) struct Network {
     pub shape: Shape,
@@ -28,23 +28,23 @@ pub(super) struct Network {
     linear: Vec<f64>,
     /// `c`.
     constant: Vec<f64>,
-    /// For each group of slopes, the products of each hidden unit's weights that stand beside its `1 - h^2`.
-    // (dx+/dx)_qj = A_qj + sum over units of E_qi (1 - h_i^2) Wx_ij: with E_qi Wx_ij formed once for a theta, a lane is
-    // an entry (q, j) and a unit's 1 - h^2 is spread: no sum over lanes is left in it. It costs nx (nx + ny) numbers a
+    /// For each group of slopes, the weight products that multiply each hidden unit's `1 - h^2`.
+    // (dx+/dx)_qj = A_qj + sum over units of E_qi (1 - h_i^2) Wx_ij. With E_qi Wx_ij formed once per theta, a lane is
+    // an entry (q, j) and a unit's 1 - h^2 is broadcast: no sum over lanes is left. This takes nx (nx + ny) numbers a
     // unit.
     products: Vec<Lanes>,
     /// The linear part of the slopes: `[A; C]` in the order of `products`.
     base: Vec<Lanes>,
-    /// For each argument its column of `[A B 0; C D c]`, where that has no more rows than a group.
-    // A lane is a row here, so that [A B; C D] [x; v] for all rows is one product an argument and no sum over lanes.
+    /// For each argument its column of `[A B 0; C D c]`, if that has no more rows than a group has lanes.
+    // Here a lane is a row: [A B; C D] [x; v] for all rows is one product per argument, without a sum over lanes.
     columns: Vec<Lanes>,
 }
 
-/// What a step needs room for, and leaves behind.
+/// The buffers of a step, and its results.
 #[derive(Clone, Debug)]
 pub(super) struct Scratch {
     /// States and inputs of the step, then 1.
-    // One vector, so that a product with [A B] or with a row of [Wx Wu bh] is one walk.
+    // One vector: a product with [A B] or with a row of [Wx Wu bh] is then one pass.
     pub arguments: Vec<f64>,
     /// Hidden outputs.
     pub hidden: Vec<Lanes>,
@@ -74,7 +74,7 @@ impl Scratch {
         }
     }
 
-    /// Takes up state and inputs of a step.
+    /// Sets state and inputs of a step.
     #[inline(always)]
     pub fn set(&mut self, x: &[f64], v: &[f64]) {
         let (states, inputs) = self.arguments.split_at_mut(x.len());
@@ -82,7 +82,7 @@ impl Scratch {
         copy(&mut inputs[..v.len()], v);
     }
 
-    /// Takes up the state that the last step led to, and the inputs of the next one.
+    /// Continues from the state after the last step, with the inputs of the next one.
     #[inline(always)]
     pub fn go_on(&mut self, v: &[f64]) {
         let (states, inputs) = self.arguments.split_at_mut(self.next.len());
@@ -100,7 +100,7 @@ impl Scratch {
 /// A copy of a few numbers, for which a call would take longer than the copy.
 #[inline(always)]
 pub(super) fn copy(to: &mut [f64], from: &[f64]) {
-    // `copy_from_slice` is a call of memcpy where the length is not known.
+    // `copy_from_slice` calls memcpy if the length is not known at compile time.
     match (to, from) {
         ([to], [from]) => *to = *from,
         ([to, a], [from, b]) => (*to, *a) = (*from, *b),
@@ -112,15 +112,15 @@ pub(super) fn copy(to: &mut [f64], from: &[f64]) {
 /// `1 - h^2` from hidden outputs: fast, and exact to 1e-16.
 #[inline(always)]
 pub(super) fn rises_of<V: F64x8>(hidden: &[Lanes], rises: &mut [Lanes]) {
-    // With d tanh(z)/dz = 1 - tanh(z)^2 no function is evaluated; near h = 1 the difference has an error of 1e-16 and no
-    // digits.
+    // d tanh(z)/dz = 1 - tanh(z)^2 evaluates no function. Near h = 1 the difference has an absolute error of 1e-16, but
+    // no relative precision.
     for (rise, hidden) in rises.iter_mut().zip(hidden) {
         let h = V::load(&hidden.0);
         V::splat(1.0).sub(h.mul(h)).store(&mut rise.0);
     }
 }
 
-/// Calls a method for a number of states, so that its loops are unrolled; 0 stands for any other number.
+/// Calls a method for a constant number of states, so that its loops are unrolled; 0 stands for any other number.
 macro_rules! unrolled {
     ($nx:expr, $this:ident.$method:ident::<$V:ty>) => {
         match $nx {
@@ -161,7 +161,7 @@ impl Network {
         self.shape.hidden.div_ceil(LANES)
     }
 
-    /// Takes the weights from `theta`.
+    /// Loads the weights from `theta`.
     pub fn load(&mut self, theta: &[f64]) {
         let Shape {
             nx,
@@ -179,7 +179,7 @@ impl Network {
                 group.0[i % LANES] = *weight;
             }
         }
-        // Rows of E, then of G: units behind the last one keep their zeros.
+        // Rows of E, then of G: units after the last one keep their zeros.
         let second = theta[parts.e]
             .chunks_exact(hidden)
             .chain(theta[parts.g].chunks_exact(hidden));
@@ -190,7 +190,7 @@ impl Network {
         }
         let (left, right) = (&theta[parts.a], &theta[parts.b]);
         let (lower_left, lower_right) = (&theta[parts.c], &theta[parts.d]);
-        // [A B] and [C D] row by row, each row's states and inputs side by side as `arguments` has them.
+        // [A B] and [C D] row by row, with states and inputs side by side as in `arguments`.
         for q in 0..nx + ny {
             let row = &mut self.linear[q * width..][..width];
             let (states, inputs) = match q.checked_sub(nx) {
@@ -201,9 +201,9 @@ impl Network {
             row[nx..].copy_from_slice(inputs);
         }
         self.constant.copy_from_slice(&theta[parts.constant]);
-        // Behind E, G and [A B; C D], of which it is made.
+        // After E, G and [A B; C D], from which the products are made.
         self.multiply(wx);
-        // As many rows as lanes; `step_small` is the only reader.
+        // A lane per row; only `step_small` reads these.
         if nx + ny <= LANES {
             for (q, row) in self.linear.chunks_exact(width).enumerate() {
                 for (column, weight) in self.columns.iter_mut().zip(row) {
@@ -214,7 +214,7 @@ impl Network {
         }
     }
 
-    /// Fills what only the slopes need.
+    /// Computes the weights that only the slopes need.
     fn multiply(&mut self, wx: &[f64]) {
         let (nx, width, groups) = (self.shape.nx, self.shape.arguments(), self.groups());
         for q in 0..nx + self.shape.outputs {
@@ -235,9 +235,9 @@ impl Network {
     #[inline(always)]
     fn argument<V: F64x8>(&self, group: usize, states: &[f64], inputs: &[f64]) -> V {
         let width = states.len() + inputs.len();
-        // The states come last: everything else is ready before they are known.
+        // The states come last: all other terms are ready before they are known.
         let (of_states, of_inputs) = self.first[group * width..][..width].split_at(states.len());
-        // The bias is the last of the inputs' weights, beside their 1.
+        // The bias is the last of the inputs' weights; its input is 1.
         let mut z = V::splat(0.0);
         for (weights, value) in of_inputs.iter().zip(inputs) {
             z = z.add_product(V::load(&weights.0), V::splat(*value));
@@ -248,7 +248,7 @@ impl Network {
         z
     }
 
-    /// `1 - h^2` to its last digits, for `[x, v, 1]`; [`rises_of`] is faster, and less exact in saturation.
+    /// `1 - h^2` to its last digits, for `[x, v, 1]`; [`rises_of`] is faster, but less exact in saturation.
     #[inline(always)]
     pub fn rises<V: F64x8>(&self, arguments: &[f64], rises: &mut [Lanes]) {
         let (states, inputs) = arguments.split_at(self.shape.nx);
@@ -276,7 +276,7 @@ impl Network {
                 .store(&mut hidden.0);
         }
         for (q, next) in next[..nx].iter_mut().enumerate() {
-            // `next` is not `states`: all rows are of the same x.
+            // `next` is not `states`: all rows use the same x.
             *next = self.row::<V>(q, states, inputs, hidden);
         }
         for (p, (sum, constant)) in sums.iter_mut().zip(&self.constant).enumerate() {
@@ -284,8 +284,8 @@ impl Network {
         }
     }
 
-    /// [`Network::step`] of one output, a number of states and a number of groups: takes `x` a step on, with
-    /// everything in registers. Gives the sum `s`.
+    /// [`Network::step`] for one output and constant numbers of states and groups: advances `x` by one step, with
+    /// everything in registers. Returns the sum `s`.
     #[inline(always)]
     pub fn step_small<V: F64x8, const NX: usize, const GROUPS: usize>(
         &self,
@@ -296,26 +296,26 @@ impl Network {
         let width = NX + v.len();
         let mut units = [V::splat(0.0); GROUPS];
         for (g, unit) in units.iter_mut().enumerate() {
-            // The states come last: everything else is ready before they are known.
+            // The states come last: all other terms are ready before they are known.
             let weights = &self.first[g * (width + 1)..][..width + 1];
             *unit = affine::<V, NX>(weights, x, v);
             *unit = unit.tanh();
             unit.store(&mut hidden[g].0);
         }
-        // Beside the tanh: the linear part of all rows at once, a lane a row, is done while h is waited for.
+        // The linear part of all rows at once, a lane per row: it is computed while the tanh is pending.
         let mut linear = Lanes::ZERO;
         affine::<V, NX>(&self.columns[..width + 1], x, v).store(&mut linear.0);
         let mut sum = 0.0;
-        // A sum over lanes for each state and the output: NX + 1 of them side by side, of which the chain has one.
+        // A sum over lanes for each state and the output: NX + 1 sums side by side, so the chain waits for one.
         for q in 0..=NX {
             let weights = &self.second[q * GROUPS..][..GROUPS];
-            // E h or G h of one row, groups added lane by lane before the lanes are summed.
+            // E h or G h of one row: groups are added lane by lane before the lanes are summed.
             let mut row = V::load(&weights[0].0).mul(units[0]);
             for (weights, unit) in weights.iter().zip(units).skip(1) {
                 row = row.add_product(V::load(&weights.0), unit);
             }
             sum = linear.0[q] + row.sum();
-            // The last row is the output, whose sum is what is returned.
+            // The last row is the output; its sum is returned.
             if let Some(x) = x.get_mut(q) {
                 *x = sum;
             }
@@ -336,7 +336,7 @@ impl Network {
         // Inputs first, then the states, which are known last.
         let product = |sum: f64, (w, v): (&f64, &f64)| sum + w * v;
         let direct = of_inputs.iter().zip(v).fold(0.0, product);
-        // The sum over lanes last: it is there later than the few products of the linear part.
+        // The sum over lanes comes last: it takes longer than the few products of the linear part.
         of_states.iter().zip(x).fold(direct, product) + sum.sum()
     }
 
@@ -344,10 +344,10 @@ impl Network {
     #[inline(always)]
     pub fn slopes<V: F64x8>(&self, rises: &[Lanes], slopes: &mut [Lanes]) {
         let products = self.products.chunks_exact(self.groups() * LANES);
-        // slope_at = base_at + sum over units of product_at,i (1 - h_i^2): lanes are entries, a unit's number is spread.
+        // slope_at = base_at + sum over units of product_at,i (1 - h_i^2): lanes are entries, a unit's number is broadcast.
         for ((slope, base), products) in slopes.iter_mut().zip(&self.base).zip(products) {
-            // Two sums side by side: one alone would wait for each product. Four samples side by side, with their products
-            // loaded once, took less than 1 % off a training (Zen 4).
+            // Two sums side by side: a single one would wait for each product. Four samples side by side, with their
+            // products loaded once, gained less than 1 % of a training (Zen 4).
             let (mut even, mut odd) = (V::load(&base.0), V::splat(0.0));
             let (products, _) = products.as_chunks::<LANES>();
             for (rises, products) in rises.iter().zip(products) {
@@ -368,7 +368,7 @@ impl Network {
 fn affine<V: F64x8, const NX: usize>(columns: &[Lanes], x: &[f64; NX], v: &[f64]) -> V {
     let (of_states, rest) = columns.split_at(NX);
     let (of_inputs, constant) = rest.split_at(v.len());
-    // The constant, the inputs, the states: everything else is there before the states are.
+    // The constant, the inputs, then the states, which are known last.
     let mut sum = V::load(&constant[0].0);
     for (column, value) in of_inputs.iter().zip(v) {
         sum = sum.add_product(V::load(&column.0), V::splat(*value));

@@ -1,4 +1,4 @@
-//! What stands between the sum of an output and the output itself.
+//! The output function: from the sum of an output to the output itself.
 
 use crate::{Error, Result};
 
@@ -7,7 +7,7 @@ use crate::{Error, Result};
 pub enum OutputFunction {
     /// `f(s) = s`.
     Linear,
-    /// `f(s) = low + w p((s - low)/w) - w p((s - high)/w)` with `p(z) = log(1 + e^z)`: limits with soft corners.
+    /// `f(s) = low + w p((s - low)/w) - w p((s - high)/w)` with `p(z) = log(1 + e^z)`: limits with smooth corners.
     Saturation {
         /// Lower limit.
         low: f64,
@@ -27,8 +27,8 @@ impl OutputFunction {
     /// The function called `name`, with its parameters `()`, `(low, high, w)` or `(w,)`.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for another name, another number of parameters, limits without room or a width that is
-    /// not above 0.
+    /// `ErrorKind::Setting` for another name, another number of parameters, limits without room or a width that is not
+    /// above 0.
     pub fn new(name: &str, parameters: &[f64]) -> Result<Self> {
         let function = match (name, parameters) {
             ("linear", []) => Self::Linear,
@@ -101,7 +101,7 @@ impl OutputFunction {
     }
 }
 
-/// The form of the nearer limit, with `p(z) = z + p(-z)`: the other would subtract large numbers.
+/// Expanded about the nearer limit, with `p(z) = z + p(-z)`: about the other one it would subtract large numbers.
 fn saturated(s: f64, low: f64, high: f64, width: f64) -> (f64, f64) {
     let middle = low + 0.5 * (high - low);
     let (base, first, second) = if s < middle {

@@ -22,11 +22,11 @@ const DIVERGED: f64 = 1e3;
 #[derive(Clone, Debug)]
 pub(super) struct Experiment {
     /// Inputs, delayed by nk.
-    // Sample by sample, inputs side by side; y and its weights likewise, so that one index is a sample's output.
+    // Sample by sample, inputs side by side; y and its weights likewise, so an index is an output of a sample.
     pub v: Vec<f64>,
-    /// Outputs, NaN where not known.
+    /// Outputs, NaN if unknown.
     pub y: Vec<f64>,
-    /// A weight for each output; none where all count alike.
+    /// A weight for each output; empty if all count alike.
     pub weights: Vec<f64>,
 }
 
@@ -37,20 +37,20 @@ impl Experiment {
     }
 }
 
-/// Simulations of one point, with what the normal equations take from them.
+/// Simulations at one point, with the data that the normal equations need.
 #[derive(Debug)]
 struct Attempt {
-    // By which the normal equations find the trial that was accepted, of the two that were simulated.
+    // By it the normal equations find the accepted trial, if two were simulated.
     theta: Vec<f64>,
     network: Network,
     scratch: Scratch,
     runs: Vec<Trajectory>,
 }
 
-/// The last simulations: one, and the one beside it where two at once pay. Others may look at them between two calls.
+/// The last simulations: one or, if two at once pay, two. Others may read them between two calls.
 #[derive(Debug)]
-// In a cell: while the minimiser holds the problem, its caller is told of an accepted step and looks at the runs that led
-// there (`Referee`), without simulating them again.
+// In a cell: the minimiser holds the problem while its caller (`Referee`) is told of an accepted step and reads that
+// step's runs, without simulating them again.
 pub(super) struct Attempts(RefCell<Vec<Attempt>>);
 
 impl Attempts {
@@ -67,10 +67,10 @@ impl Attempts {
         Self(RefCell::new((0..count).map(|_| attempt()).collect()))
     }
 
-    /// The runs at these parameters, which were simulated last, experiment by experiment.
+    /// The runs at these parameters, experiment by experiment; they must be among the last simulations.
     pub fn at(&self, theta: &[f64]) -> Ref<'_, [Trajectory]> {
         Ref::map(self.0.borrow(), |attempts| {
-            // By value: parameters that are equal to the bit have equal runs.
+            // By value: bitwise equal parameters have equal runs.
             let same = attempts.iter().find(|attempt| attempt.theta == theta);
             same.unwrap_or(&attempts[0]).runs.as_slice()
         })
@@ -81,20 +81,20 @@ impl Attempts {
     }
 }
 
-/// Bytes up to which a second run is worth its memory.
+/// Most bytes for which a second run is worth its memory.
 const MOST_TOGETHER: usize = 1 << 30;
-/// Hidden groups of a run that leaves room for a second one: more fill the waiting by themselves.
+/// Most groups of hidden units with which a run leaves room for a second one: more fill the waiting times themselves.
 const MOST_GROUPS: usize = 2;
 
-/// Whether a second run beside the first takes hardly any time of its own: in the widest registers; in narrower ones it is
-/// no faster than one after the other.
+/// Whether a second run beside the first takes hardly any extra time. That needs the widest registers; with narrower
+/// ones it is no faster than one run after the other.
 fn pays(network: &Network, experiments: &[Experiment]) -> bool {
     let Shape { nx, outputs, .. } = network.shape;
     let samples: usize = experiments.iter().map(|e| e.y.len()).sum();
     let bytes = size_of::<f64>() * (nx + 1) + size_of::<Lanes>() * network.groups();
-    // The shapes of `free_run::together`, in whose registers two runs overlap.
+    // The shapes of `free_run::together`, whose registers let two runs overlap.
     let small = outputs == 1 && nx <= MOST_STATES && network.groups() <= MOST_GROUPS;
-    // With AVX2 the two runs take as long as one after the other: 16 registers hold one of them.
+    // With AVX2 two runs together take as long as one after the other: 16 registers hold only one of them.
     small && samples * bytes <= MOST_TOGETHER && simd::level() == Ok(simd::Level::Avx512)
 }
 
@@ -103,7 +103,7 @@ fn pays(network: &Network, experiments: &[Experiment]) -> bool {
 pub(super) struct Decay(Vec<f64>);
 
 impl Decay {
-    /// `decay/2 (|E|^2 + |Wx|^2 + |Wu|^2 + |G|^2 + .1 |bh|^2)`: the part of the cost that is not the squared error.
+    /// `decay/2 (|E|^2 + |Wx|^2 + |Wu|^2 + |G|^2 + .1 |bh|^2)`: the weight decay's part of the cost.
     pub fn penalty(&self, theta: &[f64]) -> f64 {
         let weighted = self.0.iter().zip(theta).map(|(decay, t)| decay * t * t);
         0.5 * weighted.sum::<f64>()
@@ -116,7 +116,7 @@ pub(super) struct Training<'a> {
     monitor: &'a Monitor,
     pub network: Network,
     pub decay: Decay,
-    /// Known outputs, each by its weight.
+    /// Number of known outputs, each counted by its weight.
     samples: f64,
     attempts: &'a Attempts,
     gram: Gram,
@@ -149,7 +149,7 @@ impl<'a> Training<'a> {
             ),
             samples: experiments.iter().map(weight).sum(),
             attempts,
-            // No memory of rows: here the recursion is of states, in `Sensitivities`, and a row is a function of them.
+            // No past rows: here the recursion is of states, in `Sensitivities`, and a row is a function of them.
             gram: Gram::new(columns.room, 0),
             columns: columns.of_theta(),
             buffers: Sensitivities::new(shape),
@@ -162,14 +162,14 @@ impl<'a> Training<'a> {
         self.network.shape
     }
 
-    /// Runs once more at parameters that have run before, whatever the monitor says.
+    /// Repeats the runs at parameters that have run before, even after a stop request.
     pub fn rerun(&mut self, theta: &[f64]) -> Option<()> {
-        // The runs that are kept may be those of a later trial that was rejected, or that a stop ended.
+        // The stored runs may belong to a later trial that was rejected or stopped.
         let [cost] = self.simulate([theta], f64::INFINITY, &Monitor::default());
         cost.map(drop)
     }
 
-    /// Costs below `limit` of the free runs at several points, which are stored.
+    /// Costs, below `limit`, of the free runs at several points; the runs are stored.
     fn simulate<const RUNS: usize>(
         &mut self,
         thetas: [&[f64]; RUNS],
@@ -177,7 +177,7 @@ impl<'a> Training<'a> {
         monitor: &Monitor,
     ) -> [Option<f64>; RUNS] {
         let (nx, own) = (self.shape().nx, self.columns.len());
-        // None is a run that has failed: handed on from experiment to experiment.
+        // `None` is a failed run: it is passed on from experiment to experiment.
         let mut limits = thetas.map(|theta| {
             Some(Limit {
                 before: 0.0,
@@ -214,7 +214,7 @@ impl<'a> Training<'a> {
             }
             .go();
             for (limit, sum) in limits.iter_mut().zip(sums) {
-                // What this experiment cost is taken off what is left for the next ones.
+                // The cost of this experiment is subtracted from the limit for the next ones.
                 *limit = limit.zip(sum).map(|(limit, sum)| limit.after(sum));
             }
         }
@@ -232,16 +232,16 @@ impl<'a> Training<'a> {
                 at.state + i - own
             }
         };
-        // theta adds up over the experiments, each state has rows and columns of its own: J'J is full for theta, block-
-        // diagonal for the states.
+        // All experiments share theta, so its sums add up; each state has its own rows and columns. J'J is full for
+        // theta and block-diagonal for the states.
         let place = |i: usize| if i < own { i } else { i + experiment * nx };
         let (sums, width) = self.gram.finish();
-        // The cost is 1/(2N) sum e^2, N being the sum of the known outputs' weights.
+        // The cost is 1/(2N) sum e^2, with N the sum of the known outputs' weights.
         let scale = 1.0 / self.samples;
         for i in 0..own + nx {
             let a = column(i);
-            // The error is the last column that counts, so that its row is below all others. Other pairs are looked up
-            // in the lower triangle, in the order of a row's columns and not of theta's.
+            // The error is the last column that counts, so its row is below all others. Other pairs are looked up in
+            // the lower triangle, in the order of a row's columns, not of theta's.
             jte[place(i)] += sums[at.error * width + a] * scale;
             let row = &mut jtj[place(i) * n..][..n];
             for j in 0..=i {
@@ -251,12 +251,12 @@ impl<'a> Training<'a> {
         }
     }
 
-    /// Held parameters are taken out of the system: their step is zero.
+    /// Removes held parameters from the system: their step is zero.
     fn hold(&self, jtj: &mut [f64], jte: &mut [f64]) {
         let n = jte.len();
         for &(i, _) in &self.held {
-            // Row and column of the unit matrix and no gradient: the step is 0 under every damping, and the others do
-            // not see it. Left out, the system would be smaller, and every index another one.
+            // A row and column of the unit matrix and no gradient: the step is 0 for every damping, and the others are
+            // not affected. Removing them would shrink the system and change every index.
             jte[i] = 0.0;
             for j in 0..n {
                 jtj[i * n + j] = 0.0;
@@ -286,7 +286,7 @@ impl Problem for Training<'_> {
     }
 
     fn costs_below(&mut self, thetas: [&[f64]; 2], limit: f64) -> [Option<f64>; 2] {
-        // Each run has the bits that it has alone.
+        // Each run has the bits of a single run.
         self.simulate(thetas, limit, self.monitor)
     }
 
@@ -305,14 +305,14 @@ impl Problem for Training<'_> {
                 weights: &data.weights,
                 buffers: &mut self.buffers,
                 rows: &mut self.gram,
-                // As the slopes of saturated units do not show in a sum of squares, no tanh is computed again.
+                // The slopes of saturated units do not show in a sum of squares, so no tanh is recomputed.
                 exact: false,
                 monitor: self.monitor,
             });
             self.scatter(i, jtj, jte);
         }
         for (i, (t, decay)) in theta.iter().zip(&self.decay.0).enumerate() {
-            // Weight decay as residuals sqrt(decay) t: decay on the diagonal of J'J, -decay t in J'e; the states have
+            // Weight decay as residuals sqrt(decay) t: decay on the diagonal of J'J, -decay t in J'e. The states have
             // none.
             jtj[i * n + i] += decay;
             jte[i] -= decay * t;

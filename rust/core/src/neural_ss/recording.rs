@@ -1,4 +1,4 @@
-//! Recordings as they are measured: their check, their scaling, and what a constant makes of them.
+//! Recordings as measured: their check, their scaling, and the cost of the best constant.
 
 use super::output::OutputFunction;
 use super::problem::Experiment;
@@ -6,7 +6,7 @@ use super::shape::{Scaling, Shape, moments};
 use crate::data::{check_weights, unless_one};
 use crate::{Error, Record, Result};
 
-/// One experiment as it was measured; outputs that are not known are NaN.
+/// One experiment as measured; unknown outputs are NaN.
 #[derive(Clone, Copy, Debug)]
 pub struct Recording<'a> {
     /// Inputs, time first.
@@ -17,7 +17,7 @@ pub struct Recording<'a> {
     pub y: &'a [f64],
     /// Number of outputs.
     pub outputs: usize,
-    /// How much the squared errors of each sample count, finite and 0 or more; all alike where there are none.
+    /// Weights of the samples' squared errors, finite and 0 or more; `None` if all count alike.
     pub weights: Option<&'a [f64]>,
 }
 
@@ -69,12 +69,12 @@ impl<'a> Recording<'a> {
         })
     }
 
-    /// The same recording with a weight for each sample: costs are `sum w e^2 / (2 sum w)`. What is no sum of squared
-    /// errors (scaling, starts, estimated states, the guard) does not look at them.
+    /// The same recording with a weight for each sample: costs are `sum w e^2 / (2 sum w)`. Only sums of squared errors
+    /// use the weights; scaling, starts, estimated states and the guard ignore them.
     ///
     /// # Errors
-    /// `ErrorKind::Data` for another number of weights, weights that are negative or not finite, or 0 wherever an output
-    /// is known.
+    /// `ErrorKind::Data` for another number of weights, weights that are negative or not finite, or 0 wherever an
+    /// output is known.
     pub fn with_weights(self, weights: &'a [f64]) -> Result<Self> {
         let first_known = |y: &[f64]| y.iter().copied().find(|y| !y.is_nan()).unwrap_or(f64::NAN);
         let known: Vec<f64> = self.y.chunks_exact(self.outputs).map(first_known).collect();
@@ -85,7 +85,7 @@ impl<'a> Recording<'a> {
         })
     }
 
-    /// A weight for each output, those of a sample alike; none where all count alike.
+    /// A weight for each output, equal for those of a sample; empty if all count alike.
     pub(super) fn output_weights(&self) -> Vec<f64> {
         let repeated = |w: &f64| std::iter::repeat_n(*w, self.outputs);
         let weights = self.weights.unwrap_or_default();
@@ -97,7 +97,7 @@ impl<'a> Recording<'a> {
         self.u.len() / self.inputs
     }
 
-    /// Number of leading samples of which `count` have a known output; all where there are not as many.
+    /// Number of leading samples that contain `count` samples with a known output; all samples if there are fewer.
     pub(crate) fn first_samples(&self, count: usize) -> usize {
         let known = |y: &[f64]| y.iter().any(|y| !y.is_nan());
         let mut samples = self.y.chunks_exact(self.outputs).enumerate();
@@ -106,7 +106,7 @@ impl<'a> Recording<'a> {
     }
 }
 
-/// Means and standard deviations of the known values. An output function without sign counts from 0.
+/// Means and standard deviations of the known values. With an output function that loses the sign, outputs have a mean of 0.
 pub(super) fn scaling(recordings: &[Recording], output: OutputFunction) -> Result<Scaling> {
     let (inputs, outputs) = (recordings[0].inputs, recordings[0].outputs);
     let input = |j: usize| {
@@ -131,7 +131,7 @@ pub(super) fn scaling(recordings: &[Recording], output: OutputFunction) -> Resul
     let (y_mean, y_scale): (Vec<f64>, Vec<f64>) =
         (0..outputs).map(|p| from_zero(measured(p))).unzip();
     for (name, scales) in [("input", &u_scale), ("output", &y_scale)] {
-        // NaN, of an output that is never known, does not change either
+        // an output that is never known has NaN here, and is refused as well
         if let Some(j) = scales.iter().position(|s| !(s.is_finite() && *s > 0.0)) {
             return Err(Error::data(format!(
                 "expected {name} {j} (0-based) to change, got a constant or no known value; leave it out or excite the drive"
@@ -170,7 +170,7 @@ pub(super) fn constant_cost(experiments: &[Experiment], shape: Shape) -> f64 {
     0.5 * sum / samples
 }
 
-/// Refuses recordings that a model of this shape cannot be trained on.
+/// Refuses recordings on which a model of this shape cannot be trained.
 pub(super) fn check_recordings(
     recordings: &[Recording],
     validation: &[Recording],

@@ -8,10 +8,10 @@ use super::state::{self, Statistics};
 use crate::Monitor;
 use crate::lagged::STATE_SAMPLES;
 
-/// Residual variances below this part of the output's count as this much: the arithmetic has an end.
+/// Least residual variance, relative to the output's: below it is rounding.
 const LEAST_VARIANCE: f64 = 1e-12;
 
-/// The iterate that is kept.
+/// The iterate kept.
 pub(super) struct Best {
     score: f64,
     pub validation_cost: Option<f64>,
@@ -58,7 +58,7 @@ impl<'a> Referee<'a> {
         }
     }
 
-    /// Looks at an accepted iterate, whose training run is stored; `error` is its cost without weight decay.
+    /// Judges an accepted iterate whose training run is stored; `error` is its cost without weight decay.
     pub fn judge(&mut self, all: &[f64], cost: f64, error: f64) {
         self.network.load(&all[..self.network.shape.parameters()]);
         let validation_cost = (!self.validation.is_empty()).then(|| self.validation_cost(all));
@@ -73,7 +73,7 @@ impl<'a> Referee<'a> {
         }
     }
 
-    /// J over all validation experiments, after the samples that their states are estimated from; infinite where one
+    /// J over all validation experiments, without the samples from which their states are estimated; infinite if one
     /// diverges.
     fn validation_cost(&mut self, all: &[f64]) -> f64 {
         let statistics = statistics(&self.network, self.experiments, &self.attempts.at(all));
@@ -88,7 +88,7 @@ impl<'a> Referee<'a> {
         if cost.is_nan() { f64::INFINITY } else { cost }
     }
 
-    /// Sum of squared errors and of the weights of the outputs it is taken over.
+    /// Sum of squared errors, and of the weights of the outputs in it.
     fn score(&mut self, i: usize, statistics: &Statistics) -> Option<(f64, f64)> {
         let Shape {
             inputs, outputs, ..
@@ -126,7 +126,7 @@ impl<'a> Referee<'a> {
     }
 }
 
-/// What the runs over the training data say of states and residuals.
+/// Statistics of states and residuals from the runs over the training data.
 pub(super) fn statistics(
     network: &Network,
     experiments: &[Experiment],

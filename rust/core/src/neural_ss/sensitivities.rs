@@ -1,7 +1,7 @@
 //! Exact derivatives of the free run by the forward recursion, eight columns at a time.
 //!
 //! With `X = dx/d(theta, x0)`: `X(k+1) = (dx+/dx) X(k) + dx+/dtheta` and `dy(k) = f'(s) ((ds/dx) X(k) + ds/dtheta)`,
-//! all at the states and hidden outputs that the simulation left behind.
+//! all at the states and hidden outputs stored by the simulation.
 //!
 //! With `h = tanh(Wx x + Wu v + bh)` and `R = diag(1 - h^2)` the slopes are `dx+/dx = A + E R Wx` and `ds/dx = C + G R Wx`, and the
 //! columns of theta come in kinds with one rule each:
@@ -15,9 +15,10 @@
 //! | x0 | 0, begins as the unit matrix | 0 |
 //! | [C D c] | 0 (no recursion) | argument |
 //!
-//! In a row they stand by kinds with the hidden units side by side (`Columns`), so that eight columns share every scalar factor. Parts
-//! behind each other may overlap: a group whose last units are missing writes zeros over the next group's first columns, which come later.
-//! One output and up to four states take a block of samples at a time (`super::single`); the rest goes sample by sample here.
+//! In a row they are sorted by kind, with the hidden units side by side (`Columns`), so eight columns share every
+//! scalar factor. Adjacent parts may overlap when written: a group with missing last units writes zeros over the next
+//! group's first columns, which come later. Models of one output and up to four states process a block of samples at a
+//! time (`super::single`); all others go sample by sample here.
 
 use super::free_run::Trajectory;
 use super::network::{Network, Scratch, rises_of, unrolled};
@@ -27,11 +28,11 @@ use crate::Monitor;
 use crate::gram::{Gram, forget};
 use crate::simd::{F64x8, Kernel, LANES, Lanes};
 
-/// Samples between two looks at the monitor, and at sensitivities that have all but decayed.
+/// Samples between two checks of the monitor, and of sensitivities that have almost decayed.
 const LOOK: usize = 64;
 
-/// Where the parameters' columns stand in a row: for each state, each input and the bias, then for each row of E, then
-/// for each row of G, all hidden units; then `[A B]` row by row, the initial state, `[C D c]` row by row, the error.
+/// Order of the parameters' columns in a row: all hidden units for each state, for each input and for the bias, then for each row of E,
+/// then for each row of G; then `[A B]` row by row, the initial state, `[C D c]` row by row, the error.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Columns {
     pub(super) shape: Shape,
@@ -45,7 +46,7 @@ pub(super) struct Columns {
     pub sums: usize,
     /// Column of the error.
     pub error: usize,
-    /// Numbers that a row must have room for: some are written beyond its end.
+    /// Numbers for which a row must have room: some are written beyond its end.
     pub room: usize,
 }
 
@@ -58,7 +59,7 @@ impl Columns {
         let state = linear + nx * width;
         let sums = state + nx;
         let error = sums + ny * (width + 1);
-        // The last group of [A B x0] is written whole, and may end beyond the error.
+        // The last group of [A B x0] is written whole and may end beyond the error.
         let room = (error + 1).max(linear + (nx * width + nx).next_multiple_of(LANES));
         Self {
             shape,
@@ -80,9 +81,9 @@ impl Columns {
             hidden,
             ..
         } = self.shape;
-        // theta is A, B, E, Wx, Wu, bh, C, D, c, G; a row's columns are by what they share: for a weight of the hidden
-        // layer the argument, then the unit. So Wx of theta, unit by unit, is transposed here, and A and B are
-        // interleaved.
+        // theta is A, B, E, Wx, Wu, bh, C, D, c, G; a row's columns are ordered by their common factors: for a weight
+        // of the hidden layer by argument, then by unit. So Wx, unit by unit in theta, is transposed here, and A and B
+        // are interleaved.
         let width = nx + nu;
         let mut columns = Vec::with_capacity(self.shape.parameters());
         columns.extend((0..nx).flat_map(|q| (0..nx).map(move |j| self.linear + q * width + j)));
@@ -102,13 +103,13 @@ impl Columns {
     }
 }
 
-/// What takes the rows.
+/// Receives the rows.
 pub(super) trait Rows {
     /// Numbers from one row to the next.
     fn width(&self) -> usize;
-    /// Room for `count` rows, at most a block or one sample's.
+    /// Room for `count` rows: up to a block, or one sample's.
     fn room(&mut self, count: usize) -> &mut [f64];
-    /// The rows have been written.
+    /// Called when the rows are written.
     fn keep(&mut self, count: usize);
 }
 
@@ -132,21 +133,21 @@ pub(super) struct Sensitivities {
     pub(super) columns: Columns,
     /// `X` in groups of columns: for each group the rows of all states.
     //   states   | Wx, Wu, bh by argument and group | E by row and group | [A B x0] by eights |     nx groups for each
-    // Eight columns with all their states are contiguous: what one step reads and writes of X. G and [C D c] move no
-    // state and have no X.
+    // Eight columns with all their states are contiguous: the part of X that one step reads and writes. G and [C D c]
+    // move no state and have no X.
     pub(super) states: Vec<Lanes>,
-    /// `dx+/d[A B x0]`, in groups as `states`.
-    // Zeros but for the argument in the column's own state: written over in the same places at every sample.
+    /// `dx+/d[A B x0]`, in groups like `states`.
+    // Zeros except for the argument in the column's own state, which is overwritten in the same place at every sample.
     pub(super) linear: Vec<Lanes>,
     /// `[E; f' G] diag(1 - h^2)`.
     pub(super) weighted: Vec<Lanes>,
     /// `f' ds/dx` of the outputs that are known.
     pub(super) outward: Vec<f64>,
-    /// Room for one group of columns of the states.
+    /// Buffer for one group of columns of the states.
     moved: Vec<Lanes>,
     pub(super) scratch: Scratch,
     pub(super) block: Block,
-    /// Outputs of a sample that are known: which, slope of the output function, error.
+    /// The known outputs of a sample: index, slope of the output function, error.
     known: Vec<(usize, f64, f64)>,
 }
 
@@ -168,13 +169,13 @@ impl Sensitivities {
         }
     }
 
-    /// Before the first sample the states depend on nothing but themselves.
+    /// Before the first sample the states depend on themselves only.
     fn reset(&mut self) {
         let Shape { nx, .. } = self.columns.shape;
         let first = self.states.len() - self.linear.len();
         self.states.fill(Lanes::ZERO);
         for q in 0..nx {
-            // dx(0)/dx0 = 1, in the columns behind [A B].
+            // dx(0)/dx0 = 1, in the columns after [A B].
             let column = self.columns.state - self.columns.linear + q;
             self.states[first + column / LANES * nx + q].0[column % LANES] = 1.0;
         }
@@ -188,11 +189,11 @@ pub(super) struct Recursion<'a> {
     pub v: &'a [f64],
     /// Measured outputs; an output that is NaN has no row.
     pub y: &'a [f64],
-    /// A weight for each of them, by whose root its row is multiplied once it is written; none where all count alike.
+    /// Weights of the outputs; a written row is multiplied by the root of its weight. Empty if all count alike.
     pub weights: &'a [f64],
     pub buffers: &'a mut Sensitivities,
     pub rows: &'a mut dyn Rows,
-    /// Whether the slopes of saturated units keep their digits, for which their arguments are computed once more.
+    /// Whether the slopes of saturated units keep their digits; their arguments are then computed again.
     pub exact: bool,
     pub monitor: &'a Monitor,
 }
@@ -204,7 +205,7 @@ impl Kernel for Recursion<'_> {
     fn run<V: F64x8>(self) {
         self.buffers.reset();
         let Shape { nx, outputs, .. } = self.network.shape;
-        // The sizes that are trained most have the block pass; the gain stands in `super::single`.
+        // The sizes that are trained most use the block pass; `super::single` states its gain.
         match (outputs, nx) {
             (1, 1) => self.blocks::<V, 1>(),
             (1, 2) => self.blocks::<V, 2>(),
@@ -216,7 +217,7 @@ impl Kernel for Recursion<'_> {
 }
 
 impl Recursion<'_> {
-    /// `NX` states; 0 stands for any number.
+    /// `NX` states; 0 for any number.
     #[inline(always)]
     fn samples<V: F64x8, const NX: usize>(self) {
         let Self {
@@ -246,12 +247,12 @@ impl Recursion<'_> {
                 return;
             }
             buffers.scratch.set(x, v);
-            // All that columns share, then all columns: with 155 parameters X is 18 groups of three registers, which
-            // pass through memory once a sample here. `super::single` keeps them.
+            // First everything that the columns share, then the columns: with 155 parameters X is 18 groups of three
+            // registers, which here pass through memory at every sample. `super::single` keeps them in registers.
             buffers.prepare::<V>(network, h, (s, y), exact);
             let count = buffers.known.len();
             let width = rows.width();
-            // A row for each output that is known: an output without a measurement costs the recursion, no row.
+            // A row for each known output: an unknown output takes part in the recursion but has no row.
             let room = rows.room(count);
             buffers.advance::<V, NX>(network, h, room, width);
             if let Some(weights) = weights.get(k * outputs..(k + 1) * outputs) {
@@ -264,24 +265,24 @@ impl Recursion<'_> {
 }
 
 /// Multiplies each of the rows, `width` numbers apart, by the root of its weight.
-// Not inlined: hardly any training has weights, and the kernels stay as they are without them.
+// Not inlined: hardly any training has weights, and without them the kernels stay unchanged.
 #[inline(never)]
 pub(super) fn weigh(weights: impl Iterator<Item = f64>, rows: &mut [f64], width: usize) {
     for (row, weight) in rows.chunks_mut(width).zip(weights) {
-        // sum w j j' = sum (sqrt(w) j)(sqrt(w) j)'; X itself has no weight, as the recursion goes on from it.
+        // sum w j j' = sum (sqrt(w) j)(sqrt(w) j)'. X itself is not weighted, as the recursion continues from it.
         let root = weight.sqrt();
         row.iter_mut().for_each(|value| *value *= root);
     }
 }
 
 impl Sensitivities {
-    /// Every so often: ends what has all but decayed; false where the monitor says stop.
+    /// Every `LOOK` samples: clears what has almost decayed; false if the monitor requests a stop.
     #[inline(always)]
     pub(super) fn look(&mut self, k: usize, monitor: &Monitor) -> bool {
         if !k.is_multiple_of(LOOK) {
             return true;
         }
-        // What depends on the initial state decays for ever; among denormal numbers each operation would take a hundred
+        // Sensitivities to the initial state decay for ever; with denormal numbers each operation would take a hundred
         // times as long.
         for states in &mut self.states {
             states.0.iter_mut().for_each(forget);
@@ -289,7 +290,7 @@ impl Sensitivities {
         !monitor.stopped()
     }
 
-    /// All that the columns have in common.
+    /// Computes all that the columns have in common.
     #[inline(always)]
     fn prepare<V: F64x8>(
         &mut self,
@@ -308,13 +309,13 @@ impl Sensitivities {
         self.known.clear();
         for (p, (s, y)) in s.iter().zip(y).enumerate() {
             let (value, slope) = network.output.value_and_slope(*s);
-            // f' and the error of each known output; s and f' are of the free run.
+            // f' and the error of each known output; s and f' are those of the free run.
             if !y.is_nan() {
                 self.known.push((p, slope, y - value));
             }
         }
-        // 1 - h^2 loses its digits where h is near 1. A training does not see it, as such a slope is far below what its sum of
-        // squares shows; in a Jacobian that is handed out it would be wrong.
+        // 1 - h^2 loses its digits if h is near 1. In training that is far below the resolution of the sum of squares;
+        // in a Jacobian that leaves the core it would be wrong.
         if exact {
             network.rises::<V>(arguments, rises);
         } else {
@@ -328,8 +329,8 @@ impl Sensitivities {
                 *outward = row.1 * slopes[at / LANES].0[at % LANES];
             }
         }
-        // E diag(1 - h^2) and f' G diag(1 - h^2): what all weights of one hidden unit share, once a sample and not once
-        // a column.
+        // E diag(1 - h^2) and f' G diag(1 - h^2): common to all weights of a hidden unit, so computed once a sample,
+        // not once a column.
         let groups = rises.len();
         let of_outputs = self
             .known
@@ -343,7 +344,7 @@ impl Sensitivities {
                 weight.mul(V::load(&rise.0)).store(&mut weighted.0);
             }
         }
-        // Row q of [A B] moves state q by the argument: column q width + c, row q.
+        // The argument in row q of [A B] moves state q: column q width + c, row q.
         for q in 0..nx {
             for (c, value) in arguments[..width].iter().enumerate() {
                 let column = q * width + c;
@@ -364,9 +365,9 @@ impl Sensitivities {
         let nx = if NX == 0 { network.shape.nx } else { NX };
         let (groups, hidden) = (h.len(), network.shape.hidden);
         let width = network.shape.arguments();
-        // [E; f' G] diag(1 - h^2): rows of the states, then of the outputs, of which those that are known are this sample's.
+        // [E; f' G] diag(1 - h^2): rows of the states, then of those outputs that are known in this sample.
         let (of_states, of_outputs) = self.weighted.split_at(nx * groups);
-        // F spread over the lanes once for all columns: NX^2 registers, 16 of 32 at most.
+        // F broadcast once for all columns: NX^2 registers, at most 16 of 32.
         let mut onward = [[V::splat(0.0); NX]; NX];
         for (i, slope) in onward.as_flattened_mut().iter_mut().enumerate() {
             *slope = V::splat(self.scratch.slope(i));
@@ -379,7 +380,7 @@ impl Sensitivities {
         };
         let moved = &mut self.moved;
         let mut states = self.states.chunks_exact_mut(nx);
-        // Wx, Wu, bh: for each argument c, the last of which is 1, all units: c times the weighted rows.
+        // Wx, Wu, bh: the weighted rows of all units times each argument c, the last of which is 1.
         for (c, argument) in self.scratch.arguments.iter().enumerate() {
             let argument = V::splat(*argument);
             for g in 0..groups {
@@ -395,7 +396,7 @@ impl Sensitivities {
                 );
             }
         }
-        // E: unit i of row q is moved by h_i in state q alone.
+        // E: h_i moves only state q for unit i of row q.
         for row in 0..nx {
             for (g, h) in h.iter().enumerate() {
                 let Some(x) = states.next() else { return };
@@ -411,7 +412,7 @@ impl Sensitivities {
                 slopes.advance(x, moved, rows, place, |_| V::splat(0.0), own);
             }
         }
-        // G comes between E and [A B] in a row, and its groups write beyond their end as the others do: the order has to
+        // G comes between E and [A B] in a row, and its groups write beyond their end as the others do: this order must
         // be kept.
         slopes.write_direct(h, rows, stride, self.columns.direct, hidden);
         // [A B x0]: `linear` has the argument in the row of the column's own state.
@@ -434,8 +435,8 @@ impl Sensitivities {
 
 /// The slopes of one sample.
 struct Slopes<'a, V, const NX: usize> {
-    /// `dx+/dx` in registers, where the number of states is known.
-    // Empty where NX is 0: the general step reads `scratch` then.
+    /// `dx+/dx` in registers, if the number of states is a constant.
+    // Empty if NX is 0: the general step then reads `scratch`.
     onward: [[V; NX]; NX],
     scratch: &'a Scratch,
     outward: &'a [f64],
@@ -443,8 +444,8 @@ struct Slopes<'a, V, const NX: usize> {
 }
 
 impl<V: F64x8, const NX: usize> Slopes<'_, V, NX> {
-    /// One group of columns: its part of the rows, from `start` on, and `X` one step on. `direct(p)` and `next(q)` are
-    /// `f' ds/dtheta` and `dx+/dtheta`.
+    /// Writes one group of columns into the rows, from `start` on, and advances its `X` by one step. `direct(p)` and
+    /// `next(q)` are `f' ds/dtheta` and `dx+/dtheta`.
     #[inline(always)]
     fn advance(
         &self,
@@ -456,16 +457,16 @@ impl<V: F64x8, const NX: usize> Slopes<'_, V, NX> {
         next: impl Fn(usize) -> V,
     ) {
         let nx = x.len();
-        // dy = f' (ds/dx X + ds/dtheta), with X as it is before the step.
+        // dy = f' (ds/dx X + ds/dtheta), with X before the step.
         let outward = self.outward.chunks_exact(nx);
-        // A row of its own for each known output, `stride` numbers apart.
+        // Each known output has its own row, `stride` numbers apart.
         for (row, ((p, ..), outward)) in self.known.iter().zip(outward).enumerate() {
             let sum = outward.iter().zip(&*x).fold(direct(*p), |sum, (slope, x)| {
                 sum.add_product(V::splat(*slope), V::load(&x.0))
             });
             sum.write(&mut rows[start + row * stride..]);
         }
-        // All states are read before one is written: the new ones go to a room of their own first.
+        // All states are read before one is written: the new ones go to a buffer first.
         if NX == 0 {
             for (q, moved) in moved.iter_mut().enumerate() {
                 let sum = x.iter().enumerate().fold(next(q), |sum, (j, x)| {
@@ -504,7 +505,7 @@ impl<V: F64x8, const NX: usize> Slopes<'_, V, NX> {
         for (row, &(own, steepness, _)) in rows.chunks_exact_mut(stride).zip(self.known) {
             for p in 0..outputs {
                 for (g, h) in h.iter().enumerate() {
-                    // ds_p/dG_q = h where p = q, else 0.
+                    // ds_p/dG_q = h if p = q, else 0.
                     let factor = if p == own { steepness } else { 0.0 };
                     let place = &mut row[first + p * hidden + g * LANES..];
                     V::load(&h.0).mul(V::splat(factor)).write(place);
@@ -518,7 +519,7 @@ impl<V: F64x8, const NX: usize> Slopes<'_, V, NX> {
     fn write_sums(&self, rows: &mut [f64], stride: usize, columns: &Columns) {
         let arguments = &self.scratch.arguments;
         for (row, &(own, steepness, error)) in rows.chunks_exact_mut(stride).zip(self.known) {
-            // [C D c] row by row, each as wide as the arguments with their 1.
+            // [C D c] row by row, each as wide as the arguments including their 1.
             let sums = row[columns.sums..columns.error].chunks_exact_mut(arguments.len());
             for (p, sums) in sums.enumerate() {
                 let factor = if p == own { steepness } else { 0.0 };

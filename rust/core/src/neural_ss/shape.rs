@@ -1,4 +1,4 @@
-//! What fixes the length and the order of theta, and where its parts stand; between the data's units and the model's.
+//! Length, order and parts of theta; and the scaling between the data's units and the model's.
 
 use std::ops::Range;
 
@@ -21,7 +21,7 @@ pub struct Shape {
     pub integrator: bool,
 }
 
-/// More than this is a slip of the pen.
+/// Larger sizes are typing errors.
 const MOST: [(&str, usize, usize); 5] = [
     ("nx", 1, 50),
     ("nk", 0, 1_000),
@@ -30,7 +30,7 @@ const MOST: [(&str, usize, usize); 5] = [
     ("hidden", 1, 1_000),
 ];
 
-/// Where each part of theta stands.
+/// The range of each part of theta.
 #[derive(Clone, Debug)]
 pub(crate) struct Parts {
     pub a: Range<usize>,
@@ -46,7 +46,7 @@ pub(crate) struct Parts {
 }
 
 impl Shape {
-    /// The same shape, once its sizes are known to make a model.
+    /// The same shape, if its sizes make a model.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for sizes out of range.
@@ -67,12 +67,12 @@ impl Shape {
         self.parts().g.end
     }
 
-    /// What enters a hidden unit beside its bias: states and inputs.
+    /// Number of arguments of a hidden unit besides its bias: states and inputs.
     pub(super) fn arguments(&self) -> usize {
         self.nx + self.inputs
     }
 
-    /// Where each part stands.
+    /// The range of each part.
     pub(crate) fn parts(&self) -> Parts {
         let (nx, nu, ny, hidden) = (self.nx, self.inputs, self.outputs, self.hidden);
         let mut next = 0;
@@ -94,12 +94,12 @@ impl Shape {
         }
     }
 
-    /// Where the last state's own pole stands.
+    /// Index of the last state's own pole.
     pub(super) fn pole(&self) -> usize {
         self.parts().a.end - 1
     }
 
-    /// Parameters that an integrator holds, and their values.
+    /// Parameters held fixed by an integrator, and their values.
     pub(super) fn held(&self) -> Vec<(usize, f64)> {
         if !self.integrator {
             return Vec::new();
@@ -110,14 +110,14 @@ impl Shape {
         column.chain([(self.pole(), 1.0)]).chain(units).collect()
     }
 
-    /// Sets the parameters that an integrator holds.
+    /// Sets the parameters held fixed by an integrator.
     pub(super) fn hold(&self, theta: &mut [f64]) {
         for (i, value) in self.held() {
             theta[i] = value;
         }
     }
 
-    /// Share of the weight decay that a parameter bears: the network's weights bear it, its biases a tenth of it.
+    /// Share of the weight decay for a parameter: 1 for the network's weights, a tenth for its biases, else 0.
     pub(super) fn decay(&self, parameter: usize) -> f64 {
         let parts = self.parts();
         if parts.bh.contains(&parameter) {
@@ -133,13 +133,13 @@ impl Shape {
 /// `(u - u_mean)/u_scale` and `(y - y_mean)/y_scale`, input by input and output by output.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scaling {
-    /// What is taken off each input.
+    /// Subtracted from each input.
     pub u_mean: Vec<f64>,
-    /// What each input is then divided by.
+    /// Each input is then divided by it.
     pub u_scale: Vec<f64>,
-    /// What is taken off each output.
+    /// Subtracted from each output.
     pub y_mean: Vec<f64>,
-    /// What each output is then divided by.
+    /// Each output is then divided by it.
     pub y_scale: Vec<f64>,
 }
 
@@ -168,7 +168,7 @@ impl Scaling {
         Ok(())
     }
 
-    /// All inputs, scaled and delayed by `delay` samples; before the first sample they are held at their first value.
+    /// All inputs, scaled and delayed by `delay` samples; before the first sample they hold their first value.
     pub(super) fn delayed_inputs(&self, u: &[f64], delay: usize) -> Vec<f64> {
         let channels = self.u_mean.len();
         let samples = u.len() / channels;
@@ -205,14 +205,14 @@ impl Scaling {
     }
 }
 
-/// Root mean square of the values that are numbers; 0 where there are none.
+/// Root mean square of the values that are not NaN; 0 if there are none.
 pub(super) fn root_mean_square(values: impl Iterator<Item = f64>) -> f64 {
     let known = values.filter(|v| !v.is_nan());
     let (count, squares) = known.fold((0.0, 0.0), |(n, q), v| (n + 1.0, q + v * v));
     (squares / f64::max(count, 1.0)).sqrt()
 }
 
-/// Mean and standard deviation of the values that are numbers.
+/// Mean and standard deviation of the values that are not NaN.
 pub(super) fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
     let known = values.filter(|v| !v.is_nan());
     let count = known.clone().count() as f64;

@@ -1,6 +1,6 @@
-//! The sensitivity recursion for one output and up to four states, a block of samples at a time: what the columns have
-//! in common is prepared for all of its samples, then each group of columns passes over them with its states in
-//! registers.
+//! The sensitivity recursion for one output and up to four states, a block of samples at a time. Everything that the
+//! columns share is prepared for all samples of the block; then each group of columns passes over them with its states
+//! in registers.
 //!
 //! With `X(k) = dx(k)/dtheta`, `F = dx+/dx` and `f'` the slope of the output function,
 //!
@@ -9,8 +9,8 @@
 //!   dy(k)  = f'(k) (ds/dx(k) X(k) + ds/dtheta(k))
 //! ```
 //!
-//! Columns do not see each other: eight of them, for all NX states, are NX registers (`[V; NX]`), and F is the same for all
-//! columns. So the work is turned round. First everything that depends on the sample alone, for a block of 32 samples (`Block`):
+//! Columns are independent: eight of them, for all NX states, are NX registers (`[V; NX]`), and F is the same for all columns. So the
+//! loops are exchanged. First everything that depends on the sample alone, for a block of 32 samples (`Block`):
 //!
 //! ```text
 //!   slopes     F and f' ds/dx, NX (NX + 1) numbers a sample      broadcast while a column passes
@@ -20,26 +20,26 @@
 //!   spaced     | 0 .. 0 | x v |   one run of zeros a sample      dx+/dtheta of [A B]: row q of A is (x v) shifted by q rows
 //! ```
 //!
-//! Then one or two groups of columns pass over the 32 samples. What a kind of columns adds is a `Source`: weights of an argument
-//! (`OfArgument`), a row of E (`OfUnits`: only state q is moved), `[A B x0]` (`OfStates`). A source says `None` where it adds nothing, so
-//! that no zeros are added. What is owned: `Sensitivities` owns X between blocks, `Block` the block's numbers, the rows are the
-//! caller's (`Rows`).
+//! Then one or two groups of columns pass over the 32 samples. A `Source` is what a kind of columns adds: weights of an
+//! argument (`OfArgument`), a row of E (`OfUnits`: it moves state q only), `[A B x0]` (`OfStates`). A source returns
+//! `None` if it adds nothing, so no zeros are added. Ownership: `Sensitivities` owns X between blocks, `Block` the
+//! block's numbers, the caller the rows (`Rows`).
 //!
-//! Why it is there: against the general recursion, sample by sample, a training of 3 states and 15 units takes 5 % less by the least and
-//! 11 % by the median of 7 runs (processor time, Zen 4; 150 against 166 ns a sample for the recursion alone on an Intel Xeon). Two groups
-//! at once fill the latency of the products where there are 32 registers, by count; a Zen 4 shows nothing (`state_space_training_8`, least
-//! and median of 80 alike), and where registers are as wide as units it has not been measured.
+//! Why it exists: compared with the general recursion, sample by sample, a training of 3 states and 15 units takes 5 % less by the least
+//! and 11 % by the median of 7 runs (processor time, Zen 4; the recursion alone takes 150 instead of 166 ns a sample on an Intel Xeon).
+//! With 32 registers two groups at once fill the latency of the products, by count of operations; a Zen 4 shows no gain
+//! (`state_space_training_8`, least and median of 80 alike). Processors whose units are as wide as the registers have not been measured.
 
 use super::network::{Network, rises_of};
 use super::sensitivities::{Recursion, Sensitivities, weigh};
 use super::shape::Shape;
 use crate::simd::{F64x8, LANES, Lanes};
 
-/// Samples of a block: what all groups of columns read stays in the first-level cache.
+/// Samples of a block: what all groups of columns read then stays in the first-level cache.
 pub(super) const BLOCK: usize = 32;
-/// States of a model that is small.
+/// Most states of a small model.
 pub(super) const MOST_STATES: usize = 4;
-/// Groups that hold the slopes of one sample.
+/// Number of groups that hold the slopes of one sample.
 const SLOPES: usize = ((MOST_STATES + 1) * MOST_STATES).div_ceil(LANES);
 
 /// What the columns have in common, for each sample of a block.
@@ -51,33 +51,33 @@ pub(super) struct Block {
     /// `1 - h^2`.
     rises: Vec<Lanes>,
     /// States, inputs and 1, one after the other.
-    // Sample after sample of one argument: a group of columns reads one of them along the block.
+    // By argument, then by sample: a group of columns reads one argument along the block.
     arguments: Vec<[f64; BLOCK]>,
     /// `E diag(1 - h^2)`: for each group and sample the rows of all states.
-    // By group first: one group's columns pass over all samples and read nothing of the others.
+    // By group first: a group's columns pass over all samples and read nothing of the others.
     weighted: Vec<Lanes>,
     /// `f' G diag(1 - h^2)` for each group.
     direct: Vec<[Lanes; BLOCK]>,
     /// `f'` and the error.
     outputs: [(f64, f64); BLOCK],
-    /// Where the sample's row begins, or that of the next one that has one.
-    // Rows of unknown outputs are not there: such a sample's row is written in the place of the next one, and by that
-    // over.
+    /// Offset of the sample's row or, if it has none, of the next row.
+    // Unknown outputs have no rows: the row of such a sample is written to the place of the next one, which overwrites
+    // it.
     places: [usize; BLOCK],
-    /// States and inputs of a sample behind as many zeros as the columns of `[A B]` may be apart from them.
+    /// States and inputs of a sample, after as many zeros as the columns of `[A B]` may be away from them.
     //   sample k   | 0 .. 0, nx width + 8 of them | x v |
-    // Of column i in the order of [A B x0], state q is moved by argument i - q width, if there is one of that number: so
-    // eight columns are one load of this, `width` numbers further left for the next state, with zeros where a column
-    // belongs to another row. What is beyond x v, x0 too, reads the zeros of the next sample.
+    // Column i, in the order of [A B x0], moves state q by argument i - q width, if that exists. So eight columns are
+    // one load, `width` numbers further left for each next state, with zeros if a column belongs to another row.
+    // Columns beyond x v, including x0, read the zeros of the next sample.
     spaced: Vec<f64>,
-    /// Numbers from one sample's states to the next one's.
+    /// Distance from one sample's states to the next one's.
     space: usize,
 }
 
 impl Block {
     pub fn new(shape: Shape) -> Self {
         let groups = shape.hidden.div_ceil(LANES);
-        // Zeros for nx - 1 rows before the numbers, and behind them for the rows and x0 of the sample before.
+        // Zeros for nx - 1 rows before the numbers, and after them for the rows and x0 of the previous sample.
         let space = (shape.nx + 1) * shape.arguments() + LANES;
         Self {
             slopes: Box::new([[Lanes::ZERO; SLOPES]; BLOCK]),
@@ -92,7 +92,7 @@ impl Block {
         }
     }
 
-    /// Takes up the states and inputs of sample `k`.
+    /// Sets the states and inputs of sample `k`.
     #[inline(always)]
     fn set(&mut self, k: usize, x: &[f64], v: &[f64]) {
         // The numbers end where sample k + 1's space begins; the zeros were written once and stay.
@@ -105,11 +105,11 @@ impl Block {
     }
 }
 
-/// What a group of columns takes from a sample: `f' ds/dtheta`, and `dx+/dtheta` for each state; none is zero.
+/// What a group of columns adds at a sample: `f' ds/dtheta`, and `dx+/dtheta` for each state; `None` is zero.
 #[derive(Clone, Copy)]
 struct Gains<V, const NX: usize> {
-    // `Option`s that the compiler resolves: for a kind of columns each is always there or never, so that the code has
-    // neither a test nor a zero to add.
+    // The compiler resolves these `Option`s: for a kind of columns each is always or never present, so the code neither
+    // tests them nor adds zeros.
     direct: Option<V>,
     next: [Option<V>; NX],
 }
@@ -119,7 +119,7 @@ trait Source<const NX: usize>: Copy {
     fn gains<V: F64x8>(&self, k: usize) -> Gains<V, NX>;
 }
 
-/// Weights of one argument of a group of hidden units.
+/// Weights of one argument on a group of hidden units.
 #[derive(Clone, Copy)]
 struct OfArgument<'a, const NX: usize> {
     argument: &'a [f64; BLOCK],
@@ -144,7 +144,7 @@ impl<const NX: usize> Source<NX> for OfArgument<'_, NX> {
 /// Row `Q` of E, for a group of hidden units.
 #[derive(Clone, Copy)]
 struct OfUnits<'a, const Q: usize> {
-    /// Hidden outputs from this group on, and groups.
+    /// Hidden outputs from this group on, and the number of groups.
     hidden: &'a [Lanes],
     groups: usize,
 }
@@ -153,7 +153,7 @@ impl<const NX: usize, const Q: usize> Source<NX> for OfUnits<'_, Q> {
     #[inline(always)]
     fn gains<V: F64x8>(&self, k: usize) -> Gains<V, NX> {
         let mut next = [None; NX];
-        // Q is a constant, and with it the only state that is moved.
+        // Q is a constant, so the only state that moves is known at compile time.
         if let Some(next) = next.get_mut(Q) {
             *next = Some(V::load(&self.hidden[k * self.groups].0));
         }
@@ -164,7 +164,7 @@ impl<const NX: usize, const Q: usize> Source<NX> for OfUnits<'_, Q> {
 /// A group of `[A B x0]`.
 #[derive(Clone, Copy)]
 struct OfStates<'a> {
-    /// States and inputs between zeros, from where this group stands for the first state.
+    /// States and inputs between zeros, from this group's position for the first state.
     spaced: &'a [f64],
     space: usize,
     width: usize,
@@ -174,7 +174,7 @@ impl<const NX: usize> Source<NX> for OfStates<'_> {
     #[inline(always)]
     fn gains<V: F64x8>(&self, k: usize) -> Gains<V, NX> {
         let mut next = [None; NX];
-        // State NX - 1 - q: a row further up in [A B] is `width` numbers further right in the zeros.
+        // State NX - 1 - q: one row up in [A B] is `width` numbers further right in the zeros.
         for (q, next) in next.iter_mut().rev().enumerate() {
             let start = k * self.space + q * self.width;
             *next = Some(V::first(&self.spaced[start..]));
@@ -217,7 +217,7 @@ impl Block {
             network.slopes::<V>(rises, &mut slopes[..used]);
         }
         for (slopes, (steepness, _)) in self.slopes.iter_mut().zip(self.outputs).take(count) {
-            // The output function is the identity most often.
+            // The output function is usually the identity.
             if steepness != 1.0 {
                 for at in NX * NX..NX * (NX + 1) {
                     slopes[at / LANES].0[at % LANES] *= steepness;
@@ -226,7 +226,7 @@ impl Block {
         }
     }
 
-    /// Takes all groups of a kind over the block, as many at a time as there are registers for.
+    /// Passes all groups of a kind over the block, as many at a time as registers allow.
     #[inline(always)]
     fn pass_all<V: F64x8, const NX: usize, S: Source<NX>>(
         &self,
@@ -237,10 +237,10 @@ impl Block {
         rows: &mut [f64],
     ) {
         let mut i = 0;
-        // In the order of the columns: where a group has fewer than eight, it writes over the next one's first.
-        // Counted for 3 states: a group is 12 fused operations a sample, 6 cycles on two units, but its chain of three takes
-        // 12. A second one fits into that, for 32 registers; with 16 there is no room. Where a register is worked on in
-        // halves (Zen 4) one group takes the 12 cycles by itself. A constant condition.
+        // In the order of the columns: a group of fewer than eight writes over the next one's first columns. Counted
+        // for 3 states: a group is 12 fused operations a sample, 6 cycles on two units, but its chain of three takes
+        // 12. With 32 registers a second group fits into that; with 16 there is no room. If a register is processed in
+        // halves (Zen 4), one group fills the 12 cycles by itself. The condition is a constant.
         while V::TILE_ROWS == LANES && i + 2 <= states.len() {
             let sources = [source(i), source(i + 1)];
             let starts = [start(i), start(i + 1)];
@@ -254,7 +254,7 @@ impl Block {
         }
     }
 
-    /// The columns of row `Q` of E, the first of which is `first`.
+    /// The columns of row `Q` of E; `first` is the first of them.
     #[inline(always)]
     fn pass_row<V: F64x8, const NX: usize, const Q: usize>(
         &self,
@@ -263,7 +263,7 @@ impl Block {
         first: usize,
         rows: &mut [f64],
     ) {
-        // A row that this model does not have; its code is not made.
+        // This model has no such row, and no code is generated for it.
         if Q >= NX {
             return;
         }
@@ -276,7 +276,7 @@ impl Block {
         self.pass_all::<V, NX, _>(part.sums.len(), states, source, start, rows);
     }
 
-    /// Takes `GROUPS` groups of columns over the block; their parts of the rows begin at `starts`.
+    /// Passes `GROUPS` groups of columns over the block; their parts of the rows begin at `starts`.
     #[inline(always)]
     fn pass<V: F64x8, const NX: usize, const GROUPS: usize>(
         &self,
@@ -286,7 +286,7 @@ impl Block {
         starts: [usize; GROUPS],
         rows: &mut [f64],
     ) {
-        // X of these columns: loaded once, kept in registers for 32 samples, stored once. Sample by sample each of the
+        // X of these columns: loaded once, kept in registers for 32 samples, stored once. Sample by sample, each of the
         // 18 groups of 155 parameters would go through memory at every sample.
         let mut x = [[V::splat(0.0); NX]; GROUPS];
         for (x, states) in x.iter_mut().zip(&*states) {
@@ -296,7 +296,7 @@ impl Block {
         }
         for k in 0..count.min(BLOCK) {
             let slopes = &self.slopes[k];
-            // A load that is spread; all groups of columns read the same few cache lines.
+            // A broadcast load; all groups of columns read the same few cache lines.
             let slope = |i: usize| slopes[i / LANES].0[i % LANES];
             let mut sums = [[None; NX]; GROUPS];
             for g in 0..GROUPS {
@@ -311,8 +311,8 @@ impl Block {
                 }
                 sums[g] = gains.next;
             }
-            // X+_q = gains_q + sum_j F_qj X_j. Slopes outside, groups inside: a slope is spread once for all groups. In
-            // `sums` first, as all of X is needed until the last row is done.
+            // X+_q = gains_q + sum_j F_qj X_j. Slopes in the outer loop, groups in the inner one: a slope is broadcast
+            // once for all groups. The results stay in `sums` because all of X is needed until the last row is done.
             for at in 0..NX * NX {
                 let (q, j) = (at / NX, at % NX);
                 let slope = V::splat(slope(at));
@@ -336,7 +336,7 @@ impl Block {
     }
 }
 
-/// `sum + slope x`, where there is a sum.
+/// `sum + slope x`, or `slope x` if there is no sum yet.
 #[inline(always)]
 fn plus<V: F64x8>(sum: Option<V>, slope: V, x: V) -> V {
     match sum {
@@ -363,12 +363,12 @@ impl Recursion<'_> {
         let (groups, inputs) = (network.groups(), network.shape.inputs);
         for start in (0..run.sums.len()).step_by(BLOCK) {
             let count = BLOCK.min(run.sums.len() - start);
-            // Every second block, as 32 divides 64.
+            // Effective at every second block, as 32 divides 64.
             if !buffers.look(start, monitor) {
                 return;
             }
             let samples = start..start + count;
-            // What the free run left of these samples; nothing of it is computed again but 1 - h^2.
+            // The free run's results for these samples; only 1 - h^2 is computed again.
             let part = Part {
                 states: &run.states[samples.start * NX..samples.end * NX],
                 hidden: &run.hidden[samples.start * groups..samples.end * groups],
@@ -384,7 +384,7 @@ impl Recursion<'_> {
             buffers.pass_units::<V, NX>(&part, room);
             buffers.pass_rest::<V, NX>(&part, room);
             if let Some(weights) = weights.get(samples) {
-                // Rows of unknown outputs are not there, so neither are their weights.
+                // Unknown outputs have no rows, so their weights are skipped.
                 let known = weights.iter().zip(part.y).filter(|(_, y)| !y.is_nan());
                 weigh(known.map(|(w, _)| *w), room, width);
             }
@@ -393,7 +393,7 @@ impl Recursion<'_> {
     }
 }
 
-/// What the simulation left behind of a block, and its inputs and measured outputs.
+/// The simulation's results for a block, with its inputs and measured outputs.
 struct Part<'a> {
     states: &'a [f64],
     hidden: &'a [Lanes],
@@ -403,7 +403,7 @@ struct Part<'a> {
 }
 
 impl Sensitivities {
-    /// All that the columns have in common; how many samples have a row.
+    /// Computes all that the columns have in common; returns how many samples have a row.
     #[inline(always)]
     fn prepare_block<V: F64x8, const NX: usize>(
         &mut self,
@@ -426,7 +426,7 @@ impl Sensitivities {
         let arguments = arguments.zip(part.v.chunks_exact(inputs));
         for (k, (x, v)) in arguments.enumerate().take(BLOCK) {
             block.set(k, x, v);
-            // Per sample, for a Jacobian that is handed out; a training takes the block's stored h at once.
+            // Per sample, for a Jacobian that leaves the core; a training takes the block's stored h at once.
             if exact {
                 scratch.set(x, v);
                 network.rises::<V>(&scratch.arguments, &mut block.rises[k * groups..][..groups]);
@@ -447,13 +447,13 @@ impl Sensitivities {
         let groups = block.direct.len();
         let (weighted, _) = block.weighted.as_chunks::<NX>();
         let (weighted, _) = weighted.as_chunks::<BLOCK>();
-        // Column groups i: argument i / groups, units of group i mod groups.
+        // Column group i: argument i / groups, units of group i mod groups.
         let source = |i: usize| OfArgument {
             argument: &block.arguments[i / groups],
             weighted: &weighted[i % groups],
             direct: &block.direct[i % groups],
         };
-        // Kinds of units follow each other without gaps, so that a row is short; groups within a kind are eight apart.
+        // Kinds of units follow each other without gaps, so a row is short; groups within a kind are eight apart.
         let start = |i: usize| i / groups * hidden + i % groups * LANES;
         let (states, _) = self.states.as_chunks_mut::<NX>();
         let states = &mut states[..block.arguments.len() * groups];
@@ -468,7 +468,7 @@ impl Sensitivities {
         let states = &mut states[self.block.arguments.len() * groups..];
         for (q, states) in states.chunks_exact_mut(groups).take(NX).enumerate() {
             let first = (self.block.arguments.len() + q) * self.columns.shape.hidden;
-            // The row as a constant: it is known then which state a column moves.
+            // The row as a constant: the compiler then knows which state a column moves.
             match q {
                 0 => self.block.pass_row::<V, NX, 0>(part, states, first, rows),
                 1 => self.block.pass_row::<V, NX, 1>(part, states, first, rows),
@@ -487,7 +487,7 @@ impl Sensitivities {
             let steepness = V::splat(block.outputs[k].0);
             let row = &mut rows[block.places[k] + columns.direct..];
             for (g, h) in h.iter().enumerate() {
-                // ds/dG = h: no recursion, and so no pass.
+                // ds/dG = h: no recursion, so no pass.
                 let part = V::load(&h.0).mul(steepness);
                 part.write(&mut row[g * LANES..]);
             }

@@ -1,4 +1,4 @@
-//! States of a model on new data: maximum a posteriori from a record's first samples, and rest.
+//! States of a model on new data: the maximum a posteriori estimate from a record's first samples, and the state at rest.
 
 use super::network::{Network, Scratch, rises_of};
 use super::shape::Shape;
@@ -6,15 +6,15 @@ use crate::lm::{cholesky, substitute};
 use crate::simd::{self, F64x8, Kernel};
 use crate::{Error, Result};
 
-/// Steps of one descent, which almost always ends earlier.
+/// Most steps of one descent, which almost always ends earlier.
 const STEPS: usize = 40;
-/// Added to the diagonal of a covariance, relative to its mean: states may depend on each other.
+/// Added to the diagonal of a covariance, relative to its mean: states may be linearly dependent.
 const RIDGE: f64 = 1e-8;
-/// How often the ridge may grow a hundredfold.
+/// Most times that the ridge is multiplied by a hundred.
 const MOST_RIDGES: usize = 10;
 
-/// What training knows of a model beside its parameters, in scaled units: what a state is likely to be before any output
-/// is measured, and how far outputs and equations are to be trusted.
+/// Training results of a model beside its parameters, in scaled units: the prior of a state before any output is
+/// measured, and the variances of outputs and equations.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Statistics {
     /// Mean of the training states.
@@ -28,11 +28,11 @@ pub struct Statistics {
 }
 
 impl Statistics {
-    /// Refuses what cannot be a model's statistics.
+    /// Refuses invalid statistics.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for wrong lengths, values that are not finite, variances that are negative or, of a
-    /// residual, zero.
+    /// `ErrorKind::Setting` for wrong lengths, values that are not finite, negative variances, or a residual variance
+    /// of zero.
     pub(super) fn check(&self, shape: Shape) -> Result<()> {
         let nx = shape.nx;
         let finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
@@ -71,7 +71,7 @@ impl Statistics {
             }
             ridge *= 100.0;
         }
-        // No covariance at all: every state has a variance of 1.
+        // No usable covariance: every state gets a variance of 1.
         (0..n * n)
             .map(|i| f64::from(u8::from(i % (n + 1) == 0)))
             .collect()
@@ -99,7 +99,7 @@ trait Squares {
     fn evaluate(&mut self, x: &[f64], normal: &mut [f64], gradient: &mut [f64]) -> f64;
 }
 
-/// Levenberg-Marquardt over a few values: the sum reached and where, if it is finite.
+/// Levenberg-Marquardt for few variables: the least sum and its place, if it is finite.
 fn descend(squares: &mut impl Squares, mut x: Vec<f64>) -> Option<(f64, Vec<f64>)> {
     let n = x.len();
     let (mut normal, mut gradient) = (vec![0.0; n * n], vec![0.0; n]);
@@ -143,7 +143,7 @@ fn best(found: impl Iterator<Item = (f64, Vec<f64>)>) -> Option<Vec<f64>> {
     found.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, x)| x)
 }
 
-/// The state `x(0)` that maximises the posterior: least `sum e^2/r + (x - m)' P^-1 (x - m)`; none where every start
+/// The state `x(0)` that maximises the posterior: least `sum e^2/r + (x - m)' P^-1 (x - m)`; `None` if every start
 /// diverges. Outputs that are NaN do not count. `also` are further starts.
 pub(super) fn estimate(
     network: &Network,
@@ -163,7 +163,7 @@ pub(super) fn estimate(
     )
 }
 
-/// As [`estimate`], but from the starts given alone: for a model that moved a little since the last estimate.
+/// As [`estimate`], but only from the given starts: for a model that moved little since the last estimate.
 pub(super) fn update(
     network: &Network,
     prior: &Statistics,
@@ -180,8 +180,8 @@ pub(super) fn update(
     )
 }
 
-/// The state at which the model rests: least `|x+ - x|^2 + |y|^2` at input zero, `y` being the output in scaled units
-/// above `zero`.
+/// The state at which the model rests: least `|x+ - x|^2 + |y|^2` at input zero, where `y` is the output in scaled
+/// units above `zero`.
 pub(super) fn rest(network: &Network, prior: &Statistics, v: &[f64], zero: &[f64]) -> Vec<f64> {
     let factor = prior.factor();
     let mut starts = prior.starts(&factor);
@@ -208,7 +208,7 @@ struct Posterior<'a> {
     v: &'a [f64],
     y: &'a [f64],
     scratch: Scratch,
-    /// `dx/dx0`, row by row, and room for the next.
+    /// `dx/dx0`, row by row, and a buffer for the next.
     sensitivity: Vec<f64>,
     moved: Vec<f64>,
 }
@@ -345,7 +345,7 @@ pub(super) fn step_with_slopes<V: F64x8>(network: &Network, scratch: &mut Scratc
     network.slopes::<V>(rises, slopes);
 }
 
-/// The distance from rest.
+/// The distance from rest, as a sum of squares.
 struct Still<'a> {
     network: &'a Network,
     v: &'a [f64],

@@ -9,7 +9,7 @@ fn random_model(seed: u64, shape: Shape, output: OutputFunction) -> NeuralSS {
     let mut theta: Vec<f64> = (0..shape.parameters())
         .map(|_| random.between(-0.5, 0.5))
         .collect();
-    // rows of A and E so small that no state can grow
+    // rows of A and E are so small that no state can grow
     for range in [parts.a, parts.e] {
         let width = range.len() / shape.nx;
         theta[range].iter_mut().for_each(|t| *t /= width as f64);
@@ -76,7 +76,7 @@ fn functions() -> impl Strategy<Value = OutputFunction> {
     ]
 }
 
-/// Every so many parameters are moved in a case.
+/// In each case every fifth parameter is varied.
 const EVERY: usize = 5;
 
 proptest! {
@@ -88,7 +88,7 @@ proptest! {
         let state = noise(shape.nx, seed ^ 2);
         let (run, rows) = model.jacobian(&u, shape.inputs, &state).unwrap();
         let columns = shape.parameters() + shape.nx;
-        // some in each case: two runs for every parameter of the largest take most of the time
+        // some in each case: two runs for every parameter of the largest model would take most of the time
         for i in (seed as usize % EVERY..columns).step_by(EVERY) {
             let at = |by: f64| match i.checked_sub(shape.parameters()) {
                 None => moved(&model, i, by).simulate(&u, shape.inputs, &state).unwrap(),
@@ -381,7 +381,7 @@ impl simd::Kernel for Whole<'_> {
     }
 }
 
-/// All rows; what is not written is NaN.
+/// All rows; entries that are not written stay NaN.
 struct Kept {
     width: usize,
     columns: usize,
@@ -426,7 +426,7 @@ fn kinds() -> impl Iterator<Item = Shape> {
 
 #[test]
 fn every_processor_runs_and_differentiates_alike() {
-    // Some hundred operations a sample that round at 1e-16 each, in states that forget.
+    // Some hundred operations a sample, each rounded at 1e-16, in states that forget.
     let close = |a: f64, b: f64| (a - b).abs() < 1e-12 * (1.0 + a.abs());
     for shape in kinds() {
         let network = network_of(3, shape);
@@ -536,7 +536,7 @@ fn a_grown_model_runs_almost_as_before() {
                 let rms = |squares: f64| (squares / y.len() as f64).sqrt();
                 let spread = rms(y.iter().map(|y| (y - mean).powi(2)).sum());
                 let moved = rms(y.iter().zip(&run).map(|(y, run)| (y - run).powi(2)).sum());
-                // an output that hardly moves is measured by the scale of those in training
+                // an output that hardly moves is measured by its scale in training
                 let moved = moved / spread.max(model.scaling().y_scale[p]);
                 assert!(
                     moved < 1e-2 && moved > 0.0,

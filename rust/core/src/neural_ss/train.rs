@@ -1,4 +1,4 @@
-//! Training in free run: many starts in parallel, each by Levenberg-Marquardt, chosen by free run.
+//! Training in free run: many starts in parallel, each by Levenberg-Marquardt; the best free run is chosen.
 
 use super::draw::{self, Realisation};
 use super::free_run::Trajectory;
@@ -27,10 +27,10 @@ pub struct Settings {
     pub nk: usize,
     /// Hidden units.
     pub hidden: usize,
-    /// Where the starts begin, a model of order nx; without it they begin at random states.
+    /// A model of order nx at which the starts begin; without it they begin at random states.
     pub linear: Option<LinearModel>,
-    /// Models of this shape and output, of one scaling, that are trained further: start `first_start + i` begins at the
-    /// i-th. Where there are any, nothing is drawn, `linear` is not used, and there are as many starts.
+    /// Models to be trained further, of this shape and output and with the same scaling: start `first_start + i` begins
+    /// at the i-th. If there are any, nothing is drawn, `linear` is not used, and there are as many starts as models.
     pub initial: Vec<NeuralSS>,
     /// Output function, its parameters in scaled units.
     pub output: OutputFunction,
@@ -38,7 +38,7 @@ pub struct Settings {
     pub integrator: bool,
     /// Weight of `1/2 (|E|^2 + |Wx|^2 + |Wu|^2 + |G|^2 + .1 |bh|^2)` beside J; 1e-8 or less on much data.
     pub weight_decay: f64,
-    /// Standard deviation of a hidden unit's argument at the start, beside its bias: .3 to 1.
+    /// Standard deviation of a hidden unit's argument at the start, without its bias: .3 to 1.
     pub hidden_scale: f64,
     /// Iterations of each start.
     pub max_iterations: usize,
@@ -48,21 +48,21 @@ pub struct Settings {
     pub first_start: usize,
     /// Seed of the starts; start `i` draws from stream `i`.
     pub seed: u64,
-    /// Threads; 0 takes as many as the machine has. The result does not depend on it.
+    /// Threads; 0 for as many as the machine has. The result does not depend on it.
     pub threads: usize,
-    /// Whether each start's model is asked the questions of [`guard`](crate::guard) on the training data. Pieces of
-    /// records that are shorter than the drive's memory say little there: rather ask a chosen model on whole records.
+    /// Whether each start's model has to pass the [`guard`](crate::guard) on the training data. Pieces of records that
+    /// are shorter than the drive's memory say little there: it is better to test a chosen model on whole records.
     pub guard: bool,
 }
 
-/// A trained model with the story of its training.
+/// A trained model and how it was trained.
 #[derive(Clone, Debug)]
 pub struct NeuralSSFit {
     /// The chosen model.
     pub model: NeuralSS,
     /// `J = 1/(2N) sum e^2` in scaled units, free run, on the training data, without weight decay.
     pub cost: f64,
-    /// The same on the validation data, where there are any.
+    /// The same on the validation data, if there are any.
     pub validation_cost: Option<f64>,
     /// Iterations of the chosen start.
     pub iterations: usize,
@@ -72,17 +72,17 @@ pub struct NeuralSSFit {
     pub trace: Vec<f64>,
     /// Which start was chosen, counted from `first_start`.
     pub start: usize,
-    /// What each start was judged by: J on the validation data, else on the training data; infinite for a failed one.
+    /// The score of each start: J on the validation data, else on the training data; infinite for a failed one.
     pub start_costs: Vec<f64>,
-    /// Starts that were dead and drawn again.
+    /// Dead starts that were drawn again.
     pub discarded: usize,
-    /// Whether the chosen model passed the guard, or was not asked; false only where no start passed.
+    /// Whether the chosen model passed the guard or was not tested; false only if no start passed.
     pub sound: bool,
     /// Models of all starts with a finite cost, those that passed the guard first, each part best first.
     pub models: Vec<NeuralSS>,
     /// The model of each start, in the order of the starts.
     pub start_models: Vec<Option<NeuralSS>>,
-    /// Whether each start's model passed the guard; true for all where it was not asked.
+    /// Whether each start's model passed the guard; true for all if they were not tested.
     pub sounds: Vec<bool>,
     /// Initial state of each training experiment, in scaled units.
     pub initial_states: Vec<Vec<f64>>,
@@ -92,28 +92,28 @@ pub struct NeuralSSFit {
 const FIRST_MU: f64 = 1e-2;
 /// Relative reduction of the cost that counts as none.
 const NO_REDUCTION: f64 = 1e-7;
-/// Growth of the sensitivities' squares from one step to the next that counts as an explosion. Asked of positions, where
-/// it has been measured: friction that overshoots the standstill is what explodes.
+/// Growth of the sensitivities' squares in one step that counts as an explosion. Tested for positions, for which it was
+/// measured: there friction that overshoots standstill explodes.
 const MOST_GROWTH: f64 = 1e3;
-/// Share of a position's starts that train a network of its speed first.
+/// Share of a position's starts that first train a network of its speed.
 const BY_SPEED: f64 = 0.6;
-/// Share of its other starts that begin with an estimate of its friction, where one shows.
+/// Share of its other starts that begin with an estimate of its friction, if one shows.
 const WITH_FRICTION: f64 = 0.7;
-/// One of so many iterations of a position is for its speed, or for its recent motion.
+/// One in so many iterations of a position goes to its speed or its recent motion.
 const FIRST_PART: usize = 3;
-/// Samples of an experiment that its state is first estimated from.
+/// Samples of an experiment from which its state is first estimated.
 const STATE_SAMPLES: usize = 2_000;
-/// Share of the output's variance that a linear model is taken to miss while it is.
+/// Share of the output's variance that a linear model is assumed to leave unexplained while it starts.
 const LINEAR_RESIDUAL: f64 = 0.1;
 
-/// Trains `settings.starts` models in free run and chooses by validation J, without validation data by training J.
+/// Trains `settings.starts` models in free run and chooses by J on the validation data, else on the training data.
 ///
-/// With validation data each start keeps its best iterate on them. A start is dead where its free run diverges or ends
-/// no better than a constant output; it is drawn again from its own stream, and counted in `discarded`. A start whose
-/// model does not pass the guard, where that is asked, is chosen only where none does.
+/// With validation data each start keeps its best iterate on them. A start is dead if its free run diverges or ends no
+/// better than a constant output. It is drawn again from its own stream and counted in `discarded`. With the guard, a
+/// start whose model does not pass is chosen only if none does.
 ///
 /// # Errors
-/// `ErrorKind::Data` and `ErrorKind::Setting` for what cannot be trained; `ErrorKind::Fit` where every start failed.
+/// `ErrorKind::Data` and `ErrorKind::Setting` for data or settings that cannot be trained; `ErrorKind::Fit` if every start failed.
 pub fn fit(
     recordings: &[Recording],
     validation: &[Recording],
@@ -128,7 +128,7 @@ pub fn fit(
     task.chosen(results)
 }
 
-/// All that the starts share.
+/// The data that all starts share.
 struct Task<'a> {
     settings: &'a Settings,
     monitor: &'a Monitor,
@@ -221,7 +221,7 @@ impl<'a> Task<'a> {
             let (theta, taken) = self.by_recent_motion(&mut problem, theta, &attempts);
             Some((self.train(&mut problem, theta, &attempts, taken)?, dead))
         };
-        // nothing is drawn where models are trained further, so that another training would end the same
+        // models to be trained further are not drawn, so another training would end the same
         let trainings = match self.settings.initial.is_empty() {
             true => starts::MOST_TRAININGS,
             false => 1,
@@ -234,7 +234,7 @@ impl<'a> Task<'a> {
         })
     }
 
-    /// Parameters with a free run to learn from, and how many draws had none.
+    /// Parameters with a usable free run, and how many draws had none.
     fn drawn(
         &self,
         problem: &mut problem::Training,
@@ -261,7 +261,7 @@ impl<'a> Task<'a> {
         })
     }
 
-    /// Most starts of a position know its dry friction; none where it is not their turn, or none shows.
+    /// A position's start from an estimate of its dry friction; `None` if the draw is against it, or if no friction shows.
     fn with_friction(&self, random: &mut Random) -> Option<Vec<f64>> {
         let Shape { nx, outputs, .. } = self.shape;
         let is_position = self.shape.integrator && nx > 1 && outputs == 1;
@@ -279,8 +279,8 @@ impl<'a> Task<'a> {
         ))
     }
 
-    /// Many starts of a position train a network of its speed first: the parameters from which they go on, and the
-    /// iterations taken; none where it is not their turn, or where nothing comes of it.
+    /// A position's start that first trains a network of its speed, as many of its starts do: the parameters from which
+    /// they go on, and the iterations used. `None` for the other starts, or if that training fails.
     fn by_speed(
         &self,
         problem: &mut problem::Training,
@@ -307,7 +307,7 @@ impl<'a> Task<'a> {
         Some((theta, iterations))
     }
 
-    /// A position is trained by its recent motion first; the parameters from which it goes on, and the iterations taken.
+    /// Trains a position by its recent motion first; returns the parameters from which it goes on, and the iterations used.
     fn by_recent_motion(
         &self,
         problem: &mut problem::Training,
@@ -324,7 +324,7 @@ impl<'a> Task<'a> {
         (found.unwrap_or(theta), iterations)
     }
 
-    /// The parameters after training behind the filter of [`Leak`].
+    /// The parameters after training on the outputs filtered by [`Leak`].
     fn leaking(&self, mut theta: Vec<f64>, iterations: usize) -> Option<Vec<f64>> {
         let leak = Leak::new(&self.experiments, friction::pace(&self.experiments)?)?;
         leak.entered(&mut theta, self.shape);
@@ -335,7 +335,7 @@ impl<'a> Task<'a> {
         Some(theta)
     }
 
-    /// The parameters after so many iterations on these experiments; none where no free run is finite.
+    /// The parameters after `iterations` on these experiments; `None` if no free run is finite.
     fn descended(
         &self,
         experiments: &[Experiment],
@@ -354,7 +354,7 @@ impl<'a> Task<'a> {
         outcome.cost.is_finite().then_some(outcome.theta)
     }
 
-    /// With positions at which the free run has no mean error; none where it diverges.
+    /// With initial positions at which the free run has no mean error; `None` if it diverges.
     fn with_positions(
         &self,
         problem: &mut problem::Training,
@@ -381,14 +381,14 @@ impl<'a> Task<'a> {
         problem.cost(&theta).map(|_| theta)
     }
 
-    /// A hidden layer beside the linear equations, and the states at which those come nearest to the experiments.
+    /// A hidden layer beside the linear equations, with initial states at which the linear equations fit the experiments best.
     fn begun(&self, linear: &Realisation, random: &mut Random) -> Vec<f64> {
         let network = Network::new(self.shape, self.settings.output, &linear.theta(self.shape));
         let theta = draw::beside(linear, self.shape, self.settings.hidden_scale, random);
         with_states(theta, &network, &unit_prior(self.shape), &self.experiments)
     }
 
-    /// A model that is trained further, and its states on the experiments.
+    /// A model to be trained further, with its states on the experiments.
     fn resumed(&self, model: &NeuralSS) -> Vec<f64> {
         let network = Network::new(self.shape, self.settings.output, model.theta());
         with_states(
@@ -451,7 +451,7 @@ impl<'a> Task<'a> {
         }
     }
 
-    /// The model with all that its training run says, its initial states and the guard's verdict.
+    /// The model with the statistics of its training run, its initial states and the guard's verdict.
     fn finished(
         &self,
         problem: &mut problem::Training,
@@ -486,7 +486,7 @@ impl<'a> Task<'a> {
         Some((model, states, sound))
     }
 
-    /// The guard's verdict, whatever the monitor says: what has been trained is to be judged as well.
+    /// The guard's verdict, independent of the monitor: a trained model is judged even after a stop request.
     fn passes(&self, model: &NeuralSS) -> bool {
         let linear = match self.shape.outputs {
             1 => self.settings.linear.as_slice(),
@@ -539,7 +539,7 @@ impl<'a> Task<'a> {
     }
 }
 
-/// What is known of states before there is a run: they are scaled to unit variance.
+/// Statistics before there is a run: states are scaled to unit variance.
 fn unit_prior(shape: Shape) -> Statistics {
     let Shape { nx, outputs, .. } = shape;
     let unit = (0..nx * nx).map(|i| f64::from(u8::from(i % (nx + 1) == 0)));
@@ -551,7 +551,7 @@ fn unit_prior(shape: Shape) -> Statistics {
     }
 }
 
-/// The parameters, and after them the states at which `network` comes nearest to the experiments.
+/// The parameters, followed by the initial states at which `network` fits the experiments best.
 fn with_states(
     mut theta: Vec<f64>,
     network: &Network,
@@ -590,7 +590,7 @@ fn check(settings: &Settings) -> Result<()> {
     Ok(())
 }
 
-/// Models to be trained further are of one kind, and as many as there are starts.
+/// Refuses models to be trained further that are of different kinds, or not as many as starts.
 fn check_initial(settings: &Settings, shape: Shape, scaling: &Scaling) -> Result<()> {
     let initial = &settings.initial;
     let alike = |m: &NeuralSS| {

@@ -3,7 +3,7 @@ use crate::neural_ss::tests::{network_of, noise};
 
 const SAMPLES: usize = 150;
 
-/// Runs of two models with these limits, side by side or one after the other: what they reach and leave behind.
+/// Runs of two models with these limits, side by side or one after the other: their costs and trajectories.
 fn runs(shape: Shape, limits: [f64; 2], together: bool) -> ([Option<f64>; 2], [Trajectory; 2]) {
     let networks = [1, 2].map(|seed| network_of(seed, shape));
     let v = noise(SAMPLES * shape.inputs, 3);
