@@ -1,4 +1,4 @@
-//! ARX by least squares: one-step errors, normal equations with scaled columns, QR where they are near singular.
+//! ARX by least squares: one-step errors, normal equations with scaled columns, and QR if these are nearly singular.
 
 mod shifts;
 
@@ -10,7 +10,7 @@ use crate::linear::LinearModel;
 use crate::{Error, Record, Result};
 use shifts::Shifts;
 
-/// A pivot of the scaled Gram matrix below this leaves fewer than five digits: QR then keeps them.
+/// A pivot of the scaled Gram matrix below this leaves fewer than five digits; QR keeps them.
 const SMALL_PIVOT: f64 = 1e-10;
 /// Relative size of the smallest singular value below which columns count as linearly dependent.
 const RANK_TOLERANCE: f64 = 1e-12;
@@ -57,7 +57,7 @@ pub fn fit(
     model(&lags, &solution)
 }
 
-/// As [`fit`], on samples whose values nobody has looked at yet: every pass over a long recording costs as much as the fit.
+/// As [`fit`], on samples whose values have not been checked yet: every pass over a long recording costs as much as the fit.
 ///
 /// # Errors
 /// As [`fit`], and as [`Record::with_gaps`].
@@ -75,7 +75,7 @@ pub fn fit_samples(
     fit(&records?, na, nb, nk, offset)
 }
 
-/// The fit where nothing is out of the ordinary; its sums tell whether all values are finite.
+/// The fit without checks of the values; its sums show whether all of them are finite.
 fn fit_unseen(
     samples: &[Samples],
     na: usize,
@@ -100,7 +100,7 @@ fn fit_unseen(
     model(&lags, &by_cholesky(&gram, &moment)?).ok()
 }
 
-/// Whether the values that stand in no column of the regressors are finite: they are at the ends.
+/// Whether the values at the ends of the record, which are in no column of the regressors, are finite.
 fn has_finite_ends(record: &Record, lags: &Lags) -> bool {
     let (first, last) = (lags.first_whole(), lags.nk.max(1));
     let finite = |values: &[f64], width: usize| {
@@ -122,7 +122,7 @@ fn model(lags: &Lags, solution: &DVector<f64>) -> Result<LinearModel> {
     LinearModel::new(a, b.to_vec(), lags.channels, lags.nk, offset)
 }
 
-/// The orders, once the records have been found fit for identification.
+/// The orders, if the records can be used for identification.
 ///
 /// # Errors
 /// `ErrorKind::Setting` for impossible orders; `ErrorKind::Data` for no records, different numbers of inputs, or an
@@ -170,7 +170,7 @@ fn usable(records: &[Record], lags: &Lags) -> usize {
     records.iter().map(whole).sum()
 }
 
-/// Samples that count, whose regressor lies inside the record and which, like the outputs in it, were measured.
+/// Samples that count: their regressor lies inside the record, and they and the outputs in it were measured.
 fn whole_rows<'r>(record: &'r Record<'r>, lags: &Lags) -> impl Iterator<Item = usize> + 'r {
     let (na, complete) = (lags.na, record.unmeasured == 0);
     (lags.first_whole()..record.len())
@@ -178,8 +178,8 @@ fn whole_rows<'r>(record: &'r Record<'r>, lags: &Lags) -> impl Iterator<Item = u
         .filter(|&k| record.weight(k) > 0.0)
 }
 
-/// Calls `each(row, y)` for every sample of a record with a whole regressor; a last column is 1. Both are multiplied by
-/// the root of the sample's weight.
+/// Calls `each(row, y)` for every sample of a record with a whole regressor; an additional column is 1. Both are
+/// multiplied by the root of the sample's weight.
 fn each_row(record: &Record, lags: &Lags, columns: usize, mut each: impl FnMut(&[f64], f64)) {
     let mut row = vec![1.0; columns];
     for k in whole_rows(record, lags) {
@@ -229,11 +229,11 @@ fn add_rows(record: &Record, lags: &Lags, system: &mut DMatrix<f64>) {
     });
 }
 
-/// Squared lengths below this have lost digits to underflow, or will in products with others.
+/// Squared lengths below this have lost digits to underflow, or lose them in products with others.
 const LEAST_SQUARE: f64 = 1e-280;
 
-/// Solution of the normal equations with columns scaled to length 1; none where a pivot is small, or products leave the
-/// range of the numbers.
+/// Solution of the normal equations with columns scaled to length 1; `None` if a pivot is small or products overflow or
+/// underflow.
 fn by_cholesky(gram: &DMatrix<f64>, moment: &DVector<f64>) -> Option<DVector<f64>> {
     let in_range = |d: &f64| *d > LEAST_SQUARE && d.is_finite();
     if !gram.diagonal().iter().all(in_range) {
@@ -289,7 +289,7 @@ fn by_qr(records: &[Record], lags: &Lags, columns: usize, rows: usize) -> Result
     Ok(solution)
 }
 
-/// Scales a column to length 1 and gives its length, whose square need not be a number.
+/// Scales a column to length 1 and returns its length; the square of the length may overflow.
 fn normalise(mut column: DVectorViewMut<f64>) -> f64 {
     let largest = column.amax().max(f64::MIN_POSITIVE);
     column /= largest;
@@ -384,7 +384,7 @@ mod tests {
             let records = [record.with_weights(weights).unwrap(), record];
             fit(&records, 2, 2, 1, true).unwrap()
         };
-        // twice a record is a record of weight 2, and nothing counts with weight 0
+        // a record twice is a record of weight 2; weight 0 counts nothing
         let once = fit(&[record; 2], 2, 2, 1, true).unwrap();
         let twice = fit(&[record; 3], 2, 2, 1, true).unwrap();
         assert_eq!(fitted(&[1.0; 400]).a(), once.a());
@@ -393,7 +393,7 @@ mod tests {
         let later = Record::new(&u[198..], 1, &y[198..]).unwrap();
         let later = fit(&[later, record], 2, 2, 1, true).unwrap();
         assert!(worst(fitted(&half).a(), later.a()) < 1e-12);
-        // also on the way through the triangle, for columns that are nearly dependent
+        // the same with nearly dependent columns, which are solved by the triangle
         let rows = |weights: &[f64]| {
             let weighted = record.with_weights(weights).unwrap();
             let lags = check(&[weighted], 2, 2, 1).unwrap();

@@ -1,15 +1,15 @@
-//! What has changed in a machine: the one change of a simple motor that explains a run best.
+//! What has changed in a machine: finds the single change of a simple motor that explains a run best.
 //!
-//! The motor is of first order with delay, Coulomb friction and a constant load,
-//! `T w' = K (u(t - L) + bias - friction sgn w) - w`, at rest before each run. It is fitted to earlier runs or, without any,
-//! to the run itself until the change. Then one thing changes at one sample ([`Change`]): every pair of a change and a
-//! sample is simulated and compared with the counts, and the smallest error names the cause. The command is the recorded
-//! one, so a loop need not be known.
+//! The motor is of first order with delay, Coulomb friction and a constant load, `T w' = K (u(t - L) + bias - friction
+//! sgn w) - w`, at rest before each run. It is fitted to earlier runs or, if there are none, to the run itself before
+//! the change. Then one thing changes at one sample ([`Change`]): each pair of change and sample is simulated and
+//! compared with the counts, and the smallest error names the cause. The simulation uses the recorded command, so a
+//! loop need not be known.
 
 use crate::least_squares::{self, Residuals, Settings};
 use crate::{Error, Monitor, Result};
 
-/// One run from rest: commands, and counts read before each of them acts.
+/// One run from rest: commands, and the counts read before each of them acts.
 #[derive(Clone, Copy, Debug)]
 pub struct Run<'a> {
     /// Command \[u\].
@@ -18,20 +18,20 @@ pub struct Run<'a> {
     pub counts: &'a [f64],
 }
 
-/// What can change, each with one value.
+/// A possible change, with one value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Change {
-    /// The command acts with this factor: below 0 its sign has turned, 0 nothing acts.
+    /// The command acts with this factor: below 0 its sign is reversed, at 0 nothing acts.
     Gain,
-    /// This command acts, whatever is commanded.
+    /// This command acts whatever is commanded.
     Stuck,
-    /// A load of this size \[u\] comes on.
+    /// A load of this size \[u\] sets in.
     Load,
-    /// The encoder counts this factor of the motion: below 0 its sign has turned, at 0 it is lost.
+    /// The encoder counts this factor of the motion: below 0 its sign is reversed, at 0 it is lost.
     Counts,
     /// The counts jump once by this number.
     Jump,
-    /// The response is later by this time \[s\].
+    /// The response is delayed by this additional time \[s\].
     Delay,
     /// The time constant is this many times as long, at the same gain.
     Inertia,
@@ -52,7 +52,7 @@ impl Change {
         Self::Friction,
     ];
 
-    /// The name that Python carries.
+    /// The name used in Python.
     pub fn name(self) -> &'static str {
         match self {
             Self::Gain => "gain",
@@ -89,27 +89,27 @@ pub struct Finding {
     pub change: Change,
     /// See [`Change`].
     pub value: f64,
-    /// When it came \[s\].
+    /// When it happened \[s\].
     pub at: f64,
-    /// Rms error of the speed with it over the whole run \[RPM\].
+    /// Rms error of the speed with the change, over the whole run \[RPM\].
     pub error: f64,
-    /// The motor until then.
+    /// The motor before it.
     pub motor: Motor,
 }
 
-/// All that was found.
+/// The result of the search.
 #[derive(Clone, Debug)]
 pub struct Causes {
     /// The motor without any change, fitted to earlier runs or to this one.
     pub motor: Motor,
     /// Its rms error on the earlier runs, as a share of their rms speed; NaN without any.
     pub unsure: f64,
-    /// The same of a motor that turns against its command, on this run.
+    /// The same for a motor that turns against its command, on this run.
     pub backwards: f64,
     /// Rms error of the speed of the run without a change \[RPM\].
     pub error: f64,
-    /// What the run adds to the errors of earlier ones if one motor is fitted to all, as an rms over the run \[RPM\]; NaN
-    /// without earlier ones.
+    /// What the run adds to the errors of earlier runs if one motor is fitted to all, as an rms over the run \[RPM\];
+    /// NaN without earlier runs.
     pub together: f64,
     /// Rms of the speed itself \[RPM\].
     pub size: f64,
@@ -119,26 +119,26 @@ pub struct Causes {
     pub findings: Vec<Finding>,
 }
 
-/// Blocks of samples into which runs are averaged at most.
+/// Most blocks of samples into which a run is averaged.
 const BLOCKS: usize = 2000;
-/// Samples of a change that are tried.
+/// Number of samples tried as the time of a change.
 const PLACES: usize = 40;
-/// Times that the steps about the best are halved, and the share of the squares that must go for another round before.
+/// How often the steps around the best are halved, and the share to which the squares must fall for another round before that.
 const HALVINGS: usize = 10;
 const FALLS: f64 = 0.999;
-/// The same where the motor is fitted up to each.
+/// The number of samples tried if a motor is fitted up to each of them.
 const OWN_PLACES: usize = 12;
-/// A motor is fitted to this many blocks at least, and must explain them within this share of their speed.
+/// A motor is fitted to at least this many blocks, and must explain them within this share of their speed.
 const FEWEST: usize = 12;
 const UNSURE: f64 = 0.1;
-/// Error of each block, as a share of the largest speed, that a load of the largest command has to be worth.
+/// Error of each block, as a share of the largest speed, that is charged for a load of the largest command.
 const UNLIKELY: f64 = 1e-3;
 
-/// Names the changes that explain `run`; `before` are earlier runs of the machine as it should be.
+/// Names the changes that explain `run`; `before` are earlier runs of the sound machine.
 ///
 /// # Errors
-/// `ErrorKind::Data` for columns of different lengths, of fewer than three samples or not finite, `ErrorKind::Setting` for
-/// numbers that are not above zero.
+/// `ErrorKind::Data` for columns of different lengths, with fewer than three samples or not finite;
+/// `ErrorKind::Setting` for numbers that are not above zero.
 pub fn causes(
     before: &[Run<'_>],
     run: Run<'_>,
@@ -162,7 +162,7 @@ pub fn causes(
     let earlier = if known.is_empty() { whole } else { &known };
     let motor = fitted(earlier, &LAGS, 1.0, monitor)?;
     let without = blocks.squares(&motor, None);
-    // one motor for all runs that fits as well as a change does needs none
+    // if one motor for all runs fits as well as a change does, nothing has changed
     let together = if known.is_empty() {
         f64::NAN
     } else {
@@ -176,7 +176,7 @@ pub fn causes(
             if place >= FEWEST && blocks.len() - place >= 2 && !monitor.stopped() {
                 let first = [blocks.until(place)];
                 let motor = fitted(&first, &LAGS[1..3], 1.0, monitor)?;
-                // a motor that did not move, not as such a motor does or not for long says nothing of what follows
+                // if the motor did not move, or not long enough, or not like such a motor, it says nothing about what follows
                 let is_long = 2.0 * motor.lag < place as f64 * blocks.step;
                 if is_long && unexplained(&first, &motor) <= UNSURE {
                     tried.extend(considered(&blocks, &motor, &[place]));
@@ -218,7 +218,7 @@ pub fn causes(
     })
 }
 
-/// Sum of the squares of a motor's errors on runs.
+/// Sum of the squares of a motor's errors over runs.
 fn squares(runs: &[Blocks], motor: &Motor) -> f64 {
     runs.iter().map(|r| r.squares(motor, None)).sum()
 }
@@ -228,7 +228,7 @@ fn unexplained(runs: &[Blocks], motor: &Motor) -> f64 {
     (squares(runs, motor) / runs.iter().map(Blocks::energy).sum::<f64>()).sqrt()
 }
 
-/// `many` numbers evenly from 0 to below `end`, without repetition.
+/// `many` numbers spread evenly from 0 to below `end`, without repetition.
 fn places(end: usize, many: usize) -> Vec<usize> {
     let mut found: Vec<usize> = (0..many).map(|i| i * end / many).collect();
     found.dedup();
@@ -237,7 +237,7 @@ fn places(end: usize, many: usize) -> Vec<usize> {
 
 // --- Runs in blocks -------------------------------------------------------------------------------------------------------
 
-/// A run as mean speeds over blocks of samples, with the integral of its command for means over any span.
+/// A run as mean speeds over blocks of samples, with the integral of its command, which gives the mean over any span.
 #[derive(Clone, Debug)]
 struct Blocks {
     /// Mean speeds \[RPM\].
@@ -271,7 +271,7 @@ impl Blocks {
         let samples = (u.len() - 1).div_ceil(BLOCKS);
         let step = samples as f64 * ts;
         let per_count = 60.0 / (counts_per_rev * step);
-        // the last sample counts: it can be the one that ended the run
+        // the last sample must be included: the run may have ended because of it
         let first = (u.len() - 1) % samples;
         let (u, counts) = (&u[first..], &counts[first..]);
         let ends: Vec<f64> = counts.iter().step_by(samples).copied().collect();
@@ -299,7 +299,7 @@ impl Blocks {
         self.speed.iter().map(|y| y * y).sum()
     }
 
-    /// The first blocks.
+    /// The first `end` blocks.
     fn until(&self, end: usize) -> Self {
         Self {
             speed: self.speed[..end].to_vec(),
@@ -307,7 +307,7 @@ impl Blocks {
         }
     }
 
-    /// Mean command in block `k` of a signal that comes `delay` later \[s\].
+    /// Mean command in block `k` of a command delayed by `delay` \[s\].
     fn command(&self, k: usize, delay: f64) -> f64 {
         let at = |sample: f64| {
             let sample = sample.clamp(0.0, (self.integral.len() - 1) as f64);
@@ -319,14 +319,14 @@ impl Blocks {
         (at(start + self.samples as f64) - at(start)) / self.samples as f64
     }
 
-    /// Simulates the motor, with a change from a block on; hands each block's error to `each`.
+    /// Simulates the motor, with a change from a block on; passes each block's error to `each`.
     fn simulate(
         &self,
         motor: &Motor,
         change: Option<(Change, f64, usize)>,
         mut each: impl FnMut(f64),
     ) {
-        // what an exponential keeps over a block, and its mean there
+        // the share that an exponential keeps over a block, and its mean over the block
         let over_a_block = |lag: f64| {
             let decay = self.step / lag;
             let mean = if decay > 1e-6 {
@@ -357,7 +357,7 @@ impl Blocks {
                 _ => {}
             }
             drive += motor.bias;
-            // friction holds a standing shaft until the drive exceeds it, and never reverses one
+            // friction holds a standing shaft until the drive exceeds it, and never reverses its motion
             let against = if turning * motor.gain != 0.0 {
                 friction * (turning * motor.gain).signum()
             } else {
@@ -389,10 +389,10 @@ impl Blocks {
 
 // --- The motor ------------------------------------------------------------------------------------------------------------
 
-/// Runs to which a motor is fitted: parameters `gain`, `ln lag`, `delay`, `friction`, `bias`, in sizes of about 1.
+/// Runs to which a motor is fitted: parameters `gain`, `ln lag`, `delay`, `friction`, `bias`, scaled to about 1.
 struct Fit<'a> {
     runs: &'a [Blocks],
-    /// Gain of about the right size \[RPM/u\], largest command \[u\].
+    /// Approximate gain \[RPM/u\], largest command \[u\].
     gain: f64,
     largest: f64,
 }
@@ -427,7 +427,7 @@ impl Residuals for Fit<'_> {
                 at += 1;
             });
         }
-        // in one direction friction and a load are one: then it is friction
+        // in one direction friction and a load are equivalent: this prefers friction
         r[at] = UNLIKELY * self.gain * self.largest * (at as f64).sqrt() * theta[4];
         r.iter().all(|x| x.is_finite())
     }
@@ -449,10 +449,10 @@ impl Residuals for Fit<'_> {
     }
 }
 
-/// Time constants from which the fit begins, as shares of the longest run.
+/// Time constants at which the fit begins, as shares of the longest run.
 const LAGS: [f64; 5] = [0.003, 0.02, 0.1, 1.0, 10.0];
 
-/// The motor with a gain of this sign that fits runs best; the zero motor if they do not move.
+/// The motor with a gain of this sign that fits the runs best; the zero motor if they do not move.
 fn fitted(runs: &[Blocks], lags: &[f64], sign: f64, monitor: &Monitor) -> Result<Motor> {
     let largest = runs.iter().fold(0.0, |a: f64, r| a.max(r.largest));
     let fastest = runs
@@ -490,7 +490,7 @@ fn fitted(runs: &[Blocks], lags: &[f64], sign: f64, monitor: &Monitor) -> Result
     };
     let mut best = (f64::INFINITY, still);
     for &lag in lags {
-        // of a slow motor only the rise is seen
+        // of a slow motor only the rise is visible
         let gain = 1.0 + lag;
         let lag = (lag * longest).ln().clamp(low, high);
         let delay = (0.5 * shortest).min(0.2 * longest).ln();
@@ -513,12 +513,12 @@ struct Candidate {
     at: usize,
     squares: f64,
     motor: Motor,
-    /// Steps in which block and value are refined.
+    /// Step sizes with which block and value are refined.
     wide: usize,
     apart: f64,
 }
 
-/// Every change at the best of some places with the best of some values.
+/// Every change at the best of the given samples with the best of its values.
 fn considered(blocks: &Blocks, motor: &Motor, at: &[usize]) -> Vec<Candidate> {
     let wide = (blocks.len() / at.len().max(OWN_PLACES)).max(1);
     let best = |&change: &Change| {
@@ -579,7 +579,7 @@ fn values(change: Change, blocks: &Blocks, motor: &Motor, at: usize) -> Vec<(f64
 }
 
 impl Candidate {
-    /// Moves block and value as long as the error falls, then halves the steps (Hooke and Jeeves 1961).
+    /// Moves block and value while the error falls, then halves the steps (Hooke and Jeeves 1961).
     fn refine(&mut self, blocks: &Blocks, monitor: &Monitor) {
         if self.change == Change::Jump {
             self.place_the_jump(blocks);
@@ -613,9 +613,9 @@ impl Candidate {
         let value = self.value + more;
         let is_possible = match self.change {
             Change::Delay => value >= 0.0,
-            // more than the largest command would only be a shaft that stands
+            // friction beyond the largest command would only hold the shaft
             Change::Friction => (0.0..=blocks.largest).contains(&value),
-            // more than that would have turned the machine before
+            // a larger load would have turned the machine before
             Change::Load => value.abs() <= blocks.largest,
             Change::Inertia => value > 0.05,
             // a decoder makes 1, 2 or 4 counts of a line
@@ -630,7 +630,7 @@ impl Candidate {
         }
     }
 
-    /// A jump is where the motor errs most.
+    /// Puts a jump where the motor's error is largest.
     fn place_the_jump(&mut self, blocks: &Blocks) {
         let mut errors = Vec::with_capacity(blocks.len());
         blocks.simulate(&self.motor, None, |error| errors.push(error));

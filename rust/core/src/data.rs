@@ -1,9 +1,9 @@
-//! Records as the core sees them: borrowed slices with their shape.
+//! Records for the core: borrowed slices with their shape.
 
 use crate::simd::{self, F64x8, Kernel, LANES};
 use crate::{Error, Result};
 
-/// One experiment of which only the shape has been checked.
+/// One experiment; only its shape has been checked.
 #[derive(Clone, Copy, Debug)]
 pub struct Samples<'a> {
     u: &'a [f64],
@@ -34,7 +34,7 @@ impl<'a> Samples<'a> {
         })
     }
 
-    /// The same with a weight for each sample; see [`Record::with_weights`].
+    /// The same samples with a weight for each; see [`Record::with_weights`].
     ///
     /// # Errors
     /// As [`Record::with_weights`].
@@ -46,10 +46,10 @@ impl<'a> Samples<'a> {
         })
     }
 
-    /// The record, once its values have been found usable; outputs may be NaN where not measured.
+    /// The record, if its values can be used; outputs may be NaN if not measured.
     ///
     /// # Errors
-    /// As [`Record::with_gaps`], but for lengths.
+    /// As [`Record::with_gaps`], except for lengths.
     pub fn record(&self) -> Result<Record<'a>> {
         let Self { u, channels, y, .. } = *self;
         if let Some(i) = first_not_finite(u) {
@@ -66,7 +66,7 @@ impl<'a> Samples<'a> {
         })
     }
 
-    /// The record as it is where all values are finite.
+    /// The record without a check: valid only if all values are finite.
     pub(crate) fn unseen(&self) -> Record<'a> {
         Record {
             u: self.u,
@@ -124,7 +124,7 @@ fn unmeasured(y: &[f64]) -> Result<usize> {
     Ok(unmeasured)
 }
 
-/// Where the first value stands that is NaN or infinite.
+/// Index of the first value that is NaN or infinite.
 fn first_not_finite(values: &[f64]) -> Option<usize> {
     let not_finite = |v: &f64| !v.is_finite();
     match simd::run(Finite(values)) {
@@ -133,7 +133,7 @@ fn first_not_finite(values: &[f64]) -> Option<usize> {
     }
 }
 
-/// Whether all values are finite: only then `0 v` is 0 for each of them.
+/// Whether all values are finite: only then is `0 v` equal to 0 for each of them.
 struct Finite<'a>(&'a [f64]);
 
 impl Kernel for Finite<'_> {
@@ -157,8 +157,8 @@ impl Kernel for Finite<'_> {
     }
 }
 
-/// One experiment: inputs row by row (time first, `channels` values per sample) and the measured output, NaN where it was
-/// not measured.
+/// One experiment: inputs row by row (time first, `channels` values per sample) and the measured output, NaN if not
+/// measured.
 #[derive(Clone, Copy, Debug)]
 pub struct Record<'a> {
     /// Inputs, `y.len() * channels` values.
@@ -169,14 +169,14 @@ pub struct Record<'a> {
     pub y: &'a [f64],
     /// Samples whose output was not measured.
     pub unmeasured: usize,
-    /// How much the squared error of each sample counts, finite and 0 or more; all alike where there are none.
+    /// Weights of the samples' squared errors, finite and 0 or more; `None` if all count alike.
     pub weights: Option<&'a [f64]>,
     /// Whether the plant stood still before the first sample: at the equilibrium of the inputs there.
     pub rests: bool,
 }
 
 impl<'a> Record<'a> {
-    /// A record whose shape has been checked and whose values are finite.
+    /// A record whose shape is checked and whose values are finite.
     ///
     /// # Errors
     /// `ErrorKind::Data` for lengths that do not match or values that are not finite.
@@ -190,17 +190,17 @@ impl<'a> Record<'a> {
         }
     }
 
-    /// A record whose output may be NaN: such a sample has no weight, a simulation runs through it.
+    /// A record whose output may be NaN: such a sample has no weight, but a simulation runs through it.
     ///
     /// # Errors
-    /// `ErrorKind::Data` for lengths that do not match, inputs that are not finite, infinite outputs, or outputs of which
-    /// none was measured.
+    /// `ErrorKind::Data` for lengths that do not match, inputs that are not finite, infinite outputs, or no measured
+    /// output at all.
     pub fn with_gaps(u: &'a [f64], channels: usize, y: &'a [f64]) -> Result<Self> {
         Samples::new(u, channels, y)?.record()
     }
 
-    /// The same record with a weight for each sample: costs are `sum w e^2 / (2 sum w)`. What is no sum of squared errors
-    /// (scaling, starts, estimated states) does not look at them.
+    /// The same record with a weight for each sample: costs are `sum w e^2 / (2 sum w)`. Only sums of squared errors
+    /// use the weights; scaling, starts and estimated states ignore them.
     ///
     /// # Errors
     /// `ErrorKind::Data` for another number of weights, weights that are negative or not finite, or 0 at every measured
@@ -218,7 +218,7 @@ impl<'a> Record<'a> {
         Self { rests, ..self }
     }
 
-    /// Whether the inputs keep their first values for so many measured outputs, and move later.
+    /// Whether the inputs keep their first values for `outputs` measured outputs, and change later.
     pub fn begins_held(&self, outputs: usize) -> bool {
         let rows = self.u.chunks_exact(self.channels);
         let held = rows
@@ -269,14 +269,14 @@ impl<'a> Record<'a> {
         self.y.is_empty()
     }
 
-    /// Inputs of sample `k`; before the first sample they are held at their first value.
+    /// Inputs of sample `k`; before the first sample they hold their first value.
     pub fn input(&self, k: isize) -> &'a [f64] {
         let k = k.max(0) as usize;
         &self.u[k * self.channels..(k + 1) * self.channels]
     }
 }
 
-/// Weights that are all 1 are none, so that nothing is computed otherwise than without.
+/// `None` if all weights are 1: the computation is then exactly the one without weights.
 pub(crate) fn unless_one(weights: &[f64]) -> Option<&[f64]> {
     weights.iter().any(|w| *w != 1.0).then_some(weights)
 }
@@ -296,7 +296,7 @@ pub(crate) fn weighted_squares(weights: &[f64], y: &[f64], run: &[f64]) -> f64 {
         .sum()
 }
 
-/// Number of leading samples that hold `count` measured outputs; none where there are not as many.
+/// Number of leading samples that contain `count` measured outputs; `None` if there are not as many.
 pub(crate) fn window(y: &[f64], count: usize) -> Option<usize> {
     let mut measured = y.iter().enumerate().filter(|(_, y)| !y.is_nan());
     match count {
@@ -354,7 +354,7 @@ mod tests {
         assert!(samples.with_weights(&[0.0; 4]).is_err());
         let record = samples.with_weights(&[1.0; 4]).unwrap().record().unwrap();
         assert!(record.weights.is_none());
-        // a run that has left the numbers has no sum
+        // a run that is no longer finite has no finite sum
         assert_eq!(weighted_squares(&[2.0, 3.0], &[1.0, nan], &[3.0, 4.0]), 8.0);
         assert!(weighted_squares(&[2.0, 3.0], &[1.0, 2.0], &[nan, 4.0]).is_nan());
     }

@@ -1,4 +1,4 @@
-//! Models in the form of a microcontroller: named coefficients and the step of `sewfast_control::model`.
+//! Models in a microcontroller's form: named coefficients and the step of `sewfast_control::model`.
 
 use sewfast_control::Real;
 use sewfast_control::model::{
@@ -11,7 +11,7 @@ use crate::neural::NeuralOE;
 use crate::neural_ss::{NeuralSS, OutputFunction};
 use crate::{Error, Result};
 
-/// The numbers of a model as its step takes them.
+/// The numbers of a model, as its step takes them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Embedded {
     /// `linear`, `network` or `states`.
@@ -45,7 +45,7 @@ impl Precision for f32 {
 }
 
 impl Embedded {
-    /// The free run over `u` (time first) in precision `T`, from `state` and with inputs of `held` before the first sample.
+    /// The free run over `u` (time first) in precision `T`, from `state`, with inputs of `held` before the first sample.
     ///
     /// # Errors
     /// `ErrorKind::Data` for inputs or a state of another length.
@@ -140,7 +140,7 @@ fn lagged(model: &impl Lagged) -> Orders {
 }
 
 impl LinearModel {
-    /// In the form of a microcontroller.
+    /// The microcontroller's form.
     pub fn embedded(&self) -> Embedded {
         Embedded {
             kind: "linear",
@@ -157,8 +157,8 @@ impl LinearModel {
 }
 
 impl NeuralOE {
-    /// In the form of a microcontroller: in the data's units where a free run is, or `scaled`, which keeps more digits in
-    /// single precision.
+    /// The microcontroller's form in the data's units, as in a free run, or `scaled`, which keeps more digits in single
+    /// precision.
     pub fn embedded(&self, scaled: bool) -> Embedded {
         let shape = self.shape();
         let own = scaled || !self.scaling().is_moderate();
@@ -197,7 +197,7 @@ impl NeuralOE {
 }
 
 impl NeuralSS {
-    /// In the form of a microcontroller.
+    /// The microcontroller's form.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for several outputs.

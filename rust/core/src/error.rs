@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-/// What went wrong, as far as a caller can act on it.
+/// The kind of an error, by what a caller can do about it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ErrorKind {
     /// The data cannot be used: wrong shape, too few samples, not finite, constant.
@@ -51,7 +51,7 @@ impl Error {
     }
 }
 
-/// A number for a message: four decimals, or as a power of ten where these would say nothing.
+/// A number for a message: four decimals, or a power of ten if these would show nothing.
 pub(crate) fn shown(x: f64) -> String {
     if x == 0.0 || (1e-3..1e6).contains(&x.abs()) {
         format!("{x:.4}")

@@ -7,7 +7,7 @@ use nalgebra::{Matrix3, Vector3};
 use crate::error::shown;
 use crate::{Error, Monitor, Record, Result};
 
-/// `K e^(-sL) / (1 + sT)` about an operating point, with the story of its fit.
+/// `K e^(-sL) / (1 + sT)` around an operating point, and how it was fitted.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fopdt {
     /// Gain \[y/u\].
@@ -24,14 +24,14 @@ pub struct Fopdt {
     pub u_high: f64,
     /// `100 (1 - |y - model| / |y - mean(y)|)` over the samples used.
     pub fit_percent: f64,
-    /// Standard errors of `K`, `T` and `L`, for residuals of any colour.
+    /// Standard errors of `K`, `T` and `L`, for residuals of any spectrum.
     pub errors: [f64; 3],
-    /// Samples on a limit of the output, which had no weight.
+    /// Samples at a limit of the output; they had no weight.
     pub limited: usize,
     /// Whether the machine was still moving before the step; its free response was fitted too.
     pub moving: bool,
-    /// How far the response goes beyond where it settles, as a share of its rise, where that stands out of the noise: it is
-    /// then of no first order.
+    /// Overshoot of the response beyond its final level, as a share of its rise; 0 unless it stands out of the noise. A
+    /// response with overshoot is not of first order.
     pub overshoot: f64,
 }
 
@@ -41,30 +41,30 @@ const STEP_SHARE: f64 = 0.05;
 const FEWEST: usize = 10;
 /// A response is settled once this share of it has passed.
 const SETTLED: f64 = 0.95;
-/// A free response must lower the squares to this share to be believed.
+/// A free response is accepted only if it lowers the squares to this share.
 const CLEARLY: f64 = 0.99;
-/// What a response must go beyond a limit by, as a share of its rise.
+/// Least excess of a response beyond a limit, as a share of its rise.
 const BEYOND: f64 = 0.005;
-/// Points of the search in each direction.
+/// Grid points of the search in each direction.
 const GRID: usize = 21;
-/// Times that the search is narrowed about the best point, each time to a half.
+/// How often the search is narrowed around the best point, each time by half.
 const ROUNDS: usize = 26;
-/// Shares of `T` in the sum of `T` and `L` from which the polish begins, too.
+/// Shares of `T` in the sum of `T` and `L` at which the polish begins as well.
 const SHARES: [f64; 9] = [0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0];
-/// Most steps of the polish, and halvings of one.
+/// Most steps of the polish, and most halvings of a step.
 const STEPS: usize = 30;
 const HALVINGS: usize = 12;
 
 /// Fits the response to the first step in a record with one input.
 ///
-/// `K` and the level before the step follow by linear least squares for each `T` and `L` of a search that is narrowed
-/// until its steps are below a millionth. The record is used from its start to the next step of the input. Where a response with
-/// the same `T` that began before the record lowers the squares by a percent and is three of its standard errors, it is part of the fit. Samples at the largest
-/// output have no weight where the response without them would go on beyond: the output was limited there.
+/// For each `T` and `L` of the search, `K` and the level before the step follow by linear least squares; the search is narrowed until its
+/// steps are below a millionth. The record is used up to the next step of the input. A free response with the same `T` that began before
+/// the record is part of the fit if it lowers the squares by a percent and is three of its standard errors. Samples at the largest output
+/// have no weight if the response fitted without them continues beyond it: the output was limited there.
 ///
 /// # Errors
-/// `ErrorKind::Data` without a step, with too few samples after it or a response that does not settle or drowns in
-/// noise; `ErrorKind::Setting` for several inputs or an unusable sample time; `ErrorKind::Fit` on a stop.
+/// `ErrorKind::Data` without a step, with too few samples after it, or for a response that does not settle or is buried
+/// in noise; `ErrorKind::Setting` for several inputs or an unusable sample time; `ErrorKind::Fit` on a stop.
 pub fn fit_fopdt(record: Record<'_>, ts: f64, monitor: &Monitor) -> Result<Fopdt> {
     if record.channels != 1 || !(ts > 0.0 && ts.is_finite()) {
         return Err(Error::setting(format!(
@@ -98,19 +98,19 @@ pub fn fit_fopdt(record: Record<'_>, ts: f64, monitor: &Monitor) -> Result<Fopdt
     })
 }
 
-/// One step of the input and the outputs about it; times in samples.
+/// One step of the input and the outputs around it; times in samples.
 struct Step<'a> {
     y: &'a [f64],
-    /// The sample from which on the input is at its new level.
+    /// The first sample with the input at its new level.
     at: usize,
-    /// How long before that sample the step came, less than one sample: resampled inputs are averaged, so that the sample of the
-    /// step lies between the levels.
+    /// Time of the step before that sample, less than one sample: resampled inputs are averaged, so the sample in which
+    /// the step falls lies between the levels.
     early: f64,
     u_low: f64,
     u_high: f64,
-    /// Which samples have weight.
+    /// Whether a sample has weight.
     used: Vec<bool>,
-    /// Whether a free response is part of the fit.
+    /// Whether the fit includes a free response.
     moving: bool,
     monitor: &'a Monitor,
 }
@@ -159,7 +159,7 @@ impl<'a> Step<'a> {
         let mut end = next_after(at).unwrap_or(u.len());
         let before = at;
         let mut early = 0.0;
-        // one sample between two levels: the step came within the time that it stands for
+        // one sample between two levels: the step fell within the time of that sample
         let between = at + 1 < u.len() && (u[at + 1] - u[at]) * (u[at] - u[at - 1]) > 0.0;
         if end == at + 1 && between {
             early = (u[at] - u[at - 1]) / (u[at + 1] - u[at - 1]);
@@ -191,7 +191,7 @@ impl<'a> Step<'a> {
         (self.y.len() - self.at) as f64
     }
 
-    /// Outputs with weight, and their places.
+    /// Outputs with weight, and their indices.
     fn samples(&self) -> impl Iterator<Item = (usize, f64)> {
         let with_weight = |(k, &y): (usize, &f64)| self.used[k].then_some((k, y));
         self.y.iter().enumerate().filter_map(with_weight)
@@ -206,7 +206,7 @@ impl<'a> Step<'a> {
         self.samples().map(|(_, y)| (y - mean).powi(2)).sum()
     }
 
-    /// The best candidate from rest, or of a machine that still moved where that is clearly better.
+    /// The best candidate from rest, or with a free response if that is clearly better.
     fn best(&mut self) -> Candidate {
         self.moving = false;
         let from_rest = self.search();
@@ -219,8 +219,8 @@ impl<'a> Step<'a> {
                 moving: true,
                 ..*self
             };
-            // What helps at the best point of the other search is worth one of its own. A plant whose samples before the step
-            // stand still did not move: what helps then is a second lag, which this response is not.
+            // If a free response helps at the best point of the other search, it gets a search of its own. A plant that stands still
+            // before the step was not moving: an improvement is then a second lag, which this response does not model.
             if confidence::drifts(self) && clearly(&in_motion.candidate(from_rest.t, from_rest.l)) {
                 let found = in_motion.search();
                 if clearly(&found) && confidence::moves(&in_motion, &found) {
@@ -232,13 +232,13 @@ impl<'a> Step<'a> {
         from_rest
     }
 
-    /// Squares that are rounding errors of an exact response.
+    /// Squares at the level of rounding for an exact response.
     fn rounding(&self) -> f64 {
         1e-10 * self.spread()
     }
 
-    /// The samples before a limit of the output and the response that they speak of, where there is one: many samples share
-    /// the outermost value, and without them the response would go on beyond it.
+    /// The samples before a limit of the output and the response fitted to them, if there is a limit: many samples
+    /// share the outermost value, and the response without them continues beyond it.
     fn without_limit(&mut self, all: &Candidate) -> Option<(Vec<bool>, Candidate)> {
         let outward = all.rise.signum();
         let edge = self
@@ -259,7 +259,7 @@ impl<'a> Step<'a> {
             .filter(|&k| !self.used[k])
             .map(|k| outward * beyond.output(k, self.at) - edge);
         let excess = excess.sum::<f64>() / on_edge as f64;
-        // a share of the rise as well: an exact response settles on its last digit
+        // relative to the rise as well: even an exact response settles at its last digit
         let limited = excess > (3.0 * noise).max(BEYOND * beyond.rise.abs());
         let used = std::mem::replace(&mut self.used, kept);
         if !limited {
@@ -268,7 +268,7 @@ impl<'a> Step<'a> {
         limited.then_some((used, beyond))
     }
 
-    /// The grid over `ln T` and `L`, narrowed about its best point until it is fine.
+    /// The grid over `ln T` and `L`, narrowed around its best point until it is fine.
     fn search(&self) -> Candidate {
         let (mut ln_t, mut l) = (
             (0.05_f64.ln(), (4.0 * self.length()).ln()),
@@ -290,8 +290,8 @@ impl<'a> Step<'a> {
             ln_t = narrowed(ln_t, best.t.ln(), f64::NEG_INFINITY);
             l = narrowed(l, best.l, -self.early);
         }
-        // The sum of T and L is what a response tells best; how it is shared between them the grid can miss by a whole basin where
-        // T is a small part of it.
+        // A response determines the sum of T and L best. If T is a small part of it, the grid can miss the basin of the
+        // best split.
         let sum = best.t + best.l;
         let shared = SHARES.map(|share| self.candidate(share * sum, (1.0 - share) * sum));
         let other = shared
@@ -302,10 +302,10 @@ impl<'a> Step<'a> {
         other.filter(|other| other.cost < best.cost).unwrap_or(best)
     }
 
-    /// Gauss and Newton's steps from where the grid has ended, for as long as they lower the squares.
+    /// Gauss-Newton steps from the end of the grid search, as long as they lower the squares.
     ///
-    /// `T` and `L` are exchanged for each other along a narrow valley. A grid that is narrowed about its best point can leave the
-    /// lowest place of one beside it: of an exact response 1 in some 5,000 was found with a gain that was 1e-4 off.
+    /// `T` and `L` trade off along a narrow valley. A grid narrowed around its best point can leave the lowest place of
+    /// a valley beside it: for one exact response in some 5,000 the gain was off by 1e-4.
     fn polished(&self, mut best: Candidate) -> Candidate {
         for _ in 0..STEPS {
             if self.monitor.stopped() {
@@ -315,7 +315,7 @@ impl<'a> Step<'a> {
                 return best;
             };
             let held = best.l + l < -self.early || best.l + l > self.length() / 2.0;
-            // at the edge of dead times T goes alone
+            // at the edge of dead times only T moves
             let (t, l) = if held {
                 confidence::step(self, &best, true).unwrap_or((t, l))
             } else {
@@ -342,7 +342,7 @@ impl<'a> Step<'a> {
         let decay = (-1.0 / t).exp();
         let mut left = (-(first as f64 - self.at as f64 - l) / t).exp();
         let mut free = if self.moving { 1.0 } else { 0.0 };
-        // The sums of squares must not drown in a large level.
+        // Relative to the first output: the sums of squares must not be lost in a large level.
         let from = self.y[0];
         let [mut n, mut p, mut pp, mut y, mut py, mut yy] = [0.0; 6];
         let [mut f, mut ff, mut pf, mut fy] = [0.0; 4];
@@ -395,7 +395,7 @@ impl<'a> Step<'a> {
 
     fn check(&self, found: &Candidate) -> Result<()> {
         let noise = (found.cost / self.count() as f64).sqrt();
-        // A constant output leaves rounding errors as its rise.
+        // For a constant output the rise is a rounding error.
         let least = (2.0 * noise).max(1e-9 * found.level.abs());
         let stands_out = found.rise.abs() > least && found.cost < 0.5 * self.spread();
         if !stands_out {

@@ -10,15 +10,15 @@
 //!                                      | e'J  e'e |      J'J, and J'e as its last row
 //! ```
 //!
-//! Rows are recursions of rows before them (`memory` of these), so that the ring in front of a block keeps the last ones:
+//! Rows are recursions of previous rows (`memory` of these), so a ring in front of each block keeps the last ones:
 //!
 //! ```text
 //!   rows:  | memory old rows | block of 64 (128) new rows |      width = columns, up to an odd number of cache lines
 //!            ^ copied here when the block is folded
 //! ```
 //!
-//! A fold runs over tiles of the triangle. In a tile of r rows and c groups of eight columns every sum stays in a register while the
-//! block's rows pass by; each row costs r broadcasts and c loads for r c multiply-adds:
+//! A fold runs over tiles of the triangle. In a tile of r rows and c groups of eight columns every sum stays in a
+//! register while the block's rows pass by; each row costs r broadcasts and c loads for r c multiply-adds:
 //!
 //! ```text
 //!               group 0   group 1   group 2
@@ -26,21 +26,21 @@
 //!    row i+1  |  sums   |  sums   |  sums   |      AVX2:    6 x 1,  baseline: 2 x 1
 //! ```
 //!
-//! What the variants gain, end to end (processor time of a training; variant taken out, least and median of 7): the corner of the
-//! diagonal saves half a tile in each panel, 7 to 10 % of a training of 49 parameters (Zen 4, `training_8` of the kernels' example),
-//! 1 % with 155. Panels and blocks of 128 rows save loads: `J'J` of 155 parameters 330 -> 290 ns a sample on an Intel Xeon
-//! (docs/PERFORMANCE.md); a Zen 4 works its wide registers in halves, has loads to spare and shows nothing (-0.4 to 0 %).
+//! Gains of the variants, end to end (processor time of a training; each variant removed, least and median of 7): leaving out the corner
+//! of the diagonal saves half a tile in each panel, 7 to 10 % of a training of 49 parameters (Zen 4, `training_8` of the kernels'
+//! example), 1 % with 155. Panels and blocks of 128 rows save loads: `J'J` of 155 parameters 330 -> 290 ns a sample on an Intel Xeon
+//! (docs/PERFORMANCE.md). A Zen 4 processes its wide registers in halves, has loads to spare and shows no gain (-0.4 to 0 %).
 
 use crate::simd::{self, F64x8, Kernel, LANES};
 
 /// Rows per block: with 64 parameters a block is 32 kB and stays in the first-level cache.
 pub(crate) const BLOCK: usize = 64;
-/// Rows per block of wider rows, of which only a panel stays there: the sums are fetched half as often.
+/// Rows per block of wide rows, of which only a panel stays in the cache: the sums are fetched half as often.
 const WIDE_BLOCK: usize = 128;
-/// Numbers in a row from which it is wide.
+/// A row is wide from this many numbers on.
 const WIDE: usize = 96;
 
-/// `X'X` over rows that may depend linearly on the rows before them.
+/// `X'X` over rows that may depend linearly on previous rows.
 #[derive(Debug)]
 pub(crate) struct Gram {
     /// Columns that are summed.
@@ -51,33 +51,33 @@ pub(crate) struct Gram {
     block: usize,
     memory: usize,
     filled: usize,
-    /// Where the first row begins: on a cache line.
-    // A `Vec` of numbers begins anywhere; rows of whole cache lines from a line on have no load that touches two of
-    // them.
+    /// Start of the first row: on a cache line.
+    // A `Vec` of numbers may begin anywhere. Rows of whole cache lines that begin on one have no load that touches two
+    // lines.
     base: usize,
     rows: Vec<f64>,
     sums: Vec<f64>,
-    /// Rows of the block that do not count in full, and what they are multiplied by before they are summed: the root of
-    /// their weight, 0 where they take part in the recursion alone.
-    // A list, as hardly any row is in it: a weight for every row would be a product for every number.
+    /// Rows of the block that do not count in full, and their factor before they are summed: the root of their weight,
+    /// or 0 if they take part in the recursion only.
+    // A list, as it is almost always empty: a weight for every row would be a product for every number.
     reduced: Vec<(usize, f64)>,
 }
 
 impl Gram {
-    /// Room for rows of at least `columns` values, each of which sees `memory` rows before it.
+    /// Allocates for rows of at least `columns` values, each of which sees `memory` previous rows.
     pub fn new(columns: usize, memory: usize) -> Self {
         Self::with_room(columns, columns, memory)
     }
 
-    /// As [`Gram::new`], where rows are written up to `room` values, of which only `columns` count.
+    /// As [`Gram::new`], for rows that are written up to `room` values, of which only `columns` count.
     pub fn with_room(columns: usize, room: usize, memory: usize) -> Self {
-        // An odd number of cache lines: rows apart by a power of two would share the same few places of a cache.
+        // An odd number of cache lines: rows a power of two apart would compete for the same few places of a cache.
         let width = (room.div_ceil(LANES) | 1) * LANES;
-        // 64 rows of 64 numbers are 32 kB and stay in the first-level cache. Wide rows do not fit whatever their number, only a
-        // panel of them does, so that longer blocks cost nothing and halve the traffic of the sums (155 parameters: 330 ns
-        // a sample with 64 rows, 290 with 128).
+        // 64 rows of 64 numbers are 32 kB and stay in the first-level cache. Of wide rows only a panel fits, for any
+        // number of rows, so longer blocks cost nothing and halve the traffic of the sums (155 parameters: 330 ns a
+        // sample with 64 rows, 290 with 128).
         let block = if width < WIDE { BLOCK } else { WIDE_BLOCK };
-        // One cache line more than the rows take, for the base.
+        // One cache line more than the rows need, to align the base.
         let rows = vec![0.0; (memory + block) * width + LANES];
         Self {
             columns,
@@ -95,7 +95,7 @@ impl Gram {
         }
     }
 
-    /// Forgets all sums and rows; the rows before the first are zero.
+    /// Clears all sums and rows; the rows before the first are zero.
     pub fn clear(&mut self) {
         self.filled = 0;
         self.rows.fill(0.0);
@@ -103,21 +103,21 @@ impl Gram {
         self.reduced.clear();
     }
 
-    /// Numbers from one row to the next: the columns, and some more.
+    /// Distance from one row to the next: the columns and some padding.
     pub fn width(&self) -> usize {
         self.width
     }
 
-    /// The row `back` rows before the next one, 1 being the last.
+    /// The row `back` rows before the next one; 1 is the last.
     pub fn past_mut(&mut self, back: usize) -> &mut [f64] {
-        // The ring's rows and the block's are one sequence: past rows of the block's first are in front of it.
+        // The ring and the block are contiguous: rows before the block's first are in front of it.
         let start = self.base + (self.memory + self.filled - back) * self.width;
         &mut self.rows[start..start + self.width]
     }
 
-    /// Appends a row: `write` fills it (it comes with old values), then `sum_m gains[m] row(-1-m)` is added to it and
-    /// its column `last` is set to `value`, outside the recursion. A row whose `value` is NaN is part of the recursion
-    /// and not of the sum: a sample that was not measured. In the sum a row counts by its `weight`.
+    /// Appends a row. `write` fills it (it has old values), then `sum_m gains[m] row(-1-m)` is added and its column
+    /// `last` is set to `value`, outside the recursion. A row whose `value` is NaN, an unmeasured sample, takes part in
+    /// the recursion but not in the sum. In the sum a row counts by its `weight`.
     pub fn push(
         &mut self,
         gains: &[f64],
@@ -132,12 +132,12 @@ impl Gram {
                 *value += gain * old;
             }
         }
-        // Last, so that errors do not flow on: an error is no derivative of anything behind it.
+        // Last, so that errors do not enter the recursion: an error is no derivative of anything after it.
         row[last] = value;
         self.keep_weighed(value, weight);
     }
 
-    /// The rows before the next one, the oldest first, and room for it, which comes with old values.
+    /// The previous rows, the oldest first, and the place of the next one, which has old values.
     #[inline(always)]
     pub fn place(&mut self) -> (&[f64], &mut [f64]) {
         let next = self.base + (self.memory + self.filled) * self.width;
@@ -148,11 +148,11 @@ impl Gram {
         )
     }
 
-    /// Appends the row that was written into [`Gram::place`]. Where `value` is NaN it is part of the recursion alone: a
-    /// sample that was not measured.
+    /// Appends the row written into [`Gram::place`]. If `value` is NaN, for an unmeasured sample, it takes part in the
+    /// recursion only.
     #[inline(always)]
     pub fn keep_weighed(&mut self, value: f64, weight: f64) {
-        // sum w j j' = sum (sqrt(w) j)(sqrt(w) j)', so that a weight goes on a row as its root.
+        // sum w j j' = sum (sqrt(w) j)(sqrt(w) j)', so a row is multiplied by the root of its weight.
         if value.is_nan() {
             self.reduced.push((self.filled, 0.0));
         } else if weight != 1.0 {
@@ -164,10 +164,10 @@ impl Gram {
         }
     }
 
-    /// The rows before the next one, the oldest first, and behind them room for `count` rows, at most 64, that come with
-    /// old values; [`Gram::keep_all`] appends them.
+    /// The previous rows, the oldest first, followed by room for `count` rows, at most 64, with old values;
+    /// [`Gram::keep_all`] appends them.
     pub fn ahead(&mut self, count: usize) -> &mut [f64] {
-        // The next rows are one run of memory. Blocks of 64 divide this one, so that none is folded half full.
+        // The next rows are contiguous. The block is a multiple of 64, so no block is folded half full.
         if self.filled + count > self.block {
             self.fold();
         }
@@ -175,8 +175,8 @@ impl Gram {
         &mut self.rows[start..start + (self.memory + count) * self.width]
     }
 
-    /// Appends the rows that were written into [`Gram::ahead`]. Those whose value is NaN are part of the recursion alone,
-    /// the others count by their weights, in full where there are none.
+    /// Appends the rows written into [`Gram::ahead`]. Rows whose value is NaN take part in the recursion only; the
+    /// others count by their weights, or in full without weights.
     pub fn keep_all(&mut self, values: &[f64], weights: &[f64]) {
         let measured = values.iter().zip(weights).enumerate();
         let measured = measured.filter(|(_, (v, _))| !v.is_nan());
@@ -189,7 +189,7 @@ impl Gram {
         self.filled += values.len();
     }
 
-    /// Room for `count` rows, at most 64, that come with old values; [`Gram::keep`] appends them.
+    /// Room for `count` rows, at most 64, with old values; [`Gram::keep`] appends them.
     #[inline(always)]
     pub fn room(&mut self, count: usize) -> &mut [f64] {
         if self.filled + count > self.block {
@@ -199,7 +199,7 @@ impl Gram {
         &mut self.rows[start..start + count * self.width]
     }
 
-    /// Appends the rows that were written into [`Gram::room`].
+    /// Appends the rows written into [`Gram::room`].
     #[inline(always)]
     pub fn keep(&mut self, count: usize) {
         self.filled += count;
@@ -207,7 +207,7 @@ impl Gram {
 
     /// `X'X` row by row, `width` values each; only its lower triangle is valid. The width comes second.
     pub fn finish(&mut self) -> (&[f64], usize) {
-        // The block that is begun, however few rows it has.
+        // Includes the block in progress, however few rows it has.
         self.fold();
         (&self.sums, self.width)
     }
@@ -217,14 +217,14 @@ impl Gram {
         let width = self.width;
         let start = self.base + self.memory * width;
         let end = start + self.filled * width;
-        // The rows that the next block sees are saved before weights are put on: sensitivities themselves have none.
+        // The rows that the next block needs are saved before weights are applied: sensitivities themselves are not weighted.
         let kept = end - self.memory * width;
         self.rows.copy_within(kept..end, self.base);
         self.rows[self.base..start].iter_mut().for_each(forget);
         for (i, root) in self.reduced.drain(..) {
             let row = &mut self.rows[start + i * width..][..width];
             match root {
-                // the error is NaN where it is not known
+                // the error of an unmeasured sample is NaN
                 0.0 => row.fill(0.0),
                 _ => row.iter_mut().for_each(|value| *value *= root),
             }
@@ -239,10 +239,10 @@ impl Gram {
     }
 }
 
-/// Sensitivities below this are zero: squared they would be denormal, which many processors compute with slowly.
+/// Sensitivities below this are set to zero: their squares would be denormal, with which many processors are slow.
 const FORGOTTEN: f64 = 1e-140;
 
-/// Ends the decay of a sensitivity by the initial state.
+/// Ends the decay of a sensitivity to the initial state.
 #[inline]
 pub(crate) fn forget(value: &mut f64) {
     if value.abs() < FORGOTTEN {
@@ -280,8 +280,8 @@ impl Fold<'_> {
         //    | corner: 2 groups by 16 rows, upper right left out |
         //    | 8 rows by 3 groups                                |   next tile
         //    | 8 rows by 3 groups                                |   ..
-        // Tiles on the diagonal have something of the upper triangle, which is summed too and not read. Of the first two rows of
-        // tiles that would be most of them: the corner is 24 groups of sums in place of 48.
+        // Tiles on the diagonal contain entries of the upper triangle, which are summed but not read. In the first two
+        // rows of tiles that would be most entries: the corner has 24 groups of sums instead of 48.
         let whole = self.columns / LANES;
         for first in (0..whole).step_by(3) {
             let below = match whole - first {
@@ -299,18 +299,18 @@ impl Fold<'_> {
                 self.tile::<V, 8, 3>(group * LANES, first * LANES);
             }
         }
-        // The rows that fill no group, 4, 2 and 1 of them as the binary digits of their number say: with few rows more groups
-        // fit into the registers, 4 x 6, 2 x 7, 1 x 7 sums.
+        // The rows that fill no group, in strips of 4, 2 and 1 by the binary digits of their number: with few rows more
+        // groups fit into the registers, 4 x 6, 2 x 7, 1 x 7 sums.
         let mut row = whole * LANES;
         row = self.strip::<V, 4, 6>(row);
         row = self.strip::<V, 2, 7>(row);
         self.strip::<V, 1, 7>(row);
     }
 
-    /// Rows on their own, with as many groups at once as registers hold; the row behind them.
+    /// A strip of rows, with as many groups at once as registers hold; returns the row after it.
     #[inline(always)]
     fn strip<V: F64x8, const ROWS: usize, const MOST: usize>(&mut self, row: usize) -> usize {
-        // Rows are left in the order 4, 2, 1, so that this bit says whether it is this one's turn.
+        // Strips are done in the order 4, 2, 1, so this bit tells whether there is one of this size.
         if (self.columns - row) & ROWS == 0 {
             return row;
         }
@@ -334,8 +334,8 @@ impl Fold<'_> {
     /// One group of columns after the other.
     #[inline(always)]
     fn narrow<V: F64x8, const ROWS: usize>(&mut self) {
-        // AVX2: 6 x 1 sums in 12 registers, a group in two, a number that is spread in one, of 16. One group of columns
-        // at a time stays in the cache for all rows below it.
+        // AVX2: of 16 registers, 6 x 1 sums take 12, a group two, a broadcast number one. One group of columns at a
+        // time stays in the cache for all rows below it.
         for column in (0..self.columns).step_by(LANES) {
             let mut row = column;
             while row + ROWS <= self.columns {
@@ -366,7 +366,7 @@ impl Fold<'_> {
         let mut lower = [[V::splat(0.0); 2]; LANES];
         for row in self.block.chunks_exact(self.width) {
             let Some(own) = row[at..].first_chunk::<{ 2 * LANES }>() else {
-                // Cannot be: `wide` asks for a corner only where two groups are there. No panic in a kernel.
+                // Impossible: `wide` asks for a corner only if there are two groups. A kernel must not panic.
                 return;
             };
             let right = [V::first(own), V::first(&own[LANES..])];
@@ -386,7 +386,7 @@ impl Fold<'_> {
     #[inline(always)]
     fn tile<V: F64x8, const ROWS: usize, const GROUPS: usize>(&mut self, i: usize, j: usize) {
         // sums[r][g] += x[i + r] x[j + 8 g ..], row after row of X: an outer product of two short pieces. ROWS GROUPS
-        // independent sums, 8 or more of which hide the latency of a fused operation (4 cycles on two units).
+        // independent sums; 8 or more hide the latency of a fused operation (4 cycles on two units).
         let mut sums = [[V::splat(0.0); GROUPS]; ROWS];
         for row in self.block.chunks_exact(self.width) {
             let right = &row[j..j + GROUPS * LANES];
@@ -395,8 +395,8 @@ impl Fold<'_> {
                 *group = V::load(right);
             }
             let left = &row[i..i + ROWS];
-            // ROWS + GROUPS loads for ROWS GROUPS products: 11 for 24 with AVX-512, where two loads and two products a
-            // cycle are possible.
+            // ROWS + GROUPS loads for ROWS GROUPS products: 11 for 24 with AVX-512, which can do two loads and two
+            // products a cycle.
             for (sums, left) in sums.iter_mut().zip(left) {
                 let left = V::splat(*left);
                 for (sum, right) in sums.iter_mut().zip(groups) {
@@ -415,7 +415,7 @@ impl Fold<'_> {
         j: usize,
         tile: [[V; GROUPS]; ROWS],
     ) {
-        // Once a block: with 64 rows a sum is fetched and stored for 64 products.
+        // Once a block: with 64 rows a sum is fetched and stored once for 64 products.
         for (r, sums) in tile.iter().enumerate() {
             let totals = &mut self.sums[(i + r) * self.width + j..][..GROUPS * LANES];
             for (g, sum) in sums.iter().enumerate() {

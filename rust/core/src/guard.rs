@@ -1,59 +1,59 @@
-//! The guard: whether a trained model also holds where its record does not show it.
+//! The guard: tests whether a trained model also holds beyond its record. Begin reading at `verdict`.
 //!
-//! A model that fits its record can still run away on other inputs, or have two equilibria where the drive has one and
-//! stay at the wrong one. Runs over inputs a quarter larger, from other initial states and over the record's blocks in
-//! other orders show that. They take whole records: within a short block a slow drive forgets nothing. What they find is
-//! measured in widths of the output's range, so that one set of bounds serves every drive; where the drive itself is
-//! slow, so are its linear models, and the bounds yield to what those do in the same runs.
+//! A model that fits its record can still run away on other inputs, or have two equilibria instead of the drive's one
+//! and stay at the wrong one. Runs over inputs a quarter larger, from other initial states, and over the record's
+//! blocks in other orders show that. They need whole records: within a short block a slow drive forgets nothing.
+//! Results are measured in widths of the output's range, so one set of bounds serves every drive. If the drive itself
+//! is slow, so are its linear models, and the bounds are relaxed to what these do in the same runs.
 
 use crate::lagged::{Lagged, STATE_SAMPLES};
 use crate::linear::LinearModel;
 use crate::neural_ss::Recording;
 use crate::{Error, ErrorKind, Monitor, Result};
 
-/// Samples of an experiment that are looked at: at most these many from its beginning.
+/// Most samples of an experiment that are used, from its beginning.
 const LONGEST: usize = 20_000;
-/// Factor by which inputs are enlarged about their means.
+/// Factor by which inputs are enlarged around their means.
 const ENLARGED: f64 = 1.25;
-/// How far outside the training output's range enlarged inputs may drive a run.
+/// How far beyond the training output's range enlarged inputs may drive a run, in widths.
 const ROOM: f64 = 1.0;
-/// How far outside it the training's own inputs may drive a run, in their order or in another one.
+/// The same for the training's own inputs, in their order or in another.
 const ROOM_AT_HOME: f64 = 0.5;
-/// How far outside the range a model with past outputs is started.
+/// How far beyond the range a model with past outputs is started.
 const BESIDE: f64 = 0.25;
-/// Largest mean distance that may be left over the last tenth between runs from different states.
+/// Largest mean distance, over the last tenth, between runs from different states.
 const FORGOTTEN: f64 = 0.2;
-/// Blocks that an input is cut into to come in another order.
+/// Blocks into which an input is cut for another order.
 const BLOCKS: usize = 8;
-/// Steps by which the blocks are gone through, prime to their number.
+/// Strides through the blocks, coprime to their number.
 const STEPS: [usize; 2] = [3, 5];
-/// Samples of a block, at least: shorter experiments are not asked about the order of their inputs.
+/// Least samples of a block: shorter experiments are not tested with another order.
 const SHORTEST_BLOCK: usize = 100;
-/// Mean distance in the second halves of the blocks that is allowed whatever linear models do.
+/// Mean distance in the second halves of the blocks that is always allowed.
 const REMEMBERED: f64 = 0.03;
-/// The most that is allowed beside it, unless a linear model itself does more. Values of an output at unrelated times
-/// are about a third of its range apart.
+/// Largest mean distance that linear models can justify beyond that, unless a linear model itself exceeds it. Values of
+/// an output at unrelated times are about a third of its range apart.
 const MOST_REMEMBERED: f64 = 0.3;
-/// Largest ratio to what the linear models do.
+/// Largest ratio to the linear models' results.
 const MORE: f64 = 1.5;
 
 /// Why a model is not sound.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Unsound {
-    /// The free run over the record itself leaves its range far behind, or the finite numbers.
+    /// The free run over the record itself goes far beyond its range, or is not finite.
     Record,
     /// Larger inputs drive it far beyond what they would do to the drive.
     Larger,
     /// Runs from different states do not come together.
     State,
-    /// Inputs of the record's own size in another order drive it away.
+    /// Inputs of the record's own size in another order drive it beyond the range.
     Away,
-    /// What it does in a block depends on what was before, for longer than the drive remembers.
+    /// Its output in a block depends on earlier blocks, for longer than the drive remembers.
     Order,
 }
 
 impl Unsound {
-    /// The reason in words that follow "the model".
+    /// The reason, worded to follow "the model".
     pub fn reason(self) -> &'static str {
         match self {
             Self::Record => "runs away on its own record",
@@ -65,7 +65,7 @@ impl Unsound {
     }
 }
 
-/// A model that can be guarded. All values are in the data's units but for the state, which is the model's own.
+/// A model that can be guarded. All values are in the data's units except the state, which is the model's own.
 pub trait Guarded {
     /// Number of inputs.
     fn inputs(&self) -> usize;
@@ -76,7 +76,7 @@ pub trait Guarded {
     /// The state before these first samples.
     ///
     /// # Errors
-    /// `ErrorKind::Fit` where no state has a finite free run.
+    /// `ErrorKind::Fit` if no state has a finite free run.
     fn first_state(&self, u: &[f64], y: &[f64]) -> Result<Vec<f64>>;
 
     /// Free run, time first.
@@ -85,15 +85,15 @@ pub trait Guarded {
     /// `ErrorKind::Fit` for a run that leaves the finite numbers, or is stopped.
     fn free_run(&self, u: &[f64], state: &[f64], monitor: &Monitor) -> Result<Vec<f64>>;
 
-    /// Two states that lie on either side of those met in training, where the outputs went from `low` to `high`.
+    /// Two states on either side of those met in training, in which the outputs ranged from `low` to `high`.
     fn states_beside(&self, low: f64, high: f64) -> [Vec<f64>; 2];
 
-    /// Whether a state is integrated: it is then never forgotten, and depends on all that was before.
+    /// Whether a state is integrated: it is then never forgotten, and depends on all earlier inputs.
     fn integrates(&self) -> bool {
         false
     }
 
-    /// Whether the outputs are those of a sensor that does not see the sign.
+    /// Whether the outputs come from a sensor that does not see the sign.
     fn is_rectified(&self) -> bool {
         false
     }
@@ -122,7 +122,7 @@ impl<M: Lagged> Guarded for M {
     }
 }
 
-/// A linear model by which another one is judged; behind the same sensor, should that not see the sign.
+/// A linear model with which another model is compared; rectified like the sensor if that does not see the sign.
 struct Yardstick<'a> {
     model: &'a LinearModel,
     rectified: bool,
@@ -154,15 +154,15 @@ impl Guarded for Yardstick<'_> {
     }
 }
 
-/// Why `model` is not sound on these records; none where it is.
+/// Why `model` is not sound on these records; `None` if it is.
 ///
-/// The bounds are those of a drive that forgets quickly, or 1.5 times what the worst of the `linear` models of the same
-/// records does, where that is more; without linear models the order of the inputs is asked about less strictly. An
-/// integrated state is not asked to forget, and has only to move at a speed like that of its record.
+/// The bounds are those of a drive that forgets quickly or, if larger, 1.5 times the worst of the `linear` models of
+/// the same records. Without linear models the order of the inputs is tested less strictly. An integrated state need
+/// not forget; it only has to move at a speed like that of its record.
 ///
 /// # Errors
 /// `ErrorKind::Data` for records that do not fit the model, `ErrorKind::Setting` for linear models that do not,
-/// `ErrorKind::Fit` where a stop was requested.
+/// `ErrorKind::Fit` if a stop was requested.
 pub fn verdict<M: Guarded>(
     model: &M,
     recordings: &[Recording],
@@ -186,7 +186,7 @@ pub fn verdict<M: Guarded>(
     if linear.is_empty() {
         return Ok(found.verdict(None, integrates));
     }
-    // most models are sound without any look at the linear ones
+    // most models are sound without a look at the linear ones
     let mut known = Distances::default();
     if found.verdict(Some(&known), integrates).is_none() {
         return Ok(None);
@@ -234,7 +234,7 @@ struct Range {
 }
 
 impl Range {
-    /// The range of output `p`; outputs that are not known do not count.
+    /// The range of output `p`; unknown outputs do not count.
     fn of(recordings: &[Recording], p: usize) -> Result<Self> {
         let measured = recordings
             .iter()
@@ -265,20 +265,20 @@ fn extremes<'a>(values: impl Iterator<Item = &'a f64>) -> (f64, f64) {
     values.fold((f64::INFINITY, f64::NEG_INFINITY), wider)
 }
 
-/// What a model's runs come to, each in widths of the output's range, the largest over outputs and experiments.
+/// Results of a model's runs in widths of the output's range; each is the largest over outputs and experiments.
 #[derive(Clone, Copy, Debug, Default)]
 struct Distances {
     /// Beyond the range, on the record itself.
     record: f64,
     /// Beyond the range, on enlarged inputs.
     larger: f64,
-    /// There, the changes from sample to sample beyond those in the record, in widths of their range.
+    /// On these, the changes from sample to sample beyond those in the record, in widths of their range.
     faster: f64,
-    /// What is left at the end between runs from other states and the one over the record.
+    /// Distance left at the end between runs from other states and the one over the record.
     state: f64,
     /// Beyond the range, with the inputs in another order.
     away: f64,
-    /// Mean distance in the second halves of blocks to what the run had there in the record's order.
+    /// Mean distance, in the second halves of blocks, from the run in the record's order.
     order: f64,
 }
 
@@ -299,14 +299,14 @@ impl Distances {
         sum.is_finite()
     }
 
-    /// The first bound that is exceeded; `known` is what the linear models do, where there are any.
+    /// The first bound that is exceeded; `known` are the results of the linear models, if there are any.
     fn verdict(&self, known: Option<&Self>, integrates: bool) -> Option<Unsound> {
         let linear = known.copied().unwrap_or_default();
         let within = |found: f64, bound: f64, linear: f64| found <= bound.max(MORE * linear);
         if !integrates && !within(self.record, ROOM_AT_HOME, linear.record) {
             return Some(Unsound::Record);
         }
-        // a position may be driven anywhere, at speeds that are like those of its record
+        // a position may be driven anywhere, if its speeds are like those of its record
         let stays = within(self.larger, ROOM, linear.larger)
             || (integrates && within(self.faster, ROOM, linear.faster));
         if !stays {
@@ -329,17 +329,17 @@ impl Distances {
     }
 }
 
-/// The records, with all that is the same for every model.
+/// The records, with all that is common to every model.
 struct Task<'a> {
     recordings: &'a [Recording<'a>],
     ranges: Vec<Range>,
-    /// Whether the blocks also come sorted by their level, which leads a slow drive far away.
+    /// Whether blocks are also sorted by their level, which leads a slow drive far away.
     by_level: bool,
     monitor: &'a Monitor,
 }
 
 impl Task<'_> {
-    /// Over all experiments; none where a free run over one of them is not finite.
+    /// Over all experiments; `None` if a free run over one of them is not finite.
     fn distances<M: Guarded>(&self, model: &M) -> Result<Option<Distances>> {
         let mut all = Distances::default();
         for recording in self.recordings {
@@ -386,7 +386,7 @@ impl Task<'_> {
         Ok(Some(its))
     }
 
-    /// What a run gave; none where it has no finite values, an error where it was stopped.
+    /// The result of a run: `None` if its values are not finite, an error if it was stopped.
     fn found<T>(&self, result: Result<T>) -> Result<Option<T>> {
         if self.monitor.stopped() {
             return Err(Error::fit(
@@ -419,10 +419,10 @@ impl Task<'_> {
         self.largest(|p, range| range.beyond(self.output(run, p)))
     }
 
-    /// How far a run's changes from sample to sample go beyond those of the record, in widths of their range.
+    /// How far a run's changes from sample to sample exceed those of the record, in widths of their range.
     ///
-    /// Noise makes the measured changes larger than they are, a model that moves too fast its own ones: the narrower
-    /// range counts.
+    /// Noise makes the measured changes larger than the true ones, and a model that moves too fast makes its own too
+    /// large: the narrower range counts.
     fn faster(&self, run: &[f64], usual: &[f64], measured: &[f64]) -> f64 {
         let changes = |run: &[f64], p: usize| -> Vec<f64> {
             let (now, next) = (self.output(run, p), self.output(run, p).skip(1));
@@ -476,7 +476,7 @@ impl Task<'_> {
     }
 }
 
-/// The inputs, a quarter larger about their means.
+/// The inputs, a quarter larger around their means.
 fn enlarged(u: &[f64], channels: usize) -> Vec<f64> {
     let samples = (u.len() / channels) as f64;
     let mean = |j: usize| u.iter().skip(j).step_by(channels).sum::<f64>() / samples;
@@ -488,16 +488,16 @@ fn enlarged(u: &[f64], channels: usize) -> Vec<f64> {
     u.iter().enumerate().map(enlarge).collect()
 }
 
-/// An order in which the blocks of an input come.
+/// An order of an input's blocks.
 struct Order {
     blocks: Vec<usize>,
-    /// Whether they are shuffled, not sorted.
+    /// Whether the blocks are shuffled by a stride, not sorted.
     by_step: bool,
 }
 
-/// The blocks shuffled and, `by_level`, sorted by the mean of each input, rising and falling: a false equilibrium just
-/// beside the data is not met by the record as it is, a longer stay at an end of the range leads there. None for inputs
-/// too short to be cut.
+/// The blocks shuffled and, with `by_level`, sorted by the mean of each input, rising and falling. The record as it is
+/// may miss a false equilibrium just beside the data, but a longer stay at an end of the range leads there. Empty for
+/// inputs too short to be cut.
 fn orders(u: &[f64], channels: usize, by_level: bool) -> Vec<Order> {
     let length = u.len() / channels / BLOCKS;
     if length < SHORTEST_BLOCK {
@@ -541,7 +541,7 @@ mod tests {
     use crate::neural::{self, NeuralOE};
     use crate::random::Random;
 
-    /// A model whose free run is any function of inputs and a state.
+    /// A model whose free run is an arbitrary function of inputs and a state.
     struct Any<F> {
         run: F,
         integrates: bool,
@@ -642,7 +642,7 @@ mod tests {
             integrates: false,
         };
         assert_eq!(asked(&model, &u, &u, &[lag(0.1)]), Some(Unsound::Larger));
-        // a linear model that goes as far has nothing against it
+        // a linear model that goes as far justifies it
         let far = LinearModel::new(vec![0.0], vec![9.0], 1, 0, 0.0).unwrap();
         assert_eq!(asked(&model, &u, &u, &[far]), None);
     }
@@ -670,7 +670,7 @@ mod tests {
         assert_eq!(sound(&network(1.0)), Some(Unsound::State));
     }
 
-    /// Counts up at high inputs and down at low ones, and stays where it is otherwise.
+    /// Counts up at high inputs and down at low ones, and otherwise stays.
     fn latched(u: &[f64], start: f64) -> Vec<f64> {
         let mut latch = start.signum();
         let next = |u: &f64| {
@@ -682,7 +682,7 @@ mod tests {
 
     #[test]
     fn refuses_what_depends_on_blocks_long_past() {
-        // it latches in one sample of three thousand, and is unlatched in another: the record's end has forgotten its start
+        // it latches in one sample of three thousand and is released in another: at its end the record has forgotten its start
         let mut u: Vec<f64> = levels(8_000, 4).iter().map(|u| 0.5 * u).collect();
         u[2_100] = 1.0;
         u[5_100] = -1.0;
@@ -692,7 +692,7 @@ mod tests {
             integrates: false,
         };
         assert_eq!(asked(&model, &u, &y, &[lag(0.5)]), Some(Unsound::Order));
-        // a drive that remembers as long is not to be told from it
+        // it cannot be distinguished from a drive that remembers as long
         let long = LinearModel::new(vec![-0.9997], vec![0.005], 1, 1, 0.0).unwrap();
         assert_eq!(asked(&model, &u, &y, &[long]), None);
     }
@@ -711,7 +711,7 @@ mod tests {
                     .collect()
             }
         };
-        // friction that is left behind on one side only: it drifts away on larger inputs, as the drive would
+        // friction that is exceeded on one side only: on larger inputs it drifts away, as the drive would
         let drifts = position(|u| if u > 1.05 { 1.5 } else { u });
         let bolts = position(|u| if u > 1.05 { 30.0 } else { u });
         let y = drifts(&u, 0.0);
@@ -726,7 +726,7 @@ mod tests {
             integrates: true,
         };
         assert_eq!(asked(&bolting, &u, &y, &[]), Some(Unsound::Larger));
-        // what runs away on the record itself is not its own measure
+        // a model that runs away on the record itself must not set its own bounds
         let grows = |u: &[f64], start: f64| -> Vec<f64> {
             let grown = |k: usize| start + (k as f64 * 0.01).exp();
             (0..u.len()).map(grown).collect()

@@ -6,12 +6,12 @@
 //!   x(k) = -sum_i a_i x(k-i) + sum_j sum_i b_ji w_j(k-nk-i+1) + offset
 //! ```
 //!
-//! A dead band, a saturation or a servo valve's curve is an `f`; a sensor that is not straight is a `g`. Both are piecewise
-//! linear over evenly spaced knots of the training range and go straight on beyond it. `g` rises strictly, so that
-//! `x(k-i) = g^-1(y(k-i))` and the model is a [`Lagged`] one: past *outputs* are its state, as of every other kind.
+//! A dead band, a saturation or a servo valve's curve is an `f`; a nonlinear sensor is a `g`. Both are piecewise linear
+//! over evenly spaced knots of the training range and continue straight beyond it. `g` is strictly increasing, so
+//! `x(k-i) = g^-1(y(k-i))` and the model is a [`Lagged`] one: its state is past *outputs*, as for every other kind.
 //!
-//! A factor may be moved from `f` to `b` and on to `g` without a change of `y`. It is fixed by what the two curves do at the
-//! ends of their ranges: there `f(u) = u` and `g(x) = x`.
+//! A factor can be moved from `f` to `b` and on to `g` without changing `y`. The ends of the curves' ranges fix it:
+//! there `f(u) = u` and `g(x) = x`.
 
 use std::ops::Range;
 
@@ -20,17 +20,17 @@ use crate::linear::is_stable;
 use crate::output_error::{self, Fit, Parametric};
 use crate::{Error, Monitor, Record, Result, oe};
 
-/// Nearest that a reflection coefficient may come to the unit circle in a fit.
+/// Least distance of a reflection coefficient from the unit circle in a fit.
 const MARGIN: f64 = 1e-9;
-/// Share of the mean slope that every piece of `g` has at least: below, one step of the output's noise would be a jump of x.
+/// Least slope of a piece of `g`, as a share of the mean slope: below it, one step of the output's noise would be a jump of x.
 const LEAST_SLOPE: f64 = 0.02;
 /// More pieces than this describe noise.
 const MOST_PIECES: usize = 100;
-/// Weight of the ridge: a curve on which the data say nothing stays straight. A curve off by a tenth of its range at ten
-/// knots costs a rms error of 0.1 % of the output's.
+/// Weight of the ridge: a curve that the data do not determine stays straight. A curve off by a tenth of its range at
+/// ten knots costs an rms error of 0.1 % of the output's.
 const RIDGE: f64 = 1e-5;
 
-/// Where a curve has its knots.
+/// The knots of a curve.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Knots {
     /// First knot.
@@ -58,7 +58,7 @@ impl Knots {
         (self.high - self.low) / self.pieces as f64
     }
 
-    /// The knot `i`.
+    /// Knot `i`.
     pub fn at(&self, i: usize) -> f64 {
         self.low + (self.high - self.low) * i as f64 / self.pieces as f64
     }

@@ -14,22 +14,22 @@ use step::Refiner;
 
 pub(crate) use step::Outputs;
 
-/// A change of the free run below this part of the spread that noise gives it anyway does not matter: less than 1 % of
-/// the estimate's variance. Directions that the data hardly fix go on to move about within it.
+/// A change of the free run below this part of the spread caused by noise does not matter: it is less than 1 % of the
+/// estimate's variance. Directions that the data hardly determine keep moving within it.
 const SMALL_CHANGE: f64 = 0.1;
 /// A change of the free run below this part of the output's spread is rounding.
 const ROUNDING: f64 = 1e-9;
 
 /// Fits `LinearModel` by simple refined instrumental variables over all experiments.
 ///
-/// Each iteration filters inputs and outputs by `1/A` of the model before and solves
-/// `sum z(k) (y_f(k) - phi_f(k)' theta) = 0`, where the instruments `z` are the regressors with the model's own free run
-/// in the place of the measured outputs (Young 1976; Young 2011, section 6.4). Where the noise is white and added to the
-/// output, a fixed point is asymptotically as good as output error. The unknown state before each experiment is estimated
-/// along. It starts at the ARX model; poles outside the unit circle are mirrored into it.
+/// Each iteration filters inputs and outputs by `1/A` of the previous model and solves `sum z(k) (y_f(k) - phi_f(k)'
+/// theta) = 0`. The instruments `z` are the regressors with the model's own free run instead of the measured outputs
+/// (Young 1976; Young 2011, section 6.4). If the noise is white and added to the output, a fixed point is
+/// asymptotically as good as output error. The unknown state before each experiment is estimated as well. The iteration
+/// starts at the ARX model; poles outside the unit circle are mirrored into it.
 ///
-/// The outcome is `SmallStep` where the free run has come to rest; `Stalled` where it has done so only because a pole
-/// was mirrored; `RankDeficient` where the instruments do not fix the parameters; `MaxIterations`. In all but the first
+/// The outcome is `SmallStep` if the free run no longer changes; `Stalled` if that is only because a pole was mirrored;
+/// `RankDeficient` if the instruments do not determine the parameters; or `MaxIterations`. In all but the first case
 /// the iterate with the best free run is kept.
 ///
 /// ```
@@ -47,7 +47,8 @@ const ROUNDING: f64 = 1e-9;
 /// ```
 ///
 /// # Errors
-/// As [`arx::fit`] for unusable data and settings; `ErrorKind::Setting` for records with weights, `ErrorKind::Fit` where the first model has no finite free run.
+/// As [`arx::fit`] for unusable data and settings; `ErrorKind::Setting` for records with weights, `ErrorKind::Fit` if
+/// the first model has no finite free run.
 pub fn fit(
     records: &[Record],
     na: usize,
@@ -74,7 +75,7 @@ pub fn fit(
     Ok(search.fit(&refiner, records))
 }
 
-/// The iterations' state: where they are and the best free run so far.
+/// The state of the iteration: the present point and the best free run so far.
 struct Search {
     present: Rc<Point>,
     best: Rc<Point>,
@@ -150,9 +151,9 @@ impl Search {
     }
 }
 
-/// Denominators met by `iterations` iterations from the model `first`, which are starts for output error.
+/// Denominators met in `iterations` iterations from the model `first`, as starts for output error.
 ///
-/// With measured outputs as instruments it is the method of Steiglitz and McBride (1965).
+/// With measured outputs as instruments this is the method of Steiglitz and McBride (1965).
 pub(crate) fn denominators(
     records: &[Record],
     first: &LinearModel,
@@ -209,9 +210,9 @@ fn no_model() -> Error {
     )
 }
 
-// The free run of a linear model from the initial state that suits the record best.
+// The free run of a linear model from the initial state that fits the record best.
 
-/// Responses to the past below this have left no trace in any digit of an output.
+/// Responses to the past below this no longer affect any digit of an output.
 const DECAYED: f64 = 1e-30;
 
 /// One free run.
@@ -239,7 +240,7 @@ impl Point {
         0.5 * self.runs.iter().map(|r| r.error).sum::<f64>() / measured.max(1) as f64
     }
 
-    /// Standard deviation of the free run over that of the noise, which the estimated parameters bring into it.
+    /// Standard deviation of the free run caused by the estimated parameters, relative to that of the noise.
     fn relative_spread(&self) -> f64 {
         let measured: usize = self.runs.iter().map(|r| r.measured).sum();
         (self.model.parameters() as f64 / measured.max(1) as f64).sqrt()
@@ -257,7 +258,7 @@ impl Point {
     }
 }
 
-/// What one unit in each past output makes of the outputs after it, `na` values per sample, until it has decayed.
+/// Response of the outputs to one unit in each past output, `na` values per sample, until it has decayed.
 fn responses(a: &[f64], samples: usize) -> Vec<f64> {
     let na = a.len();
     let mut rows = vec![0.0_f64; na * na];
@@ -281,7 +282,7 @@ fn responses(a: &[f64], samples: usize) -> Vec<f64> {
     rows.split_off(na * na)
 }
 
-/// The run whose past outputs are the least-squares ones over the whole record: they enter the run linearly.
+/// The run whose past outputs are least-squares estimates over the whole record; they enter the run linearly.
 fn best_run(model: &LinearModel, record: &Record, responses: &[f64]) -> Option<Run> {
     let na = model.lags().na;
     let mut output = model
@@ -328,7 +329,7 @@ fn before(k: usize, output: &[f64], state: &[f64]) -> Vec<f64> {
 
 #[cfg(test)]
 mod tests {
-    //! What instrumental variables promise.
+    //! The properties of instrumental variables.
 
     use super::*;
     use crate::ErrorKind;
@@ -431,7 +432,7 @@ mod tests {
                 sums[i] += score;
             }
         }
-        // mean of n squared unit normals: deviation sqrt(2/n) = .071; five of those are allowed, and 2 % of bias
+        // the mean of n squared unit normals has deviation sqrt(2/n) = .071; five deviations are allowed, and 2 % of bias
         for (square, sum) in squares.iter().zip(sums) {
             let (mean, variance) = (sum / trials as f64, square / trials as f64);
             assert!((variance - 1.0).abs() < 0.37, "{squares:?}");

@@ -1,4 +1,4 @@
-//! What every model with lagged inputs and outputs shares: its regressor, free run, k-step prediction, initial state.
+//! The common part of every model with lagged inputs and outputs: regressor, free run, k-step prediction, initial state.
 
 use crate::linear::LinearModel;
 use crate::neural::Network;
@@ -20,19 +20,19 @@ pub struct Lags {
     pub channels: usize,
 }
 
-/// More lags than this are a slip of the pen, not a model.
+/// More lags than this are a typing error, not a model.
 const MOST_LAGS: usize = 1_000;
-/// How often the prior of the initial state may be loosened; on a clean record each time gains two digits or more.
+/// How often the prior of the initial state may be relaxed; on a clean record each time gains two digits or more.
 const RELAXATIONS: usize = 6;
-/// In so short a record other starts are tried too, as two basins may look alike.
+/// In a record this short other starts are tried too, as two basins may look alike.
 const SHORT: usize = 1000;
 /// The least weight of the prior of the initial state.
 const LEAST_PRIOR: f64 = 1e-9;
-/// A run whose squares are below this share of the outputs' is exact: the record is clean, and no other state is nearer.
+/// A run whose squares are below this share of the outputs' is exact: the record is clean, and no other state fits better.
 const EXACT: f64 = 1e-10;
 
 impl Lags {
-    /// Orders that make a model.
+    /// Checked orders.
     ///
     /// # Errors
     /// `ErrorKind::Setting` unless `na`, `nb` and `channels` are at least 1 and all are at most 1,000.
@@ -68,7 +68,7 @@ impl Lags {
         self.na.max(self.nk + self.nb - 1)
     }
 
-    /// Writes the input part of the regressor of sample `k`; inputs before the first sample are held at their first value.
+    /// Writes the input part of the regressor of sample `k`; before the first sample inputs hold their first value.
     pub fn write_inputs(&self, u: &[f64], k: usize, phi: &mut [f64]) {
         for (j, lagged) in phi.chunks_exact_mut(self.nb).enumerate() {
             for (i, value) in lagged.iter_mut().enumerate() {
@@ -77,7 +77,7 @@ impl Lags {
         }
     }
 
-    /// Number of samples in `u`, after its shape and that of the past outputs have been checked.
+    /// Number of samples in `u`, after a check of its shape and of the past outputs.
     ///
     /// # Errors
     /// `ErrorKind::Data` for a wrong number of past outputs or inputs, or values that are not finite.
@@ -105,17 +105,17 @@ impl Lags {
     }
 }
 
-/// A model in a form that kernels step without leaving their registers, in the data's units.
+/// A model that kernels step within registers, in the data's units.
 #[derive(Clone, Debug)]
 pub enum Form {
     /// A difference equation.
     Linear(LinearModel),
-    /// A network that takes and gives the data's units.
+    /// A network with inputs and outputs in the data's units.
     Network(Network),
 }
 
 impl Form {
-    /// The output that follows from the regressor `phi`.
+    /// The output for the regressor `phi`.
     pub fn output(&self, phi: &[f64]) -> f64 {
         match self {
             Self::Linear(model) => model.output(phi),
@@ -129,13 +129,13 @@ pub trait Lagged {
     /// The model's orders.
     fn lags(&self) -> Lags;
 
-    /// The output that follows from the regressor `phi`.
+    /// The output for the regressor `phi`.
     fn output(&self, phi: &[f64]) -> f64;
 
-    /// The output and its derivatives by the past outputs in `phi`, into `slope`.
+    /// The output; writes its derivatives with respect to the past outputs in `phi` into `slope`.
     fn output_and_slope(&self, phi: &[f64], slope: &mut [f64]) -> f64;
 
-    /// The form in which kernels step the model, in the data's units; `None` where they do not know its kind.
+    /// The form in which kernels step the model, in the data's units; `None` if they do not know its kind.
     fn form(&self) -> Option<Form> {
         None
     }
@@ -161,8 +161,8 @@ pub trait Lagged {
 
     /// The output `horizon` steps ahead: measured outputs up to sample `k - horizon`, the model's own after it.
     ///
-    /// The first samples, for which fewer outputs are known, start from `y_past`. In the place of an output that was not
-    /// measured (NaN) stands the model's one-step prediction of it.
+    /// The first samples have fewer known outputs before them and start from `y_past`. An output that was not measured
+    /// (NaN) is replaced by the model's one-step prediction.
     ///
     /// # Errors
     /// `ErrorKind::Data` for wrong shapes, `ErrorKind::Setting` for a horizon of 0, `ErrorKind::Fit` as in free run.
@@ -205,7 +205,7 @@ pub trait Lagged {
         finite((0..samples).map(ahead).collect())
     }
 
-    /// `y` with the one-step prediction in the place of what was not measured; none where everything was.
+    /// `y` with each unmeasured value replaced by its one-step prediction; `None` if all were measured.
     fn filled(&self, u: &[f64], y: &[f64], y_past: &[f64]) -> Option<Vec<f64>> {
         if !y.iter().any(|v| v.is_nan()) {
             return None;
@@ -226,17 +226,17 @@ pub trait Lagged {
         Some(y.iter().enumerate().map(next).collect())
     }
 
-    /// The past outputs with which the free run comes nearest to `y`, by regularised least squares.
+    /// The past outputs whose free run fits `y` best, by regularised least squares.
     ///
     /// Outputs that are NaN have no weight.
     ///
-    /// Damped Gauss-Newton steps on `sum e^2 + rho |y_past - level|^2` from several starts; `level` is the mean of
-    /// the first outputs. `rho` is first 1e-2, then the ratio of the residual's to the output's variance where that is
-    /// smaller: a noisy or short record cannot give a wild state. A clean one gives the exact state: where the least `rho` leads
-    /// to an exact run, that is kept.
+    /// Damped Gauss-Newton steps on `sum e^2 + rho |y_past - level|^2` from several starts; `level` is the mean of the
+    /// first outputs. `rho` is first 1e-2, then the ratio of the residual's to the output's variance if that is
+    /// smaller: so a noisy or short record cannot give a wild state. A clean one gives the exact state: if the least
+    /// `rho` leads to an exact run, that is kept.
     ///
     /// # Errors
-    /// `ErrorKind::Data` for wrong shapes or no measured samples, `ErrorKind::Fit` where every start leaves the finite
+    /// `ErrorKind::Data` for wrong shapes or no measured samples, `ErrorKind::Fit` if every start leaves the finite
     /// numbers.
     fn estimate_initial_state(&self, u: &[f64], channels: usize, y: &[f64]) -> Result<Vec<f64>> {
         let lags = self.lags();
@@ -263,7 +263,7 @@ pub trait Lagged {
         let squares: f64 = known.iter().map(|y| (y - level) * (y - level)).sum();
         let mut exact = search.squares(&best.1) <= EXACT * squares;
         if !exact && known.len() > 2 * lags.na {
-            // a state far from `level` that is soon forgotten: its prior outweighs the few outputs that tell of it
+            // a state far from `level` that is soon forgotten: its prior outweighs the few outputs that depend on it
             let prior = std::mem::replace(&mut search.rho, LEAST_PRIOR);
             match search.descend(best.1.clone()) {
                 Some(found) if search.squares(&found.1) <= EXACT * squares => {
@@ -273,10 +273,10 @@ pub trait Lagged {
             }
         }
         if known.len() <= SHORT && !exact {
-            // a network need not be monotone: starts with all past outputs alike can all lead to a state that is not the nearest
+            // a network need not be monotone: starts with equal past outputs can all miss the best state
             for start in spread_starts(lags.na, level, &known) {
                 best = match search.descend(start) {
-                    // what noise alone makes of another start is left
+                    // smaller improvements of another start are due to noise
                     Some(found) if found.0 < 0.5 * best.0 => found,
                     _ => best,
                 };
@@ -330,12 +330,12 @@ pub fn push_past(past: &mut [f64], y: f64) {
     past[0] = y;
 }
 
-/// Without a branch, so that several are looked at at once.
+/// Without a branch, so that several values are tested at once.
 fn all_finite(values: &[f64]) -> bool {
     values.iter().fold(true, |all, v| all & v.is_finite())
 }
 
-/// The run, where all of it is finite.
+/// The run, if all of it is finite.
 pub(crate) fn finite(run: Vec<f64>) -> Result<Vec<f64>> {
     if all_finite(&run) {
         return Ok(run);
@@ -347,7 +347,7 @@ pub(crate) fn finite(run: Vec<f64>) -> Result<Vec<f64>> {
     )))
 }
 
-/// Gauss-Newton over the past outputs, with buffers that are made once.
+/// Gauss-Newton over the past outputs, with preallocated buffers.
 struct StateSearch<'a, M: ?Sized> {
     model: &'a M,
     lags: Lags,
@@ -381,7 +381,7 @@ impl<'a, M: Lagged + ?Sized> StateSearch<'a, M> {
         }
     }
 
-    /// Sum of squared residuals and of the prior; fills the normal equations on the way.
+    /// Sum of squared residuals and of the prior; also fills the normal equations.
     fn evaluate(&mut self, state: &[f64]) -> f64 {
         let n = self.lags.na;
         self.phi[..n].copy_from_slice(state);
@@ -410,8 +410,8 @@ impl<'a, M: Lagged + ?Sized> StateSearch<'a, M> {
         cost
     }
 
-    /// Sensitivity row of this sample (rule of the chain over the past rows), into the normal equations where it was
-    /// measured.
+    /// Computes the sensitivity row of this sample by the chain rule over the past rows; adds it to the normal
+    /// equations if the sample was measured.
     fn add_row(&mut self, error: Option<f64>) {
         let n = self.lags.na;
         let (row, past) = self.rows.split_at_mut(n);
@@ -468,7 +468,7 @@ impl<'a, M: Lagged + ?Sized> StateSearch<'a, M> {
         squares
     }
 
-    /// Lowers the prior's weight to what the residual says; false where it is low enough already.
+    /// Lowers the prior's weight to what the residual suggests; false if it is low enough already.
     fn relax(&mut self, state: &[f64], level: f64, known: &[f64]) -> bool {
         let (prior, samples) = (self.rho, known.len());
         let residual = self.squares(state) / (samples - self.lags.na) as f64;

@@ -1,11 +1,11 @@
-//! How often a law of the tests is tried, and laws that every weighted sum of squares keeps.
+//! Number of cases of the tests' laws, and laws that hold for every weighted sum of squares.
 
 use proptest::test_runner::Config;
 
 use crate::lm::Problem;
 use crate::random::Random;
 
-/// So many cases, as one of these takes long; with `PROPTEST_CASES` as many as that says, for every law alike.
+/// `few` cases for a law whose cases are slow; `PROPTEST_CASES`, if set, overrides it for every law.
 pub(crate) fn cases(few: u32) -> Config {
     match std::env::var_os("PROPTEST_CASES") {
         Some(_) => Config::default(),
@@ -13,7 +13,7 @@ pub(crate) fn cases(few: u32) -> Config {
     }
 }
 
-/// Weights of 0 to 3, among them whole stretches of one value.
+/// Weights of 0 to 3, with whole stretches of one value.
 pub(crate) fn weights(samples: usize, seed: u64) -> Vec<f64> {
     let mut random = Random::new(seed);
     let drawn = (0..samples).map(|k| match k % 50 {
@@ -24,7 +24,7 @@ pub(crate) fn weights(samples: usize, seed: u64) -> Vec<f64> {
     drawn.collect()
 }
 
-/// Holds a problem's `J'e` against differences of its cost.
+/// Compares a problem's `J'e` with differences of its cost.
 pub(crate) fn check_gradient(problem: &mut impl Problem, theta: &[f64]) {
     let (_, _, gradient) = sums(problem, theta, 1.0);
     let size = gradient.iter().fold(0.0, |size: f64, g| size.max(g.abs()));
@@ -41,7 +41,7 @@ pub(crate) fn check_gradient(problem: &mut impl Problem, theta: &[f64]) {
     }
 }
 
-/// Whether the sums of a problem are those of `parts`, each with its own sum of weights, times factors.
+/// Whether a problem's sums are those of `parts`, each with its own sum of weights, times factors.
 pub(crate) fn check_sum<P: Problem>(
     theta: &[f64],
     (whole, total): (&mut P, f64),

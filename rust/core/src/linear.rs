@@ -1,4 +1,4 @@
-//! The linear difference equation with offset, and a fit of it with its covariance.
+//! The linear difference equation with offset, and the result of a fit with its covariance.
 
 use nalgebra::{Complex, DMatrix};
 
@@ -57,7 +57,7 @@ impl LinearModel {
         &self.b
     }
 
-    /// What the output moves by per sample without any input.
+    /// The output's change per sample without any input.
     pub fn offset(&self) -> f64 {
         self.offset
     }
@@ -67,8 +67,8 @@ impl LinearModel {
         self.lags.regressors() + 1
     }
 
-    /// Free run in the data's units, and its derivatives row by row: by [a, b input by input, offset], then by the past
-    /// outputs.
+    /// Free run in the data's units, and its derivatives row by row: with respect to [a, b input by input, offset],
+    /// then to the past outputs.
     ///
     /// `d y(k) = d f - sum_i a_i d y(k-i)`, where `d f/d a_i = -y(k-i)`, `d f/d b_ji = u_j(k-nk-i+1)`, `d f/d offset = 1`.
     ///
@@ -83,7 +83,7 @@ impl LinearModel {
         let run = self.simulate(u, channels, y_past)?;
         let (na, n_phi) = (self.lags.na, self.lags.regressors());
         let columns = n_phi + 1 + na;
-        // the rows of the past outputs themselves come first, the oldest one on top
+        // the rows of the past outputs themselves come first, the oldest on top
         let mut rows = vec![0.0; (na + run.len()) * columns];
         for i in 0..na {
             rows[(na - 1 - i) * columns + n_phi + 1 + i] = 1.0;
@@ -108,12 +108,12 @@ impl LinearModel {
         Ok((run, rows))
     }
 
-    /// The poles: roots of `z^na + a_1 z^(na-1) + .. + a_na`; NaN where they overflow.
+    /// The poles: roots of `z^na + a_1 z^(na-1) + .. + a_na`; NaN if they overflow.
     pub fn poles(&self) -> Vec<Complex<f64>> {
         poles(&self.a)
     }
 
-    /// True where every pole lies inside the unit circle.
+    /// True if every pole lies inside the unit circle.
     pub fn is_stable(&self) -> bool {
         is_stable(&self.a, 0.0)
     }
@@ -142,7 +142,7 @@ impl LinearModel {
         sum
     }
 
-    /// The outputs for eight regressors, lane by lane; each to the bit what [`Lagged::output`] gives for it.
+    /// The outputs for eight regressors, one per lane; each has the bits of [`Lagged::output`].
     #[inline(always)]
     pub(crate) fn next_in_lanes<V: F64x8>(&self, phi: &[Lanes]) -> V {
         let (past, inputs) = phi.split_at(self.lags.na);
@@ -188,7 +188,7 @@ impl Lagged for LinearModel {
     }
 }
 
-/// Roots of `z^n + a_1 z^(n-1) + .. + a_n`, the eigenvalues of its companion matrix; NaN where they overflow.
+/// Roots of `z^n + a_1 z^(n-1) + .. + a_n`, the eigenvalues of its companion matrix; NaN if they overflow.
 pub(crate) fn poles(a: &[f64]) -> Vec<Complex<f64>> {
     let n = a.len();
     if n == 0 {
@@ -198,7 +198,7 @@ pub(crate) fn poles(a: &[f64]) -> Vec<Complex<f64>> {
         (0, j) => -a[j],
         (i, j) => f64::from(u8::from(i == j + 1)),
     });
-    // without a limit the QR iteration never ends on coefficients whose squares overflow
+    // without a limit the QR iteration never ends if squares of the coefficients overflow
     companion.try_schur(f64::EPSILON, 200 * n).map_or_else(
         || vec![Complex::new(f64::NAN, f64::NAN); n],
         |schur| schur.complex_eigenvalues().iter().copied().collect(),
@@ -223,7 +223,7 @@ pub(crate) fn monic(roots: &[Complex<f64>]) -> Vec<Complex<f64>> {
     coefficients
 }
 
-/// The denominator with every root inside the unit circle: those outside are mirrored at it.
+/// The denominator with every root inside the unit circle: roots outside are mirrored into it.
 pub(crate) fn stabilised(a: &[f64]) -> Vec<f64> {
     if is_stable(a, 1e-6) {
         return a.to_vec();
@@ -240,7 +240,7 @@ pub(crate) fn stabilised(a: &[f64]) -> Vec<f64> {
     polynomial(&poles(a).into_iter().map(inside).collect::<Vec<_>>())
 }
 
-/// True where every root lies inside the unit circle: all reflection coefficients below `1 - margin` (Schur and Cohn).
+/// True if every root lies inside the unit circle: all reflection coefficients are below `1 - margin` (Schur-Cohn).
 pub(crate) fn is_stable(a: &[f64], margin: f64) -> bool {
     let mut a = a.to_vec();
     while let Some(reflection) = a.pop() {
@@ -265,7 +265,7 @@ pub struct LinearFit {
     pub model: LinearModel,
     /// `1/(2N) sum e^2` in free run, in the output's unit squared.
     pub cost: f64,
-    /// Iterations over all refined starts.
+    /// Iterations of all refined starts together.
     pub iterations: usize,
     /// How the best one ended.
     pub termination: Termination,
@@ -274,13 +274,13 @@ pub struct LinearFit {
     /// Past outputs per experiment, newest first, as estimated with the model.
     pub initial_states: Vec<Vec<f64>>,
     /// Covariance of [a, b input by input, offset], row by row, for white measurement noise: the noise's variance times
-    /// the inverse of the information matrix. Zero for an offset that was not estimated, infinite where the data do
-    /// not fix the parameters.
+    /// the inverse of the information matrix. Zero for an offset that was not estimated, infinite if the data do not
+    /// determine the parameters.
     pub covariance: Vec<f64>,
 }
 
 impl LinearFit {
-    /// Square roots of the covariance's diagonal: one for each of [a, b input by input, offset].
+    /// Square roots of the covariance's diagonal, one for each of [a, b input by input, offset].
     pub fn standard_errors(&self) -> Vec<f64> {
         let n = self.model.parameters();
         self.covariance
@@ -291,7 +291,7 @@ impl LinearFit {
     }
 }
 
-/// `variance information^-1`, with columns scaled to a diagonal of ones on the way; none where it is singular.
+/// `variance information^-1`, with columns scaled to a unit diagonal for the inversion; `None` if it is singular.
 pub(crate) fn spread(information: &DMatrix<f64>, variance: f64) -> Option<DMatrix<f64>> {
     let scale = information.diagonal().map(|d| 1.0 / d.sqrt());
     let n = information.nrows();
@@ -301,7 +301,7 @@ pub(crate) fn spread(information: &DMatrix<f64>, variance: f64) -> Option<DMatri
     Some(DMatrix::from_fn(n, n, entry)).filter(|c| c.iter().all(|v| v.is_finite()))
 }
 
-/// What is left of the first `kept` rows and columns of an information matrix when the others are free, too.
+/// Schur complement: the information about the first `kept` parameters if the others are free as well.
 pub(crate) fn without_nuisance(information: &DMatrix<f64>, kept: usize) -> Option<DMatrix<f64>> {
     let others = information.nrows() - kept;
     if others == 0 {
@@ -316,14 +316,14 @@ pub(crate) fn without_nuisance(information: &DMatrix<f64>, kept: usize) -> Optio
     Some(information.view((0, 0), (kept, kept)) - taken)
 }
 
-/// A ridge of 1e-12 of each diagonal entry: what leaves no trace in the output stays near zero.
+/// Adds a ridge of 1e-12 of each diagonal entry: a parameter without effect on the output stays near zero.
 pub(crate) fn soften(normal: &mut DMatrix<f64>) {
     for i in 0..normal.nrows() {
         normal[(i, i)] = normal[(i, i)] * (1.0 + 1e-12) + f64::MIN_POSITIVE;
     }
 }
 
-/// The covariance row by row for `parameters` parameters; those beyond its size are not estimated.
+/// The covariance row by row for `parameters` parameters; those beyond the matrix were not estimated.
 pub(crate) fn covariance_rows(found: Option<&DMatrix<f64>>, parameters: usize) -> Vec<f64> {
     let entry = |i: usize, j: usize| match found {
         Some(c) => c.get((i, j)).copied().unwrap_or(0.0),

@@ -1,4 +1,4 @@
-//! Small signals of a model: the derivative of one step.
+//! Small-signal models: the derivatives of one step.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -7,11 +7,11 @@ use crate::model::Differentiable;
 use crate::neural_ss::NeuralSS;
 use crate::{Error, Result};
 
-/// `x+ = A x + B v`, `y = C x + D v` in small signals, where `v(k) = u(k - nk)`: the delay is not among the states.
+/// `x+ = A x + B v`, `y = C x + D v` for small signals, where `v(k) = u(k - nk)`: the delay is not part of the state.
 ///
 /// Inputs and outputs are in the data's units. The state of a [`NeuralSS`] is its own, in scaled units. The state of a
-/// lagged model consists of the past outputs `y(k-1) .. y(k-na)` and, of one input after the other, the past values
-/// `v(k-1) .. v(k-nb+1)`.
+/// lagged model consists of the past outputs `y(k-1) .. y(k-na)` and, input by input, the past values `v(k-1) ..
+/// v(k-nb+1)`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Linearised {
     /// `dx+/dx`, row by row.
@@ -29,7 +29,7 @@ pub struct Linearised {
 }
 
 impl Linearised {
-    /// Of a lagged model, from the derivatives of its output by the regressor.
+    /// Of a lagged model, from the derivatives of its output with respect to the regressor.
     fn lagged(lags: Lags, slopes: &[f64]) -> Self {
         let Lags {
             na, nb, channels, ..
@@ -94,8 +94,8 @@ fn check(u: &[f64], state: &[f64], inputs: usize, states: usize) -> Result<()> {
     ))
 }
 
-/// Of a lagged model about the input `u`, which has been held for `nk` samples, and a state. Where its output is limited
-/// nothing moves it.
+/// Of a lagged model around the input `u`, held for `nk` samples, and a state. At a limit of the output all derivatives
+/// are zero.
 pub(crate) fn of_lagged(
     model: &impl Differentiable,
     u: &[f64],
@@ -106,7 +106,7 @@ pub(crate) fn of_lagged(
 }
 
 impl NeuralSS {
-    /// About the input `u`, which has been held for `nk` samples, and a state.
+    /// Linearises around the input `u`, held for `nk` samples, and a state.
     ///
     /// # Errors
     /// `ErrorKind::Data` for wrong numbers of inputs or states, or values that are not finite.
@@ -161,7 +161,7 @@ mod tests {
     use crate::neural_ss::{OutputFunction, Scaling, Shape, Statistics};
     use crate::random::Random;
 
-    /// Compares with differences of a step, which gives the next state and then the outputs.
+    /// Compares with differences of a step, which returns the next state followed by the outputs.
     fn check_against_differences(
         found: &Linearised,
         u: &[f64],

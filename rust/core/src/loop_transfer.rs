@@ -1,13 +1,14 @@
 //! The sampled linear loop: a plant under a zero-order hold and the controller's feedback path, as functions of frequency.
 //!
-//! The loop is broken at the plant's input. With `z = exp(j w Ts)`, `G` the plant, `E` the encoder and `R` the way from
-//! the measured output to the command,
+//! The loop is broken at the plant's input. With `z = exp(j w Ts)`, `G` the plant, `E` the encoder and `R` the path
+//! from the measured output to the command,
 //!
 //! ```text
 //! L = R E G,    S = 1/(1 + L),    T = L/(1 + L),    u = -R/(1 + L) n    (n: noise on the measured output)
 //! ```
 //!
-//! [`Path`] is `R E`, [`Plant`] and [`Measured`] are `G`. [`margins`] says how far the loop is from instability, [`peak_sensitivity`] only `max |S|`, fast enough for a search, [`Changing`] what that becomes when a resonance moves.
+//! [`Path`] is `R E`; [`Plant`] and [`Measured`] are `G`. [`margins`] says how far the loop is from instability;
+//! [`peak_sensitivity`] only `max |S|`, fast enough for a search; [`Changing`] the same when a resonance moves.
 
 mod margins;
 mod plant;
@@ -23,7 +24,7 @@ pub use margins::{Margins, margins, peak_sensitivity};
 pub use plant::{Measured, Plant};
 pub use tolerance::{Change, Changing};
 
-/// A place on the unit circle: `z^-1 = exp(-j theta)` and `1 - z^-1`, which keeps its digits at small angles.
+/// A point on the unit circle: `z^-1 = exp(-j theta)` and `1 - z^-1`, which keeps its digits at small angles.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Place {
     theta: f64,
@@ -50,11 +51,11 @@ pub struct Loop<'a> {
 }
 
 impl<'a> Loop<'a> {
-    /// The loop of `path` around `plant`, whose coefficients hold at the path's sample time.
+    /// The loop of `path` around `plant`, whose coefficients are for the path's sample time.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for a setting of the path out of range, or a plant whose output depends on the command of the
-    /// same sample.
+    /// `ErrorKind::Setting` for a setting of the path out of range, or a plant whose output depends on the command of
+    /// the same sample.
     pub fn new(path: &'a Path, plant: &'a Plant) -> Result<Self> {
         path.check()?;
         if plant.num.first().is_some_and(|&b| b != 0.0) {
@@ -76,13 +77,13 @@ impl<'a> Loop<'a> {
     }
 }
 
-/// What of a controller lies in the loop, in plain numbers; alpha, beta and the limits do not.
+/// The part of a controller that is in the loop, as plain numbers; alpha, beta and the limits are not.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Path {
     /// Gains in standard form.
     pub gains: Standard<f64>,
-    /// Gain that a schedule adds to the proportional one \[u/y\]: where `Kp` depends on the output, `-Kp alpha r` does too,
-    /// and `alpha r dKp/dy` acts on the output's deviation.
+    /// Gain that a schedule adds to the proportional gain \[u/y\]: if `Kp` depends on the output, so does `-Kp alpha
+    /// r`, and `alpha r dKp/dy` acts on the output's deviation.
     pub slope: f64,
     /// The derivative is filtered with time constant `Td/N`; infinite for no filter.
     pub n: f64,
@@ -92,9 +93,9 @@ pub struct Path {
     pub filter_time: f64,
     /// Time constant of the alpha-beta observer \[s\]; 0 for none.
     pub observer_time: f64,
-    /// Notches and the like on the feedback.
+    /// Biquads, such as notches, on the feedback.
     pub biquads: Cascade<f64>,
-    /// Whether the output is measured as a difference of positions: the mean over the sample before.
+    /// Whether the output is measured as a difference of positions: the mean over the last sample.
     pub encoder: bool,
     /// Sample time \[s\].
     pub ts: f64,
@@ -162,7 +163,7 @@ impl Path {
         self.gains.kp * self.ts / self.gains.ti
     }
 
-    /// Gain on the difference of the output, `Kp Td/(Td/N + Ts)`.
+    /// Gain on the output's difference, `Kp Td/(Td/N + Ts)`.
     pub(super) fn kd(&self) -> f64 {
         self.gains.kp * self.gains.td / (self.gains.td / self.n + self.ts)
     }
@@ -183,7 +184,7 @@ impl Path {
         (-self.ts / self.observer_time).exp()
     }
 
-    /// From the measured output to the command, with its sign turned:
+    /// From the measured output to the command, with reversed sign:
     ///
     /// ```text
     /// R = (Kp + slope + Ki/(1 - 1/z) + Kd (1 - 1/z)/(1 - pole/z)) F,
@@ -218,7 +219,7 @@ impl Path {
         response
     }
 
-    /// The encoder: `(1 + 1/z)/2`, as the output runs straight between samples.
+    /// The encoder: `(1 + 1/z)/2`, as the output is taken to be linear between samples.
     pub(super) fn encoder_response(&self, at: &Place) -> Complex<f64> {
         let half = if self.encoder { 0.5 } else { 0.0 };
         Complex::new(1.0, 0.0) - at.difference * half
@@ -228,7 +229,7 @@ impl Path {
 /// Doublings of the horizon; the last one spans 2^60 samples.
 const DOUBLINGS: usize = 60;
 
-/// The most states whose eigenvalues are worth their time.
+/// Most states whose eigenvalues are worth the time.
 const MOST: usize = 250;
 
 /// `x(k+1) = A x(k) + B n(k)`, `u(k) = C x(k) + D n(k)` with noise `n` on the measured output.
@@ -240,7 +241,7 @@ struct States {
 }
 
 impl States {
-    /// Column by column, by stepping the loop from each unit vector; `None` beyond [`MOST`] states.
+    /// Computed column by column, by stepping the loop from each unit vector; `None` beyond [`MOST`] states.
     fn of(closed: &Loop<'_>) -> Option<Self> {
         let memory = Memory::of(closed);
         let n = memory.size();
@@ -265,7 +266,7 @@ impl States {
         })
     }
 
-    /// The largest size of a pole; NaN where the eigenvalues cannot be found.
+    /// The largest magnitude of a pole; NaN if the eigenvalues cannot be found.
     fn largest_pole(&self) -> f64 {
         let n = self.a.nrows();
         let schur = self.a.clone().try_schur(f64::EPSILON, 200 * n.max(1));
@@ -296,11 +297,11 @@ impl States {
     }
 }
 
-/// What the parts of the loop remember, one after the other in one vector.
+/// The states of all parts of the loop, one after the other in one vector.
 struct Memory<'a> {
     path: &'a Path,
     plant: &'a Plant,
-    /// Where each part begins: plant, encoder, average, lag, observer, biquads, integral, derivative.
+    /// Start of each part: plant, encoder, average, lag, observer, biquads, integral, derivative.
     at: [usize; 9],
 }
 
@@ -329,7 +330,7 @@ impl<'a> Memory<'a> {
         self.at[8]
     }
 
-    /// One sample with reference 0: the command, and `x` becomes the next state.
+    /// One sample with reference 0: returns the command, and `x` becomes the next state.
     fn step(&self, x: &mut [f64], noise: f64) -> f64 {
         let mut y = x[0];
         if self.path.encoder {
@@ -371,7 +372,7 @@ impl<'a> Memory<'a> {
         *speed
     }
 
-    /// Section by section the last input and the two states of transposed direct form II on its change.
+    /// For each section the last input and the two states of the transposed direct form II on its change.
     fn notched(&self, memory: &mut [f64], mut y: f64) -> f64 {
         let sections = self.path.biquads.sections().iter();
         for (state, section) in memory.chunks_exact_mut(3).zip(sections) {
@@ -399,7 +400,7 @@ impl<'a> Memory<'a> {
         u
     }
 
-    /// Observer form: `x_i` is what past inputs and outputs contribute to the output `i` samples ahead.
+    /// Observer form: `x_i` is the contribution of past inputs and outputs to the output `i` samples ahead.
     fn advance(&self, x: &mut [f64], u: f64) {
         let y = x[0];
         for i in 0..x.len() {

@@ -20,7 +20,7 @@ fn rms(values: impl ExactSizeIterator<Item = f64>) -> f64 {
     (values.map(|v| v * v).sum::<f64>() / n).sqrt()
 }
 
-/// What a controller spends.
+/// The effort of a controller.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Effort {
     /// Root mean square of the command \[u\].
@@ -43,7 +43,7 @@ impl Effort {
     }
 }
 
-/// A rise or fall of a reference from a level to one that it then holds; indices of samples.
+/// A rise or fall of a reference from one level to another that it then holds; indices of samples.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Edge {
     /// Last sample at the first level.
@@ -59,7 +59,7 @@ pub struct Edge {
 }
 
 impl Edge {
-    /// The first edge of a step or trapezoid; `None` where the reference holds no level after its first edge.
+    /// The first edge of a step or trapezoid; `None` if the reference holds no level after its first edge.
     pub fn first(reference: &[f64]) -> Option<Self> {
         let change = |k: usize| reference[k + 1] - reference[k];
         let last = reference.len().checked_sub(1)?;
@@ -69,7 +69,7 @@ impl Edge {
             .find(|&k| change(k) * direction <= 0.0)
             .unwrap_or(last);
         let (low, high) = (reference[start], reference[top]);
-        // Ramps computed in floating point end a rounding error beside their level.
+        // Ramps computed in floating point end a rounding error away from their level.
         let holds = |k: &usize| (reference[*k] - high).abs() <= 1e-9 * (high - low).abs();
         let end = (top..=last).take_while(holds).last()?;
         let long_enough = end - top >= 3.max((top - start) / 5);
@@ -82,7 +82,7 @@ impl Edge {
         })
     }
 
-    /// Time in samples from 10 % to 90 % of the step; NaN where `y` does not get there before the reference leaves.
+    /// Time in samples from 10 % to 90 % of the step; NaN if `y` does not reach 90 % before the reference moves on.
     pub fn rise(&self, y: &[f64]) -> f64 {
         self.crossing(y, 0.9) - self.crossing(y, 0.1)
     }
@@ -115,7 +115,7 @@ impl Edge {
 /// How a response follows the first edge of its reference.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StepMetrics {
-    /// 10 % to 90 % \[s\]; NaN where the response does not get to 90 % before the reference moves on.
+    /// 10 % to 90 % \[s\]; NaN if the response does not reach 90 % before the reference moves on.
     pub rise_time: f64,
     /// The same of the reference itself \[s\].
     pub reference_rise_time: f64,
@@ -126,8 +126,8 @@ pub struct StepMetrics {
 /// Rise time and overshoot on the first edge of a step or trapezoid, after a centred moving average of `smoothing` seconds.
 ///
 /// # Errors
-/// `ErrorKind::Data` for lengths that differ or a reference without an edge and a level after it,
-/// `ErrorKind::Setting` for a sample time or smoothing that is not usable.
+/// `ErrorKind::Data` for lengths that differ or a reference without an edge followed by a level, `ErrorKind::Setting`
+/// for an unusable sample time or smoothing.
 pub fn step_metrics(y: &[f64], reference: &[f64], ts: f64, smoothing: f64) -> Result<StepMetrics> {
     if y.len() != reference.len() {
         return Err(Error::data(format!(
@@ -155,7 +155,7 @@ pub fn step_metrics(y: &[f64], reference: &[f64], ts: f64, smoothing: f64) -> Re
     })
 }
 
-/// Centred moving average of about `smoothing` seconds, an odd number of samples; over fewer at the ends.
+/// Centred moving average over about `smoothing` seconds, an odd number of samples; fewer at the ends.
 pub(crate) fn smooth(y: &[f64], ts: f64, smoothing: f64) -> Vec<f64> {
     let half = (smoothing / ts / 2.0).floor() as usize;
     let mean = |k: usize| {
@@ -209,7 +209,7 @@ mod tests {
             "{metrics:?}"
         );
         assert!((metrics.rise_time - 0.12).abs() < 1e-9);
-        // A single sample of noise is taken out by the smoothing: a fifth of it stays.
+        // The smoothing reduces a single sample of noise to a fifth.
         let mut spike = r.clone();
         spike[500] = 3150.0;
         let spiked = step_metrics(&spike, &r, 1e-3, 0.005).unwrap();

@@ -1,8 +1,8 @@
 //! `Model`: what every identified model can do, whatever its equations.
 //!
-//! In reading order: [`Model`] is what Python, the closed loop and the deployment ask for. A lagged model has its step,
-//! from which [`Lagged`] makes free run, prediction and state; what it adds is [`Differentiable`], and the rest of
-//! [`Model`] follows. [`NeuralSS`] has states of its own and answers for itself.
+//! In reading order: [`Model`] is what Python, the closed loop and the deployment use. A lagged model has its step,
+//! from which [`Lagged`] makes free run, prediction and state; it adds [`Differentiable`], and the rest of [`Model`]
+//! follows. [`NeuralSS`] has its own states and implements [`Model`] itself.
 
 use crate::closed_loop::{LaggedPlant, Plant, StatePlant};
 use crate::embedded::Embedded;
@@ -13,7 +13,7 @@ use crate::neural::NeuralOE;
 use crate::neural_ss::NeuralSS;
 use crate::{Error, Result};
 
-/// A free run and its derivatives, row by row: by the parameters, then by the initial state.
+/// A free run and its derivatives, row by row: with respect to the parameters, then to the initial state.
 pub type RunAndRows = (Vec<f64>, Vec<f64>);
 
 /// A model of one plant. Arrays have time first; the state is the model's own (past outputs, newest first, or states).
@@ -43,7 +43,7 @@ pub trait Model: Send + Sync {
         horizon: usize,
     ) -> Result<Vec<f64>>;
 
-    /// The state from which the free run comes nearest to `y`.
+    /// The state whose free run fits `y` best.
     ///
     /// # Errors
     /// As [`Model::simulate`]; `ErrorKind::Data` without a measured sample.
@@ -55,28 +55,28 @@ pub trait Model: Send + Sync {
     /// As [`Model::simulate`].
     fn jacobian(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<RunAndRows>;
 
-    /// Small signals about an input that has been held, and a state (see [`Linearised`]).
+    /// Small-signal model around a held input and a state (see [`Linearised`]).
     ///
     /// # Errors
     /// `ErrorKind::Data` for wrong numbers of inputs or states, or values that are not finite.
     fn linearise(&self, u: &[f64], state: &[f64]) -> Result<Linearised>;
 
-    /// The model at rest as a plant that a loop steps, at a sample time \[s\].
+    /// The model at rest as a plant for a loop, at a sample time \[s\].
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for a model that no loop can be closed around.
+    /// `ErrorKind::Setting` for a model around which no loop can be closed.
     fn plant(&self, ts: f64) -> Result<Box<dyn ClonePlant + '_>>;
 
-    /// In the form of a microcontroller; `scaled` keeps more digits in single precision.
+    /// The microcontroller's form; `scaled` keeps more digits in single precision.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for a kind that has no such form.
     fn embedded(&self, scaled: bool) -> Result<Embedded>;
 }
 
-/// A plant behind a pointer, of which a search makes copies.
+/// A boxed plant that a search can copy.
 pub trait ClonePlant: Plant + Send + Sync {
-    /// A copy, where the plant stands.
+    /// A copy in the same state.
     fn copied<'a>(&self) -> Box<dyn ClonePlant + 'a>
     where
         Self: 'a;
@@ -96,7 +96,7 @@ pub trait Differentiable: Lagged + Clone + Send + Sync {
     /// The parameters.
     fn theta(&self) -> Vec<f64>;
 
-    /// The derivatives of the output by the whole regressor.
+    /// The derivatives of the output with respect to the whole regressor.
     fn slopes(&self, phi: &[f64]) -> Vec<f64>;
 
     /// Free run and its derivatives.
@@ -105,7 +105,7 @@ pub trait Differentiable: Lagged + Clone + Send + Sync {
     /// As [`Lagged::simulate`].
     fn jacobian(&self, u: &[f64], channels: usize, y_past: &[f64]) -> Result<RunAndRows>;
 
-    /// In the form of a microcontroller; a kind without one keeps this refusal.
+    /// The microcontroller's form; a kind without one keeps this refusal.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for a kind that has no such form.

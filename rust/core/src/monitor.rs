@@ -1,8 +1,8 @@
-//! What ends long work early: a request to stop, through the thread-safe seam to whoever watches it, and a cost that is too high.
+//! What ends long work early: a stop request from a thread-safe watcher, or a cost that is too high.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-/// Samples between two looks at a monitor in a loop with `products` per sample, a power of two: a few milliseconds.
+/// Samples between two checks of a monitor in a loop with `products` per sample, a power of two: a few milliseconds.
 pub(crate) fn look(products: usize) -> usize {
     let samples = (1 << 22) / products.max(1);
     1 << samples.clamp(16, 4096).ilog2()
@@ -36,7 +36,7 @@ impl Monitor {
         self.stop.store(true, Ordering::Relaxed);
     }
 
-    /// True once a stop has been requested; long loops ask at least every 10 ms.
+    /// True after a stop request; long loops ask at least every 10 ms.
     pub fn stopped(&self) -> bool {
         let stopped = self.stop.load(Ordering::Relaxed);
         if stopped {
@@ -45,7 +45,7 @@ impl Monitor {
         stopped
     }
 
-    /// True once the computation has learned of a stop request: its result is then marked as interrupted.
+    /// True if the computation has seen a stop request: its result is then marked as interrupted.
     pub fn heard(&self) -> bool {
         self.heard.load(Ordering::Relaxed)
     }
@@ -63,7 +63,7 @@ impl Monitor {
     /// Reports a cost; the lowest one is kept for display. A cost that is not a number is ignored.
     pub fn report_cost(&self, cost: f64) {
         let lower = |bits: u64| (cost < f64::from_bits(bits)).then_some(cost.to_bits());
-        // An Err only says that the kept cost is the lower one.
+        // An Err only means that the stored cost is lower.
         let _ = self
             .best
             .fetch_update(Ordering::Relaxed, Ordering::Relaxed, lower);
@@ -91,7 +91,7 @@ pub(crate) struct Limit {
 }
 
 impl Limit {
-    /// For a run that nothing is asked of.
+    /// For a run without a limit.
     pub const NONE: Self = Self {
         before: 0.0,
         samples: 1.0,
@@ -99,12 +99,12 @@ impl Limit {
         limit: f64::INFINITY,
     };
 
-    /// The cost with this sum of squares; it grows with the sum, rounding included.
+    /// The cost for this sum of squares; it increases with the sum, even with rounding.
     pub fn cost(&self, sum: f64) -> f64 {
         0.5 * (self.before + sum) / self.samples + self.penalty
     }
 
-    /// What is left after a run with this sum.
+    /// The limit that remains after a run with this sum.
     pub fn after(self, sum: f64) -> Self {
         Self {
             before: self.before + sum,
@@ -112,7 +112,7 @@ impl Limit {
         }
     }
 
-    /// Whether a sum that only grows can no longer stay below it.
+    /// Whether a sum that only grows can no longer stay below the limit.
     pub fn is_reached(&self, sum: f64) -> bool {
         self.cost(sum) >= self.limit
     }

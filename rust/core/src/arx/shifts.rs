@@ -1,8 +1,8 @@
-//! Normal equations from products of shifted signals: no row is formed.
+//! Normal equations from products of shifted signals, without forming rows.
 //!
-//! Over the rows `k` of a record, with `t = k - i`, `sum_k p(k-i) q(k-j) = sum_t p(t) q(t-(j-i))`: but for a few products
-//! at both ends it depends on the difference of the lags alone. The common part is summed for all differences in one pass
-//! over the record; the ends are added to it. Nothing is subtracted, so that no digit is lost that rows would keep.
+//! Over the rows `k` of a record, with `t = k - i`, `sum_k p(k-i) q(k-j) = sum_t p(t) q(t-(j-i))`: except for a few
+//! products at both ends, this depends only on the difference of the lags. One pass over the record sums the common
+//! part for all differences; then the ends are added. Nothing is subtracted, so no digits are lost compared with rows.
 
 use nalgebra::DMatrix;
 
@@ -10,11 +10,11 @@ use crate::Record;
 use crate::lagged::Lags;
 use crate::simd::{self, F64x8, Kernel, LANES};
 
-/// Samples of a block, of which two signals and the ones stay in the first-level cache.
+/// Samples of a block: two signals and the ones then stay in the first-level cache.
 const BLOCK: usize = 1024;
 const ONES: [f64; BLOCK] = [1.0; BLOCK];
 
-/// A signal, the lags at which it stands in a row, and what it is multiplied with.
+/// A signal, the lags at which it is in a row, and the signals it is multiplied with.
 struct Signal {
     first: usize,
     last: usize,
@@ -38,7 +38,7 @@ pub(super) struct Shifts {
 }
 
 impl Shifts {
-    /// For rows of `columns` values: the regressors, and 1 where there is one more.
+    /// For rows of `columns` values: the regressors, and 1 if there is an additional column.
     pub fn new(lags: &Lags, columns: usize) -> Self {
         let inputs = (0..lags.channels).map(|_| (lags.nk, lags.nk + lags.nb - 1));
         let spans: Vec<(usize, usize)> = std::iter::once((0, lags.na)).chain(inputs).collect();
@@ -58,13 +58,13 @@ impl Shifts {
         }
     }
 
-    /// Whether a record is measured throughout, has no weights and is long enough to have samples between its ends.
+    /// Whether a record is measured throughout, has no weights and has samples between its ends.
     pub fn suit(&self, record: &Record) -> bool {
         let plain = record.unmeasured == 0 && record.weights.is_none();
         plain && record.len() > self.lags.first_whole() + self.longest()
     }
 
-    /// The longest span of lags of a signal.
+    /// The longest range of lags of a signal.
     fn longest(&self) -> usize {
         self.lags.na.max(self.lags.nb)
     }
@@ -93,7 +93,7 @@ impl Shifts {
         }
     }
 
-    /// Room for a block of each input where they are interleaved.
+    /// Size of the buffer for a block of each input, if inputs are interleaved.
     fn room(&self) -> usize {
         match self.lags.channels {
             1 => 0,
@@ -106,7 +106,7 @@ impl Shifts {
         self.lags.first_whole() + BLOCK + self.longest()
     }
 
-    /// Adds a sum, completed by the products at both ends, for all pairs of lags with one difference.
+    /// Adds a sum to all pairs of lags with the same difference, completed by the products at both ends.
     fn spread(
         &self,
         record: &Record,
@@ -146,7 +146,7 @@ impl Shifts {
         }
     }
 
-    /// The column that stands beside a signal's lag; none where the partner has no such lag.
+    /// The column of the partner for a signal's lag; `None` if the partner has no such lag.
     fn partner_column(&self, partner: Partner, lag: usize) -> Option<usize> {
         let Partner::Shifted { signal, difference } = partner else {
             return Some(self.columns - 1);
@@ -159,7 +159,7 @@ impl Shifts {
     }
 }
 
-/// All differences of lags between two signals; of a signal with itself those that are not negative.
+/// All differences of lags between two signals; for a signal with itself only those from 0 on.
 fn differences(
     spans: &[(usize, usize)],
     p: usize,
@@ -184,11 +184,11 @@ fn value(record: &Record, signal: usize, t: usize) -> f64 {
     }
 }
 
-/// The sums over all samples but those at the ends, block by block.
+/// The sums over all samples except those at the ends, block by block.
 struct Middle<'a> {
     shifts: &'a Shifts,
     record: &'a Record<'a>,
-    /// A block of each input, where they are interleaved in the record.
+    /// A block of each input, if they are interleaved in the record.
     separated: Vec<f64>,
     sums: Vec<Vec<f64>>,
 }
@@ -210,7 +210,7 @@ impl Kernel for Middle<'_> {
 }
 
 impl Middle<'_> {
-    /// Copies a block's inputs, and the samples around it that it needs, one input after the other.
+    /// Copies a block's inputs, with the neighbouring samples that it needs, one input after the other.
     fn separate(&mut self, begin: usize) {
         let (channels, stride) = (self.record.channels, self.shifts.stride());
         if channels == 1 {
@@ -225,7 +225,7 @@ impl Middle<'_> {
         }
     }
 
-    /// `count` values of a signal from sample `t` on, which the block that begins at `begin` needs.
+    /// `count` values of a signal from sample `t` on, for the block that begins at `begin`.
     #[inline(always)]
     fn values(&self, signal: usize, t: usize, begin: usize, count: usize) -> &[f64] {
         let (shifts, record) = (self.shifts, self.record);
@@ -264,7 +264,7 @@ impl Middle<'_> {
         }
     }
 
-    /// The products with `COUNT` partners; of each, `WAYS` sums grow side by side: one alone would wait for itself.
+    /// The products with `COUNT` partners. Each has `WAYS` partial sums side by side, because a single sum would wait for itself.
     #[inline(always)]
     fn tile<V: F64x8, const COUNT: usize, const WAYS: usize>(
         &mut self,
@@ -341,7 +341,7 @@ mod tests {
             .collect()
     }
 
-    /// Both ways round, and how far they may part: each sum by rounding of its own products.
+    /// Compares both ways; each sum may differ by the rounding of its own products.
     fn assert_like_rows(record: &Record, lags: &Lags, offset: bool) {
         let columns = lags.regressors() + usize::from(offset);
         let shifts = Shifts::new(lags, columns);

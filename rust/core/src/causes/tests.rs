@@ -3,7 +3,7 @@ use super::*;
 const TS: f64 = 1e-3;
 const PER_TURN: f64 = 4096.0;
 
-/// A motor of 250 RPM/V and .1 s with friction of .3 V, advanced by Euler's method in tenths of a sample; a fault changes it.
+/// A motor of 250 RPM/V and .1 s with friction of .3 V, by Euler's method in tenths of a sample; a fault changes it.
 struct Rig {
     speed: f64,
     angle: f64,
@@ -68,7 +68,7 @@ impl Rig {
     }
 }
 
-/// A loop along levels, or commands that are given; until 3,000 RPM.
+/// A loop that follows levels, or given commands; ends at 3,000 RPM.
 fn run(fault: Option<Fault>, samples: usize, is_loop: bool) -> (Vec<f64>, Vec<f64>) {
     let mut rig = Rig::new();
     let (mut u, mut counts, mut sum) = (vec![], vec![], 0.0);
@@ -140,7 +140,7 @@ fn each_change_is_named_with_its_value_after_earlier_runs() {
                 (best.value - value).abs() < 0.25 * value.abs().max(0.5),
                 "{said}"
             );
-            // a delay shows where the command moves
+            // a delay shows only when the command changes
             assert!((best.at - at as f64 * TS).abs() < 0.1, "{said}");
             assert!(best.error < 0.5 * found.error, "{said}");
         }
@@ -176,7 +176,7 @@ fn a_healthy_run_needs_no_change() {
     .unwrap();
     assert!(found.error < 0.03 * found.size, "{found:?}");
     assert!((found.motor.gain - 250.0).abs() < 10.0, "{found:?}");
-    // in one direction friction and a load are one number
+    // in one direction friction and a load are the same number
     let lost = found.motor.friction - found.motor.bias;
     assert!((lost - 0.3).abs() < 0.1, "{found:?}");
 }

@@ -8,10 +8,10 @@ use crate::linear::{LinearModel, is_stable, soften, spread, stabilised};
 use crate::monitor::look;
 use crate::{Monitor, Record};
 
-/// A pivot of the scaled matrix below this part of the largest one leaves no digits.
+/// A pivot of the scaled matrix below this part of the largest one has no digits left.
 const SMALL_PIVOT: f64 = 1e-14;
 
-/// Whose past outputs stand in the regressor.
+/// Which past outputs are in the regressor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Outputs {
     /// The model's own free run: no noise in it.
@@ -20,12 +20,12 @@ pub(crate) enum Outputs {
     Measured,
 }
 
-/// The records and what does not change over the iterations.
+/// The records and what stays the same over the iterations.
 pub(super) struct Refiner<'a> {
     records: &'a [Record<'a>],
     lags: Lags,
     monitor: &'a Monitor,
-    /// Means that are taken off inputs and output where there is an offset: it keeps the columns apart.
+    /// Means subtracted from inputs and output if there is an offset; this keeps the columns well separated.
     centre: Option<Centre>,
 }
 
@@ -66,7 +66,7 @@ impl<'a> Refiner<'a> {
         }
     }
 
-    /// The model with its free runs; none where one leaves the finite numbers or a stop was requested.
+    /// The model with its free runs; `None` if one is not finite or a stop was requested.
     pub fn point(&self, model: LinearModel) -> Option<Point> {
         let longest = self.records.iter().map(Record::len).max()?;
         let responses = responses(model.a(), longest);
@@ -78,7 +78,7 @@ impl<'a> Refiner<'a> {
         Some(Point { model, runs })
     }
 
-    /// The estimate whose errors, filtered by `1/A` of `model`, do not correlate with the instruments.
+    /// The estimate whose errors, filtered by `1/A` of `model`, are uncorrelated with the instruments.
     pub fn refine(&self, point: &Point, instruments: Outputs) -> Option<Estimate> {
         let (left, right) = self.moments(point, instruments, Outputs::Measured)?;
         let solution = solved(left, right)?;
@@ -95,7 +95,7 @@ impl<'a> Refiner<'a> {
         Some(Estimate { model, reflected })
     }
 
-    /// The offset in the data's units from that of the centred data.
+    /// The offset in the data's units, from that of the centred data.
     fn offset(&self, a: &[f64], b: &[f64], centred: Option<f64>) -> f64 {
         let (Some(centre), Some(centred)) = (&self.centre, centred) else {
             return 0.0;
@@ -107,7 +107,7 @@ impl<'a> Refiner<'a> {
         })
     }
 
-    /// Covariance of [a, b, offset] for white noise of this variance: the inverse of the noise-free regressors' matrix.
+    /// Covariance of [a, b, offset] for white noise of this variance, from the inverse of the noise-free regressors' matrix.
     pub fn covariance(&self, point: &Point, variance: f64) -> Option<DMatrix<f64>> {
         let (simulated, na) = (Outputs::Simulated, self.lags.na);
         let (information, _) = self.moments(point, simulated, simulated)?;
@@ -181,7 +181,7 @@ impl<'a> Refiner<'a> {
     fn filtered_series(&self, model: &LinearModel, record: &Record, run: &Run) -> Series {
         let (mean_y, channels) = (self.centre.as_ref().map_or(0.0, |c| c.y), record.channels);
         let mean_u = |i: usize| self.centre.as_ref().map_or(0.0, |c| c.u[i % channels]);
-        // a gap is filled with the model's output, so that the filter can run through it
+        // a gap is filled with the model's output so that the filter can run through it
         let known = |(y, x): (&f64, &f64)| if y.is_nan() { x - mean_y } else { y - mean_y };
         let y = record.y.iter().zip(&run.output).map(known).collect();
         let x = run.output.iter().map(|x| x - mean_y).collect();
@@ -219,8 +219,8 @@ fn filtered(a: &[f64], mut values: Vec<f64>, channels: usize) -> Vec<f64> {
 
 /// Moments of one record, bordered by its transient.
 ///
-/// What happened before the record reaches the filtered equation as a free response of `1/A`: `na` unknown numbers per
-/// record, which enter linearly. They are columns of their own and are eliminated before records are added up.
+/// Events before the record reach the filtered equation as a free response of `1/A`: `na` unknown numbers per record,
+/// which enter linearly. They have their own columns and are eliminated before records are added up.
 struct Sums {
     left: DMatrix<f64>,
     right: DVector<f64>,
@@ -275,7 +275,7 @@ impl Sums {
     }
 }
 
-/// Solution by LU with rows and columns scaled; none where a pivot is small.
+/// Solution by LU with rows and columns scaled; `None` if a pivot is small.
 fn solved(left: DMatrix<f64>, right: DVector<f64>) -> Option<DVector<f64>> {
     let scale = left
         .diagonal()

@@ -1,5 +1,5 @@
-//! Margins of the sampled loop: how much gain, phase and delay it bears, how it passes on disturbances and noise; and the locus of
-//! `L` that they are read from, as dense as it turns.
+//! Margins of the sampled loop: how much gain, phase and delay it tolerates, and how it passes on disturbances and
+//! noise. They are read from the locus of `L`, sampled more densely where it turns faster.
 
 use std::cmp::Ordering;
 use std::f64::consts::{FRAC_1_SQRT_2, PI};
@@ -9,15 +9,15 @@ use sewfast_control::Biquad;
 
 use super::{Loop, Place, States};
 
-/// Points per decade to begin with.
+/// Initial points per decade.
 const DENSITY: f64 = 16.0;
-/// A turn of `1 + L` [rad] between two points that calls for one between them.
+/// A turn of `1 + L` [rad] between two points that calls for another one between them.
 const TURN: f64 = 0.3;
-/// The same of `L` itself where it is not negligible.
+/// The same for `L` itself, if it is not negligible.
 const OWN_TURN: f64 = 0.6;
-/// What is negligible: no gain margin of this size is of interest.
+/// Sizes of `L` that are negligible: no gain margin of this size is of interest.
 const NEGLIGIBLE: f64 = 1e-4;
-/// Halvings of an interval before it counts as a passage through -1.
+/// Halvings of an interval until it counts as a passage through -1.
 const DEPTH: usize = 40;
 
 /// A point of the locus.
@@ -27,10 +27,10 @@ pub(super) struct Point {
     l: Complex<f64>,
 }
 
-/// The locus in order of frequency, and what it encircles.
+/// The locus in order of frequency, and the encirclements it makes.
 pub(super) struct Curve {
     pub(super) points: Vec<Point>,
-    /// Closed-loop poles outside the unit circle; `None` where the locus runs through -1.
+    /// Closed-loop poles outside the unit circle; `None` if the locus passes through -1.
     unstable: Option<usize>,
 }
 
@@ -68,8 +68,8 @@ impl Curve {
     }
 }
 
-/// Where a lightly damped filter or plant turns the locus, which can be between two points of the grid: the angles of its poles and
-/// zeros, and beside them.
+/// Angles at which a lightly damped filter or plant turns the locus, possibly between two points of the grid: those of
+/// its poles and zeros, and neighbours.
 fn turns(closed: &Loop<'_>) -> Vec<f64> {
     let sections = closed.path.biquads.sections().iter();
     let roots = sections.flat_map(|&Biquad { c0, c1, a1, a2 }| {
@@ -92,7 +92,7 @@ fn upper_root(b0: f64, b1: f64, b2: f64) -> Option<Complex<f64>> {
     (under > 0.0).then(|| Complex::new(-b1 / (2.0 * b0), under.sqrt() / (2.0 * b0.abs())))
 }
 
-/// Adds the points after `from` up to `to`; false where they cannot be brought near enough.
+/// Adds the points after `from` up to `to`; false if they cannot be brought near enough.
 fn refine(
     at: &impl Fn(f64) -> Point,
     points: &mut Vec<Point>,
@@ -114,7 +114,7 @@ fn refine(
     refine(at, points, middle, to, depth - 1, turned) && first
 }
 
-/// Well below every corner; with integrators low enough that they alone decide the phase.
+/// An angle well below every corner; with integrators so low that they alone determine the phase.
 fn lowest(closed: &Loop<'_>) -> f64 {
     let (path, plant) = (closed.path, closed.plant);
     let corners = plant
@@ -140,7 +140,7 @@ fn lowest(closed: &Loop<'_>) -> f64 {
     theta
 }
 
-/// How far `1 + L` has turned since frequency 0; with integrators there is no such turn.
+/// The turn of `1 + L` since frequency 0; undefined with integrators, and then 0.
 fn from_rest(closed: &Loop<'_>, l: Complex<f64>) -> f64 {
     if integrators(closed) > 0 {
         return 0.0;
@@ -152,8 +152,8 @@ fn integrators(closed: &Loop<'_>) -> usize {
     closed.plant.integrators + usize::from(closed.path.ki() != 0.0)
 }
 
-/// Unstable poles by the argument principle: over the upper half circle `1 + L` turns by `(q/2 + P - N) pi` with `q`
-/// integrators and `P` unstable poles in the open loop and `N` in the closed one.
+/// Unstable poles by the argument principle: over the upper half circle `1 + L` turns by `(q/2 + P - N) pi`, with `q`
+/// integrators and `P` unstable poles in the open loop and `N` unstable poles in the closed one.
 fn encircled(closed: &Loop<'_>, turned: f64) -> Option<usize> {
     let open = 0.5 * integrators(closed) as f64 + closed.plant.unstable as f64;
     let found = open - turned / PI;
@@ -161,7 +161,7 @@ fn encircled(closed: &Loop<'_>, turned: f64) -> Option<usize> {
         .then(|| found.round().max(0.0) as usize)
 }
 
-/// Halvings that locate a crossing, and narrowings that locate a peak.
+/// Halvings to locate a crossing, and narrowings to locate a peak.
 const LOCATED: usize = 60;
 
 /// Distances from instability, and peaks. Frequencies in rad/s.
@@ -169,36 +169,36 @@ const LOCATED: usize = 60;
 pub struct Margins {
     /// Whether every closed-loop pole lies inside the unit circle.
     pub stable: bool,
-    /// The largest size of a closed-loop pole; NaN with a memory of more than 250 samples.
+    /// The largest magnitude of a closed-loop pole; NaN with more than 250 states.
     pub largest_pole: f64,
-    /// `max |S|`, and where.
+    /// `max |S|`, and its frequency.
     pub ms: (f64, f64),
-    /// `max |T|`, and where.
+    /// `max |T|`, and its frequency.
     pub mt: (f64, f64),
-    /// The factor above 1 on the loop's gain that reaches instability; infinite where none does.
+    /// The factor above 1 on the loop's gain at which it becomes unstable; infinite if there is none.
     pub gain_margin: f64,
-    /// The factor below 1 that does; 0 where none does.
+    /// The factor below 1 at which it becomes unstable; 0 if there is none.
     pub gain_reduction: f64,
-    /// The least turn of `L` either way that reaches instability \[deg\]; infinite where `|L|` is nowhere 1.
+    /// The least turn of `L` in either direction that makes it unstable \[deg\]; infinite if `|L|` is nowhere 1.
     pub phase_margin: f64,
-    /// The additional delay that reaches instability \[s\].
+    /// The least additional delay that makes it unstable \[s\].
     pub delay_margin: f64,
-    /// Where `|S|` first reaches `1/sqrt(2)`: slower disturbances are weakened by 3 dB or more.
+    /// The frequency at which `|S|` first reaches `1/sqrt(2)`: slower disturbances are attenuated by 3 dB or more.
     pub bandwidth: f64,
-    /// Where `|L| = 1`.
+    /// Frequencies at which `|L| = 1`.
     pub gain_crossovers: Vec<f64>,
-    /// Where `L` is real and negative.
+    /// Frequencies at which `L` is real and negative.
     pub phase_crossovers: Vec<f64>,
     /// rms of the command over rms of white noise on the measured output.
     pub noise_gain: f64,
 }
 
-/// All margins of a loop; for an unstable one the peaks and the noise gain are infinite, the other margins NaN.
+/// All margins of a loop; if it is unstable, the peaks and the noise gain are infinite, the other margins NaN.
 pub fn margins(closed: &Loop<'_>) -> Margins {
     let curve = &Curve::of(closed);
     let states = States::of(closed);
     let largest_pole = states.as_ref().map_or(f64::NAN, States::largest_pole);
-    // NaN where there are too many states to ask
+    // NaN if there are too many states for eigenvalues
     let stable = curve.unstable == Some(0)
         && !matches!(
             largest_pole.partial_cmp(&1.0),
@@ -234,19 +234,19 @@ pub fn margins(closed: &Loop<'_>) -> Margins {
     }
 }
 
-/// What a search for bandwidth pays for; of a stable loop.
+/// The quantities that a search for bandwidth weighs, for a stable loop.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Weakening {
     /// `max |S|`.
     pub ms: f64,
-    /// What `|S|` passes: a level and where it is first reached \[rad/s\], then the height of each peak beyond and where that is first
-    /// exceeded, up to 1. A search that pays for a level has no jump where a peak rises above the first one.
+    /// Levels that `|S|` passes, and where it first reaches each \[rad/s\]: the given level, then the height of each
+    /// later peak, up to 1. With all of them a search has no jump when a peak rises above the first level.
     pub levels: Vec<(f64, f64)>,
-    /// rms of the command over rms of white noise on the measured output; not computed where nobody asks.
+    /// rms of the command over rms of white noise on the measured output; `None` if not requested.
     pub noise_gain: Option<f64>,
 }
 
-/// How a loop weakens disturbances from `level` on; `None` if it is unstable.
+/// How a loop attenuates disturbances, from `level` on; `None` if it is unstable.
 pub(crate) fn weakening(closed: &Loop<'_>, level: f64, noisy: bool) -> Option<Weakening> {
     let curve = Curve::of(closed);
     if curve.unstable != Some(0) {
@@ -265,7 +265,7 @@ fn noise_gain(closed: &Loop<'_>, states: Option<&States>, curve: &Curve) -> f64 
     states.map_or_else(|| noise_on(closed, &curve.points), States::noise_gain)
 }
 
-/// `max |S|`, infinite where the loop is unstable; without the other margins.
+/// `max |S|`, infinite if the loop is unstable; without the other margins.
 pub fn peak_sensitivity(closed: &Loop<'_>) -> f64 {
     let curve = Curve::of(closed);
     match curve.unstable {
@@ -282,14 +282,14 @@ fn complementary(l: Complex<f64>) -> f64 {
     l.norm() / (l + 1.0).norm()
 }
 
-/// Largest value of `size` and its angle: the best point of the locus, narrowed between its neighbours.
+/// Largest value of `size` and its angle: the best point of the locus, refined between its neighbours.
 fn peak(closed: &Loop<'_>, points: &[Point], size: fn(Complex<f64>) -> f64) -> (f64, f64) {
     let values: Vec<f64> = points.iter().map(|p| size(p.l)).collect();
     let top = values.iter().copied().fold(0.0, f64::max);
     let mut best = (0.0, f64::NAN);
     for i in 0..points.len() {
         let (before, after) = (i.saturating_sub(1), (i + 1).min(points.len() - 1));
-        // a peak between points is at most little higher than they are, as densely as they lie
+        // the points are so dense that a peak between them is at most a little higher than they are
         if values[i] >= 0.9 * top && values[i] >= values[before] && values[i] >= values[after] {
             let found = narrowed(closed, points[before].theta, points[after].theta, size);
             let own = (values[i], points[i].theta);
@@ -300,13 +300,13 @@ fn peak(closed: &Loop<'_>, points: &[Point], size: fn(Complex<f64>) -> f64) -> (
     best
 }
 
-/// Where `|S|` first reaches a level: 0 where it begins above, pi where it stays below.
+/// Where `|S|` first reaches a level: 0 if it begins above, pi if it stays below.
 fn reached(closed: &Loop<'_>, points: &[Point], level: f64) -> f64 {
     let size = |theta: f64| sensitivity(closed.at(&Place::at(theta)));
     let mut below = 0.0;
     for (i, point) in points.iter().enumerate() {
         let mut above = (sensitivity(point.l) >= level).then_some(point.theta);
-        // a peak between points, which is at most little higher than they are
+        // a peak between points, at most a little higher than they are
         if above.is_none() && sensitivity(point.l) >= 0.9 * level {
             above = peak_at(closed, points, i)
                 .filter(|(height, theta)| *height >= level && *theta > below)
@@ -328,7 +328,7 @@ fn reached(closed: &Loop<'_>, points: &[Point], level: f64) -> f64 {
     PI
 }
 
-/// Height and angle of a peak of `|S|` about a point of the locus, if there is one.
+/// Height and angle of a peak of `|S|` around a point of the locus, if there is one.
 fn peak_at(closed: &Loop<'_>, points: &[Point], i: usize) -> Option<(f64, f64)> {
     let value = sensitivity(points[i].l);
     let (before, after) = (points.get(i.checked_sub(1)?)?, points.get(i + 1)?);
@@ -351,7 +351,7 @@ fn passed(closed: &Loop<'_>, points: &[Point], level: f64) -> Vec<(f64, f64)> {
     found
 }
 
-/// Golden section.
+/// Golden-section search.
 fn narrowed(
     closed: &Loop<'_>,
     mut low: f64,
@@ -384,7 +384,7 @@ fn narrowed(
     }
 }
 
-/// Points where `of(L)` changes its sign and `counts` holds.
+/// Points at which `of(L)` changes its sign and `counts` holds.
 fn crossings(
     closed: &Loop<'_>,
     points: &[Point],
@@ -417,7 +417,7 @@ fn crossings(
     found
 }
 
-/// Where `L` is real and negative, half the sample rate and, without an integrator, frequency 0 among them.
+/// Points with real and negative `L`, including half the sample rate and, without an integrator, frequency 0.
 fn phase_crossings(closed: &Loop<'_>, points: &[Point]) -> Vec<Point> {
     let (first, last) = (points[0], points[points.len() - 1]);
     let mut found = Vec::new();
@@ -451,7 +451,7 @@ fn gain_factors(crossings: &[Point]) -> (f64, f64) {
     (above, below)
 }
 
-/// What `L` has to turn back to lie on -1, from 0 to below 2 pi.
+/// The lag that would turn `L` to -1, from 0 to below 2 pi.
 fn lag_left(l: Complex<f64>) -> f64 {
     (l.arg() + PI).rem_euclid(2.0 * PI)
 }
@@ -465,7 +465,7 @@ fn phase_margin(crossings: &[Point]) -> f64 {
         .to_degrees()
 }
 
-/// In samples.
+/// The delay margin \[samples\].
 fn delay_margin(crossings: &[Point]) -> f64 {
     crossings
         .iter()
@@ -473,7 +473,7 @@ fn delay_margin(crossings: &[Point]) -> f64 {
         .fold(f64::INFINITY, f64::min)
 }
 
-/// Nodes and weights of Gauss and Legendre from -1 to 1.
+/// Gauss-Legendre nodes and weights from -1 to 1.
 const GAUSS: [(f64, f64); 4] = [
     (-0.861_136_311_594_052_6, 0.347_854_845_137_453_86),
     (-0.339_981_043_584_856_26, 0.652_145_154_862_546_1),
@@ -481,7 +481,7 @@ const GAUSS: [(f64, f64); 4] = [
     (0.861_136_311_594_052_6, 0.347_854_845_137_453_86),
 ];
 
-/// Noise gain where there are too many states: the square root of `1/pi int |R/(1 + L)|^2 dtheta`, interval by interval.
+/// Noise gain if there are too many states: the square root of `1/pi int |R/(1 + L)|^2 dtheta`, interval by interval.
 pub(super) fn noise_on(closed: &Loop<'_>, points: &[Point]) -> f64 {
     let power = |theta: f64| {
         let place = Place::at(theta);

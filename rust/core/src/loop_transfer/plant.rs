@@ -1,5 +1,5 @@
-//! The plant of a linear loop: a fraction of polynomials in `z^-1` with delays as leading zeros, or what was measured at some
-//! frequencies, with the sensitivity of a loop around that.
+//! The plant of a linear loop: a fraction of polynomials in `z^-1` with delays as leading zeros, or a frequency
+//! response measured at some frequencies, with the sensitivity of a loop around it.
 
 use nalgebra::Complex;
 
@@ -7,10 +7,10 @@ use super::{Path, Place};
 use crate::linear::poles;
 use crate::{Error, Result};
 
-/// How near to 1 a pole is an integrator.
+/// A pole this near to 1 is an integrator.
 const INTEGRATOR: f64 = 1e-9;
 
-/// `G(z) = (num_0 + num_1 z^-1 + ..)/(1 + den_1 z^-1 + ..)` with what the argument principle needs of its poles.
+/// `G(z) = (num_0 + num_1 z^-1 + ..)/(1 + den_1 z^-1 + ..)`, and the facts about its poles that the argument principle needs.
 #[derive(Clone, Debug)]
 pub struct Plant {
     pub(super) num: Vec<f64>,
@@ -66,7 +66,7 @@ impl Plant {
         })
     }
 
-    /// `K e^(-sL)/(1 + sT)` under a zero-order hold, exactly, also where `L` is not a whole number of samples:
+    /// `K e^(-sL)/(1 + sT)` under a zero-order hold, exact even if `L` is not a whole number of samples:
     ///
     /// ```text
     /// L = d Ts + tau:  y(k+1) = a y(k) + K (1 - e^(-(Ts-tau)/T)) u(k-d) + K (e^(-(Ts-tau)/T) - a) u(k-d-1),  a = e^(-Ts/T)
@@ -75,7 +75,7 @@ impl Plant {
     /// (K. J. Astrom, B. Wittenmark, *Computer-Controlled Systems*, 3rd ed., 1997, section 2.3.)
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for numbers that are no such plant, or a dead time of more than 10,000 samples.
+    /// `ErrorKind::Setting` for invalid numbers, or a dead time of more than 10,000 samples.
     pub fn fopdt(k: f64, t: f64, l: f64, ts: f64) -> Result<Self> {
         let known =
             k.is_finite() && t > 0.0 && t.is_finite() && l >= 0.0 && ts > 0.0 && l / ts <= 1e4;
@@ -86,7 +86,7 @@ impl Plant {
         }
         let d = (l / ts).floor();
         let rest = ts - (l - d * ts);
-        // 1 - e^(-x) keeps its digits for slow plants
+        // expm1 keeps the digits of 1 - e^(-x) for slow plants
         let (early, whole) = (-(-rest / t).exp_m1(), -(-ts / t).exp_m1());
         let mut num = vec![0.0; d as usize + 1];
         num.extend([k * early, k * (whole - early)]);
@@ -120,19 +120,19 @@ fn horner(coefficients: &[f64], x: Complex<f64>) -> Complex<f64> {
         .fold(Complex::new(0.0, 0.0), |sum, &c| sum * x + c)
 }
 
-/// A frequency response with the radius of the circle in which it lies at each frequency.
+/// A frequency response, with the radius of the circle in which it lies at each frequency.
 #[derive(Clone, Debug)]
 pub struct Measured {
     lines: Vec<(Place, Complex<f64>, f64)>,
-    /// Whether the output was counted: the encoder's mean over a sample is in the response already.
+    /// Whether the output was counted: the response then includes the encoder's mean over a sample.
     counted: bool,
 }
 
 impl Measured {
-    /// From frequencies \[rad/s\], responses and radii at sample time `ts`; `counted`: the encoder is in the response.
+    /// From frequencies \[rad/s\], responses and radii at sample time `ts`; `counted`: the response includes the encoder.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for no line, other lengths, a frequency beyond half the sample rate, what is not finite.
+    /// `ErrorKind::Setting` for no line, different lengths, a frequency beyond half the sample rate, or values that are not finite.
     pub fn new(
         omega: &[f64],
         response: &[Complex<f64>],
@@ -166,7 +166,7 @@ impl Measured {
         Ok(Self { lines, counted })
     }
 
-    /// The largest `|S|` that the circles allow, infinite where one reaches -1. That the loop is stable is taken for granted.
+    /// The largest `|S|` that the circles allow; infinite if one reaches -1. The loop is assumed to be stable.
     pub fn peak_sensitivity(&self, path: &Path) -> f64 {
         let largest = |most: f64, (at, plant, radius): &(Place, Complex<f64>, f64)| {
             let feedback = self.feedback(path, at);
@@ -235,7 +235,7 @@ mod tests {
             let none = vec![0.0; omega.len()];
             let measured = Measured::new(&omega, &response, &none, counted, TS).unwrap();
             assert!((measured.peak_sensitivity(&path) / exact - 1.0).abs() < 1e-4);
-            // circles can only make it worse, and -1 inside of one has no bound
+            // circles can only make it worse; a circle around -1 allows any size
             let radius: Vec<f64> = response.iter().map(|g| 0.1 * g.norm()).collect();
             let wide = Measured::new(&omega, &response, &radius, counted, TS).unwrap();
             assert!(wide.peak_sensitivity(&path) > 1.02 * exact);

@@ -13,7 +13,7 @@ fn path(kp: f64, ti: f64, td: f64) -> Path {
     Path::new(Standard { kp, ti, td }, TS)
 }
 
-/// The drive of the paper with a first-order time constant and a dead time between two samples.
+/// The paper's drive with a first-order time constant, and a dead time between two samples.
 fn drive() -> Plant {
     Plant::fopdt(490.0, 0.25, 0.0083, TS).unwrap()
 }
@@ -185,7 +185,7 @@ fn margins_of_a_first_order_loop_by_hand() {
     let plant = Plant::new(&[0.0, 1.0], &[1.0, -a]).unwrap();
     let found = margins_of(&path(k, f64::INFINITY, 0.0), &plant);
     assert!(found.stable && (found.largest_pole - (k - a)).abs() < 1e-12);
-    // L(-1) = -k/(1 + a) is the only negative real point beside none at z = 1
+    // L(-1) = -k/(1 + a) is the only negative real point apart from z = 1, where there is none
     assert!(
         (found.gain_margin - (1.0 + a) / k).abs() < 1e-9,
         "{found:?}"

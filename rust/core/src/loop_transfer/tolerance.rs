@@ -1,21 +1,21 @@
-//! What a loop around a resonance bears. Gain and delay margins move the whole plant; a resonance also moves by itself, with the
-//! load, with wear and with temperature, and leaves the notch that was made for it.
+//! How far a loop around a resonance tolerates changes. Gain and delay margins move the whole plant; a resonance also
+//! moves by itself, with load, wear and temperature, and away from the notch designed for it.
 
 use nalgebra::Complex;
 
 use super::{Loop, Path, Plant, peak_sensitivity};
 use crate::linear::{poles, polynomial};
 
-/// A pair of poles or zeros damped less than this moves.
+/// Pairs of poles or zeros with less damping than this are moved.
 const SWINGS: f64 = 0.3;
 const PITCHES: [f64; 5] = [0.9, 0.95, 1.0, 1.05, 1.1];
-/// Also inertias: where a motor's loop crosses 1, its gain is the inverse of its inertia.
+/// These also stand for inertias: where a motor's loop crosses 1, its gain is the inverse of its inertia.
 const GAINS: [f64; 3] = [0.8, 1.0, 1.25];
 const DELAYS: [usize; 2] = [0, 2];
-/// The part of a loop's distance from instability that is left after a change.
+/// The part of a loop's distance from instability that must be left after a change.
 const LEFT: f64 = 0.5;
 
-/// A plant at another time: its gain and the frequency of its resonances as factors, an additional delay \[samples\].
+/// A change of a plant: factors on its gain and on the frequencies of its resonances, and an additional delay \[samples\].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Change {
     /// Factor on the gain.
@@ -26,8 +26,8 @@ pub struct Change {
     pub pitch: f64,
 }
 
-/// A plant, and what becomes of it if it has a resonance: all changes by -20 to +25 % of its gain, two samples of delay, and 10 % of
-/// the frequencies of its resonances.
+/// A plant and, if it has a resonance, its changed versions: all combinations of -20 to +25 % of its gain, two samples
+/// of delay, and 10 % of its resonances' frequencies.
 #[derive(Clone, Debug)]
 pub struct Changing {
     plant: Plant,
@@ -35,7 +35,7 @@ pub struct Changing {
 }
 
 impl Changing {
-    /// With the changes of a plant with a resonance; other plants have none.
+    /// The plant with its changes, if it has a resonance; other plants have none.
     pub fn new(plant: Plant) -> Self {
         let mut changed = Vec::new();
         if plant.poles.iter().any(|&p| swings(p)) {
@@ -49,8 +49,8 @@ impl Changing {
         Self { plant, changed }
     }
 
-    /// The largest `|S|` that a limit is compared with: the plant's, or [`LEFT`] of that after the worst change; and that of the
-    /// worst change with the change, infinite for an unstable loop, `None` without a resonance.
+    /// The largest `|S|` to compare with a limit: the plant's, or [`LEFT`] times that after the worst change. Also that
+    /// of the worst change with the change itself; infinite for an unstable loop, `None` without a resonance.
     pub fn sensitivity(&self, path: &Path) -> (f64, Option<(f64, Change)>) {
         let of = |(change, plant): &(Change, Plant)| (peak(path, plant), *change);
         let all = self.changed.iter().map(of);
@@ -89,7 +89,7 @@ impl Plant {
     }
 }
 
-/// The polynomial of roots of which the lightly damped ones are moved, and the factor by which that changed it at frequency 0.
+/// The polynomial of `roots` with the lightly damped ones moved, and the factor by which that changed it at frequency 0.
 fn pitched(roots: &[Complex<f64>], pitch: f64) -> (Vec<f64>, f64) {
     let mut factor = 1.0;
     let moved = roots.iter().map(|&root| {
@@ -114,7 +114,7 @@ mod tests {
 
     const TS: f64 = 1e-3;
 
-    /// A lag of first order beside a pair of zeros and one of poles at these frequencies [Hz].
+    /// A first-order lag with a pair of zeros and one of poles at these frequencies [Hz].
     fn shaft(zeros: f64, poles: f64, damping: f64) -> Plant {
         let pair = |hertz: f64| {
             let w = std::f64::consts::TAU * hertz * TS;
