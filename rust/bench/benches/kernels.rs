@@ -1,4 +1,4 @@
-//! Every kernel of the core by itself, on the level that `SEWFAST_CPU` names.
+//! Every kernel of the core by itself, on the level named by `SEWFAST_CPU`.
 
 #[path = "../../core/examples/kernels/work.rs"]
 mod work;

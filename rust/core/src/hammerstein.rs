@@ -63,18 +63,18 @@ impl Knots {
         self.low + (self.high - self.low) * i as f64 / self.pieces as f64
     }
 
-    /// The piece that `x` is on, and how far along it; below 0 or above 1 beyond the ends.
+    /// The piece that contains `x`, and the position on it; below 0 or above 1 beyond the ends.
     fn place(&self, x: f64) -> (usize, f64) {
-        // Knots are evenly spaced, so that the piece is a division and no search. `along` is not limited: beyond the
-        // ends the first and the last piece go straight on.
+        // Knots are evenly spaced, so the piece is found by a division, not a search. `along` is not clipped: beyond
+        // the ends the first and the last piece continue straight.
         let along = (x - self.low) / self.width();
-        // NaN and what is below the first knot become piece 0
+        // NaN and values below the first knot become piece 0
         let piece = (along.max(0.0) as usize).min(self.pieces - 1);
         (piece, along - piece as f64)
     }
 }
 
-/// `f(u) = u + (high - low) c(u)`; `c` is 0 at both ends and a free number at each knot between them.
+/// `f(u) = u + (high - low) c(u)`; `c` is 0 at both ends and a free number at each inner knot.
 #[derive(Clone, Debug)]
 struct Bent {
     knots: Knots,
@@ -82,7 +82,7 @@ struct Bent {
 }
 
 impl Bent {
-    /// With the ends put back.
+    /// With the zeros at the ends added.
     fn new(knots: Knots, inner: &[f64]) -> Self {
         Self {
             knots,
@@ -92,7 +92,7 @@ impl Bent {
 
     fn value_and_slope(&self, u: f64) -> (f64, f64) {
         let (i, t) = self.knots.place(u);
-        // c is in parts of the range: a bend has the same size whatever the input's unit, and one ridge fits all.
+        // c is in parts of the range: a bend has the same size for every unit of the input, so one ridge fits all.
         let range = self.knots.high - self.knots.low;
         let (left, rise) = (self.c[i], self.c[i + 1] - self.c[i]);
         (
@@ -106,7 +106,7 @@ impl Bent {
     fn add_gradient(&self, u: f64, factor: f64, by_c: &mut [f64]) {
         let (i, t) = self.knots.place(u);
         let range = self.knots.high - self.knots.low;
-        // f depends on the two knots beside u, by 1 - t and t; those at the ends are 0 and no parameters.
+        // f depends on the two knots next to u, by 1 - t and t; the end knots are 0 and no parameters.
         for (knot, share) in [(i, 1.0 - t), (i + 1, t)] {
             if let Some(place) = knot.checked_sub(1).and_then(|inner| by_c.get_mut(inner)) {
                 *place += factor * range * share;
@@ -115,8 +115,8 @@ impl Bent {
     }
 }
 
-/// `g` from the logarithms `d` of its pieces' slopes over the first one's: with `s = softmax(0, d)` piece `i` rises by
-/// `(high - low) (LEAST_SLOPE/n + (1 - LEAST_SLOPE) s_i)`. It rises strictly for every `d`, and no constraint is needed.
+/// `g` from the logarithms `d` of its pieces' slopes over the first one's: with `s = softmax(0, d)` piece `i` rises by `(high - low)
+/// (LEAST_SLOPE/n + (1 - LEAST_SLOPE) s_i)`. It increases strictly for every `d`, so no constraint is needed.
 #[derive(Clone, Debug)]
 struct Rising {
     knots: Knots,
@@ -128,8 +128,8 @@ struct Rising {
 impl Rising {
     fn new(knots: Knots, d: &[f64]) -> Self {
         let n = knots.pieces;
-        // exp(d - largest): the softmax is the same, and no exponential overflows. It begins at 0, as the first piece's
-        // own d is 0: of n shares n - 1 are free.
+        // exp(d - largest): the softmax is the same, and no exponential overflows. `largest` starts at 0, the first
+        // piece's own d: of n shares n - 1 are free.
         let largest = d.iter().fold(0.0, |most: f64, d| most.max(*d));
         let mut shares: Vec<f64> = std::iter::once(&0.0)
             .chain(d)
@@ -140,8 +140,8 @@ impl Rising {
         let range = knots.high - knots.low;
         let mut values = vec![knots.low];
         for share in &shares {
-            // Shares add up to 1, so that the rises add up to the range: g(high) = high, which fixes the factor between
-            // the curves.
+            // Shares sum to 1, so the rises sum to the range: g(high) = high, which fixes the factor between the
+            // curves.
             let rise = range * (LEAST_SLOPE / n as f64 + (1.0 - LEAST_SLOPE) * share);
             values.push(values[values.len() - 1] + rise);
         }
@@ -157,7 +157,7 @@ impl Rising {
     }
 
     fn value_and_slope(&self, x: f64) -> (f64, f64) {
-        // Exactly the identity: a Hammerstein model has no rounding of a curve that is not there.
+        // Exactly the identity: a Hammerstein model gets no rounding from a curve that it does not have.
         if self.knots.pieces == 1 {
             return (x, 1.0);
         }
@@ -172,12 +172,12 @@ impl Rising {
             return (y, 1.0);
         }
         let inner = &self.values[1..self.knots.pieces];
-        // The values rise, but are not evenly spaced: a search by halves. Inner ones alone, so that what is beyond the
-        // ends is on the first or the last piece.
+        // The values increase but are not evenly spaced: a binary search. Over inner values only, so that values beyond
+        // the ends are on the first or the last piece.
         let i = inner.partition_point(|value| *value <= y);
         let (rise, width) = (self.rise(i), self.knots.width());
         let t = (y - self.values[i]) / rise;
-        // 1/g' is what a past output's noise is multiplied by: `LEAST_SLOPE` bounds it.
+        // The noise of a past output is multiplied by 1/g', which `LEAST_SLOPE` bounds.
         (self.knots.at(i) + t * width, rise / width)
     }
 
@@ -185,8 +185,8 @@ impl Rising {
     /// `dg/dd_m = R (1 - LEAST_SLOPE) s_m ([m < i] - C_i + t ([m = i] - s_i))`.
     fn add_gradient(&self, x: f64, factor: f64, by_d: &mut [f64]) {
         let (i, t) = self.knots.place(x);
-        // From ds_i/dd_m = s_m ([i = m] - s_i): the pieces before x count in full, the one it is on by t, and the least
-        // slope not at all, as it does not depend on d.
+        // From ds_i/dd_m = s_m ([i = m] - s_i): the pieces before x count in full, its own by t, and the least slope
+        // not at all, as it does not depend on d.
         let before: f64 = self.shares[..i].iter().sum();
         let range = (self.knots.high - self.knots.low) * (1.0 - LEAST_SLOPE);
         for (m, (place, share)) in (1..).zip(by_d.iter_mut().zip(&self.shares[1..])) {
@@ -199,8 +199,8 @@ impl Rising {
 
 /// A Hammerstein-Wiener model in the data's units.
 ///
-/// `theta = [a, b input by input, offset, c input by input, d]`: bends of `f` at the inner knots in parts of the input's
-/// range, logarithms of the slopes of `g` over that of its first piece.
+/// `theta = [a, b input by input, offset, c input by input, d]`: bends of `f` at the inner knots in parts of the
+/// input's range, then logarithms of the slopes of `g` over that of its first piece.
 #[derive(Clone, Debug)]
 pub struct HammersteinWiener {
     theta: Vec<f64>,
@@ -209,7 +209,7 @@ pub struct HammersteinWiener {
     output: Rising,
 }
 
-/// Where the parts of theta are.
+/// The ranges of the parts of theta.
 struct Parts {
     offset: usize,
     bends: usize,
@@ -221,7 +221,7 @@ impl Parts {
     fn of(lags: Lags, inputs: &[Knots], output: Knots) -> Self {
         //   theta   | a | b, input by input | offset | c, input by input | d |
         //           ^ 0 .. regressors        ^ offset ^ bends             ^ slopes
-        // A curve of n pieces has n - 1 free numbers: the ends of f are fixed, as is the first slope of g.
+        // A curve of n pieces has n - 1 free numbers: the ends of f and the first slope of g are fixed.
         let offset = lags.regressors();
         let bends = offset + 1;
         let slopes = bends + inputs.iter().map(|k| k.pieces - 1).sum::<usize>();
@@ -238,7 +238,7 @@ impl HammersteinWiener {
     /// A model from its parameters.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for knots that are no range, a wrong number of parameters, or values that are not finite.
+    /// `ErrorKind::Setting` for knots that form no range, a wrong number of parameters, or values that are not finite.
     pub fn new(lags: Lags, inputs: &[Knots], output: Knots, theta: Vec<f64>) -> Result<Self> {
         if inputs.len() != lags.channels {
             return Err(Error::setting(format!(
@@ -314,13 +314,13 @@ impl HammersteinWiener {
         Parts::of(self.lags, &self.input_knots(), self.output.knots)
     }
 
-    /// `x`, the linear part's output, and in `each` what is called with every term: its place, coefficient, value, slope.
+    /// Returns `x`, the linear part's output; calls `each` for every term with its index, coefficient, value and slope.
     fn linear_part(&self, phi: &[f64], mut each: impl FnMut(usize, f64, f64, f64)) -> f64 {
         let Lags { na, nb, .. } = self.lags;
         let mut x = self.theta[phi.len()];
         for (i, value) in phi.iter().enumerate() {
             let coefficient = self.theta[i];
-            // phi has past outputs y; the difference equation wants the x behind them, -a_i x(k-i) with x = g^-1(y) and
+            // phi has past outputs y, but the difference equation -a_i x(k-i) needs the x of each: x = g^-1(y) and
             // dx/dy = 1/g'.
             let (value, slope) = if i < na {
                 let (past, slope) = self.output.inverse(*value);
@@ -341,14 +341,14 @@ impl Lagged for HammersteinWiener {
     }
 
     fn output(&self, phi: &[f64]) -> f64 {
-        // An empty closure: the walk for the output alone costs no derivatives.
+        // With an empty closure the output alone costs no derivatives.
         let x = self.linear_part(phi, |_, _, _, _| ());
         self.output.value_and_slope(x).0
     }
 
     fn output_and_slope(&self, phi: &[f64], slope: &mut [f64]) -> f64 {
         let x = self.linear_part(phi, |i, coefficient, _, steep| {
-            // As many as were asked, the past outputs first.
+            // As many as requested, the past outputs first.
             if let Some(slope) = slope.get_mut(i) {
                 *slope = coefficient * steep;
             }
@@ -367,8 +367,8 @@ impl Parametric for HammersteinWiener {
 
     fn with_theta(&self, theta: &[f64]) -> Option<Self> {
         let finite = theta.iter().all(|value| value.is_finite());
-        // A trial beyond the unit circle is refused as one that diverges would be: its free run may still be finite over
-        // a short record.
+        // A trial with a pole outside the unit circle is refused like one that diverges: over a short record its free
+        // run may still be finite.
         (finite && is_stable(&theta[..self.lags.na], MARGIN)).then(|| {
             Self::made(
                 self.lags,
@@ -379,11 +379,11 @@ impl Parametric for HammersteinWiener {
         })
     }
 
-    /// With `x` as above, `dy = g'(x) dx + (dg/dd)(x)`, where a past `x = g^-1(y)` gives `dx/dy = 1/g'` and
-    /// `dx/dd = -(dg/dd)/g'`.
+    /// With `x` as above, `dy = g'(x) dx + (dg/dd)(x)`; a past `x = g^-1(y)` gives `dx/dy = 1/g'` and `dx/dd =
+    /// -(dg/dd)/g'`.
     fn gradient(&self, phi: &[f64], by_theta: &mut [f64], by_phi: &mut [f64]) -> f64 {
         let (Lags { na, nb, .. }, parts) = (self.lags, self.parts());
-        // Curves' derivatives are sums over several terms of phi, so that they begin at 0; a and b have one term each.
+        // Derivatives of the curves are sums over several terms of phi, so they begin at 0; a and b have one term each.
         by_theta[parts.offset..].fill(0.0);
         by_theta[parts.offset] = 1.0;
         let (linear, curves) = by_theta.split_at_mut(parts.bends);
@@ -399,7 +399,7 @@ impl Parametric for HammersteinWiener {
                 return;
             }
             let (j, of_input) = ((i - na) / nb, (i - na) % nb);
-            // Terms come input by input: with the first of each its bends begin behind those of the input before.
+            // Terms come input by input: at an input's first term, its bends begin after those of the previous input.
             if of_input == 0 && j > 0 {
                 first += self.inputs[j - 1].knots.pieces - 1;
             }
@@ -407,7 +407,7 @@ impl Parametric for HammersteinWiener {
             let own = &mut bends[first..first + inner];
             self.inputs[j].add_gradient(phi[i], coefficient, own);
         });
-        // All so far is dx; dy = g'(x) dx, and behind it what d moves at x itself.
+        // So far all is dx; dy = g'(x) dx, plus the direct effect of d at x.
         let (y, steep) = self.output.value_and_slope(x);
         by_theta.iter_mut().for_each(|value| *value *= steep);
         by_phi.iter_mut().for_each(|value| *value *= steep);
@@ -417,7 +417,7 @@ impl Parametric for HammersteinWiener {
     }
 
     fn shrunk(&self) -> Range<usize> {
-        // Bends and slopes, not a and b: a curve without data stays straight, the dynamics are what they are.
+        // Bends and slopes, not a and b: a curve without data stays straight, and the dynamics are not biased.
         let parts = self.parts();
         parts.bends..parts.end
     }
@@ -426,7 +426,7 @@ impl Parametric for HammersteinWiener {
 /// Fits a Hammerstein-Wiener model in free run over all experiments, with an initial state per experiment.
 ///
 /// It begins as the linear output-error model of the same orders, with straight curves over the ranges of the data.
-/// `pieces` are those of every input's curve and of the output's.
+/// `pieces` are those of every input's curve, then of the output's.
 ///
 /// ```
 /// use sewfast_core::{Monitor, Record, hammerstein};
@@ -465,13 +465,13 @@ pub fn fit(
             knots(values, pieces.0)
         })
         .collect();
-    // Curves over the ranges of the data. g begins as the identity, so that the range of x is that of y.
+    // Curves over the ranges of the data. g begins as the identity, so the range of x is that of y.
     let output = knots(records.iter().flat_map(|r| r.y), pieces.1);
     output.check("output")?;
     inputs.iter().try_for_each(|knots| knots.check("input"))?;
     let straight = Parts::of(lags, &inputs, output);
     let mut theta = [linear.model.a(), linear.model.b(), &[linear.model.offset()]].concat();
-    // Zeros are straight curves: the start runs as the linear model does.
+    // Zeros are straight curves: the start runs like the linear model.
     theta.resize(straight.end, 0.0);
     let start = HammersteinWiener::new(lags, &inputs, output, theta)?;
     let states = &linear.initial_states;
@@ -479,9 +479,9 @@ pub fn fit(
     output_error::fit(&start, states, records, RIDGE, max_iterations, monitor)
 }
 
-/// Knots over the range of the values that are there.
+/// Knots over the range of the known values.
 fn knots<'a>(values: impl Iterator<Item = &'a f64>, pieces: usize) -> Knots {
-    // Gaps are NaN, which `min` and `max` pass over.
+    // Gaps are NaN, which `min` and `max` skip.
     let empty = (f64::INFINITY, f64::NEG_INFINITY);
     let (low, high) = values.fold(empty, |(low, high), v| (low.min(*v), high.max(*v)));
     Knots { low, high, pieces }
@@ -560,7 +560,7 @@ mod tests {
             for i in 0..columns {
                 let (ahead, behind) = (moved(i, 1e-6), moved(i, -1e-6));
                 for k in 0..run.len() {
-                    // a run that passes a knot within the step has two slopes there, and others after it
+                    // a run that passes a knot within the step has two slopes there, and different ones after it
                     let forward = (ahead[k] - run[k]) / 1e-6;
                     let backward = (run[k] - behind[k]) / 1e-6;
                     if (forward - backward).abs() > 1e-3 * (1.0 + forward.abs()) {
@@ -604,7 +604,7 @@ mod tests {
             let records = [Record::new(&u, 1, &y).unwrap()];
             let monitor = Monitor::default();
             let linear = oe::fit(&records, 2, 2, 1, true, 100, &monitor).unwrap();
-            // knots lie elsewhere than those of the truth: many pieces come close to a few, a few do not
+            // knots are not where the true ones are: many pieces come close, few do not
             let found = fit(&records, 2, 2, 1, (16, 16), 200, &monitor).unwrap();
             assert!(
                 found.cost < 0.25 * linear.cost,

@@ -11,31 +11,31 @@ use crate::linear::{LinearFit, LinearModel, stabilised};
 use crate::lm::{self, Outcome, Problem, Settings, Termination};
 use crate::{Error, Monitor, Record, Result, arx};
 
-/// How many of the candidates are refined: half of them for their cost, half for their restarts.
+/// How many candidates are refined: half of them for their cost, half for their restart error.
 const REFINED: usize = 8;
-/// Candidates looked at for their restarts.
+/// Candidates whose restart error is computed.
 const RESTARTED: usize = 40;
-/// Restart errors within this ratio say nothing about which model is the better one; the cost does.
+/// Restart errors within this ratio do not decide which model is better; the cost does.
 const ABOUT_AS_WELL: f64 = 1.05;
-/// Iterations after which the refined candidates are compared and the best one goes on alone.
+/// Iterations after which the refined candidates are compared and only the best one continues.
 const HEAT: usize = 30;
 
-/// Measured outputs under the first inputs from which a plant can be seen to stand: two always lie on a line.
+/// Measured outputs under the first inputs needed to see that a plant stands: two always lie on a line.
 const HELD: usize = 3;
 
 /// Fits `LinearModel` in free run over all experiments, with an initial state per experiment.
 ///
-/// Records whose inputs are held at first are fitted a second time, from the model's own equilibrium under these inputs: a
-/// free state could take over the response to a step soon after the start, and nothing would tell the gain. The free states
-/// are kept if they lower the Bayesian information criterion (Schwarz, *Ann. Stat.* 6, 1978) of as many independent samples
-/// as the colour of the residuals leaves: then the plant was moving before the record began.
+/// Records whose inputs are held at first are fitted a second time, from the model's own equilibrium under these
+/// inputs. A free state could absorb the response to a step soon after the start, and the gain would be undetermined.
+/// The free states are kept only if they lower the Bayesian information criterion (Schwarz, *Ann. Stat.* 6, 1978), with
+/// as many independent samples as the residuals' spectrum leaves: then the plant was moving before the record began.
 ///
-/// Least squares is biased by measurement noise, so its model is one candidate among others: instrumental-variable
-/// iterations (SRIV, Young 1976; Steiglitz and McBride 1965) and fixed sets of real and complex poles over the whole
-/// range of time constants, each with its best numerator. The best free runs are refined; steps that would move a pole
-/// out of the unit circle are rejected (Schur-Cohn test), so every accepted step is stable. Of the refined models that
-/// run on about as well as the best when started anew from a few samples ([`restart_error`]) the one with the lowest
-/// cost is chosen. Of records of more than 40,000 samples an excerpt is searched so; all of them are fitted from there.
+/// Least squares is biased by measurement noise, so its model is only one candidate. Others are instrumental-variable iterations (SRIV,
+/// Young 1976; Steiglitz and McBride 1965) and fixed sets of real and complex poles over the whole range of time constants, each with its
+/// best numerator. The best free runs are refined; steps that would move a pole out of the unit circle are rejected (Schur-Cohn test), so
+/// every accepted step is stable. Refined models are restarted from a few samples ([`restart_error`]); of those that then run about as
+/// well as the best, the one with the lowest cost is chosen. For records of more than 40,000 samples this search uses an excerpt, and the
+/// final fit all samples.
 ///
 /// ```
 /// use sewfast_core::lagged::Lagged;
@@ -52,7 +52,7 @@ const HELD: usize = 3;
 /// ```
 ///
 /// # Errors
-/// As [`arx::fit`] for unusable data and settings; `ErrorKind::Fit` where no stable model has a finite free run.
+/// As [`arx::fit`] for unusable data and settings; `ErrorKind::Fit` if no stable model has a finite free run.
 pub fn fit(
     records: &[Record],
     na: usize,
@@ -78,10 +78,10 @@ pub fn fit(
     })
 }
 
-/// [`fit`] from one model instead of a search over many: for data that a model is known to describe nearly.
+/// [`fit`] from one model instead of a search over many, for data that the model is known to describe nearly.
 ///
-/// The initial states are estimated first. The poles of a model that is not stable are mirrored into the unit circle, and
-/// its numerator is estimated anew. Without `offset` that of the model is left out.
+/// The initial states are estimated first. The poles of an unstable model are mirrored into the unit circle, and its
+/// numerator is estimated anew. Without `offset` the model's offset is dropped.
 ///
 /// # Errors
 /// As [`fit`], `ErrorKind::Setting` for a model with another number of inputs than the records have.
@@ -116,7 +116,7 @@ pub fn fit_from(
     })
 }
 
-/// The fit with free initial states, or that from rest if the free states do not pay.
+/// The fit with free initial states, or the one from rest if the free states do not pay.
 fn from_rest_or_motion(
     records: &[Record],
     iterations: usize,
@@ -147,14 +147,14 @@ fn from_rest_or_motion(
     Ok(chosen)
 }
 
-/// A fit, and how many independent samples its residuals are worth.
+/// A fit, and the number of independent samples in its residuals.
 struct Fitted {
     fit: LinearFit,
     independent: f64,
 }
 
 impl Fitted {
-    /// Whether the free states of `tied` records lower the information criterion of a fit from rest.
+    /// Whether the free states of `tied` records lower the information criterion compared with a fit from rest.
     fn pays(&self, rest: &Self, tied: usize) -> bool {
         let states = (tied * self.fit.model.lags().na) as f64;
         let n = self.independent;
@@ -162,7 +162,7 @@ impl Fitted {
     }
 }
 
-/// The fit that goes on from `best` for the iterations that are left, after `spent` ones in all.
+/// The fit that continues from `best` with the remaining iterations, after `spent` ones in all.
 fn finished(
     mut problem: OutputError,
     best: Outcome,
@@ -201,7 +201,7 @@ fn finished(
     Ok(Fitted { fit, independent })
 }
 
-/// The best of the refined candidates, and the iterations of all.
+/// The best refined candidate, and the iterations of all.
 fn searched(
     problem: &mut OutputError,
     records: &[Record],
@@ -218,7 +218,7 @@ fn searched(
     Some((chosen(problem, records, heats, monitor)?, spent))
 }
 
-/// The same in pieces of the records; what comes out is a start for all of them.
+/// The same on pieces of the records; the result is a start for all of them.
 fn searched_in(
     pieces: &[Record],
     problem: &mut OutputError,
@@ -242,7 +242,7 @@ fn searched_in(
     Some((found, spent))
 }
 
-/// The candidates with the lowest cost and those that restart best, without repetition.
+/// The candidates with the lowest cost and those with the least restart error, without repetition.
 fn promising(
     problem: &OutputError,
     records: &[Record],
@@ -262,7 +262,7 @@ fn promising(
 
 /// The outcome with the lowest cost among those that restart about as well as the best one.
 ///
-/// After a stop those that have not been restarted yet do not count, or all of them alike.
+/// After a stop, candidates that have not been restarted count as failed; if none has been, all are equal.
 fn chosen(
     problem: &OutputError,
     records: &[Record],
@@ -284,7 +284,7 @@ fn restarted(problem: &OutputError, records: &[Record], theta: &[f64], monitor: 
     problem.model(theta).map_or(f64::INFINITY, error)
 }
 
-/// A few iterations from each of the best candidates; the best candidate as it is where a stop leaves no time for that.
+/// A few iterations from each of the best candidates; after an early stop, the best candidate unchanged.
 fn refined(
     problem: &mut OutputError,
     candidates: Vec<(f64, Vec<f64>)>,
@@ -298,7 +298,7 @@ fn refined(
             let start = theta.clone();
             outcomes.push(lm::minimize(problem, start, &heat, monitor, |_, _| {}));
         }
-        // a stop may come before the refinement has a cost of its own
+        // a stop may come before the refinement has a cost
         outcomes.retain(|o: &Outcome| o.cost.is_finite());
         if monitor.stopped() && outcomes.is_empty() {
             outcomes.push(unfinished(cost, theta, Termination::Interrupted));
@@ -307,7 +307,7 @@ fn refined(
     outcomes
 }
 
-/// Parameters from which no iteration has been done.
+/// An outcome without iterations.
 fn unfinished(cost: f64, theta: Vec<f64>, termination: Termination) -> Outcome {
     Outcome {
         theta,
@@ -426,7 +426,7 @@ mod tests {
 
     #[test]
     fn does_not_follow_the_trend_of_a_drive_with_friction() {
-        // Friction and dead time bend the record: its lowest cost belongs to a pole beyond 1 s that no other record shows.
+        // Friction and dead time bend the record: its lowest cost belongs to a pole beyond 1 s that other records do not show.
         let run = |u: &[f64]| {
             let mut machine = Machine::new(Parameters::default()).unwrap();
             machine.run(u).unwrap().1
@@ -522,7 +522,7 @@ mod tests {
             "{}",
             found.iterations
         );
-        // at the end of one fit there is nothing left to do but the last test
+        // at the end of a fit only the last test remains
         let again = fit_from(&records, &searched.model, true, 100, &Monitor::default()).unwrap();
         assert!(again.iterations <= PATIENCE, "{}", again.iterations);
         assert!((again.trace[0] / searched.cost - 1.0).abs() < 1e-9);
@@ -536,7 +536,7 @@ mod tests {
         assert_eq!(refused.kind, crate::ErrorKind::Setting);
     }
 
-    /// Slow iterations that end a fit.
+    /// Slow iterations in a row that end a fit.
     const PATIENCE: usize = 6;
 
     #[test]
@@ -570,7 +570,7 @@ mod tests {
         let u = chirp(3_000, 3.0);
         let y = noisy(&truth.simulate(&u, 1, &[0.0; 2]).unwrap(), 0.5, 3);
         let records = [Record::new(&u, 1, &y).unwrap()];
-        // iterations of the first refinements, of which there are more
+        // the first refinements have more iterations than these
         for iterations in [1, 20, 40] {
             let (monitor, done) = (Monitor::default(), AtomicBool::new(false));
             let found = std::thread::scope(|scope| {

@@ -1,14 +1,14 @@
-//! The free run of any lagged model fitted by Levenberg-Marquardt, from the derivatives of one step.
+//! Fits the free run of any lagged model by Levenberg-Marquardt, from the derivatives of one step.
 //!
-//! A model `y(k) = f(phi(k); theta)` that knows its gradient ([`Parametric`]) gets its sensitivities and its fit from here.
-//! With `S(k) = dy(k)/d(theta, y_past)` the rule of the chain along the free run is
+//! A model `y(k) = f(phi(k); theta)` that knows its gradient ([`Parametric`]) gets its sensitivities and its fit from
+//! here. With `S(k) = dy(k)/d(theta, y_past)` the chain rule along the free run is
 //!
 //! ```text
 //! S(k) = [df/dtheta  0](k) + sum_m (df/dy(k-m)) S(k-m),    S(-m) = [0  e_m]
 //! ```
 //!
-//! Row by row this is a recursion with gains that change from sample to sample, as [`Gram`] has it. The parameters of a
-//! fit are theta, then the past outputs of each experiment, so that `J'J` is full for theta and block-diagonal for those.
+//! Row by row this is a recursion with gains that change from sample to sample, which [`Gram`] provides. The parameters of a fit are
+//! theta, then the past outputs of each experiment, so `J'J` is full for theta and block-diagonal for the past outputs.
 
 use std::ops::Range;
 
@@ -25,13 +25,13 @@ pub trait Parametric: Lagged + Clone + Send + Sync {
     /// The parameters.
     fn theta(&self) -> Vec<f64>;
 
-    /// The same structure with other parameters; `None` where these make no stable model.
+    /// The same structure with other parameters; `None` if these make no stable model.
     fn with_theta(&self, theta: &[f64]) -> Option<Self>;
 
-    /// The output, and its derivatives by the parameters and by the regressor, into room of their lengths.
+    /// The output; writes its derivatives with respect to the parameters and to the regressor, into slices of their lengths.
     fn gradient(&self, phi: &[f64], by_theta: &mut [f64], by_phi: &mut [f64]) -> f64;
 
-    /// The parameters that a fit holds near 0 where the data say nothing about them; each is of size 1.
+    /// The parameters that a fit holds near 0 if the data do not determine them; each is of size 1.
     fn shrunk(&self) -> Range<usize>;
 }
 
@@ -61,11 +61,11 @@ impl<M: Parametric> Differentiable for M {
         phi[..na].copy_from_slice(y_past);
         for (k, &y) in run.iter().enumerate() {
             lags.write_inputs(u, k, &mut phi[na..]);
-            // All rows before this one, and room for it: S(k-m) is the m-th from the end.
+            // All rows before this one, and the place of this one: S(k-m) is the m-th from the end.
             let (before, rest) = rows.split_at_mut((na + k) * columns);
             let row = &mut rest[..columns];
             self.gradient(&phi, &mut row[..parameters], &mut by_phi);
-            // S(k) = df/dtheta + sum_m df/dy(k-m) S(k-m); the columns of y_past have no part of their own.
+            // S(k) = df/dtheta + sum_m df/dy(k-m) S(k-m); the columns of y_past have only the second part.
             for (gain, old) in by_phi[..na].iter().zip(before.rchunks_exact(columns)) {
                 for (value, old) in row.iter_mut().zip(old) {
                     *value += gain * old;
@@ -73,7 +73,7 @@ impl<M: Parametric> Differentiable for M {
             }
             push_past(&mut phi[..na], y);
         }
-        // Those of the past outputs are no samples.
+        // The rows of the past outputs are no samples.
         rows.drain(..na * columns);
         Ok((run, rows))
     }
@@ -84,13 +84,13 @@ impl<M: Parametric> Differentiable for M {
 pub struct Fit<M> {
     /// The model.
     pub model: M,
-    /// `1/(2N) sum e^2` in free run, in the output's unit squared, without what holds parameters near 0.
+    /// `1/(2N) sum e^2` in free run, in the output's unit squared, without the ridge.
     pub cost: f64,
     /// Iterations.
     pub iterations: usize,
     /// How the iteration ended.
     pub termination: lm::Termination,
-    /// What was minimised, at the start and after each accepted step.
+    /// The minimised cost, including the ridge, at the start and after each accepted step.
     pub trace: Vec<f64>,
     /// Past outputs of each experiment, newest first, as estimated with the model.
     pub initial_states: Vec<Vec<f64>>,
@@ -98,11 +98,11 @@ pub struct Fit<M> {
 
 /// Fits the free run of `start`'s structure to all experiments, from its parameters and from past outputs.
 ///
-/// `ridge` times half the sum of the squares of the shrunk parameters, in units of the output's variance, is added to the
-/// cost: a parameter on which the data say nothing stays at 0, and one on which they do is moved by about `ridge`.
+/// The cost includes `ridge` times half the sum of the squares of the shrunk parameters, in units of the output's variance. A parameter
+/// that the data do not determine stays at 0; one that they do determine is moved by about `ridge`.
 ///
 /// # Errors
-/// `ErrorKind::Data` for fewer samples than unknowns, `ErrorKind::Fit` where the start has no finite free run.
+/// `ErrorKind::Data` for fewer samples than unknowns, `ErrorKind::Fit` if the start has no finite free run.
 pub fn fit<M: Parametric>(
     start: &M,
     initial_states: &[Vec<f64>],
@@ -111,12 +111,12 @@ pub fn fit<M: Parametric>(
     max_iterations: usize,
     monitor: &Monitor,
 ) -> Result<Fit<M>> {
-    // Initial states are parameters, behind theta: wrong past outputs would be an error that the model has to explain.
+    // Initial states are parameters, after theta: the model would have to explain errors caused by wrong past outputs.
     let theta = [Parametric::theta(start), initial_states.concat()].concat();
     let mut problem = FreeRun::new(start.clone(), records, ridge, monitor)?;
     let settings = lm::Settings {
         max_iterations,
-        // Parameters of different units: a, b and the bends of a curve.
+        // The parameters have different units: a, b and the bends of a curve.
         damping: Damping::Diagonal,
         ..lm::Settings::default()
     };
@@ -131,7 +131,7 @@ pub fn fit<M: Parametric>(
         Error::fit("expected a stable model, the fit found none; lower the orders")
     })?;
     Ok(Fit {
-        // What is told is the error alone, by which models with and without a ridge can be compared.
+        // Only the error is reported, so that models with and without a ridge can be compared.
         cost: found.cost - problem.ridged(&found.theta),
         model,
         iterations: found.iterations,
@@ -153,7 +153,7 @@ struct FreeRun<'a, M> {
     shared: usize,
     weight: f64,
     ridge: f64,
-    /// Free runs from each record's first measured sample on: a state before a gap would leave no trace.
+    /// Free runs from each record's first measured sample on: a state before a gap would have no effect.
     runs: Vec<Vec<f64>>,
     gram: Gram,
 }
@@ -163,7 +163,7 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
         let (shared, na) = (Parametric::theta(&model).len(), model.lags().na);
         let samples: usize = records.iter().map(Record::counting).sum();
         let unknowns = shared + na * records.len();
-        // Samples are counted and not weighed: a weight below 1 does not make them fewer equations.
+        // Samples are counted, not weighted: a weight below 1 does not reduce the number of equations.
         if samples <= unknowns {
             return Err(Error::data(format!(
                 "expected more than {unknowns} samples for as many parameters and initial states, got {samples} measured; record longer or lower na and nb"
@@ -174,20 +174,20 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
             shared,
             monitor,
             weight,
-            // In units of the cost, so that the same ridge means the same in every unit of y.
+            // In units of the cost, so that a ridge means the same for every unit of y.
             ridge: ridge * variance(records, weight),
             runs: records
                 .iter()
                 .map(|r| vec![0.0; r.len() - r.first_measured()])
                 .collect(),
-            // theta, the states of one experiment, the error: those of others would be zeros.
+            // theta, the states of one experiment, the error: the states of other experiments would be zeros.
             gram: Gram::new(shared + na + 1, na),
             records,
             model,
         })
     }
 
-    /// What holds the shrunk parameters near 0.
+    /// The ridge's part of the cost.
     fn ridged(&self, theta: &[f64]) -> f64 {
         // 1/2 ridge sum t^2: a residual sqrt(ridge) t each, without a sum over samples.
         let shrunk = &theta[self.model.shrunk()];
@@ -201,7 +201,7 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
 
     fn run(&mut self, model: &M, theta: &[f64], experiment: usize) -> Option<f64> {
         let (lags, record) = (model.lags(), &self.records[experiment]);
-        // By how long a sample takes: a power of two, so that the question is a mask.
+        // Checked by the duration of a sample: the interval is a power of two, so the test is a mask.
         let (first, look) = (record.first_measured(), look(8 * lags.regressors()));
         let mut phi = vec![0.0; lags.regressors()];
         phi[..lags.na].copy_from_slice(self.state(theta, experiment));
@@ -214,21 +214,21 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
             *out = model.output(&phi);
             push_past(&mut phi[..lags.na], *out);
             let error = record.y[k] - *out;
-            // A selection, so that gaps do not branch.
+            // A selection instead of a branch for gaps.
             sum += if record.y[k].is_nan() {
                 0.0
             } else {
                 error * error
             };
         }
-        // A sum by weights is formed anew from the outputs: the loop above is that of every fit.
+        // A weighted sum is formed anew from the outputs: the loop above stays the same for every fit.
         Some(match record.weights {
             None => sum,
             Some(w) => weighted_squares(&w[first..], &record.y[first..], &self.runs[experiment]),
         })
     }
 
-    /// The rows of one experiment, into the Gram matrix.
+    /// Computes the rows of one experiment into the Gram matrix.
     fn sensitivities(&mut self, model: &M, theta: &[f64], experiment: usize) {
         let (lags, record, shared) = (model.lags(), &self.records[experiment], self.shared);
         let (first, na) = (record.first_measured(), lags.na);
@@ -249,8 +249,8 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
             model.gradient(&phi, &mut by_theta, &mut by_phi);
             let weight = record.weights.map_or(1.0, |w| w[k]);
             let error = (record.y[k] - y, weight);
-            // `push` adds the gains times the rows before, keeps the error out of that, and leaves a sample without a
-            // measurement out of the sum.
+            // `push` adds the gains times the previous rows, keeps the error out of the recursion, and leaves an
+            // unmeasured sample out of the sum.
             gram.push(&by_phi[..na], shared + na, error, |row| {
                 row[..shared].copy_from_slice(&by_theta);
                 row[shared..].fill(0.0);
@@ -262,7 +262,7 @@ impl<'a, M: Parametric> FreeRun<'a, M> {
 
 /// The weighted variance of the measured outputs.
 fn variance(records: &[Record], weight: f64) -> f64 {
-    // Two walks, mean first: a sum of squares less the square of a mean would lose the digits of a position far from 0.
+    // Two passes, mean first: the mean of squares minus the squared mean would lose the digits of a position far from 0.
     let measured = || {
         records.iter().flat_map(|r| {
             let known = (0..r.len()).filter(|&k| !r.y[k].is_nan());
@@ -279,13 +279,13 @@ impl<M: Parametric> Problem for FreeRun<'_, M> {
     }
 
     fn cost(&mut self, theta: &[f64]) -> Option<f64> {
-        // No stable model: a trial that is refused before it runs.
+        // No stable model: the trial is refused before it runs.
         let model = self.model.with_theta(&theta[..self.shared])?;
         let mut sum = 0.0;
         for experiment in 0..self.records.len() {
             sum += self.run(&model, theta, experiment)?;
         }
-        // A run that overflows is a trial that is refused.
+        // A run that overflows is a refused trial.
         Some(0.5 * sum / self.weight + self.ridged(theta)).filter(|c| c.is_finite())
     }
 
@@ -298,7 +298,7 @@ impl<M: Parametric> Problem for FreeRun<'_, M> {
         let (shared, na, n) = (self.shared, model.lags().na, self.parameters());
         for experiment in 0..self.records.len() {
             self.sensitivities(&model, theta, experiment);
-            // Shared parameters add up, the states of an experiment have rows and columns of their own.
+            // Shared parameters add up; the states of an experiment have their own rows and columns.
             let place = |i: usize| if i < shared { i } else { i + experiment * na };
             let (sums, width) = self.gram.finish();
             for i in 0..shared + na {
@@ -313,7 +313,7 @@ impl<M: Parametric> Problem for FreeRun<'_, M> {
             jtj[i * n + i] += self.ridge;
             jte[i] -= self.ridge * theta[i];
         }
-        // a state that has decayed before the first measured sample leaves no trace
+        // a state that has decayed before the first measured sample has no effect
         for i in shared..n {
             jtj[i * n + i] += f64::MIN_POSITIVE;
         }

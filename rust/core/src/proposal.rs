@@ -1,8 +1,8 @@
-//! Gains and filters of the largest bandwidth: what a controller is worth on a measured machine, and the search for the best one.
+//! Gains and filters with the largest bandwidth: the merit of a controller on a measured machine, and the search for the best one.
 //!
-//! The bandwidth is the frequency at which `|S|` reaches `1/sqrt(2)`. Ms is limited on the fitted machine, which shows whether the loop
-//! is stable, and on the measured lines with their 95 % circles, which include what the fit misses; above the lines the machine is
-//! unknown, and the loop's gain is kept low.
+//! The bandwidth is the frequency at which `|S|` reaches `1/sqrt(2)`. Ms is limited on the fitted machine, which shows
+//! whether the loop is stable, and on the measured lines with their 95 % circles, which include what the fit misses.
+//! Above the lines the machine is unknown, and the loop's gain is kept low.
 
 use sewfast_control::{Biquad, Cascade, Refused, Standard};
 
@@ -14,37 +14,37 @@ use crate::{Error, Monitor, Result};
 const BLIND: f64 = 1.25;
 /// Edges of the simplex in a round of the search, each started from the previous best.
 const EDGES: [f64; 3] = [0.4, 0.2, 0.1];
-/// Most rounds, and the least gain in bandwidth of a round for another one.
+/// Most rounds, and the least gain in bandwidth that justifies another round.
 const ROUNDS: usize = 4;
 const FURTHER: f64 = 1.01;
-/// Steps from each edge, per searched number.
+/// Steps from each edge length, per searched number.
 const STEPS: usize = 100;
-/// Difference of the best and the worst corner, in log bandwidth, at which a search ends.
+/// Difference between the best and the worst corner, in log bandwidth, at which a search ends.
 const SAME: f64 = 1e-4;
-/// Weight of an Ms above the limit, relative to it, against the logarithm of the bandwidth, and of a peak of `|S|` above [`LEVEL`]
-/// below it: the bandwidth itself would jump where such a peak arises.
+/// Weight, against the logarithm of the bandwidth, of the relative excess of Ms over its limit, and of a peak of `|S|`
+/// above [`LEVEL`] below the bandwidth: the bandwidth itself would jump when such a peak arises.
 const OUTSIDE: f64 = 30.0;
-/// What `|S|` is to keep below: a little less than its value at the bandwidth.
+/// Level of `|S|` in the search: slightly less than its value at the bandwidth.
 const LEVEL: f64 = 0.99 * std::f64::consts::FRAC_1_SQRT_2;
-/// Largest integral time, in radians of the bandwidth: a slow integral would not remove a lasting disturbance, however large the
-/// bandwidth.
+/// Largest integral time, in radians of the bandwidth: with a slow integral a lasting disturbance would not be removed,
+/// however large the bandwidth.
 const SLOWEST: f64 = 8.0;
 const DERIVATIVE_FILTER: f64 = 10.0;
-/// Least and largest numbers of filters.
+/// Bounds on the numbers of filters.
 const DEPTH: (f64, f64) = (0.005, 1.0);
 const WIDTH: (f64, f64) = (0.02, 5.0);
 const DAMPING: (f64, f64) = (1e-3, 3.0);
 
-/// A machine and what its controller has to keep.
+/// A machine and the limits for its controller.
 #[derive(Clone, Debug)]
 pub struct Task {
     /// The fitted machine.
     pub plant: Plant,
     /// Its measured lines.
     pub lines: Measured,
-    /// The fit at frequencies above them, with circles of no size.
+    /// The fit at frequencies above them, with circles of radius 0.
     pub above: Measured,
-    /// The controller's path, of which gains, lag and biquads are searched.
+    /// The controller's path; its gains, lag and biquads are searched.
     pub path: Path,
     /// Largest sensitivity.
     pub ms: f64,
@@ -52,7 +52,7 @@ pub struct Task {
     pub quiet: f64,
 }
 
-/// A controller of the search in plain numbers.
+/// A controller of the search as plain numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Proposed {
     /// Gains in standard form.
@@ -61,16 +61,17 @@ pub struct Proposed {
     pub n: f64,
     /// Time constant of the lag \[s\].
     pub filter_time: f64,
-    /// A notch by frequency \[Hz\], depth and width, or biquads by frequency \[Hz\] and damping of zeros, then of poles.
+    /// Each filter is a notch (frequency \[Hz\], depth, width) or a biquad (frequency \[Hz\] and damping of the zeros,
+    /// then of the poles).
     pub filters: Vec<Vec<f64>>,
 }
 
-/// The end of a search.
+/// The result of a search.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Found {
-    /// Logarithm of the bandwidth less penalties; `None` if nothing found is stable within Ms.
+    /// Logarithm of the bandwidth minus penalties; `None` if nothing found is stable within Ms.
     pub merit: Option<f64>,
-    /// Where: logarithms of `Kp`, `Ti`, `Td`, the lag, and the filters' numbers.
+    /// The point: logarithms of `Kp`, `Ti`, `Td`, the lag, and the filters' numbers.
     pub x: Vec<f64>,
     /// The controller there.
     pub proposed: Proposed,
@@ -81,7 +82,7 @@ impl Proposed {
     fn of(x: &[f64], ts: f64) -> Self {
         let numbers: Vec<f64> = x.iter().map(|v| v.clamp(-40.0, 40.0).exp()).collect();
         let (gains, filters) = numbers.split_at(4);
-        // less than a tenth of a sample is none
+        // less than a tenth of a sample counts as 0
         let time = |t: f64| if t < 0.1 * ts { 0.0 } else { t.min(100.0 * ts) };
         let within = |value: f64, (low, high): (f64, f64)| value.clamp(low, high);
         let hertz = |f: f64| within(f, (1e-4 / ts, 0.49 / ts));
@@ -128,7 +129,8 @@ impl Proposed {
 }
 
 impl Task {
-    /// Logarithm of the bandwidth, less what Ms, a slow integral and the motion of the command exceed; `None` if the loop is unstable.
+    /// Logarithm of the bandwidth, minus penalties for excess of Ms, a slow integral and motion of the command; `None`
+    /// if the loop is unstable.
     fn merit(&self, path: &Path) -> Option<f64> {
         let closed = Loop::new(path, &self.plant).ok()?;
         let found = weakening(&closed, LEVEL, self.quiet.is_finite())?;
@@ -143,7 +145,7 @@ impl Task {
         Some(bandwidth.ln() - OUTSIDE * excess - over(slow) - over(noise))
     }
 
-    /// The best of searches from each start, logarithms as in [`Found::x`], each restarted at its end.
+    /// The best of the searches from each start (logarithms as in [`Found::x`]); each search is restarted from its end.
     ///
     /// # Errors
     /// `ErrorKind::Setting` without a start or for one with another number of logarithms than 4, 7, 8 or 12, or a path out of range;
@@ -192,7 +194,7 @@ fn searched(start: &[f64], cost: &impl Fn(&[f64]) -> f64) -> Corner {
         for edge in EDGES {
             found = descended(&found.1, edge, STEPS * start.len(), same, cost);
         }
-        // also if nothing was stable before or is now
+        // also true if nothing was stable before or is now
         if !matches!(
             (before - found.0).partial_cmp(&FURTHER.ln()),
             Some(std::cmp::Ordering::Greater)
@@ -212,7 +214,7 @@ mod tests {
 
     const TS: f64 = 1e-3;
 
-    /// A drive of first order with a delay, its lines up to 200 Hz with circles of this relative size.
+    /// A first-order drive with a delay; its lines go up to 200 Hz and have circles of this relative size.
     fn task(ms: f64, circles: f64, quiet: f64) -> Task {
         let plant = Plant::fopdt(100.0, 0.2, 0.004, TS).unwrap();
         let path = Path::new(
@@ -266,7 +268,7 @@ mod tests {
         let (merit, path) = best(&task);
         let its = margins(&Loop::new(&path, &task.plant).unwrap());
         assert!((its.ms.0 / 1.7 - 1.0).abs() < 0.01, "{its:?}");
-        // the level of the search lies a percent below that of the bandwidth
+        // the level of the search is a percent below that of the bandwidth
         assert!((merit - its.bandwidth.ln()).abs() < 0.05, "{merit} {its:?}");
         for kp in [0.9, 0.97, 1.03, 1.1] {
             for ti in [0.9, 1.0, 1.1] {
@@ -296,7 +298,7 @@ mod tests {
 
     #[test]
     fn without_a_stable_loop_there_is_no_merit_and_a_stop_is_an_error() {
-        // nothing near gains of a million is stable
+        // no gains near a million are stable
         let task = task(1.7, 0.0, f64::INFINITY);
         let far = [1e6, 0.1, 1.0, TS].map(f64::ln).to_vec();
         let found = task.best(std::slice::from_ref(&far), &Monitor::default());

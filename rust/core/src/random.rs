@@ -76,7 +76,7 @@ mod tests {
         }
     }
 
-    /// A saved model or a record of an experiment names a seed: its numbers must stay what they are.
+    /// Saved models and records of experiments name seeds, so the numbers of a seed must never change.
     #[test]
     fn draws_what_it_always_drew() {
         let mut random = Random::new(0);

@@ -23,7 +23,7 @@ const TABLE_1: [[f64; 6]; 10] = [
     [1.0, 1.33, 1.26, 0.34, 0.49, 0.66],
 ];
 
-/// What a rule gives: gains in standard form and the two reference parameters.
+/// The result of a rule: gains in standard form and the two reference parameters.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rule {
     /// Gains in standard form.
@@ -34,24 +34,24 @@ pub struct Rule {
     pub beta: f64,
 }
 
-/// What to do where `L/T` lies outside the table.
+/// What to do if `L/T` lies outside the table.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Outside {
     /// Refuse.
     #[default]
     Error,
-    /// Take the end row. Below .1 that is the row for a dead time of `.1 T`, longer than the plant's: conservative.
-    /// Above 1 its gains are for a shorter dead time than the plant's: not conservative.
+    /// Take the end row. Below .1 it is made for a dead time of `.1 T`, longer than the plant's: conservative. Above 1
+    /// it is made for a shorter dead time than the plant's: not conservative.
     Nearest,
 }
 
 /// Table 1 for the plant `K e^(-sL) / (1 + sT)`, interpolated in `L/T`.
 ///
-/// `Kp K` is interpolated as `Kp K L/T`, which is nearly constant; the rows themselves come out exactly.
+/// `Kp K` is interpolated as `Kp K L/T`, which is nearly constant; at the rows the result is exact.
 ///
 /// # Errors
-/// `ErrorKind::Setting` for a `K` of 0, a `T` that is not above 0, a negative `L`, or `L/T` outside .1 to 1 unless
-/// the nearest row is asked for.
+/// `ErrorKind::Setting` for a `K` of 0, a `T` that is not above 0, a negative `L`, or `L/T` outside .1 to 1 without
+/// `Nearest`.
 pub fn table_1(k: f64, t: f64, l: f64, outside: Outside) -> Result<Rule> {
     require_plant(k, t, l)?;
     let ratio = l / t;
@@ -96,12 +96,12 @@ fn interpolate(ratio: f64) -> [f64; 5] {
 
 /// SIMC: `Kc = T/(K (tau_c + L))`, `tau_I = min(T, 4 (tau_c + L))`, and with `derivative` `tau_D = L/3`.
 ///
-/// The PID is of series form with the derivative on the output alone, `Kc (1 + 1/(tau_I s)) (r - (1 + tau_D s) y)`; in the
-/// standard form `f = 1 + tau_D/tau_I` gives `Kp = Kc f`, `Ti = tau_I f`, `Td = tau_D/f`, `alpha = 1 - 1/f`, `beta = 1`.
+/// The PID is in series form with the derivative on the output only, `Kc (1 + 1/(tau_I s)) (r - (1 + tau_D s) y)`. In standard form, `f =
+/// 1 + tau_D/tau_I` gives `Kp = Kc f`, `Ti = tau_I f`, `Td = tau_D/f`, `alpha = 1 - 1/f`, `beta = 1`.
 /// (S. Skogestad, *J. Process Control* 13, 2003; `L/3`: C. Grimholt, S. Skogestad, *J. Process Control* 70, 2018.)
 ///
 /// # Errors
-/// `ErrorKind::Setting` for numbers that are no such plant, or a `tau_c + L` that is not above 0.
+/// `ErrorKind::Setting` for invalid numbers of the plant, or a `tau_c + L` that is not above 0.
 pub fn simc(k: f64, t: f64, l: f64, tau_c: f64, derivative: bool) -> Result<Rule> {
     require_plant(k, t, l)?;
     if !(tau_c >= 0.0 && tau_c.is_finite() && tau_c + l > 0.0) {
@@ -124,14 +124,14 @@ pub fn simc(k: f64, t: f64, l: f64, tau_c: f64, derivative: bool) -> Result<Rule
     })
 }
 
-/// AMIGO: `Kp = (.2 + .45 T/L)/K`, `Ti = L (.4 L + .8 T)/(L + .1 T)`, `Td = .5 L T/(.3 L + T)`, `beta = 1`, and `alpha = 1` where
-/// `L/(L + T)` is at most .5, else 0.
+/// AMIGO: `Kp = (.2 + .45 T/L)/K`, `Ti = L (.4 L + .8 T)/(L + .1 T)`, `Td = .5 L T/(.3 L + T)`, `beta = 1`, and `alpha
+/// = 1` if `L/(L + T)` is at most .5, else 0.
 ///
 /// (K. J. Astrom, T. Hagglund, "Revisiting the Ziegler-Nichols step response method for PID control", *J. Process
 /// Control* 14, 2004.)
 ///
 /// # Errors
-/// `ErrorKind::Setting` for numbers that are no such plant, or an `L` of 0.
+/// `ErrorKind::Setting` for invalid numbers of the plant, or an `L` of 0.
 pub fn amigo(k: f64, t: f64, l: f64) -> Result<Rule> {
     require_plant(k, t, l)?;
     if l == 0.0 {
@@ -226,7 +226,7 @@ mod tests {
 
     #[test]
     fn simc_is_as_robust_as_published() {
-        // tau_c = L: Ms 1.59 where the integral time is T (Skogestad 2003, Table 1)
+        // tau_c = L: Ms is 1.59 if the integral time is T (Skogestad 2003, Table 1)
         for l in [0.2, 0.5, 2.0] {
             assert!((ms(simc(1.0, 1.0, l, l, false).unwrap(), l) - 1.59).abs() < 0.01);
         }
@@ -238,7 +238,7 @@ mod tests {
             (pid.gains.kp - f / (2.0 * 0.45)).abs() < 1e-12 && (pid.gains.ti - f).abs() < 1e-12
         );
         assert!((pid.gains.td - 0.1 / f).abs() < 1e-12 && pid.beta == 1.0);
-        // what the reference meets is Kc
+        // the proportional gain on the reference is Kc
         assert!((pid.gains.kp * (1.0 - pid.alpha) - 1.0 / (2.0 * 0.45)).abs() < 1e-12);
     }
 

@@ -1,5 +1,5 @@
-//! A rigid machine, or masses on shafts, under a held command: its response as the encoder counts it, and the fit of its parameters to a
-//! measured one.
+//! A rigid machine, or masses on shafts, under a held command: its response as the encoder counts it, and the fit of
+//! its parameters to a measured response.
 //!
 //! With `n` shafts between the masses, the motor's speed under a command is
 //!
@@ -8,14 +8,14 @@
 //! ```
 //!
 //! `theta` has the logarithms of `K`, `a1`, `a2`, the delay in samples, then for each shaft the logarithms of `w_r`, `z_r`, `w_a`, `z_a`
-//! (frequencies in rad/s). What is measured is not `G` but its response to a command that is held over a sample, as a speed at the samples
-//! or, counted, as its mean between them. Partial fractions give that exactly: each pole `p` with residue `r` adds
+//! (frequencies in rad/s). The measured quantity is not `G` but its response to a command held over each sample: the speed at the samples
+//! or, counted, its mean between them. Partial fractions give it exactly: each pole `p` with residue `r` adds
 //!
 //! ```text
 //! r (b_0 + b_1 q) q^(whole + 1) / (1 - e^(p Ts) q),    b_0 = (e^(p (1 - part) Ts) - 1)/p,    b_1 = (e^(p Ts) - e^(p (1 - part) Ts))/p
 //! ```
 //!
-//! with `q = 1/z` and a delay of `whole + part` samples. Derivatives are exact: poles and residues are computed with theirs ([`Dual`]).
+//! with `q = 1/z` and a delay of `whole + part` samples. Derivatives are exact: poles and residues carry theirs ([`Dual`]).
 
 mod dual;
 mod search;
@@ -29,22 +29,22 @@ use dual::Dual;
 
 pub use search::{Fitted, search};
 
-/// Parameters of a rigid machine, and of each shaft.
+/// Number of parameters of a rigid machine, and of each shaft.
 const RIGID: usize = 4;
 const SHAFT: usize = 4;
-/// The most parameters: two shafts.
+/// Most parameters: two shafts.
 const MOST: usize = RIGID + 2 * SHAFT;
-/// The longest delay \[samples\], and the largest logarithm.
+/// Longest delay \[samples\], and largest logarithm.
 const LATEST: f64 = 50.0;
 const LARGEST: f64 = 40.0;
-/// Least lag \[samples\] and longest one \[periods of the lowest frequency\]: a lag far below a sample, or far above all measured
-/// periods, changes no residual, so that a search that gets there stays there.
+/// Least lag \[samples\] and longest lag \[periods of the lowest frequency\]. A lag far below a sample, or far above
+/// all measured periods, changes no residual, so a search that gets there would stay there.
 const FASTEST: f64 = 1e-2;
 const SLOWEST: f64 = 1e4;
 
-/// What a pole adds to the response, [`Machine::response`].
+/// The contribution of a pole to the response, see [`Machine::response`].
 struct Mode {
-    /// Residue times the weights of this command and of the one before.
+    /// Residue times the weights of the present command and of the previous one.
     now: Dual,
     before: Dual,
     /// `e^(p Ts)`.
@@ -55,7 +55,7 @@ struct Mode {
 struct Machine {
     ts: f64,
     counted: bool,
-    /// Whole samples of the delay.
+    /// The delay's whole samples.
     whole: usize,
     modes: Vec<Mode>,
 }
@@ -108,7 +108,8 @@ impl Machine {
         }
     }
 
-    /// The response at `q = exp(-j w Ts)`; calls `derivative` with each pole, and what its numbers `now`, `before`, `decay` change in it.
+    /// The response at `q = exp(-j w Ts)`; calls `derivative` with each pole and the response's derivatives by its
+    /// numbers `now`, `before`, `decay`.
     fn response(
         &self,
         q: Complex<f64>,
@@ -134,7 +135,7 @@ impl Machine {
 /// The roots of `s^2 + 2 half s + square`.
 fn pair(half: Dual, square: Dual) -> [Dual; 2] {
     let root = (half * half - square).sqrt();
-    // the smaller of two real roots comes from their product, as the difference would lose digits
+    // the smaller of two real roots comes from their product: the difference would lose digits
     let large = Dual::real(0.0)
         - (half
             + if root.value.re < 0.0 {
@@ -184,7 +185,7 @@ fn back(hertz: f64, ts: f64) -> Complex<f64> {
     Complex::from_polar(1.0, -std::f64::consts::TAU * hertz * ts)
 }
 
-/// `G` under a held command, the speed at the samples, as numerator and denominator in powers of `z^-1`.
+/// `G` under a held command, with the speed at the samples, as numerator and denominator in powers of `z^-1`.
 ///
 /// # Errors
 /// As [`response`].
@@ -208,14 +209,14 @@ pub fn fraction(theta: &[f64], ts: f64) -> Result<(Vec<f64>, Vec<f64>)> {
     ))
 }
 
-/// Lines of a measured response, and how well each is known.
+/// Lines of a measured response, with their uncertainty.
 #[derive(Clone, Copy, Debug)]
 pub struct Lines<'a> {
     /// Frequencies \[Hz\].
     pub hertz: &'a [f64],
     /// The response there.
     pub value: &'a [Complex<f64>],
-    /// Standard deviations of its real and of its imaginary part.
+    /// Standard deviations of the real part, and equally of the imaginary part.
     pub sigma: &'a [f64],
     /// Sample time \[s\].
     pub ts: f64,
@@ -292,7 +293,7 @@ impl Residuals for Fit<'_> {
     }
 }
 
-/// The parameters that fit the lines best, from a start and after at most so many evaluations.
+/// The parameters that fit the lines best, from a start and with at most `evaluations`.
 ///
 /// # Errors
 /// `ErrorKind::Setting` for another number of parameters or a start that is not finite; `ErrorKind::Fit` on a stop.

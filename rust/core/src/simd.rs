@@ -1,4 +1,4 @@
-//! Eight numbers side by side, in the widest registers that the processor has.
+//! Eight numbers side by side, in the widest registers of the processor. Begin reading at `F64x8` and `Kernel`.
 //!
 //! Eight doubles are one cache line, one AVX-512 register, two of AVX2, four of the baseline:
 //!
@@ -9,17 +9,17 @@
 //!   baseline plain::Plain                |  the compiler's, as xmm pairs |
 //! ```
 //!
-//! Every kernel works on groups of eight, whatever the register: so layouts in memory, and the order of sums, are the same on
-//! all levels. What lies in a lane is the kernel's affair: hidden units of one network, columns of a Jacobian, or eight
+//! Every kernel works on groups of eight for any register, so memory layouts and the order of sums are the same on all
+//! levels. The kernel decides what a lane is: a hidden unit of one network, a column of a Jacobian, or one of eight
 //! closed loops.
 //!
-//! Why three levels, end to end (docs/PERFORMANCE.md, processor time of the public call, Zen 5): 100 iterations of a training
-//! take 177 ms with AVX-512, 285 with AVX2, 619 on the baseline; 1,000 closed loops 37.5, 68.4 and 158 ms; a state-space
-//! training 401, 627 and 1,625 ms. A free run gains 5 % from AVX-512 and 92 % from AVX2: it is one chain, not throughput.
+//! The gain of the levels, end to end (docs/PERFORMANCE.md, processor time of the public call, Zen 5): 100 iterations of a training take
+//! 177 ms with AVX-512, 285 with AVX2, 619 on the baseline; 1,000 closed loops 37.5, 68.4 and 158 ms; a state-space training 401, 627 and
+//! 1,625 ms. A free run gains 5 % from AVX-512 and 92 % from AVX2: it is limited by one dependency chain, not by throughput.
 //!
-//! A [`Kernel`] is written once over [`F64x8`] and compiled for AVX-512, for AVX2 with fused multiply-add and for the
-//! baseline; [`run`] takes the best one at run time, or the one that `SEWFAST_CPU` names. All do the same operations in
-//! the same order, `tanh` apart, and differ in the rounding of products that are added at once: on one level a kernel has one answer.
+//! A [`Kernel`] is written once over [`F64x8`] and compiled for AVX-512, for AVX2 with fused multiply-add, and for the baseline. [`run`]
+//! takes the best one at run time, or the one named by `SEWFAST_CPU`. Except for `tanh`, all do the same operations in the same order and
+//! differ only in the rounding of fused products; on one level a kernel has one answer.
 
 mod plain;
 mod tanh;
@@ -33,10 +33,10 @@ use crate::{Error, Result};
 /// Numbers in a group.
 pub(crate) const LANES: usize = 8;
 
-/// Eight numbers in memory, on a cache line of their own.
+/// Eight numbers in memory, on their own cache line.
 #[derive(Clone, Copy, Debug, PartialEq)]
-// Aligned because a load of 64 bytes from anywhere else touches two cache lines and takes two accesses. Tables, weights
-// and states are `Lanes`; slices of plain numbers are read through `F64x8::first`, wherever they begin.
+// Aligned, because any other load of 64 bytes touches two cache lines and takes two accesses. Tables, weights and
+// states are `Lanes`; slices of plain numbers are read by `F64x8::first` from any address.
 #[repr(C, align(64))]
 pub(crate) struct Lanes(pub [f64; LANES]);
 
@@ -45,19 +45,19 @@ impl Lanes {
     pub const ZERO: Self = Self([0.0; LANES]);
 }
 
-/// Numbers that are computed with side by side, compared and chosen, each for itself: eight, or one.
+/// Numbers computed side by side, each compared and selected on its own: eight, or one.
 pub(crate) trait Arithmetic: Copy {
-    /// What [`are_less`](Self::are_less) gives where all are.
+    /// The result of [`are_less`](Self::are_less) if all are less.
     const ALL: u8;
 
     fn splat(value: f64) -> Self;
-    /// As many of the values as there is room for.
+    /// Loads as many of the values as there are lanes.
     fn load(values: &[f64; LANES]) -> Self;
     fn add(self, other: Self) -> Self;
     fn sub(self, other: Self) -> Self;
     fn mul(self, other: Self) -> Self;
     fn div(self, other: Self) -> Self;
-    // Limits are comparisons and not `f64::min`, which turns NaN into the limit: a run that has left the finite numbers
+    // Limits are comparisons, not `f64::min`, which turns NaN into the limit: a run that has left the finite numbers
     // would go on as if its output were merely limited.
     /// The smaller of `self` and `limits`, one by one; NaN in `self` stays NaN.
     fn at_most_each(self, limits: Self) -> Self;
@@ -65,11 +65,11 @@ pub(crate) trait Arithmetic: Copy {
     fn at_least_each(self, limits: Self) -> Self;
     /// `|self|`.
     fn abs(self) -> Self;
-    /// `yes` where `self < other`, else `no`.
+    /// `yes` if `self < other`, else `no`, lane by lane.
     fn if_less(self, other: Self, yes: Self, no: Self) -> Self;
-    /// `yes` where `self == other`, else `no`.
+    /// `yes` if `self == other`, else `no`, lane by lane.
     fn if_equal(self, other: Self, yes: Self, no: Self) -> Self;
-    /// Where `self < other`, one bit each, the first lowest.
+    /// One bit for each lane with `self < other`, the first lane lowest.
     fn are_less(self, other: Self) -> u8;
 }
 
@@ -77,19 +77,19 @@ pub(crate) trait Arithmetic: Copy {
 pub(crate) trait F64x8: Arithmetic {
     /// Groups of sums that stay in registers beside one group of products: 8, 6 or 2.
     ///
-    /// A group takes one of the 32 registers of AVX-512, two of the 16 of AVX2, four of the 16 of the baseline; the sums leave room
-    /// for a group that is read and a number that is spread. The sums also have to hide the latency of a fused multiply-add: 4 cycles on
-    /// two units want 8 registers in the making.
+    /// A group takes one of the 32 registers of AVX-512, two of the 16 of AVX2, four of the 16 of the baseline; the
+    /// sums leave room for a group being read and a broadcast number. The sums also have to hide the latency of a fused
+    /// multiply-add: 4 cycles on two units need 8 registers in flight.
     const TILE_ROWS: usize;
 
-    /// `self + a b`, rounded once where the processor can.
+    /// `self + a b`, rounded once if the processor can.
     fn add_product(self, a: Self, b: Self) -> Self;
-    /// The largest integers that are not above `self`.
+    /// The largest integers not above `self`.
     fn floor(self) -> Self;
     fn store(self, values: &mut [f64; LANES]);
-    /// The sum of all eight, in halves.
+    /// The sum of all eight, by halving.
     fn sum(self) -> f64;
-    /// `2^n` for numbers that hold the integer `n` in their low bits.
+    /// `2^n` for numbers with the integer `n` in their low bits.
     fn power_of_two(self) -> Self;
 
     /// The smaller of `self` and `limit`; NaN stays NaN.
@@ -116,19 +116,19 @@ pub(crate) trait F64x8: Arithmetic {
         tanh::rise(self)
     }
 
-    /// `tanh` by the shortest chain, for results that wait for each other.
+    /// `tanh` with the shortest dependency chain, for results that wait for each other.
     #[inline(always)]
     fn tanh_in_chain(self) -> Self {
         self.tanh()
     }
 
-    /// `tanh` by the fewest operations, for results that do not wait for each other.
+    /// `tanh` with the fewest operations, for results that do not wait for each other.
     #[inline(always)]
     fn tanh_of_four([a, b, c, d]: [Self; 4]) -> [Self; 4] {
         [a.tanh(), b.tanh(), c.tanh(), d.tanh()]
     }
 
-    /// To the bit what [`tanh_of_four`](Self::tanh_of_four) gives where neighbours are its first two or its last two.
+    /// Bit for bit the result of [`tanh_of_four`](Self::tanh_of_four) if neighbours are its first two or its last two.
     #[inline(always)]
     fn tanh_as_of_four(self) -> Self {
         self.tanh()
@@ -136,15 +136,15 @@ pub(crate) trait F64x8: Arithmetic {
 
     /// The step that closes the chain of a free run: `y = 1'(direct + second h)`, `z = rest + weights y`.
     ///
-    /// Written so, eight numbers are summed to one (3 dependent additions), which is spread again and multiplied. Where a level
-    /// can, the order is another one: after two foldings all lanes hold one of two partial sums `p`, `q` with `y = p + q`, and
-    /// `z = (rest + weights p) + weights q` needs neither the last addition nor the way back from scalar to vector.
+    /// In this form eight numbers are summed to one (3 dependent additions), which is broadcast again and multiplied. If a level can, it
+    /// uses another order: after two foldings all lanes hold one of two partial sums `p`, `q` with `y = p + q`, and `z = (rest + weights
+    /// p) + weights q` needs neither the last addition nor the way back from scalar to vector.
     ///
-    /// The output `y` of hidden units `self`, the sum of `direct + second self`, and `rest + weights y`, the arguments
-    /// that it leads to; rounded as is shortest here.
+    /// Returns the output `y` of hidden units `self`, which is the sum of `direct + second self`, and the next
+    /// arguments `rest + weights y`. The rounding is that of the shortest order on this level.
     #[inline(always)]
     fn fed_back(self, second: Self, direct: Self, rest: Self, weights: Self) -> (f64, Self) {
-        // Eight lanes to one number, and one number to eight lanes: `x86::Wide` has the order without this way through a
+        // Eight lanes to one number, and back to eight lanes; `x86::Wide` has an order without this way through a
         // scalar.
         let y = direct.add_product(second, self).sum();
         (y, rest.add_product(weights, Self::splat(y)))
@@ -155,13 +155,13 @@ pub(crate) trait F64x8: Arithmetic {
     fn first(values: &[f64]) -> Self {
         match values.first_chunk() {
             Some(values) => Self::load(values),
-            // NaN rather than a panic: it reaches the cost, and leaves no call in a kernel, around which registers would
-            // be emptied.
+            // NaN instead of a panic: it reaches the cost, and leaves no call in a kernel, which would spill the
+            // registers.
             None => Self::splat(f64::NAN),
         }
     }
 
-    /// Writes over the first eight numbers of a slice.
+    /// Overwrites the first eight numbers of a slice.
     #[inline(always)]
     fn write(self, values: &mut [f64]) {
         if let Some(values) = values.first_chunk_mut() {
@@ -170,14 +170,14 @@ pub(crate) trait F64x8: Arithmetic {
     }
 }
 
-/// Work that is compiled for every kind of processor.
+/// Work that is compiled for every level.
 pub(crate) trait Kernel {
     type Output;
 
-    /// Does the work; `#[inline(always)]`, as everything it calls that uses `V`.
-    // `x86::wide` and `x86::half` carry the processor's features, and only what is compiled into them has these too. A
-    // function that stays a call is compiled for the baseline: each intrinsic in it is a call itself then, with its
-    // operands in memory.
+    /// Does the work; `#[inline(always)]`, like everything it calls that uses `V`.
+    // `x86::wide` and `x86::half` have the processor's features, and only code inlined into them gets these. A function
+    // that stays a call is compiled for the baseline: each intrinsic in it is then a call itself, with its operands in
+    // memory.
     fn run<V: F64x8>(self) -> Self::Output;
 }
 
@@ -188,11 +188,10 @@ pub(crate) fn run<K: Kernel>(kernel: K) -> K::Output {
 
 /// Does the work on a level that this processor has.
 fn run_at<K: Kernel>(level: Level, kernel: K) -> K::Output {
-    // One branch for a whole kernel, not for an operation: what is chosen here is which of three copies of the kernel
-    // runs.
+    // One branch for a whole kernel, not for an operation: it selects one of three copies of the kernel.
     #[cfg(target_arch = "x86_64")]
     match level {
-        // SAFETY: levels that are handed on are those of the processor.
+        // SAFETY: callers only pass levels of this processor.
         Level::Avx512 => return unsafe { x86::wide(kernel) },
         // SAFETY: as above.
         Level::Avx2 => return unsafe { x86::half(kernel) },
@@ -211,14 +210,14 @@ pub(crate) fn run_everywhere<K: Kernel>(mut kernel: impl FnMut() -> K) -> Vec<(L
         .collect()
 }
 
-/// What kernels are compiled for.
+/// The level for which kernels are compiled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Level {
     /// What every processor of the architecture has.
     Baseline,
     /// AVX2 with fused multiply-add.
     Avx2,
-    /// AVX-512, its doubles and quadwords (DQ) included.
+    /// AVX-512, including its doubles and quadwords (DQ).
     Avx512,
 }
 
@@ -226,7 +225,7 @@ impl Level {
     /// All levels, the narrowest first.
     pub const ALL: [Self; 3] = [Self::Baseline, Self::Avx2, Self::Avx512];
 
-    /// The name by which `SEWFAST_CPU` asks for it.
+    /// The name used in `SEWFAST_CPU`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Baseline => "baseline",
@@ -237,7 +236,7 @@ impl Level {
 
     /// Whether this processor has it.
     pub fn is_here(self) -> bool {
-        // Processor and operating system: a register that the system does not save at a change of threads is not there.
+        // Processor and operating system: a register that the system does not save on a thread switch cannot be used.
         #[cfg(target_arch = "x86_64")]
         let (half, wide) = (
             is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
@@ -248,7 +247,7 @@ impl Level {
         match self {
             Self::Baseline => true,
             Self::Avx2 => half,
-            // The ends of wide kernels (sums of eight) are instructions of AVX2, so that both have to be there.
+            // Wide kernels end with AVX2 instructions (sums of eight), so both must be present.
             Self::Avx512 => half && wide,
         }
     }
@@ -262,11 +261,11 @@ impl Level {
 /// The variable that forces a level.
 const VARIABLE: &str = "SEWFAST_CPU";
 
-/// The level in use: the processor's best one, or the one that the environment variable `SEWFAST_CPU` names.
+/// The level in use: the processor's best one, or the one named by the environment variable `SEWFAST_CPU`.
 ///
 /// # Errors
-/// `ErrorKind::Setting` where the variable names no level, or one that this processor does not have; the best one is in
-/// use then.
+/// `ErrorKind::Setting` if the variable names no level, or one that this processor does not have; the best one is then
+/// in use.
 pub fn level() -> Result<Level> {
     asked_for().map(|_| in_use())
 }
@@ -282,7 +281,7 @@ fn named(name: &str) -> Result<Level> {
     let known = Level::ALL.into_iter().find(|level| level.name() == name);
     match known {
         Some(level) if level.is_here() => Ok(level),
-        // Refused and not lowered: a test that is to run on a level would pass without having run on it.
+        // Refused, not lowered: a test for a level would otherwise pass without having run on it.
         Some(_) => Err(Error::setting(format!(
             "expected a processor with {name} for {VARIABLE}={name}, got one without; its best is {}",
             Level::best().name()
@@ -297,8 +296,8 @@ fn named(name: &str) -> Result<Level> {
 #[inline]
 fn in_use() -> Level {
     static IN_USE: OnceLock<Level> = OnceLock::new();
-    // Asked once: a model that is trained on one level and judged on another would differ in its last bits. A wrong name
-    // is no error here, where no caller could take it: `level`, which the Python module asks when it is loaded, reports
+    // Determined once: a model trained on one level and judged on another would differ in its last bits. A wrong name
+    // is no error here, because no caller could handle it: `level`, which the Python module calls on import, reports
     // it.
     *IN_USE.get_or_init(|| asked_for().unwrap_or_else(|_| Level::best()))
 }

@@ -1,12 +1,12 @@
-//! The simplex search of Nelder and Mead, for a few numbers and a cost that is cheap.
+//! The simplex search of Nelder and Mead, for few variables and a cheap cost.
 //!
 //! (J. A. Nelder, R. Mead, *Computer Journal* 7, 1965.)
 
-/// A corner of the simplex: its cost and where it lies.
+/// A corner of the simplex: its cost and its point.
 pub(crate) type Corner = (f64, Vec<f64>);
 
-/// The best corner after at most so many `steps` from a simplex at `start` with edges of `edge`. It ends earlier where the corners, in
-/// the order of their cost, are `close`. A cost may be infinite.
+/// The best corner after at most `steps`, from a simplex at `start` with edges of `edge`. It ends earlier if the
+/// corners, sorted by cost, are `close`. A cost may be infinite.
 pub(crate) fn descended(
     start: &[f64],
     edge: f64,
@@ -77,7 +77,7 @@ mod tests {
 
     #[test]
     fn finds_the_bottom_of_a_curved_valley_beside_a_wall() {
-        // Rosenbrock's valley, forbidden where x is above 1.5
+        // Rosenbrock's valley, forbidden if x is above 1.5
         let cost = |x: &[f64]| match x[0] > 1.5 {
             true => f64::INFINITY,
             false => 100.0 * (x[1] - x[0] * x[0]).powi(2) + (1.0 - x[0]).powi(2),
@@ -85,7 +85,7 @@ mod tests {
         let level = |corners: &[Corner]| corners[2].0 - corners[0].0 < 1e-14;
         let (least, x) = descended(&[-1.2, 1.0], 0.5, 1_000, level, &cost);
         assert!(least < 1e-12 && (x[0] - 1.0).abs() < 1e-5, "{least} {x:?}");
-        // where every corner is forbidden the start is as good as any
+        // if every corner is forbidden, the start is as good as any
         let none = descended(&[2.0, 0.0], 0.1, 50, |_| false, &|_: &[f64]| f64::INFINITY);
         assert!(none.0.is_infinite());
     }

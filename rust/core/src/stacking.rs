@@ -1,24 +1,24 @@
-//! Convex weights of predictions: `min |R w|` over `w >= 0`, `sum w = 1`, where the columns of `R` are what each of
-//! several models leaves unexplained.
+//! Convex weights of predictions: `min |R w|` over `w >= 0`, `sum w = 1`, where each column of `R` is the residual of a
+//! model.
 //!
-//! As the weights add up to one, `R w` is what the combined model leaves unexplained (stacking: Wolpert 1992; Breiman
-//! 1996; Hansen and Racine 2012). It is the point nearest to the origin in the polytope of the columns, which Wolfe (1976)
-//! finds in finitely many steps: a corner is added while one lies on the near side of the plane through the present point;
-//! the nearest point of the corners' affine hull is taken, or, where that lies outside them, the corners that it
-//! leaves behind are dropped.
+//! As the weights sum to one, `R w` is the residual of the combined model (stacking: Wolpert 1992; Breiman 1996; Hansen
+//! and Racine 2012). It is the point nearest to the origin in the polytope of the columns, which Wolfe's algorithm
+//! (1976) finds in finitely many steps. While a corner lies on the near side of the plane through the present point, it
+//! is added. Then the point moves to the nearest point of the corners' affine hull; if that lies outside the corners,
+//! those that it leaves behind are dropped.
 
 use nalgebra::{DMatrix, DVector};
 
 use crate::{Error, Result};
 
-/// Part by which the diagonal of `R'R` is raised: equal columns share their weight.
+/// Relative increase of the diagonal of `R'R`: equal columns then share their weight.
 const RIDGE: f64 = 1e-10;
 /// Relative decrease of `|R w|^2` below which no corner is added.
 const TOLERANCE: f64 = 1e-9;
-/// Corners added at most, for each model.
+/// Most corners added, per model.
 const ROUNDS: usize = 100;
 
-/// The weights of the `models` columns of `residuals` (rows one after another), each row with its weight.
+/// The weights of the `models` columns of `residuals` (row by row); `weights` has a weight for each row.
 ///
 /// # Errors
 ///
@@ -45,7 +45,7 @@ pub fn convex_weights(residuals: &[f64], models: usize, weights: &[f64]) -> Resu
     let mut point = vec![0.0; models];
     let mut corners = vec![nearest(gram.diagonal().iter().copied())];
     point[corners[0]] = 1.0;
-    // each set of corners has one nearest point, and but for rounding none comes twice
+    // each set of corners has one nearest point, so none occurs twice, apart from rounding
     for _ in 0..ROUNDS * models {
         let slopes = &gram * DVector::from_column_slice(&point);
         let next = nearest(slopes.iter().copied());
@@ -59,7 +59,7 @@ pub fn convex_weights(residuals: &[f64], models: usize, weights: &[f64]) -> Resu
     Ok(point)
 }
 
-/// Move to the nearest point of the corners' affine hull, without those that it leaves behind.
+/// Moves to the nearest point of the corners' affine hull and drops the corners that it leaves behind.
 fn descend(gram: &DMatrix<f64>, corners: &mut Vec<usize>, point: &mut [f64]) {
     loop {
         let hull = affine(gram, corners);
@@ -84,7 +84,7 @@ fn descend(gram: &DMatrix<f64>, corners: &mut Vec<usize>, point: &mut [f64]) {
         if inside {
             return;
         }
-        // the one that ends the way is at 0 but for rounding
+        // the corner that ends the step is at 0, apart from rounding
         let least = corners
             .iter()
             .copied()
@@ -99,7 +99,7 @@ fn descend(gram: &DMatrix<f64>, corners: &mut Vec<usize>, point: &mut [f64]) {
     }
 }
 
-/// Weights of sum 1 of the point nearest to the origin in the affine hull: `G v = 1`, scaled.
+/// The point nearest to the origin in the affine hull, as weights with sum 1: `G v = 1`, scaled.
 fn affine(gram: &DMatrix<f64>, corners: &[usize]) -> DVector<f64> {
     let own = gram.select_rows(corners).select_columns(corners);
     let ones = DVector::from_element(corners.len(), 1.0);
@@ -110,7 +110,7 @@ fn affine(gram: &DMatrix<f64>, corners: &[usize]) -> DVector<f64> {
     found / sum
 }
 
-/// `R'WR`, scaled to a least diagonal of 1, with a ridge in proportion to each diagonal.
+/// `R'WR`, scaled to a least diagonal of 1, with a ridge in proportion to each diagonal entry.
 fn products(residuals: &[f64], models: usize, weights: &[f64]) -> DMatrix<f64> {
     let mut gram = DMatrix::zeros(models, models);
     for (row, &w) in residuals.chunks_exact(models).zip(weights) {
@@ -170,7 +170,7 @@ mod tests {
 
     #[test]
     fn a_model_that_adds_nothing_has_no_weight() {
-        // the second errs as the first does, and more
+        // the second has the errors of the first, enlarged
         let residuals = [1.0, 2.0, -1.0, -2.5, 0.5, 1.5];
         assert_eq!(
             convex_weights(&residuals, 2, &[1.0; 3]).unwrap(),

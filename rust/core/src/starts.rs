@@ -1,18 +1,18 @@
-//! Many starts of one fit: drawn until they can learn, trained until they have, over threads, in their order, ranked.
+//! Many starts of one fit, over threads: drawn until they can learn, trained until they have, and ranked.
 
 use std::thread;
 
 use crate::search::each;
 use crate::{Error, Monitor, Result};
 
-/// Draws of one start before it is given up.
+/// Draws of a start before it is given up.
 const MOST_DRAWS: usize = 50;
-/// Trainings of one start before it is given up: only those that ended dead are repeated.
+/// Trainings of a start before it is given up: only trainings that ended dead are repeated.
 pub(crate) const MOST_TRAININGS: usize = 3;
 /// A training that ends above this share of a constant output's J has learnt nothing.
 const DEAD_COST: f64 = 0.9;
 
-/// Refuses numbers of iterations and starts that are no numbers of such.
+/// Refuses impossible numbers of iterations and starts.
 ///
 /// # Errors
 /// `ErrorKind::Setting` outside 1 to 1,000,000.
@@ -27,7 +27,7 @@ pub(crate) fn check(max_iterations: usize, starts: usize) -> Result<()> {
     Ok(())
 }
 
-/// The first draw from which a training can begin, and how many could not.
+/// The first draw from which a training can begin, and how many draws could not.
 pub(crate) fn drawn<T>(
     monitor: &Monitor,
     mut draw: impl FnMut() -> Option<T>,
@@ -43,14 +43,14 @@ pub(crate) fn drawn<T>(
     None
 }
 
-/// Whether a training has learnt anything: its J against that of the best constant output.
+/// Whether a training has learnt anything, by its J relative to that of the best constant output.
 pub(crate) fn has_learnt(cost: f64, constant_cost: f64) -> bool {
     cost < DEAD_COST * constant_cost
 }
 
-/// The first of `trainings` that has learnt, or the last one, and how many draws and trainings were dead.
+/// The first of `trainings` that has learnt, or else the last one, and how many draws and trainings were dead.
 ///
-/// `train` returns its result and the dead draws before it.
+/// `train` returns its result and the number of dead draws before it.
 pub(crate) fn learnt<T>(
     trainings: usize,
     monitor: &Monitor,
@@ -69,22 +69,22 @@ pub(crate) fn learnt<T>(
     None
 }
 
-/// What a start is judged by: J on the validation data, else on the training data; infinite for what is no number.
+/// The score of a start: J on the validation data, else on the training data; infinite if not finite.
 pub(crate) fn score(validation_cost: Option<f64>, cost: f64) -> f64 {
     let score = validation_cost.unwrap_or(cost);
     if score.is_nan() { f64::INFINITY } else { score }
 }
 
-/// All starts have failed.
+/// The error if all starts have failed.
 pub(crate) fn none_left() -> Error {
     Error::fit(
         "expected a start with a finite free run on training and validation data, found none; give more starts, a linear model to start from, or a smaller network",
     )
 }
 
-/// Results of `run(0) .. run(starts - 1)` in their order, whatever the number of threads (0: as many as there are).
+/// Results of `run(0) .. run(starts - 1)` in order, for any number of threads (0: as many as the machine has).
 ///
-/// A start that is not begun before a stop is requested has no result.
+/// A start that has not begun when a stop is requested has no result.
 pub(crate) fn run_all<T: Send>(
     starts: usize,
     threads: usize,
@@ -102,7 +102,7 @@ pub(crate) fn run_all<T: Send>(
     results.into_iter().flatten().collect()
 }
 
-/// Starts with a finite score: sound ones first, each part best first.
+/// Starts with a finite score: sound ones first, each group best first.
 pub(crate) fn ranked(scores: &[f64], is_sound: impl Fn(usize) -> bool) -> Vec<usize> {
     let mut order: Vec<usize> = (0..scores.len())
         .filter(|&i| scores[i].is_finite())

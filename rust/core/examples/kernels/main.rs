@@ -1,4 +1,4 @@
-//! One kernel, prepared and then called in [`measured`]: what `benches/counts.py` counts the instructions of.
+//! One kernel, prepared and then called in [`measured`], whose instructions `benches/counts.py` counts.
 //!
 //! `cargo run --release -p sewfast-core --example kernels` lists the kernels with their samples by call.
 
@@ -6,7 +6,7 @@ mod work;
 
 use std::process::ExitCode;
 
-/// What is counted; not inlined, so that a profiler finds it by its name.
+/// The counted call; not inlined, so that a profiler finds it by name.
 #[inline(never)]
 fn measured(call: &mut dyn FnMut()) {
     call();
@@ -24,7 +24,7 @@ fn main() -> ExitCode {
         return ExitCode::FAILURE;
     };
     let mut call = (kernel.prepare)();
-    // tables, level of the processor and pages are there before anything is counted
+    // warm-up: tables, the processor's level and memory pages exist before anything is counted
     call();
     measured(&mut call);
     ExitCode::SUCCESS

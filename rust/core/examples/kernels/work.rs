@@ -1,4 +1,4 @@
-//! The kernels: fixed problems, each prepared once and called as often as one likes.
+//! The kernels: fixed problems, each prepared once and then called as often as needed.
 
 use std::hint::black_box;
 
@@ -16,13 +16,13 @@ use sewfast_core::{Monitor, Record, arx};
 /// A call that can be repeated.
 pub type Call = Box<dyn FnMut()>;
 
-/// A kernel by its name.
+/// A kernel with its name.
 pub struct Kernel {
     /// Its name.
     pub name: &'static str,
-    /// Samples, or steps of a candidate, by call.
+    /// Samples, or steps of a candidate, per call.
     pub samples: usize,
-    /// Makes everything that the call needs.
+    /// Creates everything that the call needs.
     pub prepare: fn() -> Call,
 }
 
@@ -35,8 +35,8 @@ const LOOP: usize = 4_000;
 const SHORT_LOOP: usize = 500;
 const CANDIDATES: usize = 64;
 
-/// Every kernel. A training of 8 iterations and one of 4 differ by 4 iterations and nothing else: both have learnt, so
-/// that none begins anew.
+/// Every kernel. A training of 8 iterations and one of 4 differ by exactly 4 iterations: both have learnt, so neither
+/// starts over.
 pub const KERNELS: &[Kernel] = &[
     kernel("free_run", RUN, free_run),
     kernel("training_4", TRAINED, || training(4)),
@@ -66,13 +66,13 @@ const fn kernel(name: &'static str, samples: usize, prepare: fn() -> Call) -> Ke
     }
 }
 
-/// A command from 0 to .6 whose frequency rises.
+/// A command from 0 to .6 with rising frequency.
 fn chirp(samples: usize) -> Vec<f64> {
     let phase = |k: usize| 1e-3 * k as f64 * (1.0 + 2e-4 * k as f64);
     (0..samples).map(|k| 0.3 * (1.0 - phase(k).cos())).collect()
 }
 
-/// A saturating second-order drive under the chirp, with a little noise.
+/// A saturating second-order drive driven by the chirp, with a little noise.
 fn drive(samples: usize) -> (Vec<f64>, Vec<f64>) {
     let (u, mut y) = (chirp(samples), vec![0.0; samples]);
     for k in 2..samples {
@@ -97,7 +97,7 @@ fn unscaled() -> Scaling {
     }
 }
 
-/// Eight tanh about a stable second-order drive.
+/// Eight tanh units around a stable second-order drive.
 fn network() -> NeuralOE {
     let shape = Shape::new(lags(), 8, false).expect("a shape");
     let mut random = Random::new(2);
@@ -162,7 +162,7 @@ fn state_space_settings(max_iterations: usize, linear: LinearModel) -> neural_ss
     }
 }
 
-/// The drive with a sensor behind it: an order of 3 in the output.
+/// The drive followed by a sensor: third order at the output.
 fn sensed() -> (Vec<f64>, Vec<f64>) {
     let (u, mut y) = drive(STATES_TRAINED);
     for k in 1..y.len() {
@@ -205,7 +205,7 @@ fn regression() -> Call {
     })
 }
 
-/// A controller of the network, one of many; with the filter that an encoder wants.
+/// A controller of the network, one of many; with the filter that an encoder needs.
 fn design(candidate: usize, encoded: bool) -> Design<f64> {
     let share = candidate as f64 / CANDIDATES as f64;
     let gains = Standard {

@@ -1,15 +1,15 @@
-//! What a first-order fit leaves in doubt: how sure it is of its rise, `T` and `L`, and whether the response goes beyond where it
-//! settles, which none of first order does.
+//! The uncertainty of a first-order fit: standard errors of its rise, `T` and `L`, and whether the response overshoots
+//! its final level, which no first-order response does.
 
 use nalgebra::{DMatrix, DVector};
 
 use super::{Candidate, Step};
 use crate::colour::Colour;
 
-/// A free response of fewer standard errors is none.
+/// A free response below this many standard errors counts as none.
 const SIGMAS: f64 = 3.0;
 
-/// Whether the free response stands out of what the residuals alone would make of it.
+/// Whether the free response exceeds what the residuals alone would explain.
 pub(super) fn moves(step: &Step<'_>, found: &Candidate) -> bool {
     variances(step, found).is_some_and(|v| found.free.powi(2) > SIGMAS.powi(2) * v[4])
 }
@@ -28,7 +28,7 @@ pub(super) fn drifts(step: &Step<'_>) -> bool {
     let squares: f64 = about().map(|(k, _)| k * k).sum();
     let slope = about().map(|(k, y)| k * y).sum::<f64>() / squares;
     let left: Vec<f64> = about().map(|(k, y)| y - slope * k).collect();
-    // coloured noise drifts by itself: as many independent samples as its colour leaves
+    // coloured noise drifts by itself: count only as many independent samples as its spectrum leaves
     let free = Colour::of(&left).independent(left.len()) - 2.0;
     let variance = left.iter().map(|e| e * e).sum::<f64>() / (free * squares);
     free > 0.0 && slope * slope > SIGMAS * SIGMAS * variance
@@ -41,7 +41,7 @@ pub(super) fn errors(step: &Step<'_>, found: &Candidate) -> [f64; 3] {
     })
 }
 
-/// Gauss and Newton's step from a candidate, in `t` and `l`; `held`: with its `l`, and 0 for it.
+/// Gauss-Newton step from a candidate, in `t` and `l`; with `held` `l` stays and its step is 0.
 pub(super) fn step(step: &Step<'_>, found: &Candidate, held: bool) -> Option<(f64, f64)> {
     let (rows, residual) = slopes(step, found);
     let rows = if held { rows.remove_column(2) } else { rows };
@@ -51,17 +51,17 @@ pub(super) fn step(step: &Step<'_>, found: &Candidate, held: bool) -> Option<(f6
     (t.is_finite() && l.is_finite()).then_some((t, l))
 }
 
-/// Variances of rise, `t`, `l`, level and, where it is fitted, the free response, for residuals of any colour and of a size that may change: `P S P`,
-/// `P = (J'J)^-1`, with `S` the covariance of the sums `J'e`. The residuals are whitened by an autoregression, and the slopes
-/// are carried back through it:
+/// Variances of rise, `t`, `l`, level and, if fitted, the free response, for residuals of any spectrum and of changing
+/// size: `P S P` with `P = (J'J)^-1` and `S` the covariance of the sums `J'e`. The residuals are whitened by an
+/// autoregression, and the slopes are carried back through it:
 ///
 /// ```text
 /// w(k) = e(k) - sum_m a_m e(k-m),   z(k) = j(k) + sum_m a_m z(k+m),   J'e = sum_k z(k) w(k),   S = sum_k w(k)^2 z(k) z(k)'
 /// ```
 ///
-/// (White, *Econometrica* 48, 1980, with the whitening of Andrews and Monahan, *Econometrica* 60, 1992.) A window over the
-/// products `j e` instead, as in Andrews 1991, sees too little of a strong correlation: two sigma then held 75 to 82 % of the
-/// records with a residual of `.8 e(k-1) + w(k)`.
+/// (White, *Econometrica* 48, 1980, with the whitening of Andrews and Monahan, *Econometrica* 60, 1992.) A window over
+/// the products `j e`, as in Andrews 1991, underestimates a strong correlation: for residuals of `.8 e(k-1) + w(k)` two
+/// sigma then covered only 75 to 82 % of the records.
 fn variances(step: &Step<'_>, found: &Candidate) -> Option<DVector<f64>> {
     let (rows, residual) = slopes(step, found);
     let (n, p) = (rows.nrows(), rows.ncols());
@@ -69,13 +69,13 @@ fn variances(step: &Step<'_>, found: &Candidate) -> Option<DVector<f64>> {
     let colour = Colour::of(residual.as_slice());
     let scores = colour.scores(&rows, residual.as_slice());
     let free = colour.independent(n);
-    // what the fit took out of the residuals
+    // corrects for the part of the residuals that the fit removed
     let share = free / (free - p as f64).max(0.5 * free);
     let covariance = &inverse * (scores.transpose() * scores) * &inverse * share;
     Some(covariance.diagonal())
 }
 
-/// Derivatives by rise, `t`, `l`, level and, where it is fitted, the free response; residuals.
+/// Derivatives by rise, `t`, `l`, level and, if fitted, the free response; and the residuals.
 fn slopes(step: &Step<'_>, found: &Candidate) -> (DMatrix<f64>, DVector<f64>) {
     let places: Vec<(usize, f64)> = step.samples().collect();
     let Candidate {
@@ -99,27 +99,28 @@ fn slopes(step: &Step<'_>, found: &Candidate) -> (DMatrix<f64>, DVector<f64>) {
     (rows, DVector::from_iterator(places.len(), residual))
 }
 
-/// Less than this share of the rise is none.
+/// A smaller share of the rise counts as no overshoot.
 const LEAST: f64 = 0.05;
-/// Standard deviations that noise is allowed: it exceeds them at one of 1,000 samples with a probability of 2e-5.
+/// Standard deviations allowed to noise: one of 1,000 samples exceeds them with a probability of 2e-5.
 const NOISE_SIGMAS: f64 = 5.5;
-/// The most that they are widened to: of 100 records with noise that is remembered for 100 samples, none went beyond 11.4.
+/// Upper bound of the widened number: of 100 records with noise remembered for 100 samples, none exceeded 11.4.
 const MOST: f64 = 12.0;
-/// The end of the record over this share of the samples after the step is where it has settled.
+/// Share of the samples after the step, at the end of the record, over which the response counts as settled.
 const END: f64 = 1.0 / 3.0;
 
-/// The largest excess over the settled level as a share of the rise; 0 where the noise would reach it too.
+/// The largest excess over the settled level as a share of the rise; 0 if noise could reach it, too.
 ///
-/// It is taken of moving means, as long as a fraction of the fitted response, whose scatter about the fit is that of the end of
-/// the record. That scatter is known as well as from so many independent samples as the noise's colour and the means leave;
-/// [`NOISE_SIGMAS`] standard deviations of a normal distribution are widened to those of Student's (Wallace, *Ann. Math. Stat.* 30, 1959).
+/// It is measured on moving means over a fraction of the fitted response, and compared with their scatter around the
+/// fit at the end of the record. How well that scatter is known depends on the number of independent samples left by
+/// the noise's spectrum and the means: [`NOISE_SIGMAS`] standard deviations of a normal distribution are widened to
+/// those of Student's (Wallace, *Ann. Math. Stat.* 30, 1959).
 pub(super) fn overshoot(step: &Step<'_>, found: &Candidate) -> f64 {
     let after = step.at..step.y.len();
     let residual: Vec<f64> = after
         .clone()
         .map(|k| step.y[k] - found.output(k, step.at))
         .collect();
-    // beyond the settled level; a free response is no part of it
+    // beyond the settled level, without the free response
     let excess: Vec<f64> = after
         .zip(&residual)
         .map(|(k, e)| e - found.rise * (1.0 - found.share(k, step.at)))
@@ -141,7 +142,7 @@ pub(super) fn overshoot(step: &Step<'_>, found: &Candidate) -> f64 {
     }
 }
 
-/// Standard deviations that means over `width` of this noise are allowed.
+/// Standard deviations allowed to means over `width` of this noise.
 fn allowed(noise: &[f64], width: usize) -> f64 {
     let level = mean(noise);
     let centred: Vec<f64> = noise.iter().map(|e| e - level).collect();
@@ -157,8 +158,8 @@ fn allowed(noise: &[f64], width: usize) -> f64 {
     student.min(MOST)
 }
 
-/// Means over `width` neighbours, from running sums: to add up every window anew took seconds of a long record, in which nobody
-/// hears Ctrl-C.
+/// Means over `width` neighbours, from running sums: summing every window anew took seconds on a long record, without a
+/// check for Ctrl-C.
 fn means(values: &[f64], width: usize) -> Vec<f64> {
     let mut sums = vec![0.0];
     let mut sum = 0.0;

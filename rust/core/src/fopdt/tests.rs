@@ -41,7 +41,7 @@ fn fit(u: &[f64], y: &[f64]) -> Result<Fopdt> {
     fit_fopdt(Record::new(u, 1, y).unwrap(), TS, &Monitor::default())
 }
 
-/// A response without noise gives its plant back.
+/// A response without noise must give its plant back.
 fn recovers(plant: &Fopdt, at: usize, n: usize) {
     let (u, y) = response(*plant, at, n);
     let found = fit(&u, &y).unwrap();
@@ -57,7 +57,7 @@ fn recovers(plant: &Fopdt, at: usize, n: usize) {
 
 proptest! {
     #![proptest_config(crate::laws::cases(500))]
-    /// The search takes as long as the record: one in a hundred is of 3,000 samples, the others are of 60 and of faster plants.
+    /// The search takes time in proportion to the record: one in a hundred has 3,000 samples, the others 60 and faster plants.
     #[test]
     fn recovers_an_exact_response(
         k in prop_oneof![1.0..1000.0, -1000.0..-1.0], t in 0.01..0.4, l in 0.0..0.2,
@@ -152,7 +152,8 @@ fn coloured(random: &mut Random, n: usize, rho: f64, size: f64) -> Vec<f64> {
         .collect()
 }
 
-/// 200 records of each colour. Two sigma are to hold 92 % of them at least (95 % were all known exactly); fewer than 165 hits are then
+/// 200 records of each spectrum. Two sigma should cover at least 92 % of them (95 % if all were known exactly); fewer
+/// than 165 hits would be five standard deviations off (binomial: 184 - 5 x 3.84).
 /// five standard deviations off (binomial: 184 - 5 x 3.84).
 #[test]
 fn intervals_hold_with_white_and_coloured_noise() {
@@ -192,7 +193,7 @@ fn a_limited_output_has_no_weight() {
     assert!(found.limited > 500, "{found:?}");
     assert!((found.k / truth.k - 1.0).abs() < 0.03, "{found:?}");
     assert!((found.t / truth.t - 1.0).abs() < 0.06, "{found:?}");
-    // a response that settles on whole counts is no limited one
+    // a response that settles at whole counts is not a limited one
     for counts in [1.0, 38.168] {
         let settled: Vec<f64> = y.iter().map(|y| (y / counts).round() * counts).collect();
         let found = fit(&u, &settled).unwrap();

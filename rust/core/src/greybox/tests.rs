@@ -36,7 +36,7 @@ fn task<'a>(theta: &'a [f64; 30], free: &'a [usize], angle: Option<&'a [f64]>) -
     }
 }
 
-/// Against differences, wherever no sample lies on a kink between them.
+/// Compares with differences, except where a sample lies on a kink between them.
 #[test]
 fn derivatives_are_those_of_the_values() {
     let u = commands(400);
@@ -58,7 +58,7 @@ fn derivatives_are_those_of_the_values() {
             let column: Vec<f64> = (0..400).map(|k| by[30 * k + j]).collect();
             let scale = column.iter().fold(0.0_f64, |most, d| most.max(d.abs()));
             if (ECCENTRIC..WAVES).contains(&j) && std::ptr::eq(by, &found.drive_by) {
-                assert_eq!(scale, 0.0); // the encoder shows it, the motor has none of it
+                assert_eq!(scale, 0.0); // the encoder shows it, but not the motor
                 continue;
             }
             assert!(scale > 0.0, "{} moves nothing", PARAMETERS[j]);
@@ -80,7 +80,7 @@ fn a_linear_motor_reaches_its_steady_speed_with_its_time_constants() {
     let mut of = task(&theta, &[], None);
     (of.speed, of.mean, of.steps) = (0.0, false, 4);
     let found = run(of, &u).unwrap();
-    // tau k_a w'' + (k_a + tau k_b) w' + (k_e + k_b) w = u, from rest, the drive from its steady value
+    // tau k_a w'' + (k_a + tau k_b) w' + (k_e + k_b) w = u, from rest, with the drive at its steady value
     let (a2, a1, a0): (f64, f64, f64) = (0.005 * 0.004, 0.004 + 0.005 * 0.001, 0.021);
     let root = (a1 * a1 - 4.0 * a2 * a0).sqrt();
     let (p, q) = ((-a1 + root) / (2.0 * a2), (-a1 - root) / (2.0 * a2));
@@ -98,7 +98,7 @@ fn a_linear_motor_reaches_its_steady_speed_with_its_time_constants() {
     }
 }
 
-/// A current is measured at the sample: half a step before is a third of a per cent of the resistance.
+/// A current is measured at the sample: an error of half a step is a third of a per cent of the resistance.
 #[test]
 fn the_drive_is_that_of_the_sample() {
     for tau in [0.0, 5e-4, 0.02] {
@@ -127,13 +127,13 @@ fn friction_holds_what_it_can_and_no_more() {
     theta[UNEVEN..].fill(0.0);
     let mut of = task(&theta, &[], None);
     of.speed = 0.0;
-    let held = run(of, &[0.38; 500]).unwrap(); // below k_s + k_t + offset, drop included
+    let held = run(of, &[0.38; 500]).unwrap(); // below k_s + k_t + offset, including the drop
     assert!(held.speed.iter().all(|&w| w == 0.0));
     let moving = run(of, &[0.6; 500]).unwrap();
     assert!(moving.speed[499] > 1.0);
 }
 
-/// What repeats several times within a sample cancels: as one sample of many, so many of one.
+/// A wave that repeats several times within a sample cancels: one long sample gives the same as many short ones.
 #[test]
 fn a_wave_acts_by_its_mean_over_a_sample() {
     let theta = {
@@ -149,7 +149,7 @@ fn a_wave_acts_by_its_mean_over_a_sample() {
         let mut of = task(&theta, &[], Some(&angle));
         (of.orders, of.mean, of.speed) = ([12, 0, 0, 0], false, speed);
         (of.sample_time, of.steps) = (ts, 1 + 64 / samples);
-        // the command that holds the speed, so that only the wave changes it
+        // the command that holds the speed, so that only the wave changes the speed
         run(of, &vec![4.0; samples + 1]).unwrap().speed[samples]
     };
     let (once, often) = (after(1) - 200.0, after(64) - 200.0);

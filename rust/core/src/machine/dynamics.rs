@@ -9,8 +9,8 @@
 //! friction(w) = sign(w) (T_coulomb + T_stribeck / (1 + (w / w_stribeck)^2)) + b w
 //! ```
 //!
-//! A regime fixes the sign of the friction, standstill and the hold of the current at its limit; within it
-//! the equations are smooth, so that a step keeps its order. [`super::Machine`] changes regimes at events.
+//! A regime fixes the sign of the friction, standstill, and whether the current is held at its limit. Within a regime
+//! the equations are smooth, so a step keeps its order. [`super::Machine`] changes regimes at events.
 
 use super::parameters::Parameters;
 
@@ -20,7 +20,7 @@ pub struct State {
     pub current: f64,
     pub speed: f64,
     pub angle: f64,
-    /// Sine and cosine of the angle, turned on from step to step.
+    /// Sine and cosine of the angle, rotated from step to step.
     direction: (f64, f64),
 }
 
@@ -35,16 +35,16 @@ impl State {
     }
 }
 
-/// Which of the smooth pieces of the physics holds.
+/// Which smooth piece of the physics applies.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Regime {
     /// The sign of the motion that friction opposes; 0 at standstill.
     pub motion: f64,
-    /// The side on which the drive holds the current at its limit; 0 where it does not.
+    /// The side on which the drive holds the current at its limit; 0 if it does not.
     pub limited: f64,
 }
 
-/// What depends on the crank angle.
+/// The quantities that depend on the crank angle.
 #[derive(Clone, Copy, Debug)]
 pub struct Crank {
     /// Torque per current and back-EMF per speed.
@@ -58,7 +58,7 @@ pub struct Crank {
 }
 
 impl Crank {
-    /// A little further on, by a turn whose square is nothing.
+    /// The same after a small turn `e`, to first order.
     #[inline(always)]
     fn turned((at, slopes): &(Self, Self), e: f64) -> Self {
         Self {
@@ -70,10 +70,10 @@ impl Crank {
     }
 }
 
-/// What stays the same within a step.
+/// The quantities that stay the same within a step.
 struct Held {
     voltage: f64,
-    /// 0 where the drive holds the current.
+    /// 0 if the drive holds the current.
     per_inductance: f64,
     /// The dead-time voltage over the inductance.
     dead: f64,
@@ -83,7 +83,7 @@ struct Held {
     stribeck: f64,
 }
 
-/// The equations' constants, worked out once.
+/// The equations' constants, precomputed.
 #[derive(Clone, Copy, Debug)]
 pub struct Dynamics {
     dead_voltage: f64,
@@ -97,7 +97,7 @@ pub struct Dynamics {
     ripple_wave: [f64; 2],
     load_first: [f64; 2],
     load_second: [f64; 2],
-    /// Load torque beside that of the crank \[N m\].
+    /// Load torque in addition to the crank's \[N m\].
     pub load: f64,
     coulomb_torque: f64,
     /// Stribeck torque times the square of its speed, and that square.
@@ -138,14 +138,14 @@ impl Dynamics {
         }
     }
 
-    /// What depends on the angle.
+    /// The quantities that depend on the angle.
     #[inline(always)]
     pub fn crank(&self, x: &State) -> Crank {
         self.crank_with_slopes(x.direction).0
     }
 
-    /// What depends on the angle with this sine and cosine, and how it changes with the angle; the harmonics 2 and 4
-    /// come from the first by doubling.
+    /// The quantities that depend on the angle, from its sine and cosine, and their derivatives; harmonics 2 and 4 come
+    /// from the first by doubling.
     #[inline(always)]
     fn crank_with_slopes(&self, (s1, c1): (f64, f64)) -> (Crank, Crank) {
         let (s2, c2) = (2.0 * s1 * c1, (c1 - s1) * (c1 + s1));
@@ -169,29 +169,29 @@ impl Dynamics {
         )
     }
 
-    /// Voltage that drives the current up: mean inverter voltage less dead time, resistance and back-EMF.
+    /// Voltage that drives the current up: mean inverter voltage minus dead time, resistance and back-EMF.
     pub fn driving_voltage(&self, crank: &Crank, current: f64, speed: f64, voltage: f64) -> f64 {
         (voltage - crank.motor_constant * speed) - self.voltage_drop(current)
     }
 
-    /// What resistance and dead time take from the mean inverter voltage.
+    /// The part of the mean inverter voltage lost to resistance and dead time.
     pub fn voltage_drop(&self, current: f64) -> f64 {
         self.resistance * current + self.dead_time(self.dead_voltage, current)
     }
 
-    /// `most s(current / i_ripple)`, of two halves that do not wait for each other.
+    /// `most s(current / i_ripple)`, as two halves that do not wait for each other.
     #[inline(always)]
     fn dead_time(&self, most: f64, current: f64) -> f64 {
         let square = self.ripple_squared + current * current;
         square.sqrt() * (most * current / square)
     }
 
-    /// Dry friction at `speed`, without its sign.
+    /// Magnitude of dry friction at `speed`.
     pub fn dry_friction(&self, speed: f64) -> f64 {
         self.coulomb_torque + self.stribeck[0] / (self.stribeck[1] + speed * speed)
     }
 
-    /// What stays the same within a step.
+    /// The quantities that stay the same within a step.
     #[inline(always)]
     fn held(&self, voltage: f64, Regime { motion, limited }: Regime) -> Held {
         let per_inductance = (1.0 - limited.abs()) * self.per_inductance;
@@ -205,7 +205,7 @@ impl Dynamics {
         }
     }
 
-    /// `(di/dt, dw/dt)`, so ordered that what current and speed have to go through last comes last.
+    /// `(di/dt, dw/dt)`, ordered so that the operations on current and speed come last.
     #[inline(always)]
     fn rates(&self, held: &Held, crank: &Crank, current: f64, speed: f64) -> (f64, f64) {
         let driven = (held.voltage - crank.motor_constant * speed) - self.resistance * current;
@@ -221,9 +221,9 @@ impl Dynamics {
 
     /// One step of Nystroem's fourth-order method for `y'' = f(y, y')` with `y' = (i, w)`.
     ///
-    /// Against the classical Runge-Kutta method it shares one angle between its two middle stages
-    /// (Hairer, Norsett and Wanner 1993, II.14). All three angles are known at once but for what the acceleration turns
-    /// them by: that turn is of second order in `h`, and its square may be left out without a loss of order.
+    /// Unlike the classical Runge-Kutta method it shares one angle between its two middle stages (Hairer, Norsett and
+    /// Wanner 1993, II.14). All three angles are known in advance except for the turn by the acceleration: that is of
+    /// second order in `h`, so its square can be dropped without losing an order.
     #[inline(always)]
     pub fn step(&self, x: &State, h: f64, voltage: f64, regime: Regime) -> State {
         let (i, w, half) = (x.current, x.speed, 0.5 * h);
@@ -260,7 +260,7 @@ impl Dynamics {
     }
 }
 
-// A second mass behind an elastic shaft, which turns with the crank.
+// A second mass behind an elastic shaft, driven by the crank.
 //
 // With the twist `e = crank - load` in rad, the play `B` and `e' = e - clamp(e, -B/2, B/2)`:
 //
@@ -279,9 +279,9 @@ pub struct Shaft {
     play: f64,
     /// [rad]
     angle: f64,
-    /// Of the load [rad/s].
+    /// Speed of the load [rad/s].
     speed: f64,
-    /// On the crank as a load, on the load as a drive [N m].
+    /// Torque on the crank as a load, on the load as a drive [N m].
     pub torque: f64,
 }
 
@@ -304,17 +304,17 @@ impl Shaft {
         self.recall([0.0; 3]);
     }
 
-    /// What changes.
+    /// The state.
     pub fn memory(&self) -> [f64; 3] {
         [self.angle, self.speed, self.torque]
     }
 
-    /// Goes on from there.
+    /// Continues from that state.
     pub fn recall(&mut self, [angle, speed, torque]: [f64; 3]) {
         (self.angle, self.speed, self.torque) = (angle, speed, torque);
     }
 
-    /// Lets the shaft twist for `h` by the difference of both speeds; its torque is that at the end.
+    /// Twists the shaft for `h` by the difference of both speeds; its torque is the one at the end.
     pub fn twist(&mut self, crank_speed: f64, h: f64) {
         let rate = crank_speed - self.speed;
         self.angle += h * rate;
@@ -322,28 +322,28 @@ impl Shaft {
         let torque = self.stiffness * bent + self.damping * rate;
         self.torque = match self.play > 0.0 {
             false => torque,
-            // between both sides nothing bears, and neither side pulls
+            // within the play nothing bears, and neither side pulls
             true if bent == 0.0 => 0.0,
             true => (torque * bent.signum()).max(0.0).copysign(bent),
         };
     }
 
-    /// The load under the torque for `h`.
+    /// Turns the load under the torque for `h`.
     pub fn turn(&mut self, h: f64) {
         self.speed += h * self.per_inertia * self.torque;
     }
 }
 
-/// 2/pi, and pi/2 in two parts whose products with small whole numbers are exact (Cody and Waite 1980).
+/// 2/pi, and pi/2 in two parts whose products with small integers are exact (Cody and Waite 1980).
 const PER_QUADRANT: f64 = std::f64::consts::FRAC_2_PI;
 const QUADRANT: [f64; 2] = [1.570_796_326_734_125_6, 6.077_100_506_506_192e-11];
 
-/// Adding this rounds a double to the nearest whole number and leaves that number in its low bits.
+/// Adding this rounds a double to the nearest integer and leaves that integer in its low bits.
 const ROUND: f64 = 6_755_399_441_055_744.0;
 
 /// `(sin x, cos x)` for `|x|` below 1e5, to a few units of the last place.
 ///
-/// Minimax polynomials of fdlibm on `[-pi/4, pi/4]`; arithmetic only, hence no platform's own last bits.
+/// Minimax polynomials of fdlibm on `[-pi/4, pi/4]`; arithmetic only, so the bits are the same on every platform.
 #[inline(always)]
 fn sin_cos(x: f64) -> (f64, f64) {
     let rounded = x * PER_QUADRANT + ROUND;
@@ -355,10 +355,10 @@ fn sin_cos(x: f64) -> (f64, f64) {
     (negate(s, quadrant), negate(c, quadrant.wrapping_add(1)))
 }
 
-/// The largest turn whose series below are exact to rounding: the next terms are `e^9/9!` and `e^10/10!`.
+/// The largest turn for which the series below are exact to rounding: the next terms are `e^9/9!` and `e^10/10!`.
 const SMALL_TURN: f64 = 0.07;
 
-/// Sine and versine `1 - cos e` of a turn, of a small one in a third of the time that [`sin_cos`] takes.
+/// Sine and versine `1 - cos e` of a turn; for a small one in a third of the time of [`sin_cos`].
 #[inline(always)]
 fn turn(e: f64) -> (f64, f64) {
     if e.abs() > SMALL_TURN {
@@ -378,7 +378,7 @@ fn turned((s, c): (f64, f64), (sine, versine): (f64, f64)) -> (f64, f64) {
     (s + (c * sine - s * versine), c - (s * sine + c * versine))
 }
 
-/// Changes the sign of `value` where bit 1 of `quadrant` is set.
+/// Changes the sign of `value` if bit 1 of `quadrant` is set.
 #[inline(always)]
 fn negate(value: f64, quadrant: u64) -> f64 {
     f64::from_bits(value.to_bits() ^ ((quadrant & 2) << 62))

@@ -1,7 +1,7 @@
 //! The virtual sewing machine: a physical model of drive, crank and load.
 //!
 //! Equations, parameters and derived figures are in `docs/CONVENTIONS.md`; the equations also in [`dynamics`], the
-//! values and their spread in [`parameters`]. Here is the machine that is advanced, sample by sample and regime by regime.
+//! values and their spread in [`parameters`]. Here the machine is advanced, sample by sample and regime by regime.
 
 mod dynamics;
 mod parameters;
@@ -21,19 +21,19 @@ pub const SAMPLE_TIME: f64 = 1e-3;
 /// Integration steps per sample.
 const STEPS: u32 = 4;
 
-/// Parts of such a step where a second mass swings behind a shaft: at 400 Hz its frequency is true to .1 %.
+/// Substeps of such a step if a second mass swings behind a shaft: at 400 Hz its frequency is accurate to .1 %.
 const SHAFT_STEPS: u32 = 6;
 
-/// Parts into which a step is cut that passes an event or the narrow zone of the current's sign.
+/// Pieces into which a step is cut if it passes an event or the narrow zone around the current's change of sign.
 const PIECES: u32 = 8;
 
-/// Half the width, in current ripples, of the zone around zero current whose crossing has a step cut.
+/// Half the width, in current ripples, of the zone around zero current; a step that crosses it is cut.
 const ZONE: f64 = 4.0;
 
-/// Fraction of that zone that the current may move by in an uncut step.
+/// Fraction of that zone by which the current may move in an uncut step.
 const STRIDE: f64 = 0.2;
 
-/// Changes of regime after which the rest of a piece is integrated as it is.
+/// Changes of regime after which the rest of a piece is integrated without further events.
 const EVENTS_PER_PIECE: u32 = 8;
 
 const RPM: f64 = 60.0 / TAU;
@@ -61,7 +61,7 @@ pub struct Machine {
     voltage: f64,
     /// Constant load torque \[N m\].
     load: f64,
-    /// The second mass; `None` where the machine is rigid.
+    /// The second mass; `None` if the machine is rigid.
     shaft: Option<Shaft>,
 }
 
@@ -117,12 +117,12 @@ impl Machine {
         self.settle();
     }
 
-    /// Loads the shaft with a constant torque \[N m\] from now on, through resets as well; 0 takes it off.
+    /// Loads the shaft with a constant torque \[N m\] from now on, including after resets; 0 removes it.
     ///
-    /// It brakes where it has the sign of the speed, and turns the machine backwards where nothing holds it.
+    /// It brakes if it has the sign of the speed, and turns the machine backwards if nothing holds it.
     ///
     /// # Errors
-    /// A setting error where `torque` is not finite.
+    /// A setting error if `torque` is not finite.
     pub fn set_load(&mut self, torque: f64) -> Result<()> {
         if !torque.is_finite() {
             return Err(Error::setting(format!(
@@ -135,7 +135,7 @@ impl Machine {
         Ok(())
     }
 
-    /// All that changes from sample to sample, the load, and the shaft's state where there is one; [`Machine::recall`] takes it up again.
+    /// Everything that changes from sample to sample, the load, and the shaft's state if there is one; for [`Machine::recall`].
     pub fn memory(&self) -> [f64; 11] {
         let State {
             current,
@@ -151,10 +151,10 @@ impl Machine {
         ]
     }
 
-    /// Goes on where a machine with the same parameters had this [`Machine::memory`].
+    /// Continues from the [`Machine::memory`] of a machine with the same parameters.
     ///
     /// # Errors
-    /// A setting error where a value is not finite.
+    /// A setting error if a value is not finite.
     pub fn recall(&mut self, memory: [f64; 11]) -> Result<()> {
         if let Some(value) = memory.iter().find(|value| !value.is_finite()) {
             return Err(Error::setting(format!(
@@ -227,8 +227,8 @@ impl Machine {
         self.unwind();
     }
 
-    /// A sample of both masses. The shaft's torque, taken in the middle of a step, acts on the crank as a load through the
-    /// whole of it: a leap-frog, of second order.
+    /// A sample of both masses. The shaft's torque, taken in the middle of a step, acts on the crank as a load through
+    /// the whole step: a leapfrog scheme of second order.
     #[cold]
     fn swing(&mut self, mut shaft: Shaft, h: f64) {
         for _ in 0..self.steps * SHAFT_STEPS {
@@ -244,10 +244,10 @@ impl Machine {
         self.shaft = Some(shaft);
     }
 
-    /// Counts and true speed [RPM] at the instants at which `u[k]` starts to act, from the present state on.
+    /// From the present state on, counts and true speed [RPM] at the instants at which `u[k]` starts to act.
     ///
     /// # Errors
-    /// A data error where `u` is not finite.
+    /// A data error if `u` is not finite.
     pub fn run(&mut self, u: &[f64]) -> Result<(Vec<f64>, Vec<f64>)> {
         if let Some(k) = u.iter().position(|value| !value.is_finite()) {
             return Err(Error::data(format!(
@@ -263,7 +263,7 @@ impl Machine {
         Ok(u.iter().map(sample).unzip())
     }
 
-    /// Moves whole turns out of the angle, so that it keeps its precision, and takes its sine and cosine anew.
+    /// Removes whole turns from the angle, to keep its precision, and recomputes its sine and cosine.
     fn unwind(&mut self) {
         let State {
             current,
@@ -295,7 +295,7 @@ impl Machine {
         }
     }
 
-    /// True where the current moves by much of the narrow zone in which the dead-time error changes its sign.
+    /// True if the current moves by much of the narrow zone in which the dead-time error changes its sign.
     #[inline(always)]
     fn hops_over_ripple(&self, next: &State) -> bool {
         let (now, then) = (self.state.current, next.current);
@@ -322,7 +322,7 @@ impl Machine {
         self.settle();
     }
 
-    /// How far the regime is from ending, negative behind its end: the least of its guards.
+    /// Distance to the regime's end, negative after it: the least of its guards.
     #[inline(always)]
     fn margin(&self, x: &State) -> f64 {
         let Regime { motion, limited } = self.regime;
@@ -342,7 +342,7 @@ impl Machine {
         motion_left.min(current_left)
     }
 
-    /// The time just after the regime's end within `h`, by the Illinois variant of false position.
+    /// The time just after the regime's end, within `h`, by the Illinois variant of false position.
     fn locate(&self, h: f64) -> f64 {
         let margin = |t: f64| self.margin(&self.after(t));
         let (mut low, mut high) = ((0.0, self.margin(&self.state).max(0.0)), (h, margin(h)));
@@ -363,7 +363,7 @@ impl Machine {
         high.0
     }
 
-    /// Puts the state onto the boundary that it has passed and chooses the regime that holds from there.
+    /// Puts the state on the boundary that it has passed and chooses the next regime.
     fn settle(&mut self) {
         let (d, x) = (&self.dynamics, &mut self.state);
         let crank = d.crank(x);
@@ -406,7 +406,7 @@ impl Plant for Machine {
     }
 }
 
-/// Small signals about a steady speed, with load, inertia and torque at their means over the turn.
+/// Small-signal model around a steady speed, with load, inertia and torque at their means over the turn.
 ///
 /// `dx/dt = A x + B u` with `x = (current, speed)` in A and rad/s, `u` in V:
 ///
@@ -428,10 +428,10 @@ pub struct Linearisation {
 }
 
 impl Machine {
-    /// Small signals about `speed_rpm`.
+    /// Linearises around `speed_rpm`.
     ///
     /// # Errors
-    /// A setting error at standstill, beyond the drive's limits and where the time constants are complex.
+    /// A setting error at standstill, beyond the drive's limits, and if the time constants are complex.
     pub fn linearise(&self, speed_rpm: f64) -> Result<Linearisation> {
         let (p, d) = (&self.parameters, &self.dynamics);
         let speed = speed_rpm / RPM;
@@ -448,7 +448,7 @@ impl Machine {
         }
         let (dead_slope, dry_slope) = d.slopes(current, speed);
         let electrical = (p.resistance + dead_slope) / p.inductance;
-        // the shaft to a second mass is taken as stiff
+        // the shaft to a second mass is treated as stiff
         let inertia = p.inertia + p.load_inertia;
         let mechanical = (p.viscous_friction + dry_slope) / inertia;
         let coupling = p.motor_constant * p.motor_constant / (p.inductance * inertia);

@@ -7,23 +7,23 @@ use std::f64::consts::TAU;
 /// The highest frequency of a shaft [Hz].
 const RESONANCE: f64 = 1000.0;
 
-/// The fastest rate at which a shaft's damping may take up a difference of speeds [1/s].
+/// The highest rate at which a shaft's damping may equalise the speeds [1/s].
 const RELAXATION: f64 = 5000.0;
 
-/// How much a parameter differs between machines of the same type (uniformly distributed).
+/// How a parameter varies between machines of the same type (uniformly distributed).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Spread {
     /// The same in every machine.
     Fixed,
-    /// Up to this fraction of the nominal value to either side.
+    /// Up to this fraction of the nominal value in either direction.
     Relative(f64),
-    /// Up to this much to either side.
+    /// Up to this much in either direction.
     Absolute(f64),
 }
 
 use Spread::{Absolute, Fixed, Relative};
 
-/// What is known about a parameter besides its value.
+/// The table entry of a parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Entry {
     /// The parameter's name, as everywhere.
@@ -143,7 +143,7 @@ parameters! {
 }
 
 impl Parameters {
-    /// Another machine of the same type: each parameter moved within its spread, the same for the same seed.
+    /// Another machine of the same type: each parameter varied within its spread, the same for the same seed.
     pub fn variant(seed: u64) -> Self {
         let mut parameters = Self::default();
         for (stream, entry) in Self::TABLE.iter().enumerate() {
@@ -158,7 +158,7 @@ impl Parameters {
         parameters
     }
 
-    /// The same parameters with `changes` made to them by name.
+    /// The same parameters with `changes` by name.
     ///
     /// # Errors
     /// A setting error for an unknown name and for a value that [`Parameters::validated`] refuses.
@@ -186,7 +186,7 @@ impl Parameters {
         Ok(self)
     }
 
-    /// What the integration of the shaft bears.
+    /// Checks that the integration can handle the shaft.
     fn check_shaft(&self) -> Result<()> {
         if self.load_inertia == 0.0 {
             return Ok(());

@@ -75,8 +75,8 @@ fn agrees_with_a_ten_times_finer_step_wherever_the_drive_is_driven() {
     }
 }
 
-/// Reversing from thousands of RPM the crank stops at an angle that rounding decides; whether it sticks there is then
-/// no question of the step's size, so the load over the turn is left out.
+/// Reversing from thousands of RPM, the crank stops at an angle decided by rounding. Whether it sticks there does not
+/// depend on the step size, so the load over the turn is left out.
 #[test]
 fn agrees_with_a_ten_times_finer_step_through_reversals_from_full_speed() {
     let even = Parameters {
@@ -308,7 +308,7 @@ fn a_load_slows_by_its_torque_and_turns_back_what_nothing_holds() {
         free.advance(4.0);
         loaded.advance(4.0);
     }
-    // what carries the load is current, which costs voltage that speed no longer gets
+    // the load is carried by current, which takes voltage that the speed then lacks
     let p = Parameters::default();
     let carried = loaded.current() - free.current();
     let lost = (free.speed_rpm() - loaded.speed_rpm()) / RPM;
@@ -342,7 +342,7 @@ fn goes_on_from_its_memory_to_the_last_bit() {
     assert!(second.recall([f64::NAN; 11]).is_err());
 }
 
-/// Both masses without any loss: the crank's speed after a blow swings at sqrt(c (1/J + 1/J_load)).
+/// Both masses without loss: after a blow the crank's speed swings at sqrt(c (1/J + 1/J_load)).
 #[test]
 fn a_shaft_swings_at_its_frequency() {
     for (stiffness, load) in [(40.0, 2e-3), (400.0, 1e-3), (2000.0, 5e-4)] {
@@ -422,7 +422,7 @@ fn play_lets_the_crank_run_free_and_then_hit() {
         .zip(&without)
         .position(|(a, b)| (a - b).abs() > 1e-6)
         .unwrap();
-    // until half of the play is used up, 0.25 rad
+    // until half of the play, 0.25 rad, is used up
     let turned: f64 = without[..apart].iter().map(|n| n / RPM * SAMPLE_TIME).sum();
     assert!((0.2..0.3).contains(&turned), "{turned}");
     assert!(with[apart + 3] < without[apart + 3]);

@@ -11,27 +11,27 @@ use crate::lm::{Problem, cholesky, substitute};
 use crate::monitor::look;
 use crate::{Error, Monitor, Record, Result};
 
-/// Nearest that a reflection coefficient may come to the unit circle.
+/// Least distance of a reflection coefficient from the unit circle.
 const MARGIN: f64 = 1e-9;
-/// Samples between two looks at the monitor.
+/// Samples between two checks of the monitor.
 const LOOK: usize = 4096;
 
-/// Parameters: a (na), b (inputs x nb), the offset where there is one, then the past outputs of each experiment that does
+/// Parameters: a (na), b (inputs x nb), the offset if there is one, then the past outputs of each experiment that does
 /// not begin at rest.
 pub(super) struct OutputError<'a> {
     pub lags: Lags,
     records: &'a [Record<'a>],
     monitor: &'a Monitor,
     offset: bool,
-    /// Samples that count, and the sum of their weights: as many where they count alike.
+    /// Number of samples that count, and the sum of their weights; both are equal if all count alike.
     samples: f64,
     weight: f64,
-    /// Where the past outputs of each experiment are among the parameters; `None` for one that begins at rest.
+    /// Index of each experiment's past outputs among the parameters; `None` if it begins at rest.
     places: Vec<Option<usize>>,
     parameters: usize,
-    /// Where each free run begins: at the first measured sample, for a state before a gap would leave no trace.
+    /// Start of each free run: the first measured sample, as a state before a gap would have no effect.
     firsts: Vec<usize>,
-    /// Free runs from there on.
+    /// Free runs from there.
     runs: Vec<Vec<f64>>,
     gram: Gram,
     phi: Vec<f64>,
@@ -109,7 +109,8 @@ impl<'a> OutputError<'a> {
         }
     }
 
-    /// The output that the model holds under the first inputs of an experiment, and its derivatives by the shared parameters:
+    /// The output that the model holds under the first inputs of an experiment, and its derivatives with respect to the
+    /// shared parameters:
     ///
     /// ```text
     /// y = (sum b u + offset) / (1 + sum a),   dy/da = -y / (1 + sum a),   dy/db = u / (1 + sum a)
@@ -118,7 +119,7 @@ impl<'a> OutputError<'a> {
         let (na, n_phi) = (self.lags.na, self.lags.regressors());
         let left = 1.0 + theta[..na].iter().sum::<f64>();
         let mut by = vec![1.0; self.shared()];
-        // before the first sample the inputs are held, so that these are the inputs at rest
+        // before the first sample inputs hold their first value, so these are the inputs at rest
         self.lags
             .write_inputs(self.records[experiment].u, 0, &mut by[na..n_phi]);
         let shared = theta[na..self.shared()].iter();
@@ -145,7 +146,7 @@ impl<'a> OutputError<'a> {
         self.completed(theta, shared)
     }
 
-    /// `theta` with the best parameters from `first` on, which must not be among `a`: all others enter the free run
+    /// `theta` with the best parameters from `first` on. These must not include `a`: all others enter the free run
     /// linearly.
     fn completed(&mut self, mut theta: Vec<f64>, first: usize) -> Option<(f64, Vec<f64>)> {
         let n = self.parameters();
@@ -157,7 +158,7 @@ impl<'a> OutputError<'a> {
         for i in 0..linear {
             normal[i * linear..][..linear]
                 .copy_from_slice(&jtj[(i + first) * n + first..][..linear]);
-            // Initial states that have decayed within the first samples leave no trace in the output.
+            // Initial states that have decayed within the first samples have no effect on the output.
             normal[i * linear + i] = normal[i * linear + i] * (1.0 + 1e-12) + f64::MIN_POSITIVE;
         }
         if !cholesky(&mut normal, linear) {
@@ -169,7 +170,7 @@ impl<'a> OutputError<'a> {
         Some((self.cost(&theta)?, theta))
     }
 
-    /// How many independent samples the residuals at `theta` are worth.
+    /// The number of independent samples in the residuals at `theta`.
     pub fn independent(&mut self, theta: &[f64]) -> f64 {
         if self.cost(theta).is_none() {
             return 0.0;
@@ -184,14 +185,14 @@ impl<'a> OutputError<'a> {
         Colour::of(&residuals).independent(residuals.len())
     }
 
-    /// Covariance of the shared parameters for white noise, row by row, with a row for the offset in any case.
+    /// Covariance of the shared parameters for white noise, row by row, always with a row for the offset.
     pub fn covariance(&mut self, theta: &[f64], cost: f64) -> Vec<f64> {
         let n = self.parameters();
         let (mut jtj, mut jte) = (vec![0.0; n * n], vec![0.0; n]);
         let is_valid = self.cost(theta).is_some();
         self.normal_equations(theta, &mut jtj, &mut jte);
         let information = DMatrix::from_fn(n, n, |i, j| jtj[i.max(j) * n + i.min(j)]);
-        // jtj is a mean over the samples, the cost half of one; weights are inverse variances but for a factor
+        // jtj is a mean over the samples, the cost half of one; weights are inverse variances up to a factor
         let variance = 2.0 * cost / (self.samples - n as f64);
         let shared = self.shared();
         let found = without_nuisance(&information, shared)
@@ -298,7 +299,7 @@ impl Problem for OutputError<'_> {
         jte.fill(0.0);
         for experiment in 0..self.records.len() {
             self.sensitivities(theta, experiment);
-            // of a record that begins at rest the columns of past outputs are 0
+            // for a record that begins at rest the columns of past outputs are 0
             let state = self.places[experiment];
             let place = |i: usize| {
                 state
@@ -342,7 +343,7 @@ mod tests {
         check_gradient(&mut problem(&weighted), &theta);
         let begun = [records[0].at_rest(true), records[1]];
         check_gradient(&mut problem(&begun), &theta[..7]);
-        // weights of 1 and, on a part, of 3
+        // weights of 1, and of 3 on a part
         let part = |k: usize| k % 7 < 3;
         let tripled: Vec<f64> = (0..400).map(|k| if part(k) { 3.0 } else { 1.0 }).collect();
         let weighted = records.map(|r| r.with_weights(&tripled).unwrap());

@@ -1,5 +1,5 @@
-//! Where linear output error starts: least squares, instrumental variables, and poles over all time constants, on pieces of long
-//! records; and how well a model runs on from a state that a few samples gave it.
+//! Starts of linear output error: least squares, instrumental variables, and poles over all time constants, on pieces
+//! of long records; and the restart error: how well a model runs on from a state estimated from a few samples.
 
 use std::f64::consts::PI;
 
@@ -13,11 +13,11 @@ use crate::linear::{LinearModel, is_stable, polynomial, stabilised};
 use crate::random::Random;
 use crate::{Monitor, Record, arx};
 
-/// Instrumental-variable iterations; they settle within five or so where they settle at all.
+/// Instrumental-variable iterations; if they settle at all, they do so within five or so.
 const IV_ITERATIONS: usize = 12;
-/// Samples to simulate in all for drawn poles: about a fifth of a second.
+/// Samples simulated in all for drawn poles: about a fifth of a second.
 const SCREENED_SAMPLES: usize = 4_000_000;
-/// Candidates whose costs agree this closely are one.
+/// Candidates whose costs agree this closely count as one.
 const SAME_COST: f64 = 1e-6;
 
 /// Start parameters with their costs, best free run first.
@@ -29,7 +29,7 @@ pub(super) fn candidates(
     let mut found: Vec<(f64, Vec<f64>)> = Vec::new();
     let lags = problem.lags;
     let offset = problem.shared() > lags.regressors();
-    // the quickest one first, so that there is something after an early stop
+    // the quickest one first, so that an early stop has a result
     let least_squares = arx::fit(records, lags.na, lags.nb, lags.nk, offset);
     if let Ok(first) = &least_squares {
         found.extend(problem.with_poles(&stabilised(first.a())));
@@ -65,7 +65,7 @@ fn identified(
 }
 
 /// Denominators with poles drawn over time constants from half a sample to a quarter of the record; a third of them
-/// has complex pairs.
+/// have complex pairs.
 fn drawn(problem: &OutputError, records: &[Record]) -> Vec<Vec<f64>> {
     let samples: usize = records.iter().map(Record::len).sum();
     let longest = records.iter().map(Record::len).max().unwrap_or(1) as f64 / 4.0;
@@ -92,14 +92,14 @@ fn drawn(problem: &OutputError, records: &[Record]) -> Vec<Vec<f64>> {
         .collect()
 }
 
-/// Records of more samples than this in all are searched in an excerpt.
+/// Records with more samples in all are searched in an excerpt.
 const LONG: usize = 40_000;
-/// Samples of an excerpt, about.
+/// Approximate number of samples of an excerpt.
 const EXCERPT: usize = 16_000;
 /// Samples of a piece.
 const PIECE: usize = 8_000;
 
-/// Pieces of each record, evenly spread and in proportion to its length; none where the records are short.
+/// Pieces of each record, evenly spread and in proportion to its length; `None` if the records are short.
 pub(super) fn excerpt<'a>(records: &[Record<'a>]) -> Option<Vec<Record<'a>>> {
     let samples: usize = records.iter().map(Record::len).sum();
     if samples <= LONG {
@@ -115,13 +115,13 @@ pub(super) fn excerpt<'a>(records: &[Record<'a>]) -> Option<Vec<Record<'a>>> {
     (!pieces.is_empty()).then_some(pieces)
 }
 
-/// Pieces of about `share` samples together; those without any measured output of some weight are left out.
+/// Pieces of about `share` samples together; pieces without any measured output of positive weight are left out.
 fn pieces_of<'a>(record: &Record<'a>, share: usize) -> Vec<Record<'a>> {
     let count = share.div_ceil(PIECE).max(1);
     let length = share / count;
     let room = record.len() - length;
     let piece = |i: usize| {
-        // a single one comes from the middle
+        // a single piece comes from the middle
         let start = if count == 1 {
             room / 2
         } else {
@@ -139,17 +139,17 @@ fn pieces_of<'a>(record: &Record<'a>, share: usize) -> Vec<Record<'a>> {
     (0..count).filter_map(piece).collect()
 }
 
-/// Segments an experiment is cut into, where it is long enough.
+/// Segments into which an experiment is cut, if it is long enough.
 const SEGMENTS: usize = 8;
 /// Shortest segment, in multiples of `STATE_SAMPLES`.
 const SHORTEST: usize = 5;
 
 /// Mean square free-run error over segments of the records, each started from its own first samples.
 ///
-/// Where the model cannot hold all of the drive (friction, limits), a slow pole almost cancelled by a zero can lower
-/// the cost by following the record's trend. Nobody can tell that pole's state from a few samples, so such a model
-/// fails whenever it is started anew, which is what a model is for. Infinite where a run leaves the finite numbers, and
-/// after a stop.
+/// If the model cannot describe all of the drive (friction, limits), a slow pole almost cancelled by a zero can lower
+/// the cost by following the record's trend. The state of that pole cannot be determined from a few samples, so such a
+/// model fails whenever it is started anew, which is what a model is for. Infinite if a run leaves the finite numbers,
+/// and after a stop.
 pub(super) fn restart_error(model: &LinearModel, records: &[Record], monitor: &Monitor) -> f64 {
     let (mut sum, mut count) = (0.0, 0.0);
     for record in records {
@@ -178,7 +178,7 @@ pub(super) fn restart_error(model: &LinearModel, records: &[Record], monitor: &M
     }
 }
 
-/// Sum of squared errors and of the weights of the measured samples behind those that set the state.
+/// Sum of squared errors, and of the weights, of the measured samples after those that set the state.
 fn segment_error(
     model: &LinearModel,
     record: &Record,

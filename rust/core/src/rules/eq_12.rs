@@ -1,5 +1,5 @@
-//! The paper's Eq. 12 itself, for any `L/T`: gains that minimise it after a step of the disturbance, alpha and beta after
-//! one of the reference.
+//! The paper's Eq. 12 for any `L/T`: the gains minimise it after a step of the disturbance, alpha and beta after a step
+//! of the reference.
 //!
 //! With `K = T = 1`, `P = s + s^2` and `Q = P e^(sL) + Kp (s + 1/Ti + Td s^2)` the errors after unit steps are
 //!
@@ -7,9 +7,9 @@
 //! E_d = 1/Q,    E_r = (1 + s) e^(sL)/Q + Kp (alpha + beta Td s)/Q,    J = int_0^inf w |d^2 E/ds^2|^2 dw   at s = jw
 //! ```
 //!
-//! `E_r` is linear in alpha and beta, so that their best values solve two linear equations. A derivative of the reference
-//! makes the output jump, and the integral of `E_r` then grows with the logarithm of its upper limit: it is taken up to
-//! `1000/L`, where alpha and beta agree best with Table 1. The integral of `E_d` converges.
+//! `E_r` is linear in alpha and beta, so their best values solve two linear equations. A derivative of the reference
+//! makes the output jump, and the integral of `E_r` then grows with the logarithm of its upper limit. It is taken up to
+//! `1000/L`, at which alpha and beta agree best with Table 1. The integral of `E_d` converges.
 
 mod locus;
 
@@ -22,19 +22,19 @@ use crate::simplex::{Corner, descended};
 use crate::{Error, Result};
 use locus::{Locus, Node};
 
-/// The range of `L/T` that the rule is made for.
+/// The range of `L/T` for which the rule is made.
 const RATIOS: (f64, f64) = (0.01, 2.0);
 /// Upper limits of the integrals times `L`.
 const TOP: (f64, f64) = (100.0, 1000.0);
-/// The same while searching: gains change by less than 1e-4.
+/// The same during the search: the gains change by less than 1e-4.
 const SEARCHED: f64 = 25.0;
-/// No loop of the least cost without a limit has a smaller `max |S|`, at any ratio.
+/// Without a limit, no loop of least cost has a smaller `max |S|`, at any ratio.
 const FREE: f64 = 1.9;
 
-/// What a set of gains costs, with `K = T = 1`.
+/// The cost of a set of gains, for `K = T = 1`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Costs {
-    /// Eq. 12 after a step of the disturbance; infinite where the loop is unstable.
+    /// Eq. 12 after a step of the disturbance; infinite if the loop is unstable.
     pub disturbance: f64,
     /// Eq. 12 after a step of the reference, up to `1000/L`.
     pub reference: f64,
@@ -42,10 +42,10 @@ pub struct Costs {
     pub ms: f64,
 }
 
-/// Gains of `K e^(-sL)/(1 + sT)` that minimise Eq. 12, among those with `max |S|` of at most `ms`.
+/// Gains of `K e^(-sL)/(1 + sT)` that minimise Eq. 12, subject to `max |S|` of at most `ms`.
 ///
 /// # Errors
-/// `ErrorKind::Setting` for numbers that are no such plant, `L/T` outside .01 to 2, or an `ms` that is not above 1.1.
+/// `ErrorKind::Setting` for invalid numbers of the plant, `L/T` outside .01 to 2, or an `ms` that is not above 1.1.
 pub fn eq_12(k: f64, t: f64, l: f64, ms: f64) -> Result<(Rule, Costs)> {
     super::require_plant(k, t, l)?;
     let ratio = l / t;
@@ -92,7 +92,7 @@ fn least(locus: &Locus, ms: f64) -> Result<Standard<f64>> {
     })
 }
 
-/// What gains for `L/T` cost with `K = T = 1`: `kp` is `Kp K`, `ti` and `td` are in units of `T`.
+/// The cost of gains for `L/T` with `K = T = 1`: `kp` is `Kp K`, `ti` and `td` are in units of `T`.
 ///
 /// # Errors
 /// `ErrorKind::Setting` for `L/T` that is not above 0, or gains that are not positive (`td` may be 0).
@@ -108,10 +108,10 @@ pub fn costs(ratio: f64, gains: Standard<f64>, alpha: f64, beta: f64) -> Result<
     Ok(locus.costs(&reference, gains, alpha, beta))
 }
 
-// The gains of the least cost: without a limit of `max |S|`, and on its boundary.
+// The gains of least cost: without a limit of `max |S|`, and on its boundary.
 
 impl Locus {
-    /// `ln` of `Kp`, `Ti` and `Td` near the least cost, from which it is searched.
+    /// `ln` of `Kp`, `Ti` and `Td` near the least cost, from which the search starts.
     fn start(&self) -> [f64; 3] {
         let l = self.l;
         [
@@ -122,7 +122,7 @@ impl Locus {
         .map(f64::ln)
     }
 
-    /// The gains of the least cost.
+    /// The gains of least cost.
     pub(super) fn free(&self) -> Standard<f64> {
         let gains = |x: &[f64; 3]| Standard {
             kp: x[0].exp(),
@@ -133,7 +133,7 @@ impl Locus {
         gains(&best)
     }
 
-    /// The gains of the least cost on the boundary `max |S| = ms`.
+    /// The gains of least cost on the boundary `max |S| = ms`.
     pub(super) fn bounded(&self, ms: f64) -> Option<Standard<f64>> {
         let gains = |x: &[f64; 2]| self.largest(x[0].exp(), x[1].exp(), ms);
         let [_, ti, td] = self.start();
@@ -141,11 +141,11 @@ impl Locus {
         gains(&minimised([ti, td + 0.8_f64.ln()], 0.2, cost))
     }
 
-    /// The largest `Kp` with these times of a stable loop with `max |S|` of `ms`; none where only `Kp = 0` has it.
+    /// The largest `Kp` with these times for which the loop is stable and `max |S|` is `ms`; `None` if only `Kp = 0` has it.
     ///
-    /// With `L = Kp x` a frequency forbids what lies between the roots of `1 + 2 Kp Re x + Kp^2 |x|^2 = 1/ms^2`, neighbours
-    /// together forbid one range, and high frequencies all above `Kp Td = 1 - 1/ms`. Between the ranges nothing meets -1, so that
-    /// all gains there are stable or none is.
+    /// With `L = Kp x` a frequency forbids the gains between the roots of `1 + 2 Kp Re x + Kp^2 |x|^2 = 1/ms^2`.
+    /// Neighbouring frequencies together forbid one range, and high frequencies forbid all gains above `Kp Td = 1 -
+    /// 1/ms`. Between the ranges nothing meets -1, so either all gains there are stable or none is.
     pub(super) fn largest(&self, ti: f64, td: f64, ms: f64) -> Option<Standard<f64>> {
         let beyond = 1.0 - 1.0 / (ms * ms);
         let mut ranges = self.forbidden(|n| n.forbids(ti, td, beyond));
@@ -173,7 +173,7 @@ impl Locus {
         })
     }
 
-    /// What runs of neighbouring frequencies forbid together.
+    /// The ranges that runs of neighbouring frequencies forbid together.
     fn forbidden(&self, of: impl Fn(&Node) -> Option<(f64, f64)>) -> Vec<Range> {
         let mut ranges: Vec<Range> = Vec::new();
         let mut running = false;
@@ -199,11 +199,11 @@ impl Locus {
     }
 }
 
-/// Gains that some frequencies forbid.
+/// A range of gains forbidden by some frequencies.
 struct Range {
     low: f64,
     high: f64,
-    /// The node that forbids the lowest of them; none where it is the limit of high frequencies.
+    /// The node that forbids the lowest of them; `None` for the limit of high frequencies.
     lowest: Option<usize>,
 }
 
@@ -214,7 +214,7 @@ impl Node {
         (s + s * s * td + 1.0 / ti) / self.p[0]
     }
 
-    /// Between which gains this frequency's `|S|` is too large.
+    /// The gains between which this frequency's `|S|` is too large.
     fn forbids(&self, ti: f64, td: f64, beyond: f64) -> Option<(f64, f64)> {
         let x = self.unit_loop(ti, td);
         let discriminant = x.re * x.re - x.norm_sqr() * beyond;
@@ -225,13 +225,13 @@ impl Node {
     }
 }
 
-/// Steps of the search before it starts again from its best point, and how often it does.
+/// Steps of the search before it restarts from its best point, and the number of restarts.
 const STEPS: usize = 400;
 const ROUNDS: usize = 2;
-/// A simplex of this extent is a point.
+/// A simplex of this size counts as a point.
 const SMALL: f64 = 1e-6;
 
-/// Where `cost` is least near `start`; the first simplex has edges of `step`.
+/// The minimum of `cost` near `start`; the first simplex has edges of `step`.
 fn minimised<const N: usize>(
     start: [f64; N],
     step: f64,
@@ -346,7 +346,7 @@ mod tests {
         }
     }
 
-    /// The largest gain is that of the quadratic of every frequency, not only of those at the nodes.
+    /// The largest gain must hold at every frequency, not only at the nodes.
     #[test]
     fn the_largest_gain_is_where_the_peak_reaches_the_limit() {
         for (ratio, ti, td) in [

@@ -1,4 +1,4 @@
-//! Complex numbers with their derivatives by the parameters of a machine.
+//! Complex numbers with their derivatives with respect to the parameters of a machine.
 
 use std::ops::{Add, Div, Mul, Sub};
 
@@ -39,7 +39,7 @@ impl Dual {
         self.of(value, 0.5 / value)
     }
 
-    /// A function of this number with this value and slope.
+    /// The result of a function of this number with this value and slope.
     fn of(self, value: Complex<f64>, slope: Complex<f64>) -> Self {
         Self {
             value,
@@ -47,7 +47,7 @@ impl Dual {
         }
     }
 
-    /// A function of two numbers by its value and its slopes.
+    /// The result of a function of two numbers, from its value and its slopes.
     fn joined(
         self,
         other: Self,

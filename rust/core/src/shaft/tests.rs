@@ -22,8 +22,8 @@ fn hertz() -> Vec<f64> {
     (1..=100).map(|k| 0.5 * 1.068_f64.powi(k)).collect()
 }
 
-/// The response of `G` between the samples, `n` of them to one: the command held, the output at the samples or their mean before it.
-/// In continuous time, `sum_k G(j w_k) H(j w_k)/Ts` over the aliases of the frequency.
+/// The sampled response of `G`: the command held, and the output at the samples or as its mean over the last one. In
+/// continuous time, `sum_k G(j w_k) H(j w_k)/Ts` over the aliases of the frequency.
 fn aliases(theta: &[f64], f: f64, counted: bool) -> Complex<f64> {
     let w = |k: i32| std::f64::consts::TAU * (f + f64::from(k) / TS);
     let of = |k: i32| {
@@ -105,7 +105,7 @@ fn what_is_no_machine_is_refused() {
     ] {
         assert!(search(lines(hertz, sigma), None, &Monitor::default()).is_err());
     }
-    // one line is no machine, and no panic
+    // one line determines no machine, but must not panic
     let (machine, beyond) = search(lines(&[1.0], &[1.0]), None, &Monitor::default()).unwrap();
     assert_eq!((machine.theta.len(), beyond), (4, None));
     let stopped = Monitor::default();
@@ -113,7 +113,7 @@ fn what_is_no_machine_is_refused() {
     assert!(search(lines(&[1.0], &[1.0]), None, &stopped).is_err());
 }
 
-/// What a search finds in an exact response whose lines are known to .5 %.
+/// The result of a search in an exact response whose lines are known to .5 %.
 fn found(theta: &[f64], resonance: Option<bool>) -> (Fitted, Option<f64>) {
     let hertz: Vec<f64> = (1..=150).map(|k| 2.0 * f64::from(k)).collect();
     let value = response(theta, &hertz, TS, true).unwrap();
@@ -140,7 +140,7 @@ fn the_search_finds_as_many_shafts_as_there_are() {
             assert!((x - exact).abs() < 1e-3, "{:?} {theta:?}", machine.theta);
         }
     }
-    // in any order of the shafts, and without any where none is asked for
+    // in any order of the shafts, and without any if none is requested
     let swapped = [motor(1.3), shaft(150.0, 110.0).to_vec(), one[4..].to_vec()].concat();
     let machine = found(&swapped, None).0;
     assert!((machine.theta[4] - one[4]).abs() < 1e-3);

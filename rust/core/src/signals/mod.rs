@@ -1,7 +1,7 @@
 //! Excitation signals and references: seeded, validated, sampled at `k Ts`.
 //!
-//! Here is what every signal asks of its arguments, and the limits of amplitude, rate and slew that are kept exactly; `shapes`
-//! (steps, trapezoids, jumps), `sines` and `random_steps` make signals.
+//! This file has the checks of arguments, common to all signals, and the limits of amplitude, rate and slew, which are
+//! kept exactly. The signals are in `shapes` (steps, trapezoids, jumps), `sines` and `random_steps`.
 
 mod random_steps;
 mod shapes;
@@ -106,9 +106,9 @@ pub struct Limits {
 impl Limits {
     /// The signal that follows `signal` within the limits; it starts at the first value, at any rate.
     ///
-    /// A signal within the limits comes back bit for bit. Otherwise each sample moves as the time-optimal brake law
-    /// says: towards the signal, as fast as still allows to meet it, and never so fast that `low` or `high` could
-    /// not be respected any more. All limits hold in floating-point arithmetic, as `numpy.diff` computes it.
+    /// A signal within the limits is returned bit for bit. Otherwise each sample follows the time-optimal braking law:
+    /// towards the signal as fast as it can still be met, and never so fast that `low` or `high` could no longer be
+    /// kept. All limits hold in floating-point arithmetic, as `numpy.diff` computes it.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for limits out of order, not above zero, or too fine for double precision beside the
@@ -152,7 +152,7 @@ impl Limits {
     }
 }
 
-/// The limits per sample. `speed` and `change` leave room for rounding, `brake` is what planning counts on.
+/// The limits per sample. `speed` and `change` leave room for rounding; planning uses `brake`.
 struct Follower {
     low: f64,
     high: f64,
@@ -199,17 +199,17 @@ impl Follower {
         out
     }
 
-    /// The next value from `x` and the last change `v`, with `ahead` samples to come after it.
+    /// The next value from `x` and the last change `v`, with `ahead` samples after it.
     fn next(&self, x: f64, v: Option<f64>, before: f64, target: f64, ahead: usize) -> f64 {
         let motion = (target - before).clamp(-self.speed, self.speed);
         let gap = target - motion - x;
         let wanted = motion + gap.signum() * fastest(gap.abs(), self.brake, ahead);
-        // Both ends contain 0 and, by the choice made one sample before, a change that braking can reach.
+        // Both ends contain 0 and, by the choice one sample before, a change that braking can reach.
         let up = fastest(self.high - x, self.brake, ahead);
         let down = -fastest(x - self.low, self.brake, ahead);
         let change = wanted.clamp(down, up).clamp(-self.speed, self.speed);
         let change = v.map_or(change, |v| change.clamp(v - self.change, v + self.change));
-        // The target itself where it can be had, so that rounding does not add up along a signal that is followed.
+        // The target itself if it is reachable, so that rounding does not accumulate along a followed signal.
         let next = if change == target - x {
             target
         } else {
@@ -219,9 +219,9 @@ impl Follower {
     }
 }
 
-/// The largest `v` with which a gap is not passed when braking by `a` per sample, over `ahead` samples after this.
+/// The largest `v` that does not overshoot a gap if braked by `a` per sample, over `ahead` further samples.
 ///
-/// The way is `v + (v - a) + (v - 2a) + .. = (n + 1) v - a n (n + 1)/2`, `n` being the samples that still move.
+/// The distance is `v + (v - a) + (v - 2a) + .. = (n + 1) v - a n (n + 1)/2`, with `n` the samples that still move.
 fn fastest(gap: f64, a: f64, ahead: usize) -> f64 {
     if a == f64::INFINITY {
         return gap;

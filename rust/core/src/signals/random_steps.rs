@@ -1,4 +1,4 @@
-//! Random levels: held for random times, with smooth transitions; and the pseudo-random binary sequence of maximal length.
+//! Random levels, held for random times, with smooth transitions; and the pseudo-random binary sequence of maximum length.
 
 use std::f64::consts::PI;
 
@@ -6,7 +6,7 @@ use super::{MAX_SAMPLES, finite, not_negative, ordered, samples};
 use crate::random::Random;
 use crate::{Error, Result};
 
-/// Uniform levels and holds; each change is half a cosine, so the signal never leaves `low .. high`.
+/// Uniform random levels and hold times; each change is half a cosine, so the signal never leaves `low .. high`.
 ///
 /// A change of `D` within `smoothing` seconds has a rate of at most `pi D / (2 smoothing)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,7 +23,7 @@ pub struct RandomSteps {
     pub hold_max: f64,
     /// How long a change takes (s), at most `hold_min`; 0 jumps.
     pub smoothing: f64,
-    /// Where the signal comes from: it changes to the first level from here. None starts at the first level.
+    /// Level before the first change; `None` starts at the first level.
     pub start: Option<f64>,
 }
 
@@ -131,8 +131,8 @@ fn advance(register: u32, mask: u32) -> u32 {
 
 /// A maximum length sequence between `low` and `high`, each bit held for `hold` seconds.
 ///
-/// The register is the shortest whose period covers the signal, so nothing repeats; the seed chooses where in the
-/// period the signal starts.
+/// The register is the shortest whose period covers the signal, so nothing repeats; the seed chooses the start within
+/// the period.
 ///
 /// # Errors
 /// `ErrorKind::Setting` for values that are not finite, a hold below one sample, or a length outside 1 to
@@ -153,7 +153,7 @@ pub fn prbs(duration: f64, ts: f64, low: f64, high: f64, hold: f64, seed: u64) -
     Ok(signal)
 }
 
-/// A register content other than zero.
+/// A nonzero register content.
 fn start(length: u32, seed: u64) -> u32 {
     let period = (1u64 << length) - 1;
     (1 + Random::new(seed).next_u64() % period) as u32

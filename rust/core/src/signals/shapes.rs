@@ -111,11 +111,11 @@ impl Trapezoid {
     }
 }
 
-/// Random speeds, each reached by a pulse of high command and then held by the command that holds it.
+/// Random speeds, each reached by a pulse of high command and then held by the matching command.
 ///
-/// The pulse lasts `|change of speed| / acceleration`, as long as a drive that accelerates at its current limit
-/// needs; the level between pulses is `speed / gain`. The signal is planned open loop, so a real drive comes near the
-/// speeds, not to them.
+/// The pulse lasts `|change of speed| / acceleration`, as long as a drive needs that accelerates at its current limit;
+/// the level between pulses is `speed / gain`. The signal is planned open loop, so a real drive only comes near the
+/// speeds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Jumps {
     /// Length of the signal (s).
@@ -146,9 +146,8 @@ impl Jumps {
     /// The sampled signal for `seed`.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for values that are not finite, out of order or not above zero where they divide, a
-    /// smallest change that does not fit twice into the range of speed, or a length outside 1 to
-    /// [`super::MAX_SAMPLES`] samples.
+    /// `ErrorKind::Setting` for values that are not finite, out of order or, for divisors, not above zero, a smallest
+    /// change that does not fit twice into the range of speed, or a length outside 1 to [`super::MAX_SAMPLES`] samples.
     pub fn generate(&self, ts: f64, seed: u64) -> Result<Vec<f64>> {
         let n = samples("duration", self.duration, ts)?;
         self.check(ts)?;
@@ -176,7 +175,7 @@ impl Jumps {
         Ok(signal)
     }
 
-    /// A speed at least `change_min` away, uniform over what that leaves of the range.
+    /// A speed at least `change_min` away, uniform over the rest of the range.
     fn next_speed(&self, random: &mut Random, speed: f64) -> f64 {
         let below = (speed - self.change_min - self.speed_low).max(0.0);
         let above = (self.speed_high - speed - self.change_min).max(0.0);

@@ -1,5 +1,5 @@
-//! Sines: the chirp, whose frequency, amplitude and offset sweep over the signal, and the random-phase multisine, all harmonics of a
-//! band with equal amplitude, with its crest factor.
+//! Sines: the chirp, whose frequency, amplitude and offset sweep over the signal, and the random-phase multisine, all
+//! harmonics of a band with equal amplitude; and the crest factor.
 
 use std::f64::consts::TAU;
 
@@ -7,7 +7,7 @@ use super::{below_nyquist, finite, not_negative, ordered, samples};
 use crate::random::Random;
 use crate::{Error, Result};
 
-/// How the frequency goes from start to end.
+/// How the frequency changes from start to end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sweep {
     /// `f = f0 + (f1 - f0) t/T`.
@@ -18,7 +18,7 @@ pub enum Sweep {
 
 /// `offset(t) + amplitude(t) sin(phase + 2 pi int f dt)`; offset and amplitude are ramps.
 ///
-/// With growing amplitude it is the paper's chirp Lo-Hi, with shrinking amplitude its Hi-Lo.
+/// With growing amplitude it is the paper's chirp Lo-Hi, with shrinking amplitude the paper's Hi-Lo.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Chirp {
     /// Length of the signal (s).
@@ -35,7 +35,7 @@ pub struct Chirp {
     pub offset_start: f64,
     /// Offset at the end.
     pub offset_end: f64,
-    /// The way of the frequency.
+    /// How the frequency changes.
     pub sweep: Sweep,
     /// Phase at the start (rad); -pi/2 starts at the lowest point.
     pub phase: f64,
@@ -94,14 +94,14 @@ impl Chirp {
     }
 }
 
-/// Samples times harmonics that are summed at most, a few seconds of work.
+/// Most samples times harmonics that are summed: a few seconds of work.
 const MAX_TERMS: usize = 1_000_000_000;
 /// Samples between exact restarts of the rotating phasor, which bounds its rounding error.
 const RESTART: usize = 256;
 
-/// `offset + g sum_h cos(2 pi h k/N + phi_h)` over the harmonics `h` of `1/duration` in the band, phases uniform.
+/// `offset + g sum_h cos(2 pi h k/N + phi_h)` over the harmonics `h` of `1/duration` in the band, with uniform random phases.
 ///
-/// The signal is periodic in its `N` samples. `g` makes the largest deviation from `offset` equal to `amplitude`.
+/// The signal is periodic with its `N` samples. `g` makes the largest deviation from `offset` equal to `amplitude`.
 /// Random phases give a crest factor near `sqrt(2 ln N)`, about 2.5 to 3.5 (Pintelon and Schoukens 2012, section 5.3).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Multisine {
@@ -121,8 +121,8 @@ impl Multisine {
     /// The sampled signal for `seed`.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for values that are not finite or out of order, a band without a harmonic or up to half
-    /// the sampling frequency, or more work than samples x harmonics = 1e9.
+    /// `ErrorKind::Setting` for values that are not finite or out of order, a band without a harmonic or up to half the
+    /// sampling frequency, or more than samples x harmonics = 1e9.
     pub fn generate(&self, ts: f64, seed: u64) -> Result<Vec<f64>> {
         let n = samples("duration", self.duration, ts)?;
         let harmonics = self.harmonics(n, ts)?;
@@ -132,7 +132,7 @@ impl Multisine {
             add_cosine(&mut sum, harmonic, random.between(0.0, TAU));
         }
         let peak = sum.iter().fold(0.0f64, |peak, v| peak.max(v.abs()));
-        // Three samples or more of a harmonic below N/2 cannot all vanish.
+        // Three or more samples of a harmonic below N/2 cannot all be zero.
         let gain = self.amplitude / peak;
         let scaled = |v: f64| self.offset + (gain * v).clamp(-self.amplitude, self.amplitude);
         Ok(sum.into_iter().map(scaled).collect())
@@ -144,7 +144,7 @@ impl Multisine {
         ordered(("f_low", self.f_low), ("f_high", self.f_high))?;
         below_nyquist("f_high", self.f_high, ts)?;
         let period = n as f64 * ts;
-        // A band edge that is a harmonic but for rounding counts as one.
+        // A band edge that is a harmonic up to rounding counts as one.
         let first = ((self.f_low * period * (1.0 - 1e-12)).ceil() as usize).max(1);
         let last = (self.f_high * period * (1.0 + 1e-12)).floor() as usize;
         let last = last.min((n - 1) / 2);
@@ -183,7 +183,7 @@ fn add_cosine(sum: &mut [f64], harmonic: usize, phase: f64) {
     }
 }
 
-/// Largest deviation from the mean by the root mean square of the deviations; 1 for a signal without deviation.
+/// Ratio of the largest deviation from the mean to the root mean square of the deviations; 1 for a constant signal.
 ///
 /// # Errors
 /// `ErrorKind::Data` for no samples or values that are not finite.

@@ -1,4 +1,4 @@
-//! Eight numbers as the baseline of any processor has them.
+//! Eight numbers for the baseline of any processor.
 
 use super::{Arithmetic, F64x8, LANES, tanh};
 
@@ -6,7 +6,7 @@ use super::{Arithmetic, F64x8, LANES, tanh};
 pub(super) struct Plain([f64; LANES]);
 
 impl Plain {
-    /// Written out: `array::from_fn` and `map` are left as calls in kernels as large as these.
+    /// Written out: in kernels this large the compiler does not inline `array::from_fn` and `map`.
     #[inline(always)]
     fn each(self, f: impl Fn(usize, f64) -> f64) -> Self {
         let v = self.0;
@@ -117,8 +117,8 @@ impl F64x8 for Plain {
     #[inline(always)]
     fn sum(self) -> f64 {
         let v = self.0;
-        // The order of a register that is folded in the middle, again and again, as `x86::sum` does it: a sum has the
-        // same rounding on all levels.
+        // The order of folding a register in the middle, again and again, as in `x86::sum`: a sum has the same rounding
+        // on all levels.
         ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]))
     }
 
@@ -134,14 +134,14 @@ impl F64x8 for Plain {
 
     #[inline(always)]
     fn power_of_two(self) -> Self {
-        // The lowest bits of n move into the exponent, whose bias is 1023; `wrapping`, as a negative n is there in two's
+        // The lowest bits of n move into the exponent, whose bias is 1023; `wrapping`, because a negative n is in two's
         // complement.
         self.each(|_, v| f64::from_bits((v.to_bits() << 52).wrapping_add(1023 << 52)))
     }
 }
 
-/// Called rather than written out: eight of them in sixteen registers are hundreds of instructions, most of a kernel's.
-// It halved the code of the kernels and the time of their build.
+/// A call instead of inlining: eight of them in sixteen registers are hundreds of instructions, most of a kernel's.
+// The call halved the kernels' code and their build time.
 #[inline(never)]
 fn tanh_of(x: &Plain) -> Plain {
     tanh::tanh(*x)
@@ -152,19 +152,19 @@ fn rise_of(x: &Plain) -> Plain {
     tanh::rise(*x)
 }
 
-/// From here on every number is an integer.
+/// From here on every double is an integer.
 const WHOLE: f64 = 4_503_599_627_370_496.0;
 
-/// The standard library's `floor` is a call where the baseline has no instruction for it.
+/// The standard library's `floor` is a call if the baseline has no instruction for it.
 #[inline(always)]
 fn floor(v: f64) -> f64 {
     let shift = WHOLE.copysign(v);
-    // Beside 2^52 a number has no bits left for a fraction, so that adding rounds to an integer and subtracting is
-    // exact. `shift` has the sign of v: the sum then grows and stays where spacing is 1 or more.
+    // Near 2^52 a number has no bits left for a fraction, so adding rounds to an integer and subtracting is exact.
+    // `shift` has the sign of v: the sum's magnitude then grows and stays where the spacing is 1 or more.
     let nearest = (v + shift) - shift;
     // Rounded to the nearest, so at most one too high.
     let below = if nearest > v { nearest - 1.0 } else { nearest };
-    // 0 keeps the sign of what it came from. From 2^52 on there is nothing to round, and v + shift would round v itself.
+    // The result keeps the sign of v, also for 0. From 2^52 on there is nothing to round, and v + shift would round v itself.
     if v.abs() < WHOLE {
         below.copysign(v)
     } else {
@@ -172,8 +172,8 @@ fn floor(v: f64) -> f64 {
     }
 }
 
-// One number in place of eight: the controllers of lanes, for a loop that runs alone. It has nothing that rounds once what
-// others round twice: so a controller gives the same bits alone, in lanes of any level, and on a microcontroller.
+// One number in place of eight: the lanes' controllers for a single loop. It fuses no products, so a controller gives
+// the same bits alone, in lanes of any level, and on a microcontroller.
 
 impl Arithmetic for f64 {
     const ALL: u8 = 1;

@@ -1,4 +1,4 @@
-//! The hyperbolic tangent, eight at a time: as a quotient, by the shortest chain of operations that every processor has.
+//! The hyperbolic tangent, eight at a time: as a quotient, by the shortest dependency chain available on every processor.
 //!
 //! tanh is odd, so with `s = x^2`
 //!
@@ -6,14 +6,14 @@
 //!   tanh(x) = x P(s) / Q(s)
 //! ```
 //!
-//! with P and Q of degree 7 up to |x| = NEAR and of degree 10 from there to SATURATED, where tanh is 1 to the last bit. The
-//! coefficients are minimax fits (tests/golden/tanh.py) and stand in `sewfast_control::model::tanh`, since the code for
-//! microcontrollers takes the same: what a model does here, its deployed form does there.
+//! with P and Q of degree 7 up to |x| = NEAR and of degree 10 from there to SATURATED, where tanh is 1 to the last bit.
+//! The coefficients are minimax fits (tests/golden/tanh.py) in `sewfast_control::model::tanh`, because the code for
+//! microcontrollers uses the same: a model's deployed form behaves like the model here.
 //!
-//! Polynomials are in Estrin's form, `(c0 + c1 s) + s^2 (c2 + c3 s) + s^4 (..)`: more multiplications than Horner's, but a chain of
-//! 3 steps instead of 7, and in a free run the chain is all that counts.
+//! Polynomials are in Estrin's form, `(c0 + c1 s) + s^2 (c2 + c3 s) + s^4 (..)`: more multiplications than Horner's,
+//! but a chain of 3 steps instead of 7, and a free run is limited by its chain.
 //!
-//! There are three ways because there are two kinds of users:
+//! There are three methods because there are two kinds of users:
 //!
 //! | way | of | when | what it costs on AVX-512 |
 //! |---|---|---|---|
@@ -21,10 +21,10 @@
 //! | `pieces` | AVX-512 | free runs: each waits for the last | chain of 36 cycles |
 //! | `sums` | AVX-512 | lanes: none waits, throughput counts | 20 operations, half a division |
 //!
-//! Measured end to end: `sums` takes a candidate's step from 34.5 to 28.5 cycles (docs/PERFORMANCE.md, Zen 5). `pieces` depends on
-//! the processor: counted, it saves 10 of 86 cycles of a free run's sample where a permutation of two registers takes 3 cycles; on a
-//! Zen 4, whose registers are half as wide inside, it saves nothing (`free_run` of the kernels' example, least of 300 calls: 22.17 ns with,
-//! 21.86 without). It may go when that is so on the processors that the figures are kept for.
+//! Measured end to end: `sums` reduces a candidate's step from 34.5 to 28.5 cycles (docs/PERFORMANCE.md, Zen 5). The gain of `pieces`
+//! depends on the processor: by count it saves 10 of 86 cycles of a free run's sample if a permutation of two registers takes 3 cycles;
+//! on a Zen 4, whose registers are half as wide inside, it saves nothing (`free_run` of the kernels' example, least of 300 calls: 22.17
+//! ns with, 21.86 without). It may be removed once that holds for the processors whose figures are kept.
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod tables;
@@ -37,36 +37,36 @@ use crate::simd::F64x8;
 
 /// From here on `tanh` is 1 to the last bit.
 const SATURATED: f64 = tanh::FAR.end;
-/// Up to here [`near`] is used, which is shorter.
+/// Up to here the shorter [`near`] is used.
 const NEAR: f64 = tanh::NEAR.end;
 
-/// `tanh(x)`, within 1e-15 of its size, never beyond +-1; NaN stays NaN. A lane's result does not depend on the others.
+/// `tanh(x)` with a relative error within 1e-15, never beyond +-1; NaN stays NaN. A lane's result does not depend on the others.
 ///
-/// A branch that is nearly always foretold keeps what large arguments need off the chain of dependent operations.
+/// A branch that is almost always predicted keeps the operations for large arguments off the dependency chain.
 #[inline(always)]
 pub(super) fn tanh<V: F64x8>(x: V) -> V {
     let (size, limit) = (x.abs(), V::splat(NEAR));
     let near = near(x);
-    // NaN is not below the limit: it takes the way of the large ones, which hands it on.
+    // NaN is not below the limit: it takes the path for large arguments, which passes it on.
     if size.are_less(limit) == u8::MAX {
         return near;
     }
     size.if_less(limit, near, far(x))
 }
 
-/// `tanh(x)` below [`NEAR`], where the quotient stays below 1.
+/// `tanh(x)` below [`NEAR`], where the quotient is below 1.
 #[inline(always)]
 fn near<V: F64x8>(x: V) -> V {
     let s = x.mul(x);
     let s2 = s.mul(s);
     let s4 = s2.mul(s2);
-    // x goes into the numerator's coefficients, while its square is still on the way.
+    // x is multiplied into the numerator's coefficients while its square is still being computed.
     let scaled = |i: usize| x.mul(V::splat(NEAR_NUMERATOR[i]));
     let even = [x, scaled(2), scaled(4), scaled(6)];
     let odd = [scaled(1), scaled(3), scaled(5), scaled(7)];
-    // P's constant is 1, so that x itself stands in its place: small numbers come out as they are, and -0 as -0.
+    // P's constant is 1, so x itself takes its place: small numbers stay unchanged, and -0 stays -0.
     let c = NEAR_DENOMINATOR.map(V::splat);
-    // Both need s, s2 and s4 only, so that numerator and denominator are computed at once and meet in the division.
+    // Both need only s, s2 and s4, so numerator and denominator are computed in parallel until the division.
     let numerator = eight(even, odd, s, s2, s4);
     let denominator = eight(
         [c[0], c[2], c[4], c[6]],
@@ -78,22 +78,22 @@ fn near<V: F64x8>(x: V) -> V {
     numerator.div(denominator)
 }
 
-/// A polynomial of degree 7 in Estrin's form, its even and its odd coefficients apart.
+/// A polynomial of degree 7 in Estrin's form, with its even and odd coefficients separate.
 #[inline(always)]
 fn eight<V: F64x8>(even: [V; 4], odd: [V; 4], s: V, s2: V, s4: V) -> V {
-    // Chain: s, s2 and the pairs, s4 and `low`, the result; a level of the tree below each power as it becomes known.
+    // Chain: s, then s2 and the pairs, then s4 and `low`, then the result: each power is used as soon as it is known.
     // Horner's form would be seven dependent steps.
     let pair = |i: usize| even[i].add_product(odd[i], s);
     let low = pair(0).add_product(pair(1), s2);
     low.add_product(pair(2).add_product(pair(3), s2), s4)
 }
 
-/// `tanh(x)` at any size.
+/// `tanh(x)` for any size.
 ///
-/// Beyond [`SATURATED`] the quotient is held and exceeds 1 with `x`, so that the last step gives +-1.
+/// Beyond [`SATURATED`] `P/Q` is held, so its product with `x` exceeds 1, and the last step gives +-1.
 #[inline(always)]
 fn far<V: F64x8>(x: V) -> V {
-    // `at_most` lets NaN pass, which the quotient and the limits hand on.
+    // `at_most` passes NaN, which also goes through the quotient and the limits.
     let s = x.mul(x).at_most(SATURATED * SATURATED);
     let s2 = s.mul(s);
     let s4 = s2.mul(s2);
@@ -101,12 +101,12 @@ fn far<V: F64x8>(x: V) -> V {
         Parts::of(&NUMERATOR, s, s2, s4),
         Parts::of(&DENOMINATOR, s, s2, s4),
     );
-    // x goes into the numerator's two parts while the denominator is still summed: behind the quotient it would be a
-    // product more on the chain.
+    // x is multiplied into the numerator's two parts while the denominator is still being summed: after the quotient it
+    // would lengthen the chain by a product.
     let numerator = x.mul(p.low).add_product(x.mul(s4), p.high);
     let denominator = q.low.add_product(s4, q.high);
-    // Below SATURATED, too: from |x| = 10 on rounding can leave the quotient a few units of the last place beyond 1, and
-    // sensitivities take 1 - h^2 for a slope that is not negative.
+    // Also needed below SATURATED: from |x| = 10 on rounding can leave the quotient a few units of the last place above
+    // 1, and sensitivities use 1 - h^2 as a slope that is not negative.
     numerator.div(denominator).at_most(1.0).at_least(-1.0)
 }
 
@@ -131,7 +131,7 @@ impl<V: F64x8> Parts<V> {
 
 /// `tanh` is 1 long before; from here on its derivative is below 1e-294, too.
 const FLAT: f64 = 340.0;
-/// Adding this rounds to an integer, which is then found in the low bits.
+/// Adding this rounds to an integer, which is then in the low bits.
 const ROUND: f64 = 6_755_399_441_055_744.0;
 /// ln 2 in two parts; the first has so few bits that its product with a small integer is exact (Cody and Waite 1980).
 const LN2: [f64; 2] = [6.931_471_803_691_238e-1, 1.908_214_929_270_587_7e-10];
@@ -151,13 +151,13 @@ const TAYLOR: [f64; 12] = [
     1.0 / 6_227_020_800.0,
 ];
 
-/// `1 - tanh(x)^2 = q (2 - q)` with `q = 1 - |tanh(x)| = 2/(exp(2|x|) + 1)`: near saturation the difference itself has
+/// `1 - tanh(x)^2 = q (2 - q)` with `q = 1 - |tanh(x)| = 2/(exp(2|x|) + 1)`: near saturation the plain difference has
 /// lost its digits.
 #[inline(always)]
 pub(super) fn rise<V: F64x8>(x: V) -> V {
     let two = V::splat(2.0);
-    // exp(2|x|) + 1 from exp(2|x|) - 1: where x is small the latter has all its digits, and where it is large they are
-    // the same. With |tanh| = 1 - q, 1 - tanh^2 = (1 - |tanh|)(1 + |tanh|) = q (2 - q).
+    // exp(2|x|) + 1 from exp(2|x|) - 1: for small x the latter has all its digits, and for large x they are the same.
+    // With |tanh| = 1 - q, 1 - tanh^2 = (1 - |tanh|)(1 + |tanh|) = q (2 - q).
     let q = two.div(growth(x).add(two));
     q.mul(two.sub(q))
 }
@@ -166,24 +166,24 @@ pub(super) fn rise<V: F64x8>(x: V) -> V {
 #[inline(always)]
 fn growth<V: F64x8>(x: V) -> V {
     let one = V::splat(1.0);
-    // 2 * 340 * log2(e) = 981 is below 1023, so that 2^n is a normal number.
+    // 2 * 340 * log2(e) = 981 is below 1023, so 2^n is a normal number.
     let size = x.abs().at_most(FLAT);
     let twice = size.add(size);
-    // 2|x| = n ln 2 + r with |r| <= ln(2)/2, and exp(2|x|) = 2^n exp(r). ROUND is 1.5 * 2^52: the sum's spacing is 1,
-    // and its lowest bits are n, which `power_of_two` takes from there without a conversion.
+    // 2|x| = n ln 2 + r with |r| <= ln(2)/2, and exp(2|x|) = 2^n exp(r). ROUND is 1.5 * 2^52: the sum's spacing is 1
+    // and its lowest bits are n, which `power_of_two` uses without a conversion.
     let shifted = V::splat(ROUND).add_product(twice, V::splat(std::f64::consts::LOG2_E));
     let n = shifted.sub(V::splat(ROUND));
-    // The large part first: its product and the difference are exact, so that only the small part rounds.
+    // The large part first: its product and the difference are exact, so only the small part rounds.
     let r = twice
         .add_product(n, V::splat(-LN2[0]))
         .add_product(n, V::splat(-LN2[1]));
     let power = shifted.power_of_two();
     let series = r.add_product(r.mul(r), series(r));
-    // 2^n exp(r) - 1 = (2^n - 1) + 2^n (exp(r) - 1): both parts are exact or small, and for n = 0 the first is 0.
+    // 2^n exp(r) - 1 = (2^n - 1) + 2^n (exp(r) - 1): both parts are exact or small; for n = 0 the first is 0.
     power.sub(one).add_product(power, series)
 }
 
-/// The Taylor sum in Estrin's form: short chains, so that a processor can do several things at once.
+/// The Taylor sum in Estrin's form: short chains that the processor can overlap.
 #[inline(always)]
 fn series<V: F64x8>(r: V) -> V {
     let r2 = r.mul(r);
@@ -227,7 +227,7 @@ mod tests {
         }
     }
 
-    /// Each number as the first, and as the last, of four of which the others differ.
+    /// Each number as the first, or as the last, of four, with different other numbers.
     struct OfFour([f64; LANES], bool);
 
     impl Kernel for OfFour {
@@ -267,7 +267,7 @@ mod tests {
         }
     }
 
-    /// Every way on every level.
+    /// Every method on every level.
     fn everywhere(x: [f64; LANES]) -> Vec<(Level, [f64; LANES])> {
         let mut all = run_everywhere(|| Tanh(x));
         all.extend(run_everywhere(|| Chained(x)));

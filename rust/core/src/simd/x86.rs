@@ -1,15 +1,15 @@
 //! Eight numbers in one AVX-512 register, or in two of AVX2.
 //!
-//! Why the `unsafe` of this file is sound, once for all: an intrinsic needs a processor that has it, and loads and stores need
-//! room for eight numbers. The types are private to `simd`, and values of them come about only in [`wide`] and [`half`], whose caller
-//! has asked the processor; the room is in the type, `[f64; LANES]`.
+//! Why the `unsafe` in this file is sound: an intrinsic needs a processor that has it, and loads and stores need room
+//! for eight numbers. The types are private to `simd`, and their values arise only in [`wide`] and [`half`], whose
+//! caller has checked the processor; the room is in the type, `[f64; LANES]`.
 
 use std::arch::x86_64::*;
 
 use super::{Arithmetic, F64x8, Kernel, LANES, Lanes, tanh};
 
-/// What is beyond the nearest quarter; half way between two of them, beyond the even one.
-// Bits 4 to 7 are the binary places to round to, two of them for quarters.
+/// The remainder from the nearest quarter; half way between two quarters, from the even one.
+// Bits 4 to 7 are the binary places to round to: two for quarters.
 const BEYOND_QUARTERS: i32 = 2 << 4 | _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
 
 /// Rounding to the integer below.
@@ -18,8 +18,8 @@ const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
 /// Runs a kernel in AVX-512 registers.
 #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
 pub(super) fn wide<K: Kernel>(kernel: K) -> K::Output {
-    // The kernel is compiled into this function, and by that for these features. AVX2 and FMA are named beside AVX-512,
-    // which has them, for the sums of half a register.
+    // The kernel is inlined into this function and thereby compiled for these features. AVX2 and FMA, which AVX-512
+    // implies, are named for the sums of half a register.
     kernel.run::<Wide>()
 }
 
@@ -33,11 +33,11 @@ pub(super) fn half<K: Kernel>(kernel: K) -> K::Output {
 pub(super) struct Wide(__m512d);
 
 impl Wide {
-    /// Entries of a table, by the low four bits.
+    /// Entries of a table, by the low four bits of each lane.
     #[inline(always)]
     pub(super) fn pick(self, table: &[Lanes; 2]) -> Self {
-        // A table is 16 numbers, two cache lines. Of an index the instruction takes bits 0 to 2 for the place and bit 3
-        // for the register, and ignores the rest: the sum of `QUARTERS` and a number is one as it is.
+        // A table is 16 numbers, two cache lines. The instruction uses bits 0 to 2 of an index for the place and bit 3
+        // for the register, and ignores the rest: the sum of `QUARTERS` and a number can be used directly.
         let (low, high) = (Self::load(&table[0].0), Self::load(&table[1].0));
         // SAFETY: as `splat`.
         unsafe {
@@ -56,26 +56,26 @@ impl Wide {
         unsafe { Self(_mm512_reduce_pd::<BEYOND_QUARTERS>(self.0)) }
     }
 
-    /// Each pair of numbers the other way round.
+    /// Swaps the two numbers of each pair.
     #[inline(always)]
     pub(super) fn neighbours(self) -> Self {
         // SAFETY: as `splat`.
         unsafe { Self(_mm512_permute_pd::<0b0101_0101>(self.0)) }
     }
 
-    /// The upper four numbers before the lower four.
+    /// Swaps the upper four numbers and the lower four.
     #[inline(always)]
     fn halves_swapped(self) -> Self {
         // SAFETY: as `splat`.
-        // A shuffle across the register takes three cycles, one within its 128-bit quarters (`neighbours`) one.
+        // A shuffle across the register takes three cycles, one within its 128-bit quarters (`neighbours`) one cycle.
         unsafe { Self(_mm512_shuffle_f64x2::<0b0100_1110>(self.0, self.0)) }
     }
 
-    /// A number that is not negative, with the sign of another.
+    /// A nonnegative number with the sign of another.
     #[inline(always)]
     pub(super) fn with_sign_of(self, other: Self) -> Self {
         // SAFETY: as `splat`.
-        // Two operations of bits instead of a product with +-1: any unit does them, and they do not round.
+        // Two bit operations instead of a product with +-1: any unit can do them, and they do not round.
         unsafe {
             Self(_mm512_or_pd(
                 self.0,
@@ -90,7 +90,7 @@ impl Arithmetic for Wide {
 
     #[inline(always)]
     fn splat(value: f64) -> Self {
-        // SAFETY: only run where the processor has AVX-512, here and below.
+        // SAFETY: only run if the processor has AVX-512, here and below.
         unsafe { Self(_mm512_set1_pd(value)) }
     }
 
@@ -120,20 +120,20 @@ impl Arithmetic for Wide {
 
     #[inline(always)]
     fn load(values: &[f64; LANES]) -> Self {
-        // Unaligned by name: at an aligned address it is as fast as the aligned one, and slices may begin anywhere.
-        // SAFETY: eight readable numbers; only run where the processor has AVX-512.
+        // `loadu` also for aligned addresses, where it is as fast as the aligned load; slices may begin anywhere.
+        // SAFETY: eight readable numbers; only run if the processor has AVX-512.
         unsafe { Self(_mm512_loadu_pd(values.as_ptr())) }
     }
 
     #[inline(always)]
     fn at_most_each(self, limits: Self) -> Self {
-        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand, which is why `self` is that.
+        // SAFETY: as `splat`. If one is NaN the instruction returns its second operand, so `self` is the second.
         unsafe { Self(_mm512_min_pd(limits.0, self.0)) }
     }
 
     #[inline(always)]
     fn at_least_each(self, limits: Self) -> Self {
-        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand, which is why `self` is that.
+        // SAFETY: as `splat`. If one is NaN the instruction returns its second operand, so `self` is the second.
         unsafe { Self(_mm512_max_pd(limits.0, self.0)) }
     }
 
@@ -145,7 +145,7 @@ impl Arithmetic for Wide {
 
     #[inline(always)]
     fn if_less(self, other: Self, yes: Self, no: Self) -> Self {
-        // No masks here: a comparison gives all ones or all zeros, and `blendv` goes by the sign bit.
+        // No masks here: a comparison gives all ones or all zeros, and `blendv` uses the sign bit.
         // SAFETY: as `splat`.
         unsafe {
             let less = _mm512_cmp_pd_mask::<_CMP_LT_OQ>(self.0, other.0);
@@ -186,7 +186,7 @@ impl F64x8 for Wide {
 
     #[inline(always)]
     fn store(self, values: &mut [f64; LANES]) {
-        // SAFETY: room for eight numbers; only run where the processor has AVX-512.
+        // SAFETY: room for eight numbers; only run if the processor has AVX-512.
         unsafe { _mm512_storeu_pd(values.as_mut_ptr(), self.0) }
     }
 
@@ -194,7 +194,7 @@ impl F64x8 for Wide {
     fn sum(self) -> f64 {
         // SAFETY: as `splat`.
         unsafe {
-            // Lane i and i + 4 first, as in the two registers of AVX2: one order of additions on all levels.
+            // Lanes i and i + 4 first, as in the two registers of AVX2: one order of additions on all levels.
             let low = _mm512_castpd512_pd256(self.0);
             sum(_mm256_add_pd(low, _mm512_extractf64x4_pd::<1>(self.0)))
         }
@@ -204,8 +204,8 @@ impl F64x8 for Wide {
     fn power_of_two(self) -> Self {
         // SAFETY: as `splat`.
         unsafe {
-            // n stands in the lowest bits: shifted behind the sign it is an exponent without its bias, which the bits of
-            // 1 are.
+            // n is in the lowest bits: shifted to the exponent field it is an exponent without bias, and the bits of 1
+            // are that bias.
             let exponent = _mm512_slli_epi64::<52>(_mm512_castpd_si512(self.0));
             let one = _mm512_castpd_si512(_mm512_set1_pd(1.0));
             Self(_mm512_castsi512_pd(_mm512_add_epi64(exponent, one)))
@@ -227,27 +227,27 @@ impl F64x8 for Wide {
         tanh::tables::of_neighbours(self)
     }
 
-    /// The sum is not waited for: halves are added, then neighbours, and the two sums that are left go into the arguments
+    /// The sum is not waited for: halves are added, then neighbours, and the two remaining sums go into the arguments
     /// one by one.
     ///
-    /// On a Zen 4 a free run takes 4 % less by this order than by the one of all levels, and a training, whose two runs side by
-    /// side leave hardly a unit idle, 4 % more (`free_run` and `training_8` of the kernels' example, least and median of 200 and 150).
+    /// On a Zen 4 a free run takes 4 % less in this order than in the common one. A training, whose two runs side by side leave hardly a
+    /// unit idle, takes 4 % more (`free_run` and `training_8` of the kernels' example, least and median of 200 and 150).
     #[inline(always)]
     fn fed_back(self, second: Self, direct: Self, rest: Self, weights: Self) -> (f64, Self) {
-        // Lane i of y's sum is direct_i + second_i h_i. Folded before the products are added up: `direct` is there
-        // early, and only two products and one shuffle of h are on the chain. Lanes 4 to 7 are lanes 0 to 3 then, but for
-        // the order of the two products and so for their last bit.
+        // Lane i of y's sum is direct_i + second_i h_i. It is folded before the products are added: `direct` is known
+        // early, so only two products and one shuffle of h are on the chain. Lanes 4 to 7 then equal lanes 0 to 3
+        // except for the order of the two products, and so the last bit.
         let four = direct
             .add(direct.halves_swapped())
             .add_product(second, self)
             .add_product(second.halves_swapped(), self.halves_swapped());
-        // Lanes hold p p q q p p q q, with y = p + q.
+        // The lanes hold p p q q p p q q, with y = p + q.
         let two = four.add(four.neighbours());
         // q q p p q q p p, a shuffle within each half.
         // SAFETY: as `splat`.
         let others = unsafe { Self(_mm512_permutex_pd::<0b0100_1110>(two.0)) };
-        // The first product needs `two` alone and goes ahead while `others` is on its way. Each lane rounds its own p + q;
-        // what is kept and measured is that of lane 0.
+        // The first product needs only `two` and goes ahead while `others` is computed. Each lane rounds its own p + q;
+        // the output kept and measured is lane 0's.
         let arguments = rest.add_product(weights, two).add_product(weights, others);
         // SAFETY: as `splat`.
         let y = unsafe { _mm512_cvtsd_f64(two.0) + _mm512_cvtsd_f64(others.0) };
@@ -263,7 +263,7 @@ impl Arithmetic for Halves {
 
     #[inline(always)]
     fn splat(value: f64) -> Self {
-        // SAFETY: only run where the processor has AVX2 and FMA, here and below.
+        // SAFETY: only run if the processor has AVX2 and FMA, here and below.
         let all = unsafe { _mm256_set1_pd(value) };
         Self(all, all)
     }
@@ -315,13 +315,13 @@ impl Arithmetic for Halves {
     #[inline(always)]
     fn load(values: &[f64; LANES]) -> Self {
         let start = values.as_ptr();
-        // SAFETY: eight readable numbers; only run where the processor has AVX2 and FMA.
+        // SAFETY: eight readable numbers; only run if the processor has AVX2 and FMA.
         unsafe { Self(_mm256_loadu_pd(start), _mm256_loadu_pd(start.add(4))) }
     }
 
     #[inline(always)]
     fn at_most_each(self, limits: Self) -> Self {
-        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand, which is why `self` is that.
+        // SAFETY: as `splat`. If one is NaN the instruction returns its second operand, so `self` is the second.
         unsafe {
             Self(
                 _mm256_min_pd(limits.0, self.0),
@@ -332,7 +332,7 @@ impl Arithmetic for Halves {
 
     #[inline(always)]
     fn at_least_each(self, limits: Self) -> Self {
-        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand, which is why `self` is that.
+        // SAFETY: as `splat`. If one is NaN the instruction returns its second operand, so `self` is the second.
         unsafe {
             Self(
                 _mm256_max_pd(limits.0, self.0),
@@ -376,7 +376,7 @@ impl Arithmetic for Halves {
         unsafe {
             let low = _mm256_movemask_pd(_mm256_cmp_pd::<_CMP_LT_OQ>(self.0, other.0));
             let high = _mm256_movemask_pd(_mm256_cmp_pd::<_CMP_LT_OQ>(self.1, other.1));
-            // Lanes 4 to 7 are the upper register's: the order of bits is that of AVX-512's mask.
+            // Lanes 4 to 7 are in the upper register: the order of bits is that of AVX-512's mask.
             (low | high << 4) as u8
         }
     }
@@ -405,7 +405,7 @@ impl F64x8 for Halves {
     #[inline(always)]
     fn store(self, values: &mut [f64; LANES]) {
         let start = values.as_mut_ptr();
-        // SAFETY: room for eight numbers; only run where the processor has AVX2 and FMA.
+        // SAFETY: room for eight numbers; only run if the processor has AVX2 and FMA.
         unsafe {
             _mm256_storeu_pd(start, self.0);
             _mm256_storeu_pd(start.add(4), self.1);
@@ -433,7 +433,7 @@ impl F64x8 for Halves {
 /// `(v0 + v2) + (v1 + v3)`.
 #[inline(always)]
 fn sum(v: __m256d) -> f64 {
-    // SAFETY: reached from AVX2 or AVX-512 only.
+    // SAFETY: only reached from AVX2 or AVX-512.
     unsafe {
         let pair = _mm_add_pd(_mm256_castpd256_pd128(v), _mm256_extractf128_pd::<1>(v));
         _mm_cvtsd_f64(_mm_add_sd(pair, _mm_unpackhi_pd(pair, pair)))

@@ -1,5 +1,5 @@
-//! Kalman filter on the position with a Rauch-Tung-Striebel smoother behind it: the search for its intensities, its gains under
-//! white jerk, its two passes.
+//! Kalman filter on the position with a Rauch-Tung-Striebel smoother: the search for its noise intensities, its gains
+//! under white jerk, its two passes.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -9,32 +9,32 @@ use crate::{Error, Result};
 
 /// Variance of a position known to one count (count^2).
 const QUANTISATION: f64 = 1.0 / 12.0;
-/// Samples of each of the eight blocks that stand for a long record.
+/// Samples of each of the eight blocks that represent a long record.
 const BLOCK: usize = 4_096;
-/// Decimal exponents of the white-jerk intensity (count^2/sample^5) that are searched.
+/// Searched decimal exponents of the white-jerk intensity (count^2/sample^5).
 const SEARCH: (f64, f64) = (-16.0, 4.0);
 /// Accuracy of the search in decades; a tenth of a decade moves the bandwidth by 4 %.
 const TOLERANCE: f64 = 0.02;
 
-/// Smoothed speed of a motion whose jerk is white noise, seen through counts (Belanger et al., Int. J.
-/// Robotics Research 17, 1998, use the same kind of model for encoders).
+/// Smoothed speed of a motion whose jerk is white noise, observed by counts (Belanger et al., Int. J. Robotics Research
+/// 17, 1998, use the same kind of model for encoders).
 ///
 /// The state is position, speed and acceleration in counts and samples:
 /// `x(k+1) = F x(k) + w`, `F = [1 1 1/2; 0 1 1; 0 0 1]`, `cov w = q [1/20 1/8 1/6; 1/8 1/3 1/2; 1/6 1/2 1]`,
 /// `c(k) = x_1(k) + v`, `var v = 1/12` for whole counts. A backward pass then uses the counts that came later
-/// (Rauch, Tung and Striebel, AIAA Journal 3, 1965). The gains soon stop changing, so both passes cost a few operations
-/// per sample.
+/// (Rauch, Tung and Striebel, AIAA Journal 3, 1965). The gains soon become constant, so both passes cost a few
+/// operations per sample.
 ///
-/// Where `q` is not given it maximises the likelihood of the innovations. Counts that are not whole numbers come from
-/// an ideal encoder or another sensor: then `var v` is estimated with it.
+/// If `q` is not given it maximises the likelihood of the innovations. Counts that are not whole numbers come from an
+/// ideal encoder or another sensor: then `var v` is estimated as well.
 ///
-/// With `ripple_orders` whole counts are also tried with a load that repeats over the turn (`ripple.rs`); the
-/// likelier of the two models smooths.
+/// With `ripple_orders`, whole counts are also tried with a load that repeats over the turn (`ripple.rs`); the more
+/// likely of the two models smooths.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Kalman<'a> {
-    /// Intensity of the white jerk (unit^2/s^3); None finds it.
+    /// Intensity of the white jerk (unit^2/s^3); `None` to estimate it.
     pub process_noise: Option<f64>,
-    /// Multiples of the shaft's turn at which the load may repeat; none leaves ripple to the white jerk.
+    /// Multiples of the shaft's turn at which the load may repeat; if empty, ripple counts as white jerk.
     pub ripple_orders: &'a [u32],
     /// Counts of one turn of the shaft.
     pub counts_per_rev: f64,
@@ -60,7 +60,7 @@ impl Kalman<'_> {
         check(counts, 5)?;
         let turn = self.turn()?;
         let q = self.given(scale)?;
-        // Counted from the first, so that a large count costs no digits.
+        // Relative to the first, so that a large count costs no digits.
         let relative: Vec<f64> = counts.iter().map(|c| c - counts[0]).collect();
         let (blocks, factor) = (blocks(&relative), scale.per_count());
         let (jerk, rounding) = noises(&blocks, q);
@@ -111,7 +111,7 @@ impl Kalman<'_> {
     }
 }
 
-/// The parts of a record that the noises are found from: all of it, or eight blocks spread evenly over a long one.
+/// The parts of a record from which the noises are estimated: all of it, or eight blocks spread evenly over a long one.
 fn blocks(counts: &[f64]) -> Vec<&[f64]> {
     const BLOCKS: usize = 8;
     if counts.len() <= BLOCKS * BLOCK {
@@ -142,19 +142,19 @@ fn noises(blocks: &[&[f64]], q: Option<f64>) -> (f64, f64) {
         let exponent = minimise(|x| cost(blocks, 10f64.powf(x)));
         return (10f64.powf(exponent), QUANTISATION);
     }
-    // With var v = 1 the likelihood is largest for the scale `square / n`, which this cost has put in.
+    // With var v = 1 the likelihood is largest for the scale `square / n`, which is substituted in this cost.
     let fit = |exponent: f64| innovations(blocks, 10f64.powf(exponent), 1.0);
     let exponent = minimise(|x| {
         let fit = fit(x);
         fit.log_variance + fit.n * (fit.square / fit.n).max(f64::MIN_POSITIVE).ln()
     });
     let best = fit(exponent);
-    // An exactly resting or linear motion leaves no innovation at all; the speed does not depend on the scale.
+    // An exactly resting or linear motion leaves no innovation; the speed does not depend on the scale.
     let noise = (best.square / best.n).max(1e-12);
     (10f64.powf(exponent) * noise, noise)
 }
 
-/// The least of `cost` over the searched exponents: a coarse grid, then golden sections around its best point.
+/// The minimum of `cost` over the searched exponents: a coarse grid, then golden sections around its best point.
 fn minimise(cost: impl Fn(f64) -> f64) -> f64 {
     let best = grid(SEARCH.0, SEARCH.1, 2.0, &cost);
     golden(best - 2.0, best + 2.0, TOLERANCE, &cost)
@@ -177,10 +177,10 @@ fn innovations(blocks: &[&[f64]], q: f64, r: f64) -> Innovations {
 
 // Gains of the filter and the smoother under white jerk, and their two passes.
 
-/// Riccati steps until the gains count as constant, whatever they do.
+/// Riccati steps after which the gains count as constant in any case.
 const MAX_TRANSIENT: usize = 50_000;
 
-/// What the innovations say about the noises: `sum ln s`, `sum e^2/s` and their number.
+/// Statistics of the innovations for the noises: `sum ln s`, `sum e^2/s` and their number.
 struct Innovations {
     log_variance: f64,
     square: f64,
@@ -195,7 +195,7 @@ struct Gain {
     variance: f64,
 }
 
-/// Gains from the first sample until they stop changing; the last one holds from then on.
+/// Gains from the first sample until they become constant; the last one holds from then on.
 struct Gains(Vec<Gain>);
 
 impl Gains {
@@ -206,7 +206,7 @@ impl Gains {
         while gains.len() < counts.len().min(MAX_TRANSIENT) {
             let variance = p[(0, 0)] + r;
             let filter: Vector3<f64> = p.column(0) / variance;
-            // Joseph's form keeps the covariance positive where the subtraction would cancel.
+            // Joseph's form keeps the covariance positive where the plain subtraction would cancel.
             let mut keep = Matrix3::identity();
             keep.set_column(0, &(keep.column(0) - filter));
             let updated = keep * p * keep.transpose() + filter * filter.transpose() * r;
@@ -232,7 +232,7 @@ impl Gains {
         &self.0[k.min(self.0.len() - 1)]
     }
 
-    /// Runs the filter and gathers its innovations; the first three only find the state.
+    /// Runs the filter and collects its innovations; the first three only determine the state.
     fn innovations(&self, counts: &[f64]) -> Innovations {
         let mut sum = Innovations {
             log_variance: 0.0,
@@ -290,7 +290,7 @@ fn jerk(q: f64) -> Matrix3<f64> {
     Matrix3::new(a, b, c, b, 1.0 / 3.0, 0.5, c, 0.5, 1.0) * q
 }
 
-/// The first position is known to one count; speed and acceleration are as wide as the largest step.
+/// The first position is known to one count; speed and acceleration are as uncertain as the largest step.
 fn prior(counts: &[f64], r: f64) -> Matrix3<f64> {
     let step = counts
         .windows(2)
@@ -302,7 +302,7 @@ fn prior(counts: &[f64], r: f64) -> Matrix3<f64> {
 /// `C = P(k|k) F' P(k+1|k)^-1`, from `P(k+1|k)` and `F P(k|k)`.
 fn smoother(predicted: &Matrix3<f64>, ahead: &Matrix3<f64>) -> Matrix3<f64> {
     let solved = predicted.cholesky().map(|factor| factor.solve(ahead));
-    // A covariance that rounding has made singular carries nothing back; it cannot be reached with q > 0.
+    // A covariance made singular by rounding carries nothing back; this cannot happen with q > 0.
     solved.map_or_else(Matrix3::zeros, |c| c.transpose())
 }
 
@@ -320,7 +320,7 @@ fn predict(x: &Vector3<f64>) -> Vector3<f64> {
     Vector3::new(x[0] + x[1] + 0.5 * x[2], x[1] + x[2], x[2])
 }
 
-// Searches along one line, for the intensities here and for the ripple's.
+// Searches along a line, for the intensities here and for those of the ripple.
 
 /// The point of the grid `from, from + step, .. <= to` with the least cost.
 pub(super) fn grid(from: f64, to: f64, step: f64, cost: impl Fn(f64) -> f64) -> f64 {
@@ -454,7 +454,7 @@ mod tests {
 
     #[test]
     fn equals_the_dense_least_squares_solution() {
-        // The smoother's mean minimises sum (c - x1)^2/r + sum w' Q^-1 w + prior, solved here all at once.
+        // The smoother's mean minimises sum (c - x1)^2/r + sum w' Q^-1 w + prior, solved here as one system.
         let (q, r) = (1e-3, 1.0 / 12.0);
         let counts = [0.0, 1.0, 3.0, 4.0, 8.0, 11.0, 15.0, 16.0];
         let smooth = Gains::new(q, r, &counts).smooth(&counts, 1.0);

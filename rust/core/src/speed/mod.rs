@@ -1,5 +1,5 @@
-//! Speed from encoder counts: what counts are (their scale, their checks, their wrapping), differences and Savitzky-Golay here; a
-//! Kalman filter with its smoother in `kalman`, loads that repeat over the turn in `ripple`.
+//! Speed from encoder counts. Here: the counts (scale, checks, unwrapping), differences and Savitzky-Golay. In
+//! `kalman`: a Kalman filter with its smoother; in `ripple`: loads that repeat over the turn.
 
 mod kalman;
 mod ripple;
@@ -95,7 +95,7 @@ fn wrap(counts: &[f64]) -> Option<(usize, u32)> {
     })
 }
 
-/// Counts of a counter of `bits` bits as one continuous count: every step is the shortest one modulo `2^bits`.
+/// Counts of a `bits`-bit counter as one continuous count: every step is the shortest one modulo `2^bits`.
 ///
 /// # Errors
 /// `ErrorKind::Setting` for bits outside 1 to 52; `ErrorKind::Data` for counts that are not finite or whose range
@@ -133,7 +133,7 @@ pub fn unwrap(counts: &[f64], bits: u32) -> Result<Vec<f64>> {
         .collect())
 }
 
-/// An encoder whose counter stands at zero, `phase` of a count past the last edge, where the position is zero.
+/// An encoder whose counter is zero at position zero, `phase` of a count past the last edge.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Encoder {
     counts_per_unit: f64,
@@ -151,7 +151,7 @@ impl Encoder {
         }
     }
 
-    /// The ideal encoder: the position in counts as a real number.
+    /// The ideal encoder: the position in counts, as a real number.
     pub fn ideal(counts_per_unit: f64) -> Self {
         Self {
             counts_per_unit,
@@ -165,7 +165,7 @@ impl Encoder {
         self.counts_per_unit
     }
 
-    /// The counter at `position`: `floor(position counts_per_unit + phase)`, without the floor where ideal.
+    /// The counter at `position`: `floor(position counts_per_unit + phase)`, without the floor if ideal.
     #[inline]
     pub fn count(&self, position: f64) -> f64 {
         let exact = position * self.counts_per_unit + self.phase;
@@ -184,7 +184,7 @@ impl Encoder {
 /// Backward difference `(c(k) - c(k-1)) / (Ts counts_per_unit)`; the first sample repeats the second.
 ///
 /// # Errors
-/// `ErrorKind::Data` for fewer than two counts, or counts that are not finite or jump as a wrapped counter does.
+/// `ErrorKind::Data` for fewer than two counts, or counts that are not finite or jump like a wrapped counter.
 pub fn difference(counts: &[f64], scale: Scale) -> Result<Vec<f64>> {
     check(counts, 2)?;
     let factor = scale.per_count();
@@ -203,8 +203,8 @@ const MAX_ORDER: usize = 15;
 
 /// Derivative of the polynomial of `order` fitted by least squares to the `window` counts around each sample.
 ///
-/// Within half a window of an end the polynomial of the first or last whole window is differentiated there, so
-/// polynomial motion of that order is exact everywhere (Savitzky and Golay, Anal. Chem. 36, 1964).
+/// Within half a window of an end, the polynomial of the first or last whole window is differentiated there. Polynomial
+/// motion of that order is therefore exact everywhere (Savitzky and Golay, Anal. Chem. 36, 1964).
 ///
 /// # Errors
 /// `ErrorKind::Setting` for an even window, one outside 3 to 10,001, or an order outside 1 to `window - 1` (15 at
@@ -217,7 +217,7 @@ pub fn savgol(counts: &[f64], scale: Scale, window: usize, order: usize) -> Resu
     let mut speed = vec![0.0; n];
     let centre = weights.at(half);
     for (v, around) in speed[half..].iter_mut().zip(counts.windows(window)) {
-        // Counted from the middle, so that a large count costs no digits.
+        // Relative to the middle, so that a large count costs no digits.
         let middle = around[half];
         *v = factor * dot(&centre, around, middle);
     }
@@ -250,7 +250,7 @@ fn dot(weights: &[f64], counts: &[f64], middle: f64) -> f64 {
     terms.map(|(w, c)| w * (c - middle)).sum()
 }
 
-/// Least squares over one window in Legendre polynomials of `x` in [-1, 1], which stay well conditioned.
+/// Least squares over one window in Legendre polynomials of `x` in [-1, 1], which are well conditioned.
 struct Weights {
     /// Coefficients from samples, `(order + 1) x window`.
     fit: DMatrix<f64>,
@@ -266,12 +266,12 @@ impl Weights {
         let slopes = DMatrix::from_fn(window, order + 1, |k, j| legendre(j, x(k)).1 / half);
         let qr = values.qr();
         let mut fit = qr.q().transpose();
-        // R has a zero on its diagonal only where order >= window, which the settings exclude.
+        // R has a zero on its diagonal only if order >= window, which the settings exclude.
         qr.r().solve_upper_triangular_mut(&mut fit);
         Self { fit, slopes }
     }
 
-    /// The weights of the counts in the slope at sample `k` of the window.
+    /// The weights of the counts for the slope at sample `k` of the window.
     fn at(&self, k: usize) -> Vec<f64> {
         (self.slopes.row(k) * &self.fit).iter().copied().collect()
     }

@@ -1,20 +1,20 @@
 //! Kalman smoother for a shaft whose load repeats over the turn.
 //!
-//! To the white jerk of [`super::Kalman`] it adds an acceleration `sum_h A_h cos(h th) + B_h sin(h th)` whose
-//! amplitudes wander slowly: cranks, unbalance and torque ripple act so. The angle `th` is known from the counts well
-//! enough, so the model stays linear: the order-tracking filter of Vold and Leuridan (SAE 931288, 1993), put on the
-//! acceleration. Without it a smoother must choose between the ripple and the counts' rounding.
+//! To the white jerk of [`super::Kalman`] it adds an acceleration `sum_h A_h cos(h th) + B_h sin(h th)` with slowly
+//! wandering amplitudes, as from cranks, unbalance and torque ripple. The counts give the angle `th` accurately enough,
+//! so the model stays linear: the order-tracking filter of Vold and Leuridan (SAE 931288, 1993), applied to the
+//! acceleration. Without it a smoother would have to choose between the ripple and the counts' rounding.
 
 use std::f64::consts::TAU;
 
 use super::kalman::{golden, grid};
 
-/// Samples of the tape that the backward pass reads: bounds the memory whatever the length.
+/// Samples stored for the backward pass: bounds the memory for any length.
 const CHUNK: usize = 8_192;
-/// Initial variance of the amplitudes by their growth per sample: known to what a million samples would bring.
+/// Initial variance of the amplitudes over their growth per sample: as if they had wandered for a million samples.
 const MEMORY: f64 = 1e6;
 
-/// What repeats: orders of the shaft, and the counts of one turn.
+/// The orders of the shaft that repeat, and the counts of one turn.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Turn<'a> {
     pub orders: &'a [u32],
@@ -29,7 +29,7 @@ pub(super) struct Noises {
     pub rounding: f64,
 }
 
-/// The rows of the transition for position and speed; all others are those of the identity.
+/// The rows of the transition matrix for position and speed; all other rows are those of the identity.
 #[derive(Clone, Copy)]
 struct Rows<const N: usize> {
     position: [f64; N],
@@ -37,7 +37,7 @@ struct Rows<const N: usize> {
 }
 
 impl<const N: usize> Rows<N> {
-    /// From angle `from` on by `by` within one sample: mean acceleration for the speed, its first moment for the position.
+    /// For a turn by `by` from angle `from` within one sample: mean acceleration for the speed, its first moment for the position.
     fn new(orders: &[u32], from: f64, by: f64) -> Self {
         let mut rows = Self {
             position: [0.0; N],
@@ -58,7 +58,7 @@ impl<const N: usize> Rows<N> {
         rows
     }
 
-    /// Rows for every sample but the last, which nothing follows.
+    /// Rows for every sample except the last, which has no successor.
     fn along(turn: Turn<'_>, counts: &[f64]) -> Vec<Self> {
         let angle = |c: f64| TAU * c / turn.counts_per_rev;
         let row = |w: &[f64]| Self::new(turn.orders, angle(w[0]), angle(w[1] - w[0]));
@@ -77,7 +77,7 @@ struct State<const N: usize> {
     p: [[f64; N]; N],
 }
 
-/// What the backward pass needs of one sample.
+/// The data of one sample that the backward pass needs.
 struct Trace<const N: usize> {
     gain: [f64; N],
     of_speed: [f64; N],
@@ -104,7 +104,7 @@ impl<const N: usize> State<N> {
         state
     }
 
-    /// Takes in one count; `-2 ln` of its likelihood but for a constant.
+    /// Uses one count; returns `-2 ln` of its likelihood up to a constant.
     fn update(&mut self, count: f64, rounding: f64) -> (Trace<N>, f64) {
         let variance = self.p[0][0] + rounding;
         let e = count - self.x[0];
@@ -154,7 +154,7 @@ fn dot<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
     (0..N).map(|i| a[i] * b[i]).sum()
 }
 
-/// `-2 ln` likelihood of the blocks, the first three counts of each left out: they only find the state.
+/// `-2 ln` likelihood of the blocks, without the first three counts of each, which only determine the state.
 fn cost<const N: usize>(blocks: &[(&[f64], Vec<Rows<N>>)], noises: Noises) -> f64 {
     let mut sum = 0.0;
     for (counts, rows) in blocks {
@@ -170,9 +170,9 @@ fn cost<const N: usize>(blocks: &[(&[f64], Vec<Rows<N>>)], noises: Noises) -> f6
     sum
 }
 
-/// Finds the wandering, and the jerk unless it is given, by maximum likelihood, and that likelihood's `-2 ln`.
+/// Estimates the wandering, and the jerk unless it is given, by maximum likelihood; also returns `-2 ln` of the likelihood.
 ///
-/// The search starts from the jerk of the model without ripple, which is the larger one.
+/// The search starts from the jerk of the model without ripple, which is larger.
 fn fit<const N: usize>(
     blocks: &[&[f64]],
     turn: Turn<'_>,
@@ -203,8 +203,8 @@ fn fit<const N: usize>(
 
 /// Smoothed speed times `factor`: forward filter, then the adjoint of Bryson and Frazier (1963) backwards.
 ///
-/// Long records are run in chunks: the first pass keeps the state at each chunk's start, from which the chunk is run again
-/// when the backward pass comes to it.
+/// Long records are run in chunks: the first pass keeps the state at each chunk's start, and the backward pass reruns
+/// each chunk from there.
 fn smooth<const N: usize>(counts: &[f64], turn: Turn<'_>, noises: Noises, factor: f64) -> Vec<f64> {
     let mut starts = vec![State::<N>::new(counts, noises)];
     for first in (0..counts.len()).step_by(CHUNK) {
@@ -229,7 +229,7 @@ fn smooth<const N: usize>(counts: &[f64], turn: Turn<'_>, noises: Noises, factor
     speed
 }
 
-/// Runs the filter over the chunk that starts at `first`; leaves the state predicted for the next one.
+/// Runs the filter over the chunk that starts at `first`; leaves the predicted state of the next chunk.
 fn run<const N: usize>(
     state: &mut State<N>,
     counts: &[f64],
@@ -260,9 +260,9 @@ fn transposed<const N: usize>(rows: &Rows<N>, adjoint: &[f64; N]) -> [f64; N] {
 /// The largest number of orders.
 pub(super) const MAX_ORDERS: usize = 6;
 
-/// Smoothed speed with ripple, or None where the model without ripple explains the counts as well.
+/// Smoothed speed with ripple, or `None` if the model without ripple explains the counts as well.
 ///
-/// Each amplitude must earn `ln n` in `-2 ln` likelihood (Schwarz 1978).
+/// Each amplitude must gain `ln n` in `-2 ln` likelihood (Schwarz 1978).
 pub(super) fn with_ripple(
     counts: &[f64],
     blocks: &[&[f64]],
@@ -301,7 +301,7 @@ mod tests {
         counts_per_rev: 400.0,
     };
 
-    /// Counts of a shaft that speeds up under an acceleration that repeats over the turn, and its speed per sample.
+    /// Counts of a shaft under an acceleration that repeats over the turn, and its speed per sample.
     fn shaft(samples: usize, ripple: f64) -> (Vec<f64>, Vec<f64>) {
         const STEPS: usize = 50;
         let (mut position, mut v) = (0.4, 8.0);

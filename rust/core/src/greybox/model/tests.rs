@@ -36,7 +36,7 @@ fn commands(n: usize) -> Vec<f64> {
     (0..n).map(|k| levels[k / 31]).collect()
 }
 
-/// Against differences, until a sample passes a kink between them.
+/// Compares with differences, until a sample passes a kink between them.
 #[test]
 fn derivatives_are_those_of_the_values() {
     for units in [0, 3, 6] {
@@ -75,7 +75,7 @@ fn a_loop_steps_it_as_the_free_run_goes() {
     for delay in [0.0, 0.001, 0.005] {
         let (model, u) = (made(2, delay), commands(300));
         let mut plant = model.plant(0.002).unwrap();
-        // from rest, which a command of nothing before the first keeps
+        // from rest, where a zero command before the first sample keeps it
         let padded: Vec<f64> = std::iter::repeat_n(0.0, 8).chain(u.clone()).collect();
         let run = model.simulate(&padded, 1, &[0.0; STATES]).unwrap();
         for (k, u) in u.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! What gains make of the loop, frequency by frequency: stability, `max |S|`, the integrals of Eq. 12.
+//! The loop for given gains, frequency by frequency: stability, `max |S|`, the integrals of Eq. 12.
 
 use std::f64::consts::PI;
 
@@ -7,9 +7,9 @@ use sewfast_control::Standard;
 
 use super::Costs;
 
-/// Times that the interval about a lowest node is cut to two thirds: the value is then exact to 1e-9.
+/// How often the interval around a lowest node is cut to two thirds: the value is then exact to 1e-9.
 const THIRDS: usize = 24;
-/// Nodes and weights of Gauss and Legendre from -1 to 1.
+/// Gauss-Legendre nodes and weights from -1 to 1.
 const GAUSS: [(f64, f64); 6] = [
     (-0.932_469_514_203_152, 0.171_324_492_379_170_35),
     (-0.661_209_386_466_264_5, 0.360_761_573_048_138_6),
@@ -19,10 +19,10 @@ const GAUSS: [(f64, f64); 6] = [
     (0.932_469_514_203_152, 0.171_324_492_379_170_35),
 ];
 
-/// A frequency with what does not depend on the gains.
+/// A frequency with the quantities that do not depend on the gains.
 pub(super) struct Node {
     pub(super) omega: f64,
-    /// Of the quadrature, times the frequency.
+    /// Weight of the quadrature, times the frequency.
     weight: f64,
     /// `e^(sL)`, and `P e^(sL)` with its two derivatives.
     turn: Complex<f64>,
@@ -73,7 +73,7 @@ impl Node {
     }
 }
 
-/// The frequencies of an integral for one `L`.
+/// The frequencies of an integral, for one `L`.
 pub(super) struct Locus {
     pub(super) l: f64,
     pub(super) nodes: Vec<Node>,
@@ -107,14 +107,14 @@ impl Locus {
         }
     }
 
-    /// The same of a loop that is known to be stable.
+    /// The same for a loop that is known to be stable.
     pub(super) fn integral(&self, g: Standard<f64>) -> f64 {
         let part = |n: &Node| n.weight * n.error(g)[2].norm_sqr();
         self.nodes.iter().map(part).sum()
     }
 
-    /// By the argument principle: `1 + F_1 G` turns by a quarter from the integrator's phase, and at high frequencies
-    /// circles 1 with radius `Kp Td`.
+    /// By the argument principle: from the integrator's phase `1 + F_1 G` turns by a quarter, and at high frequencies
+    /// it circles 1 with radius `Kp Td`.
     pub(super) fn is_stable(&self, g: Standard<f64>) -> bool {
         if g.kp * g.td >= 1.0 {
             return false;
@@ -129,7 +129,7 @@ impl Locus {
         turned > 0.0 && turned < PI
     }
 
-    /// `max |S|`; infinite where the loop is unstable.
+    /// `max |S|`; infinite if the loop is unstable.
     pub(super) fn peak(&self, g: Standard<f64>) -> f64 {
         if !self.is_stable(g) {
             return f64::INFINITY;
@@ -165,7 +165,7 @@ impl Locus {
         at(0.5 * (low + high)).min(of(&self.nodes[i]))
     }
 
-    /// Second derivatives of the error after a step of the reference: without weights, by alpha and by beta.
+    /// Second derivatives of the error after a step of the reference: without alpha and beta, by alpha and by beta.
     fn by_weights(&self, n: &Node, g: Standard<f64>) -> [Complex<f64>; 3] {
         let (s, l) = (Complex::new(0.0, n.omega), self.l);
         let [e, first, second] = n.error(g);
@@ -179,7 +179,7 @@ impl Locus {
         ]
     }
 
-    /// Alpha and beta of the least cost after a step of the reference.
+    /// Alpha and beta of least cost after a step of the reference.
     pub(super) fn weights(&self, g: Standard<f64>) -> (f64, f64) {
         let mut m = [0.0; 5];
         for n in &self.nodes {

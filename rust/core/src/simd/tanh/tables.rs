@@ -1,36 +1,36 @@
-//! The hyperbolic tangent where a processor picks numbers from tables in registers (AVX-512), in two ways.
+//! The hyperbolic tangent from tables in registers, for processors that can look numbers up there (AVX-512), in two ways.
 //!
-//! Both split the argument at the nearest quarter, `|x| = a + t` with `|t| <= 1/8`, and look up what belongs to `a`. The number of the
-//! quarter is found in the low bits of `|x| + QUARTERS`; `vpermi2pd` picks eight of a table's 16 numbers, which fill two registers, by
-//! them. [`in_chain`] looks up the coefficients of a polynomial of t, the shortest chain; [`of_four`] looks up `tanh(a)` alone and adds
-//! tangents, the fewest operations:
+//! Both split the argument at the nearest quarter, `|x| = a + t` with `|t| <= 1/8`, and look up values for `a`. The
+//! index of the quarter is in the low bits of `|x| + QUARTERS`; with it `vpermi2pd` picks eight of a table's 16
+//! numbers, which fill two registers. [`in_chain`] looks up the coefficients of a polynomial in t, for the shortest
+//! chain; [`of_four`] looks up only `tanh(a)` and uses the addition theorem, for the fewest operations:
 //!
 //! ```text
 //!   A = tanh(a)  from a table of 16,        B = tanh(t) = t + t^3 p(t^2)
 //!   tanh(|x|) = (A + B) / (1 + A B)
 //! ```
 //!
-//! Because p has degree 4 only, the sum takes 20 operations; the division is shared by two results,
-//! `1/(d1 d2)` giving `d2/(d1 d2)` and `d1/(d1 d2)`, since a division takes as long as 8 products and there is one unit for it.
+//! As p has degree 4 only, the sum takes 20 operations. Two results share a division, `1/(d1 d2)` giving `d2/(d1 d2)`
+//! and `d1/(d1 d2)`, because a division takes as long as 8 products and has only one unit.
 
 use crate::simd::x86::Wide;
 use crate::simd::{Arithmetic, F64x8, Lanes};
 
 use super::tanh as quotients;
 
-/// Adding this rounds to quarters, whose number is then found in the low bits.
-// 1.5 * 2^50: numbers of this size are spaced by 2^(50 - 52), a quarter. The half in front keeps the sum in that range.
+/// Adding this rounds to quarters; the index of the quarter is then in the low bits.
+// 1.5 * 2^50: numbers of this size are spaced by 2^(50 - 52), a quarter. The additional half keeps the sum in that range.
 const QUARTERS: f64 = 1_688_849_860_263_936.0;
-/// Below this size [`near`] holds.
+/// [`near`] is valid below this size.
 // 15.5 quarters: from here on the nearest one could be the 16th, which the tables do not have.
 const NEAR: f64 = 3.875;
 
-/// `tanh(x)` at any size.
+/// `tanh(x)` for any size.
 #[inline(always)]
 pub(in crate::simd) fn in_chain(x: Wide) -> Wide {
     let (size, limit) = (x.abs(), Wide::splat(NEAR));
     let near = near(x);
-    // A branch and not a selection alone: a processor that foretells it goes on with the polynomial, and neither the
+    // A branch, not only a selection: a processor that predicts it continues with the polynomial, and neither the
     // comparison nor the quotients are on the chain.
     if size.are_less(limit) == Wide::ALL {
         return near;
@@ -40,13 +40,13 @@ pub(in crate::simd) fn in_chain(x: Wide) -> Wide {
 
 /// `tanh(x)` below [`NEAR`]: one polynomial around each multiple of a quarter.
 ///
-/// A chain of some 36 cycles where the quotients take 46: number and remainder are there at once, nothing is divided, and
-/// the coefficients come one each cycle in the order in which they are needed.
+/// A chain of some 36 cycles instead of the quotients' 46: index and remainder are available at once, nothing is
+/// divided, and the coefficients arrive one per cycle in the order in which they are needed.
 #[inline(always)]
 fn near(x: Wide) -> Wide {
     let size = x.abs();
-    // Rounded as the addition of QUARTERS rounds, to the even one of two as near: number and remainder belong together.
-    // The remainder is computed from |x| itself, so that it does not wait for the number.
+    // Rounded like the addition of QUARTERS, to the even one of two equally near: index and remainder must match. The
+    // remainder is computed from |x| itself, so it does not wait for the index.
     let t = size.beyond_quarters();
     let t2 = t.mul(t);
     let t4 = t2.mul(t2);
@@ -58,11 +58,11 @@ fn near(x: Wide) -> Wide {
     //   four(i) = (c_i + c_(i+1) t) + t^2 (c_(i+2) + c_(i+3) t)
     //   sum of c_i t^i = four(0) + t^4 (four(4) + t^4 four(8))
     let high = piece.four(4).add_product(piece.four(8), t4);
-    // Of |x|, so never negative: the sign is put on by an OR. tanh is odd to the last bit this way.
+    // From |x|, so never negative: the sign is applied by an OR, which makes tanh odd to the last bit.
     piece.four(0).add_product(high, t4).with_sign_of(x)
 }
 
-/// The polynomial of each lane: its number in the low bits, and powers of the distance from its centre.
+/// The polynomial of each lane: its index in the low bits, and powers of the distance from its centre.
 #[derive(Clone, Copy)]
 struct Piece {
     number: Wide,
@@ -73,7 +73,7 @@ struct Piece {
 impl Piece {
     #[inline(always)]
     fn coefficient(self, power: usize) -> Wide {
-        // Only the low four bits are looked at: the sum's bits serve as an index as they are.
+        // Only the low four bits count: the sum's bits can be used directly as an index.
         self.number.pick(&PIECES[power])
     }
 
@@ -113,14 +113,14 @@ static OF_QUARTERS: [Lanes; 2] = [
     ]),
 ];
 
-/// `tanh` of each at any size. The first two and the last two share a division.
+/// `tanh` of each for any size. The first two and the last two share a division.
 #[inline(always)]
 pub(in crate::simd) fn of_four(x: [Wide; 4]) -> [Wide; 4] {
     let [a, b, c, d] = x;
     let parts = [Parts::of(a), Parts::of(b), Parts::of(c), Parts::of(d)];
     let [p, q, r, s] = parts;
     // Both denominators are 1 + A B with 0 <= A < 1 and |B| < 1/8, between .87 and 1.13: their product is as good a
-    // divisor as each of them, and loses no range.
+    // divisor as each of them and cannot overflow.
     let (first, last) = (p.share(q), r.share(s));
     let near = [
         p.beside(q, first),
@@ -128,7 +128,7 @@ pub(in crate::simd) fn of_four(x: [Wide; 4]) -> [Wide; 4] {
         r.beside(s, last),
         s.beside(r, last),
     ];
-    // Where one argument of a pair is large, its lookup is of no meaning, and so is the division that both share.
+    // If one argument of a pair is large, its lookup is meaningless, and so is the shared division.
     if p.are_near() & q.are_near() & r.are_near() & s.are_near() == Wide::ALL {
         return near;
     }
@@ -140,13 +140,13 @@ pub(in crate::simd) fn of_four(x: [Wide; 4]) -> [Wide; 4] {
     ]
 }
 
-/// `tanh` at any size, to the bit what [`of_four`] gives where neighbours are its first two or its last two.
+/// `tanh` for any size, bit for bit the result of [`of_four`] if neighbours are its first two or its last two.
 #[inline(always)]
 pub(in crate::simd) fn of_neighbours(x: Wide) -> Wide {
     let own = Parts::of(x);
-    // A register of hidden units, one group of a loop that runs alone, where `of_four` has four registers of loops: units
-    // 2i and 2i+1 are partners there, neighbours here. There is one division either way, so that nothing is saved; it is
-    // done for the bits, by which a search judges a loop alone as it does in lanes.
+    // In a single loop this is a register of hidden units, one group; `of_four` has four registers of loops. Units 2i
+    // and 2i+1 are partners there and neighbours here. There is one division either way, so nothing is saved; it is
+    // done for equal bits, so that a search judges a loop alone as in lanes.
     let other = own.of_neighbours();
     let near = own.beside(other, own.share(other));
     if own.are_near() == Wide::ALL {
@@ -155,10 +155,10 @@ pub(in crate::simd) fn of_neighbours(x: Wide) -> Wide {
     own.at_any_size(other, near)
 }
 
-/// `tanh(x)` below [`NEAR`] before the division: `(A + B)/(1 + A B)` of the tangents `A` of the nearest quarter and `B` of
-/// what is beyond it.
+/// `tanh(x)` below [`NEAR`] before the division: `(A + B)/(1 + A B)`, with `A` the tangent of the nearest quarter and
+/// `B` that of the remainder.
 ///
-/// With one division for two these are 20 operations where the quotients take 33, but a longer chain.
+/// With one division for two results these are 20 operations instead of the quotients' 33, but a longer chain.
 #[derive(Clone, Copy)]
 struct Parts {
     x: Wide,
@@ -174,12 +174,12 @@ impl Parts {
         let quarters = size.add(Wide::splat(QUARTERS)).pick(&OF_QUARTERS);
         let t = size.beyond_quarters();
         let t2 = t.mul(t);
-        // Horner and not Estrin: one product less, and four of these run side by side, so that nobody waits.
+        // Horner, not Estrin: one product less, and four of these run side by side, so nothing waits.
         let mut share = Wide::splat(BEYOND[4]);
         for power in [3, 2, 1, 0] {
             share = Wide::splat(BEYOND[power]).add_product(share, t2);
         }
-        // t + t^3 p: t itself is exact, and what is added is at most 1/192 of it, so that its rounding does not count.
+        // t + t^3 p: t itself is exact, and the addend is at most 1/192 of it, so its rounding does not count.
         let beyond = t.add_product(t.mul(t2), share);
         Self {
             x,
@@ -205,25 +205,25 @@ impl Parts {
         self.size.are_less(Wide::splat(NEAR))
     }
 
-    /// The division that two have in common.
+    /// The division shared by two results.
     #[inline(always)]
     fn share(self, other: Self) -> Wide {
         Wide::splat(1.0).div(self.below.mul(other.below))
     }
 
-    /// `tanh(x)` where both are near.
+    /// `tanh(x)` if both are near.
     #[inline(always)]
     fn beside(self, other: Self, share: Wide) -> Wide {
-        // sum / below = sum * (other.below / (below other.below)): two products for what a division of its own would be.
+        // sum / below = sum * (other.below / (below other.below)): two products instead of a separate division.
         self.sum.mul(other.below.mul(share)).with_sign_of(self.x)
     }
 
-    /// `near` where both are, else `tanh(x)` of its own.
+    /// `near` if both are near, else a separate `tanh(x)`.
     #[inline(always)]
     fn at_any_size(self, other: Self, near: Wide) -> Wide {
         let (limit, own) = (Wide::splat(NEAR), quotients(self.x));
-        // A lane whose partner is large takes its own quotient. That depends on the partner, and not on the other lanes:
-        // these are other samples or loops, which must not matter.
+        // A lane whose partner is large takes its own quotient. It depends on its partner but not on other lanes: these
+        // are other samples or loops, which must not matter.
         let near = other.size.if_less(limit, near, own);
         self.size.if_less(limit, near, own)
     }
@@ -231,7 +231,7 @@ impl Parts {
 
 /// Coefficients of each power around 0, 1/4, 1/2 ... 15/4: relative error 1.3e-16 (`tests/golden/tanh_pieces.py`).
 ///
-/// Around 0 they begin with 0 and 1: small numbers stay what they are.
+/// Around 0 they begin with 0 and 1: small numbers stay unchanged.
 #[rustfmt::skip]
 static PIECES: [[Lanes; 2]; 12] = [
     [
