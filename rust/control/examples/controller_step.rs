@@ -1,4 +1,4 @@
-//! What a step of each kind of controller costs on this machine, in single precision, by itself.
+//! The cost of a step of each kind of controller on this machine, in single precision.
 //!
 //! `cargo run --release --package sewfast-control --example controller_step`
 

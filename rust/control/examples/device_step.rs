@@ -1,4 +1,4 @@
-//! What a control period costs: measurement, heartbeats through codec and session, controller, samples on the wire.
+//! The cost of a control period: measurement, heartbeats through codec and session, controller, samples on the wire.
 //!
 //! `cargo run --release --package sewfast-control --example device_step`
 
@@ -110,7 +110,7 @@ impl Host {
         black_box(&out);
     }
 
-    /// Up to a run that only STOP ends, in mode 0, 1 or 2; `whole`: with observer, ramp and a schedule of 8 points.
+    /// Starts a run that only STOP ends, in mode 0, 1 or 2; `whole`: with observer, ramp and a schedule of 8 points.
     fn run(mode: u8, whole: bool) -> Self {
         let mut host = Self::new();
         (0..150).for_each(|_| host.period(0));
@@ -154,7 +154,7 @@ impl Host {
         host
     }
 
-    /// Keeps the profile full: 40 values each 40 samples.
+    /// Keeps the profile full: 40 values every 40 samples.
     fn feed(&mut self, mode: u8, sample: u32) {
         let mut body = Body::new();
         body.u8(mode & 1)

@@ -1,4 +1,4 @@
-//! The main loop of a drive's firmware, and a board that is a computed motor to run it on (docs/wiring.md).
+//! The main loop of a drive's firmware, and a computed motor as a board to run it on (docs/wiring.md).
 //!
 //! `cargo run --package sewfast-control --example firmware`
 
@@ -30,17 +30,17 @@ static CHANNELS: [Channel; 3] = [
     },
 ];
 
-/// What the author of a firmware writes; nothing here waits.
+/// The part that a firmware's author writes; nothing here may wait.
 trait Board {
-    /// Microseconds since boot, from a timer that only goes forwards.
+    /// Microseconds since boot, from a timer that never runs backwards.
     fn time(&self) -> u64;
-    /// Once each control period: when the counter was latched, and the counter.
+    /// Once each control period: when the counter was latched, and its value.
     fn measure(&mut self) -> Option<(u64, i32)>;
     /// Drives the motor, or switches the drive off.
     fn apply(&mut self, output: Output);
-    /// Bytes that have come; how many.
+    /// Received bytes; returns how many.
     fn read(&mut self, bytes: &mut [u8]) -> usize;
-    /// Sends what there is room for; how many.
+    /// Sends as much as there is room for; returns how many bytes.
     fn write(&mut self, bytes: &[u8]) -> usize;
     /// Kicks the hardware watchdog.
     fn alive(&mut self);
@@ -85,7 +85,7 @@ impl<B: Board> Firmware<B> {
         })
     }
 
-    /// Once round the main loop, many times a period; the sample goes first.
+    /// One turn of the main loop, many times a period; the sample goes first.
     fn step(&mut self) {
         if let Some((when, counts)) = self.board.measure() {
             let measurement = Measurement {
@@ -120,7 +120,7 @@ impl<B: Board> Firmware<B> {
     }
 }
 
-/// A motor at rest and a port that nobody has opened; time passes by 100 us at each turn of the loop.
+/// A motor at rest and a port that nobody has opened; each turn of the loop takes 100 us.
 #[derive(Default)]
 struct Desk {
     time: u64,

@@ -1,4 +1,4 @@
-//! Biquads: notches, low passes and lead-lags in series, for machines whose shaft swings.
+//! Biquads: notches, low passes and lead-lags in series, for machines with a shaft that swings.
 //!
 //! A section is a fraction of second order whose gain at standstill is 1,
 //!
@@ -6,16 +6,16 @@
 //! H(s) = (1 + n1 s + n2 s^2)/(1 + d1 s + d2 s^2)
 //! ```
 //!
-//! sampled by the bilinear transform `s = k (1 - q)/(1 + q)`, `q = 1/z`, each pair of zeros and of poles with the `k` that
-//! keeps its own frequency (prewarping: `k = w/tan(w Ts/2)`). With `N1 = n1 k`, `N2 = n2 k^2`, and `D1`, `D2` alike,
+//! sampled by the bilinear transform `s = k (1 - q)/(1 + q)`, `q = 1/z`. Each pair of zeros and of poles has the `k` that keeps its own
+//! frequency (prewarping: `k = w/tan(w Ts/2)`). With `N1 = n1 k`, `N2 = n2 k^2`, and `D1`, `D2` alike,
 //!
 //! ```text
 //! H(q) = (1 + N1 + N2 + 2 (1 - N2) q + (1 - N1 + N2) q^2)/(1 + D1 + D2 + 2 (1 - D2) q + (1 - D1 + D2) q^2)
 //!      = 1 + (1 - q) (c0 + c1 q)/(1 + a1 q + a2 q^2)
 //! ```
 //!
-//! The second line holds as numerator and denominator agree at `q = 1`, and it is how a section is computed: transposed
-//! direct form II on the change of its input, `d` being what the output differs by from the input,
+//! The second line holds because numerator and denominator agree at `q = 1`. A section is computed in this form:
+//! transposed direct form II on the change of its input, where `d` is the output minus the input,
 //!
 //! ```text
 //! d(k)  = c0 (x(k) - x(k-1)) + s1(k-1),    y(k) = x(k) + d(k)
@@ -23,8 +23,8 @@
 //! s2(k) = -a2 d(k)
 //! ```
 //!
-//! So the gain at standstill is 1 to the bit whatever single precision makes of the coefficients, a section at rest has zeros
-//! in its memory wherever the signal stands, and it can be put in, taken out or changed there without a bump.
+//! So the gain at standstill is 1 to the bit, however single precision rounds the coefficients. A section at rest has
+//! zeros in its memory at any level of the signal, so it can be added, removed or changed there without a bump.
 
 use core::f64::consts::PI;
 
@@ -36,7 +36,7 @@ pub const BIQUADS: usize = 4;
 /// A second-order section at a sample time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Biquad<T> {
-    /// Answer to a step at its own sample, less 1.
+    /// Step response at the step's own sample, minus 1.
     pub c0: T,
     /// The same a sample later, before the poles.
     pub c1: T,
@@ -47,7 +47,7 @@ pub struct Biquad<T> {
 }
 
 impl<T: Real> Biquad<T> {
-    /// Passes its input on.
+    /// Passes its input through.
     pub const NONE: Self = Self {
         c0: T::ZERO,
         c1: T::ZERO,
@@ -55,8 +55,8 @@ impl<T: Real> Biquad<T> {
         a2: T::ZERO,
     };
 
-    /// Takes out what swings at `frequency` \[Hz\]: its gain there is `depth`, and the band that a deep one weakens by 3 dB and
-    /// more is `width` times as wide as the frequency.
+    /// Removes a swing at `frequency` \[Hz\]: the gain there is `depth`, and the band in which a deep notch attenuates
+    /// by 3 dB or more is `width` times the frequency.
     ///
     /// `H(s) = (s^2 + depth width w s + w^2)/(s^2 + width w s + w^2)`.
     ///
@@ -74,8 +74,8 @@ impl<T: Real> Biquad<T> {
         )
     }
 
-    /// Zeros and poles at frequencies of their own \[Hz\], each with its damping: the inverse of a shaft's anti-resonance and
-    /// resonance.
+    /// Zeros and poles at separate frequencies \[Hz\], each with its damping: the inverse of a shaft's anti-resonance
+    /// and resonance.
     ///
     /// # Errors
     /// A frequency that is not between 0 and half the sample rate, a damping below 0, poles without damping.
@@ -97,7 +97,7 @@ impl<T: Real> Biquad<T> {
         )
     }
 
-    /// Low pass of second order, `H(s) = w^2/(s^2 + 2 damping w s + w^2)`.
+    /// Second-order low pass, `H(s) = w^2/(s^2 + 2 damping w s + w^2)`.
     ///
     /// # Errors
     /// A frequency \[Hz\] that is not between 0 and half the sample rate, a damping that is not above 0.
@@ -107,14 +107,14 @@ impl<T: Real> Biquad<T> {
         Self::sampled((0.0, 0.0), (2.0 * damping / t, 1.0 / (t * t)))
     }
 
-    /// `H(s) = (1 + s/zero)/(1 + s/pole)`, both \[Hz\]: a lead where the zero comes first, a lag where the pole does.
+    /// `H(s) = (1 + s/zero)/(1 + s/pole)`, both \[Hz\]: a lead if the zero is lower, a lag if the pole is.
     ///
     /// # Errors
     /// A frequency that is not between 0 and half the sample rate.
     pub fn lead_lag(zero: f64, pole: f64, ts: f64) -> Result<Self, Refused> {
         let n1 = 1.0 / tangent("zero", zero, ts)?;
         let d1 = 1.0 / tangent("pole", pole, ts)?;
-        // of first order: the fraction above would have a pole and a zero at -1 beside it
+        // of first order: the fraction above would have an additional pole and zero at -1
         Self {
             c0: T::from_f64((n1 - d1) / (1.0 + d1)),
             a1: T::from_f64((1.0 - d1) / (1.0 + d1)),
@@ -149,7 +149,7 @@ impl<T: Real> Biquad<T> {
         .checked()
     }
 
-    /// The section, once it is known to be stable: `|a2| < 1`, `|a1| < 1 + a2` (Jury).
+    /// The section, if it is stable: `|a2| < 1`, `|a1| < 1 + a2` (Jury).
     fn checked(self) -> Result<Self, Refused> {
         let Self { c0, c1, a1, a2 } = self;
         for c in [c0, c1] {
@@ -170,10 +170,10 @@ fn positive(name: &'static str, value: f64) -> Result<(), Refused> {
     Refused::unless(holds, name, "a finite number above 0", value)
 }
 
-/// `tan(pi frequency Ts)`, between 0 and the sample rate's half.
+/// `tan(pi frequency Ts)`, for a frequency between 0 and half the sample rate.
 ///
-/// By the series of sine and cosine, as there is no tangent without the standard library; up to a quarter turn 12 terms are
-/// exact to double precision.
+/// From the series of sine and cosine, as there is no tangent without the standard library; up to a quarter turn 12
+/// terms are exact to double precision.
 fn tangent(name: &'static str, frequency: f64, ts: f64) -> Result<f64, Refused> {
     let x = PI * frequency * ts;
     let holds = x > 0.0 && frequency * ts < 0.5;
@@ -187,13 +187,13 @@ fn tangent(name: &'static str, frequency: f64, ts: f64) -> Result<f64, Refused> 
     };
     let (sine, cosine) = (x * series(1.0), series(0.0));
     let value = sine / cosine;
-    // frequencies of subnormal size, or so near to the half that nothing is left of the cosine
+    // frequencies of subnormal size, or so near the half that the cosine vanishes
     let holds = value > 0.0 && (1.0 / (value * value)).is_finite();
     Refused::unless(holds, name, expected, frequency)?;
     Ok(value)
 }
 
-/// Up to [`BIQUADS`] sections in series; none passes its input on.
+/// Up to [`BIQUADS`] sections in series; without any the input passes through.
 ///
 /// ```
 /// use sewfast_control::{Biquad, Cascade};
@@ -216,7 +216,7 @@ impl<T: Real> Cascade<T> {
         length: 0,
     };
 
-    /// These sections, in this order.
+    /// A cascade of these sections, in this order.
     ///
     /// # Errors
     /// More than [`BIQUADS`], one that is not stable, coefficients that are not finite.
@@ -239,19 +239,19 @@ impl<T: Real> Cascade<T> {
         self.sections.get(..self.length).unwrap_or_default()
     }
 
-    /// Where sections that are put in during a run begin at rest: at the output of the `last` ones, or, if they magnify a step,
-    /// at the `standing` input.
+    /// Where sections that are added during a run begin at rest: at the output of the `last` ones or, if they magnify a
+    /// step, at the `standing` input.
     ///
-    /// The two differ by what filters and former sections hold back, and by rounding where nothing moves: a lag and an observer
-    /// come to rest some units in the last place beside what they are given. The difference reaches the output as it is from the
-    /// standing input, and times the gain from the other place: a lead of 1e5 would make a bump of the last place.
+    /// The two differ by what filters and former sections hold back, and by rounding at rest: a lag and an observer come to rest some
+    /// units in the last place away from their input. From the standing input this difference reaches the output unchanged; from the
+    /// other place it is multiplied by the gain: a lead of 1e5 would make a bump of the last place.
     pub(crate) fn origin(&self, last: T, standing: Option<T>) -> T {
         let magnified = standing.filter(|x| x.is_finite() && self.magnifies());
         magnified.unwrap_or(last)
     }
 
-    /// Lets a jump of the input that other settings of a filter will make pass as it is, for the same reason, if the sections
-    /// magnify a step.
+    /// Passes a jump of the input, caused by new settings of a filter, through unchanged if the sections magnify a
+    /// step, for the same reason.
     pub(crate) fn carry(&self, memory: &mut Memory<T>, jump: Option<T>) {
         let jump = jump.unwrap_or(T::ZERO);
         // adding 0 would turn -0 into 0
@@ -262,14 +262,14 @@ impl<T: Real> Cascade<T> {
         }
     }
 
-    /// Whether the first answer to a step is larger than the step.
+    /// Whether the first response to a step is larger than the step.
     fn magnifies(&self) -> bool {
         let each = self.sections().iter();
         let gain = each.fold(T::ONE, |gain, section| gain * (T::ONE + section.c0));
         gain > T::ONE || gain < -T::ONE
     }
 
-    /// Whether there is none.
+    /// Whether there are no sections.
     pub fn is_empty(&self) -> bool {
         self.length == 0
     }
@@ -281,7 +281,7 @@ impl<T: PartialEq> PartialEq for Cascade<T> {
     }
 }
 
-/// What a section remembers.
+/// The memory of a section.
 #[derive(Clone, Copy, Debug)]
 struct State<T> {
     /// Input at the last sample.
@@ -290,7 +290,7 @@ struct State<T> {
     s2: T,
 }
 
-/// What a cascade remembers of one signal; the sections come with each sample.
+/// The memory of a cascade for one signal; the sections come with each sample.
 #[derive(Clone, Debug)]
 pub(crate) struct Memory<T> {
     states: [State<T>; BIQUADS],
@@ -311,7 +311,7 @@ impl<T: Real> Memory<T> {
         }
     }
 
-    /// At rest, as after the signal has stood at `x` for ever.
+    /// At rest, as after a signal of constant `x`.
     pub(crate) fn rest_at(&mut self, x: T) {
         let (s1, s2) = (T::ZERO, T::ZERO);
         self.states.fill(State { x, s1, s2 });

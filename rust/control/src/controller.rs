@@ -1,4 +1,4 @@
-//! What every controller is: the interface, the kinds behind it, and how they refuse a setting.
+//! The controller interface, the kinds of controllers behind it, and how they refuse a setting.
 
 mod state_feedback;
 
@@ -10,16 +10,16 @@ pub use state_feedback::{NUMBERS, STATES, StateDesign, StateFeedback, Weights, l
 
 /// One sampled controller from reference and measured output to the command.
 ///
-/// Whatever comes, the command is finite, within the limits and no further from the last one than slew allows; every
-/// implementation runs through the laws of `pid_controller/tests/any.rs`.
+/// For any input the command is finite, within the limits, and no further from the last one than the slew rate allows;
+/// every implementation is tested with the laws of `pid_controller/tests/any.rs`.
 pub trait Controller<T: Real> {
     /// Back to the state before the first sample.
     fn reset(&mut self);
 
-    /// From reference `r` and measured output `y` to the command of this sample, with a command that is added before the limits.
+    /// From reference `r` and measured output `y` to the command of this sample; `feedforward` is added before the limits.
     fn step_with(&mut self, r: T, y: T, feedforward: T) -> T;
 
-    /// [`step_with`](Self::step_with) without a command that is added.
+    /// [`step_with`](Self::step_with) without feedforward.
     fn step(&mut self, r: T, y: T) -> T {
         // x + (-0) is x for every x, even for -0
         self.step_with(r, y, -T::ZERO)
@@ -58,7 +58,8 @@ impl<T: Real> AnyDesign<T> {
         }
     }
 
-    /// What [`controller`](Self::controller) would refuse, without the controller, which fills most of a small processor's stack.
+    /// The refusal that [`controller`](Self::controller) would give, without making the controller, which would fill
+    /// most of a small processor's stack.
     ///
     /// # Errors
     /// The first setting that is outside its range.
@@ -85,9 +86,9 @@ impl<T: Real> AnyDesign<T> {
         }
     }
 
-    /// A controller of the kind that a device is sent by this number, from the numbers that `next` gives one after the other,
-    /// without its sample time; `None` where they end too early, or for a number that is no kind's. The PID, which has commands of
-    /// its own, has none.
+    /// A controller of kind number `kind`, as sent to a device, from the numbers that `next` returns one by one,
+    /// without its sample time. `None` if the numbers end too early, or for an unknown kind. The PID has no kind
+    /// number: it has its own commands.
     pub(crate) fn from_numbers(kind: u8, next: impl FnMut() -> Option<T>) -> Option<Self> {
         match kind {
             1 => StateDesign::from_numbers(next, T::ZERO).map(Self::StateFeedback),
@@ -95,7 +96,7 @@ impl<T: Real> AnyDesign<T> {
         }
     }
 
-    /// The place of a setting among those numbers.
+    /// The index of a setting among those numbers.
     pub(crate) fn place_of(&self, name: &str) -> Option<u32> {
         match self {
             Self::Pid(_) => None,
@@ -103,7 +104,7 @@ impl<T: Real> AnyDesign<T> {
         }
     }
 
-    /// The settings of the PID that it is; `None` where it is another kind.
+    /// The settings of a PID; `None` for another kind.
     pub fn pid(&self) -> Option<&Design<T>> {
         match self {
             Self::Pid(design) => Some(design),
@@ -111,7 +112,7 @@ impl<T: Real> AnyDesign<T> {
         }
     }
 
-    /// The settings of the PID that it is, to be changed.
+    /// The settings of a PID, to be changed.
     pub(crate) fn pid_mut(&mut self) -> Option<&mut Design<T>> {
         match self {
             Self::Pid(design) => Some(design),
@@ -119,13 +120,13 @@ impl<T: Real> AnyDesign<T> {
         }
     }
 
-    /// The same at another sample time \[s\], with limits that are no wider than `bound` to either side.
+    /// The same at another sample time \[s\], with limits no wider than `bound` in either direction.
     pub(crate) fn bounded(mut self, bound: T, ts: T) -> Self {
         let (u_min, u_max, own_ts) = match &mut self {
             Self::Pid(Design { pid, .. }) => (&mut pid.u_min, &mut pid.u_max, &mut pid.ts),
             Self::StateFeedback(d) => (&mut d.u_min, &mut d.u_max, &mut d.ts),
         };
-        // comparisons, not min and max, which would hide a NaN
+        // comparisons instead of min and max, which would hide a NaN
         if *u_min < -bound {
             *u_min = -bound;
         }
@@ -152,7 +153,7 @@ pub enum AnyController<T> {
     StateFeedback(StateFeedback<T>),
 }
 
-/// The controller within, whatever its kind.
+/// Runs an expression on the controller inside, of any kind.
 macro_rules! within {
     ($any:expr, $controller:ident => $do:expr) => {
         match $any {
@@ -190,7 +191,7 @@ impl<T: Real> Controller<T> for AnyController<T> {
 }
 
 impl<T: Real> AnyController<T> {
-    /// The PID that it is; `None` where it is another kind.
+    /// The PID; `None` for another kind.
     pub fn pid(&self) -> Option<&PidController<T>> {
         match self {
             Self::Pid(controller) => Some(controller),
@@ -198,7 +199,7 @@ impl<T: Real> AnyController<T> {
         }
     }
 
-    /// The state feedback that it is; `None` where it is another kind.
+    /// The state feedback; `None` for another kind.
     pub fn state_feedback(&self) -> Option<&StateFeedback<T>> {
         match self {
             Self::StateFeedback(controller) => Some(controller),
@@ -219,18 +220,18 @@ impl<T> From<PidController<T>> for AnyController<T> {
     }
 }
 
-/// Refuses limits between which there is no command.
+/// Refuses limits that leave no command between them.
 pub(crate) fn check_limits<T: Real>((u_min, u_max): (T, T)) -> Result<(), Refused> {
     let (bounded, above) = (u_min < T::INFINITY, u_max > u_min);
     Refused::unless(bounded, "u_min", "a finite limit or -inf", u_min.to_f64())?;
     Refused::unless(above, "u_max", "a limit above u_min", u_max.to_f64())
 }
 
-/// The command for a wanted one: within the limits, and no further than `change` from the `last` one. Limits that were narrowed
-/// since the last command are reached at the slew rate.
+/// The command for a wanted one: within the limits, and no further than `change` from the `last` one. Limits narrowed
+/// since the last command are approached at the slew rate.
 ///
-/// The last command is finite: at first it is 0 or a limit next to it, and later it came from here. No comparison holds for
-/// NaN, which passes any clamp; what is not finite is the last command again.
+/// The last command is finite: first it is 0 or the nearest limit, later it comes from here. No comparison holds for
+/// NaN, which passes any clamp; if the result is not finite, the last command is returned.
 pub(crate) fn limited<T: Real>(wanted: T, last: T, (u_min, u_max): (T, T), change: T) -> T {
     let limited = wanted
         .limit(u_min, u_max)
@@ -238,7 +239,7 @@ pub(crate) fn limited<T: Real>(wanted: T, last: T, (u_min, u_max): (T, T), chang
     if limited.is_finite() { limited } else { last }
 }
 
-/// The setting's name, what was expected, what came.
+/// The setting's name, what was expected, what was received.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Refused {
     /// Name of the setting, as in docs/CONVENTIONS.md.
@@ -250,7 +251,7 @@ pub struct Refused {
 }
 
 impl Refused {
-    /// `Ok` where `holds`, else the refusal.
+    /// `Ok` if `holds`, else the refusal.
     pub(crate) fn unless(
         holds: bool,
         name: &'static str,

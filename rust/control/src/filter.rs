@@ -1,4 +1,4 @@
-//! Filters of the feedback (moving average, first-order lag, alpha-beta observer, the chain of them) and of the reference (a ramp).
+//! Filters of the feedback (moving average, first-order lag, alpha-beta observer, and their chain) and of the reference (a ramp).
 
 use crate::gains::sample_time;
 use crate::real::one_minus_exp;
@@ -7,7 +7,7 @@ use crate::{Real, Refused};
 /// The longest moving average, in samples.
 pub const CAPACITY: usize = 64;
 
-/// Mean of the last `n` samples; a delay of `(n - 1)/2` samples, and an encoder's step is `n` times smaller.
+/// Mean of the last `n` samples: a delay of `(n - 1)/2` samples, and an encoder step `n` times smaller.
 #[derive(Clone, Debug)]
 pub struct MovingAverage<T> {
     samples: [T; CAPACITY],
@@ -35,15 +35,15 @@ impl<T: Real> MovingAverage<T> {
     /// Forgets everything; the next sample fills the memory.
     pub fn reset(&mut self) {
         self.started = false;
-        // The order of summation is part of the result's last bits.
+        // Back to the first place: the order of summation determines the last bits of the result.
         self.next = 0;
     }
 
-    /// Takes a sample, gives the average.
+    /// Takes a sample and returns the average.
     ///
-    /// The sum is formed anew each time: a running sum would drift.
+    /// The sum is formed anew each time, because a running sum would drift.
     pub fn step(&mut self, x: T) -> T {
-        // get, not an index: firmware is to hold no panic
+        // get instead of an index: firmware must not contain a panic
         let memory = self.samples.get_mut(..self.length).unwrap_or_default();
         if !self.started {
             memory.fill(x);
@@ -57,7 +57,7 @@ impl<T: Real> MovingAverage<T> {
         self.mean()
     }
 
-    /// The sample that came last; `None` before the first one.
+    /// The last sample; `None` before the first one.
     fn newest(&self) -> Option<T> {
         let last = self.next.checked_sub(1).unwrap_or(self.length - 1);
         self.samples.get(last).copied().filter(|_| self.started)
@@ -69,7 +69,7 @@ impl<T: Real> MovingAverage<T> {
         sum / T::from_count(self.length)
     }
 
-    /// This average's length with the memory of `other`: all of it, or where the lengths differ its mean.
+    /// This average's length with the memory of `other`: all of it or, if the lengths differ, its mean.
     fn after(mut self, other: &Self) -> Self {
         if self.length == other.length {
             return other.clone();
@@ -110,7 +110,7 @@ impl<T: Real> Lag<T> {
         self.started = false;
     }
 
-    /// Takes a sample, gives the lagged value.
+    /// Takes a sample and returns the lagged value.
     pub fn step(&mut self, x: T) -> T {
         let from = if self.started { self.y } else { x };
         self.started = true;
@@ -154,7 +154,7 @@ impl<T: Real> Feedback<T> {
         self.observer.reset();
     }
 
-    /// Takes a sample, gives the filtered value.
+    /// Takes a sample and returns the filtered value.
     pub fn step(&mut self, x: T) -> T {
         self.observer.step(self.lag.step(self.average.step(x)))
     }
@@ -164,17 +164,17 @@ impl<T: Real> Feedback<T> {
         (self.average.length, self.lag.weight, &self.observer)
     }
 
-    /// The measurement that came last; `None` before the first one.
+    /// The last measurement; `None` before the first one.
     pub(crate) fn newest(&self) -> Option<T> {
         self.average.newest()
     }
 
-    /// What it would give next if this measurement came.
+    /// The output for `x` as the next measurement.
     pub(crate) fn given(&self, x: T) -> T {
         self.clone().step(x)
     }
 
-    /// These settings with the memory of `other`, so that a constant output goes on where that one's was.
+    /// These settings with the memory of `other`: a constant output continues at the same value.
     pub(crate) fn after(self, other: &Self) -> Self {
         Self {
             average: self.average.after(&other.average),
@@ -209,14 +209,14 @@ impl<T: Real> Ramp<T> {
         })
     }
 
-    /// Forgets where it was; the next sample begins at its start.
+    /// Forgets its value; the next sample begins at its start.
     pub fn reset(&mut self) {
         self.started = false;
     }
 
-    /// Takes a reference, gives the one to control to; the first after a reset is counted from `start`.
+    /// Takes a reference and returns the ramped one; the first ramp after a reset begins at `start`.
     ///
-    /// One that is not finite passes and leaves no trace.
+    /// A reference that is not finite is passed on without effect on the ramp.
     pub fn step(&mut self, r: T, start: T) -> T {
         let from = if self.started { self.r } else { start };
         let moved = r.limit(from - self.change, from + self.change);
@@ -228,7 +228,7 @@ impl<T: Real> Ramp<T> {
         moved
     }
 
-    /// The reference that it gave last; `None` before the first one.
+    /// The last ramped reference; `None` before the first one.
     pub(crate) fn newest(&self) -> Option<T> {
         self.started.then_some(self.r)
     }
@@ -246,9 +246,9 @@ impl<T: Real> Ramp<T> {
     }
 }
 
-// The alpha-beta observer: speed from a position that is never formed.
+// The alpha-beta observer: speed from a position that is never computed.
 //
-// The tracker of a position `p(k) = p(k-1) + Ts y(k)` with position and speed as its state (Benedict and Bordner 1962),
+// The tracker of a position `p(k) = p(k-1) + Ts y(k)` with position and speed as states (Benedict and Bordner 1962),
 //
 // ```text
 // r(k) = p(k) - x(k-1) - Ts v(k-1)        innovation
@@ -256,8 +256,8 @@ impl<T: Real> Ramp<T> {
 // v(k) = v(k-1) + b/Ts r(k)
 // ```
 //
-// leaves `p(k) - x(k) = (1 - a) r(k)` behind, so that the innovation follows from itself and from the measured speed:
-// `r(k) = (1 - a) r(k-1) + Ts (y(k) - v(k-1))`. With `s = r/Ts` neither a position nor the sample time is left:
+// leaves `p(k) - x(k) = (1 - a) r(k)`, so the innovation follows from itself and the measured speed: `r(k) = (1 - a)
+// r(k-1) + Ts (y(k) - v(k-1))`. With `s = r/Ts` both the position and the sample time drop out:
 //
 // ```text
 // s(k) = (1 - a) s(k-1) + y(k) - v(k-1)
@@ -266,7 +266,7 @@ impl<T: Real> Ramp<T> {
 //
 // Critically damped: both poles at `theta = exp(-Ts/time)`, `1 - a = theta^2`, `b = (1 - theta)^2`.
 
-/// Speed out of a measured speed, without error where the speed is constant.
+/// Filters a measured speed, without error at constant speed.
 #[derive(Clone, Debug)]
 pub struct Observer<T> {
     /// `1 - a`.
@@ -308,7 +308,7 @@ impl<T: Real> Observer<T> {
         self.started = false;
     }
 
-    /// Takes a measured speed, gives the observed one.
+    /// Takes a measured speed and returns the observed one.
     pub fn step(&mut self, y: T) -> T {
         let (from, left) = if self.started {
             (self.speed, self.innovation)
@@ -326,12 +326,12 @@ impl<T: Real> Observer<T> {
         self.speed
     }
 
-    /// `1 - a` and `b`; `None` where it passes its input through.
+    /// `1 - a` and `b`; `None` if the input passes through.
     pub(crate) fn weights(&self) -> Option<(T, T)> {
         self.on.then_some((self.keep, self.gain))
     }
 
-    /// This observer's settings with the memory of `other`, so that its output goes on where that one's was.
+    /// This observer's settings with the memory of `other`: its output continues at the same value.
     pub(crate) fn after(mut self, other: &Self) -> Self {
         self.speed = other.speed;
         self.innovation = if self.on { other.innovation } else { T::ZERO };
@@ -445,11 +445,11 @@ mod tests {
         }
     }
 
-    // The observer against the position tracker of the textbook, and its drift.
+    // The observer compared with the textbook's position tracker, and its drift.
 
     const TS: f64 = 1e-3;
 
-    /// The tracker as it stands in the books, with the position that grows.
+    /// The textbook's tracker, whose position grows.
     struct Tracker {
         alpha: f64,
         beta: f64,
@@ -459,7 +459,7 @@ mod tests {
     }
 
     impl Tracker {
-        /// In step with a constant speed.
+        /// Settled at a constant speed.
         fn new(time: f64, speed: f64) -> Self {
             let theta = (-TS / time).exp();
             Self {
@@ -510,7 +510,7 @@ mod tests {
 
     #[test]
     fn a_position_ramp_leaves_no_error_where_the_position_does() {
-        // 250,000 counts in, the position of the textbook form has lost the speed's last digits; this one has none.
+        // After 250,000 counts the textbook form's position has lost the speed's last digits; this form has no position.
         let mut observer = Observer::<f32>::new(0.01, 1e-3).unwrap();
         for _ in 0..1000 {
             observer.step(12_345.0);
@@ -534,7 +534,7 @@ mod tests {
                 late = late.max(error);
             }
         }
-        // A few roundings of 2,600 in single precision (2.4e-4 each), filtered: never more, and at the end no more than at first.
+        // A few rounding errors of 2,600 in single precision (2.4e-4 each), filtered: never more, and at the end no more than at first.
         assert!(worst < 0.01, "{worst}");
         assert!(late < 0.01, "{late}");
     }

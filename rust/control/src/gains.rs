@@ -46,7 +46,7 @@ pub struct PerSample<T> {
 }
 
 impl<T: Real> Standard<T> {
-    /// The gains, once they are known to make sense.
+    /// The gains, if they make sense.
     ///
     /// # Errors
     /// `Kp` or `Td` not finite, `Ti` not above 0, `Td` below 0.
@@ -82,8 +82,8 @@ impl<T: Real> Parallel<T> {
     /// `Ti = Kp/Ki`, `Td = Kd/Kp`.
     ///
     /// # Errors
-    /// Gains that are not finite, of different signs, or an integral or derivative gain beside `Kp = 0`,
-    /// which the standard form cannot express.
+    /// Gains that are not finite or have different signs, or an integral or derivative gain with `Kp = 0`, which the
+    /// standard form cannot express.
     pub fn to_standard(self) -> Result<Standard<T>, Refused> {
         let Self { kp, ki, kd } = self;
         for (name, gain) in [("Kp", kp), ("Ki", ki), ("Kd", kd)] {
@@ -129,7 +129,7 @@ impl<T: Real> PerSample<T> {
     /// `Ti = Kp Ts/Ki'`, `Td = Kd' Ts/Kp`.
     ///
     /// # Errors
-    /// A sample time that is not above 0, and what [`Parallel::to_standard`] refuses.
+    /// A sample time that is not above 0, and everything that [`Parallel::to_standard`] refuses.
     pub fn to_standard(self) -> Result<Standard<T>, Refused> {
         sample_time(self.ts)?;
         self.to_parallel().to_standard()

@@ -4,7 +4,7 @@ use crate::controller::{check_limits, limited};
 use crate::gains::sample_time;
 use crate::{Real, Refused, Standard};
 
-/// What a [`Pid`] is made from; symbols as in docs/CONVENTIONS.md.
+/// The settings of a [`Pid`]; symbols as in docs/CONVENTIONS.md.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings<T> {
     /// Gains in standard form.
@@ -74,7 +74,7 @@ impl<T: Real> Settings<T> {
     }
 }
 
-/// The gains of one sample in the form in which the step uses them.
+/// The gains of one sample, in the form that the step uses.
 #[derive(Clone, Copy, Debug)]
 pub struct Terms<T> {
     /// Proportional gain.
@@ -111,7 +111,7 @@ impl<T: Real> Terms<T> {
 
 #[cfg(test)]
 impl Terms<f64> {
-    /// Whether all are equal to so many parts; to the last bit for 0.
+    /// Whether all agree within the relative tolerance `parts`; bit for bit if that is 0.
     pub(crate) fn close_to(&self, other: &Self, parts: f64) -> bool {
         let all = |t: &Self| [t.kp, t.ki, t.kd, t.pole, t.rate];
         let mut pairs = all(self).into_iter().zip(all(other));
@@ -139,9 +139,9 @@ pub struct Pid<T> {
     u: T,
     /// The operator's command in manual.
     manual: Option<T>,
-    /// Whether `r` and `e` are those of a sample.
+    /// Whether `r` and `e` belong to a sample.
     started: bool,
-    /// Whether a command was given without a sample: slew counts from it.
+    /// Whether a command was given without a sample: the slew limit then starts from it.
     held: bool,
 }
 
@@ -169,8 +169,8 @@ impl<T: Real> Pid<T> {
         Ok(pid)
     }
 
-    /// Back to the state before the first sample, in automatic; the output, from which slew counts, is 0 or the limit next
-    /// to it.
+    /// Back to the state before the first sample, in automatic. The slew limit starts from an output of 0 or the
+    /// nearest limit.
     pub fn reset(&mut self) {
         self.integral = T::ZERO;
         self.derivative = T::ZERO;
@@ -182,16 +182,16 @@ impl<T: Real> Pid<T> {
 
     /// From reference `r` and filtered output `y` to the command.
     ///
-    /// Whatever comes, the command is finite, within the limits and no further from the last one than slew allows. Where it
-    /// would not be finite, as after a lost measurement, state and output stay as they are.
+    /// For any input the command is finite, within the limits, and no further from the last one than the slew rate
+    /// allows. If it would not be finite, as after a lost measurement, state and output stay unchanged.
     pub fn step(&mut self, r: T, y: T) -> T {
         // x + (-0) is x for every x, even for -0
         self.step_by(self.terms, r, y, -T::ZERO)
     }
 
-    /// [`step`](Self::step) with the gains of this sample and a command that is added before the limits.
+    /// [`step`](Self::step) with the gains of this sample and a command added before the limits.
     ///
-    /// Every branch costs the same arithmetic: what is not wanted is computed and left.
+    /// Every branch costs the same arithmetic: unused results are computed and dropped.
     pub(crate) fn step_by(&mut self, terms: Terms<T>, r: T, y: T, feedforward: T) -> T {
         let Settings { alpha, beta, .. } = self.settings;
         let e = r - y;
@@ -218,9 +218,9 @@ impl<T: Real> Pid<T> {
         self.u
     }
 
-    /// From numbers the step made none, so that its memory is to blame: a measurement near the largest number stands in it, or
-    /// settings that came since magnify it. Kept as it is, it would hold the command for ever. The derivative begins again
-    /// at this sample, and an integral term that is no number is the last command.
+    /// Finite inputs gave a result that is not, so the memory is to blame: it holds a measurement near the largest
+    /// number, or newer settings magnify it. If kept, it would hold the command for ever. The derivative starts over at
+    /// this sample, and an integral term that is not finite becomes the last command.
     #[cold]
     fn begin_again(&mut self, r: T, e: T) {
         (self.r, self.e, self.started) = (r, e, true);
@@ -230,7 +230,7 @@ impl<T: Real> Pid<T> {
         }
     }
 
-    /// A sample without measurement: the command and the memory stay; in manual the command is still the operator's.
+    /// A sample without measurement: command and memory stay; in manual the operator's command still applies.
     pub(crate) fn hold(&mut self) -> T {
         self.held = true;
         if let Some(manual) = self.manual {
@@ -241,8 +241,8 @@ impl<T: Real> Pid<T> {
         self.u
     }
 
-    /// Other settings from the next sample on, without a bump: what proportional and derivative term change by, the integral
-    /// term takes up. The derivative's memory stands for the same rate as before.
+    /// New settings from the next sample on, without a bump: the integral term absorbs the change of the proportional
+    /// and derivative terms. The derivative's memory represents the same rate as before.
     pub(crate) fn change(&mut self, settings: Settings<T>, terms: Terms<T>) {
         if self.started {
             let before = self.terms;
@@ -261,7 +261,7 @@ impl<T: Real> Pid<T> {
         (self.settings, self.terms) = (settings, terms);
     }
 
-    /// The operator's command from the next sample on, within the limits; the integral term follows it.
+    /// The operator's command from the next sample on, within the limits; the integral term tracks it.
     ///
     /// # Errors
     /// A command that is not finite.
@@ -271,7 +271,7 @@ impl<T: Real> Pid<T> {
         Ok(())
     }
 
-    /// The controller's command again, beginning where the operator's was.
+    /// Back to the controller's command, starting from the operator's.
     pub fn set_automatic(&mut self) {
         self.manual = None;
     }
@@ -281,7 +281,7 @@ impl<T: Real> Pid<T> {
         self.manual.is_some()
     }
 
-    /// The gains of the last sample; the constant ones where no other came.
+    /// The gains of the last sample; the constant ones if there were no others.
     pub fn terms(&self) -> Terms<T> {
         self.terms
     }
@@ -296,12 +296,12 @@ impl<T: Real> Pid<T> {
         self.r
     }
 
-    /// The settings it was made from.
+    /// The settings.
     pub fn settings(&self) -> &Settings<T> {
         &self.settings
     }
 
-    /// The one way to the command.
+    /// The only path to the command.
     fn limited(&self, wanted: T) -> T {
         let Settings {
             u_min,
@@ -315,7 +315,7 @@ impl<T: Real> Pid<T> {
 
     /// The integral to keep when the limits moved the output by `excess`.
     ///
-    /// Conditional integration still lets the integral move away from the limit, or it could stay there for ever.
+    /// Conditional integration still lets the integral move away from the limit; otherwise it could stay there for ever.
     fn without_windup(&self, ki: T, integral: T, excess: T) -> T {
         let pushes_on = (integral - self.integral) * excess < T::ZERO;
         let tracked = integral + self.tracking * excess;

@@ -1,15 +1,15 @@
-//! The whole controller of the paper's Fig. 16: feedback filter, reference ramp, biquads, then two-degree-of-freedom PID.
+//! The whole controller of the paper's Fig. 16: feedback filter, reference ramp, biquads, then the two-degree-of-freedom PID.
 //!
-//! Biquads act on the reference and on the feedback alike. As the PID is linear in both, that is what they would do behind it,
-//! on the command, where drives have them: the machine's resonance is neither fed back nor excited by the reference. But limits,
-//! slew, anti-windup and the operator's command stay where they are, on the command that the machine gets.
+//! Biquads act on the reference and on the feedback alike. As the PID is linear in both, this equals biquads after it,
+//! on the command, where drives have them: the machine's resonance is neither fed back nor excited by the reference.
+//! But limits, slew, anti-windup and the operator's command act on the command that the machine receives.
 
 use crate::biquad::Memory;
 use crate::pid::Terms;
 use crate::schedule::{Row, Table};
 use crate::{Cascade, Controller, Feedback, Pid, Ramp, Real, Refused, Schedule, Settings};
 
-/// What the step of a controller with constant gains computes with: for code that steps many controllers at once with
+/// The numbers used by the step of a controller with constant gains, for code that steps many controllers at once with
 /// the same operations in the same order.
 #[derive(Clone, Copy, Debug)]
 pub struct Numbers<T> {
@@ -21,13 +21,13 @@ pub struct Numbers<T> {
     pub samples: usize,
     /// Weight of a new sample in the first-order lag.
     pub lag: T,
-    /// `1 - a` and `b` of the observer; `None` where it passes its input through.
+    /// `1 - a` and `b` of the observer; `None` if its input passes through.
     pub observer: Option<(T, T)>,
     /// Largest change of the reference in one sample \[y\].
     pub ramp: T,
 }
 
-/// Feedback filter, reference ramp, biquads, gain schedule and PID behind one step.
+/// Feedback filter, reference ramp, biquads, gain schedule and PID in one step.
 #[derive(Clone, Debug)]
 pub struct PidController<T> {
     design: Design<T>,
@@ -70,7 +70,7 @@ impl<T: Real> PidController<T> {
         })
     }
 
-    /// What [`new`](Self::new) would refuse, without the controller, which fills most of a small processor's stack.
+    /// The refusal that [`new`](Self::new) would give, without making the controller, which would fill most of a small processor's stack.
     ///
     /// # Errors
     /// The first setting that is outside its range.
@@ -99,15 +99,15 @@ impl<T: Real> PidController<T> {
 
     /// From reference and measured output to the command: filter, control, limit.
     ///
-    /// Whatever comes, the command is finite, within the limits and no further from the last one than slew allows.
-    /// A measurement that is not finite is skipped: the filter keeps its memory, the command its value. One at which the
-    /// filter's sum leaves the numbers is skipped too, and the filter begins again with the next.
+    /// For any input the command is finite, within the limits, and no further from the last one than the slew rate
+    /// allows. A measurement that is not finite is skipped: the filter keeps its memory and the command its value. A
+    /// measurement at which the filter's sum overflows is skipped, too, and the filter starts over with the next one.
     pub fn step(&mut self, r: T, y: T) -> T {
         // x + (-0) is x for every x, even for -0
         self.step_with(r, y, -T::ZERO)
     }
 
-    /// [`step`](Self::step) with a command that is added before the limits.
+    /// [`step`](Self::step) with a command added before the limits.
     pub fn step_with(&mut self, r: T, y: T, feedforward: T) -> T {
         if !y.is_finite() {
             return self.pid.hold();
@@ -136,8 +136,8 @@ impl<T: Real> PidController<T> {
         self.pid.step_by(terms, r, self.filtered, feedforward)
     }
 
-    /// The reference after the biquads, which stood at the first output before it, as the ramp did: a step of the reference is
-    /// filtered too. One that is not finite passes them by, and the PID skips it.
+    /// The reference after the biquads. Before the first sample they stood, like the ramp, at the first output, so a
+    /// step of the reference is filtered as well. A reference that is not finite bypasses them, and the PID skips it.
     fn referred(&mut self, r: T) -> T {
         if !r.is_finite() {
             return r;
@@ -150,23 +150,23 @@ impl<T: Real> PidController<T> {
         filtered
     }
 
-    /// Another design from the next sample on, without a bump in the command: filter, ramp and derivative keep what they
-    /// remember, other biquads begin at rest, and the integral term takes up what the other terms change by.
+    /// Another design from the next sample on, without a bump in the command: filter, ramp and derivative keep their
+    /// memory, new biquads begin at rest, and the integral term absorbs the change of the other terms.
     ///
-    /// Where biquads begin: at the output of the former ones, or, if they magnify a step, where the reference's ramp and the new
-    /// filter are. So they never magnify what filters hold back, not even the last place by which a filter at rest misses what it
-    /// is given. Biquads that stay are told of another filter for the same reason.
+    /// New biquads begin at the output of the former ones or, if they magnify a step, at the values of the reference's
+    /// ramp and of the new filter. So they never magnify what filters hold back, not even the last place by which a
+    /// filter at rest differs from its input. Biquads that stay take a changed filter into account for the same reason.
     ///
-    /// Without integral action what it took up stays; [`reset`](Self::reset) forgets it.
+    /// Without integral action the absorbed change stays; [`reset`](Self::reset) removes it.
     ///
     /// # Errors
-    /// The first setting that is outside its range, or another sample time; nothing is changed then.
+    /// The first setting that is outside its range, or another sample time; then nothing is changed.
     pub fn set_design(&mut self, design: Design<T>) -> Result<(), Refused> {
         let (ts, now) = (design.pid.ts, self.design.pid.ts);
         let expected = "the sample time at which the controller runs";
         Refused::unless(ts == now, "Ts", expected, ts.to_f64())?;
         let new = Self::new(design)?;
-        // what the sections are given next if nothing moves: by the former filter and by the new one
+        // the next input of the sections if nothing moves: by the former filter and by the new one
         let given = |y: Option<T>, filter: &Feedback<T>| y.map(|y| filter.given(y));
         let measured = self.filter.newest();
         let before = given(measured, &self.filter);
@@ -198,8 +198,8 @@ impl<T: Real> PidController<T> {
 
     /// Hands the command to the operator: from the next sample on it is `u`, within the limits.
     ///
-    /// Filter, ramp and derivative keep following, and the integral term is what automatic would need for the same command.
-    /// A sample without measurement applies `u` all the same.
+    /// Filter, ramp and derivative keep following, and the integral term is what automatic would need for the same
+    /// command. A sample without measurement still applies `u`.
     ///
     /// # Errors
     /// A command that is not finite.
@@ -207,7 +207,7 @@ impl<T: Real> PidController<T> {
         self.pid.set_manual(u)
     }
 
-    /// Hands the command back to the controller, which begins where the operator's was.
+    /// Hands the command back to the controller, which starts from the operator's.
     pub fn set_automatic(&mut self) {
         self.pid.set_automatic();
     }
@@ -217,22 +217,22 @@ impl<T: Real> PidController<T> {
         self.pid.is_manual()
     }
 
-    /// The feedback after its filter, at the last step.
+    /// The filtered feedback of the last step.
     pub fn filtered(&self) -> T {
         self.filtered
     }
 
-    /// What it is made from.
+    /// The design.
     pub fn design(&self) -> &Design<T> {
         &self.design
     }
 
-    /// The schedule as the step uses it, one row more than points at least, the last one repeated; empty for constant gains.
+    /// The schedule as the step uses it: at least one row more than points, the last one repeated; empty for constant gains.
     pub fn rows(&self) -> &[Row<T>] {
         self.table.as_ref().map_or(&[], Table::rows)
     }
 
-    /// What a step computes with beside the biquads; `None` where the gains follow a schedule.
+    /// The numbers used by a step, apart from the biquads; `None` if the gains follow a schedule.
     pub fn numbers(&self) -> Option<Numbers<T>> {
         let (samples, lag, observer) = self.filter.parts();
         self.table.is_none().then(|| Numbers {
@@ -293,11 +293,11 @@ pub struct Design<T> {
     pub filter_time: T,
     /// Time constant of the alpha-beta observer after that \[s\]; 0 for none.
     pub observer_time: T,
-    /// Largest change of the reference that is controlled to \[y/s\]; infinite for none.
+    /// Largest change of the ramped reference \[y/s\]; infinite for none.
     pub r_rate: T,
     /// Gains over speed; empty for the constant ones of `pid`.
     pub schedule: Schedule<T>,
-    /// Notches and the like on reference and feedback; none by default.
+    /// Biquads, such as notches, on reference and feedback; none by default.
     pub biquads: Cascade<T>,
 }
 

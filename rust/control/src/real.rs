@@ -9,7 +9,7 @@ pub(crate) mod sealed {
     impl Sealed for f64 {}
 }
 
-/// What the controller asks of a number; implemented for `f32` and `f64` only.
+/// Number type of the controller; implemented for `f32` and `f64` only.
 pub trait Real:
     sealed::Sealed
     + Copy
@@ -50,11 +50,11 @@ pub trait Real:
 
 /// `1 - exp(-x)` for `x` of 0 or more, to a few units in the last place; infinite is 1.
 ///
-/// The series of a 256th of `x`, then `1 - exp(-2h) = q (2 - q)` with `q = 1 - exp(-h)` eight times, which magnifies no
+/// The series for `x/256`, then eight times `1 - exp(-2h) = q (2 - q)` with `q = 1 - exp(-h)`, which magnifies no
 /// relative error.
 pub(crate) fn one_minus_exp<T: Real>(x: T) -> T {
     let two = T::ONE + T::ONE;
-    // beyond 64 nothing of exp(-x) is left in double precision
+    // beyond 64, exp(-x) does not show in double precision
     let h = x.limit(T::ZERO, T::from_count(64)) / T::from_count(256);
     // 1 - exp(-h) = h (1 - h/2 (1 - h/3 (1 - ..)))
     let series = (2..=12)
@@ -117,7 +117,7 @@ mod tests {
 
 #[cfg(test)]
 pub(crate) mod counted {
-    //! A number that counts what is done with it.
+    //! A number that counts the operations on it.
 
     use core::cmp::Ordering;
     use core::ops::{Add, AddAssign, Div, Mul, Neg, Sub};

@@ -1,4 +1,4 @@
-//! Gains over speed: the points as they are given, the rows as they are used.
+//! Gains over speed: points as given, and rows as used.
 
 use crate::pid::Terms;
 use crate::{Real, Refused, Settings, Standard};
@@ -46,11 +46,11 @@ impl<T: Real> Schedule<T> {
         length: 0,
     };
 
-    /// A schedule through these points.
+    /// A schedule through `points`.
     ///
     /// # Errors
-    /// More than [`POINTS`] points, speeds that are not finite, below 0 or do not grow, gains that make no sense, gains
-    /// `Kp` of both signs.
+    /// More than [`POINTS`] points; speeds that are not finite, below 0 or not increasing; invalid gains; `Kp` of both
+    /// signs.
     pub fn new(points: &[Point<T>]) -> Result<Self, Refused> {
         let mut schedule = Self::NONE;
         let refuse = |holds, expected, received: T| {
@@ -90,7 +90,7 @@ impl<T: Real> Schedule<T> {
         Ok(schedule)
     }
 
-    /// The points, by growing speed.
+    /// The points, by increasing speed.
     pub fn points(&self) -> &[Point<T>] {
         self.points.get(..self.length).unwrap_or_default()
     }
@@ -115,7 +115,7 @@ fn expected_in_point(name: &str) -> &'static str {
     }
 }
 
-/// A point in the form that is interpolated, and the way to the next one.
+/// A point in the form that is interpolated, and the distance to the next one.
 #[derive(Clone, Copy, Debug)]
 pub struct Row<T> {
     /// Size of the filtered output \[y\].
@@ -130,7 +130,7 @@ pub struct Row<T> {
     pub inverse: T,
 }
 
-/// A schedule as the step uses it: one row more than points, the last one repeated, so that every look-up takes the same
+/// A schedule as the step uses it: one row more than points, the last one repeated, so that every lookup takes the same
 /// number of steps.
 #[derive(Clone, Debug)]
 pub(crate) struct Table<T> {
@@ -164,10 +164,10 @@ impl<T: Real> Table<T> {
         &self.rows
     }
 
-    /// The gains where the filtered output is `y`.
+    /// The gains for the filtered output `y`.
     ///
-    /// `Kp`, `Kp/Ti` and `Kp Td` are linear between points. `Td` itself, of which the derivative's filter is a share, is then
-    /// the mean of both ends' with their `Kp` as weights; written so, equal points give their gains to the last bit.
+    /// `Kp`, `Kp/Ti` and `Kp Td` are linear between points. `Td` itself, a share of which is the derivative's filter, is then the mean of
+    /// both ends' with their `Kp` as weights; in this form equal points give their gains to the last bit.
     pub(crate) fn at(&self, y: T) -> Terms<T> {
         let negated = -y;
         let size = if y < T::ZERO { negated } else { y };
@@ -192,7 +192,7 @@ impl<T: Real> Table<T> {
 
 #[cfg(test)]
 mod tests {
-    //! The schedule against its definition, and what it refuses.
+    //! The schedule compared with its definition, and what it refuses.
 
     use super::*;
     use proptest::prelude::*;
@@ -252,7 +252,7 @@ mod tests {
             points in points(), y in -5000.0..5000.0, n in prop_oneof![1.0..20.0, Just(f64::INFINITY)],
         ) {
             let [kp, ki, kd] = by_definition(&points, f64::abs(y));
-            // the same by the constant gains of that speed
+            // the same with the constant gains at that speed
             let td = if kp == 0.0 { 0.0 } else { kd / kp };
             let exact = Terms::new(kp, ki * TS, td, n, TS);
             prop_assert!(table(&points, n).at(y).close_to(&exact, 1e-9));

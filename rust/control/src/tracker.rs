@@ -1,55 +1,55 @@
-//! What a motor is while it runs: command per speed, per acceleration and against friction, followed sample by sample.
+//! Tracks a motor's parameters while it runs: command per speed, per acceleration and against friction, sample by sample.
 //!
-//! With the speed `w`, its derivative and the command `u` behind the winding's lag,
+//! With the speed `w`, its derivative and the command `u` after the winding's lag,
 //!
 //! ```text
 //! u = k_v w + k_a dw/dt + k_s sign(w) + offset
 //! ```
 //!
-//! holds filtered as well: speed, its sign and the command go through the same two lags, and the filtered speed is
-//! differentiated, so that the steps of an encoder do not drown the acceleration (state variable filters, Young 1981).
-//! Least squares with forgetting follow, their covariance as `U D U'`, which stays positive in single precision
-//! (Bierman 1977, Factorization Methods for Discrete Sequential Estimation, chapter V).
+//! also holds for filtered signals: speed, its sign and the command go through the same two lags. The filtered speed is
+//! differentiated, so that encoder steps do not bury the acceleration (state variable filters, Young 1981). Then least
+//! squares with forgetting, with the covariance as `U D U'`, which stays positive in single precision (Bierman 1977,
+//! Factorization Methods for Discrete Sequential Estimation, chapter V).
 
 use crate::gains::sample_time;
 use crate::real::one_minus_exp;
 use crate::{Real, Refused};
 
-/// Parameters that are followed: `k_v`, `k_a`, `k_s`, `offset`.
+/// Number of tracked parameters: `k_v`, `k_a`, `k_s`, `offset`.
 pub const TRACKED: usize = 4;
 
-/// Variance of a parameter, in units of its scale, of which nothing is known.
+/// Variance of an unknown parameter, in units of its scale.
 const UNKNOWN: usize = 1_000_000;
 
-/// Times the variance of the textbook: what is left over hangs together for longer than the filters' lag.
+/// Factor on the textbook's variance: the residuals are correlated for longer than the filters' lag.
 const TOGETHER: usize = 4;
 
-/// Standard deviations beyond the tolerance at which a parameter has moved.
+/// Standard deviations beyond the tolerance at which a parameter counts as moved.
 const CLEAR: usize = 3;
 
-/// Updates in a row that have to say so.
+/// Updates in a row that must agree.
 const IN_A_ROW: u8 = 10;
 
-/// How a [`Tracker`] listens.
+/// The settings of a [`Tracker`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Listening<T> {
     /// Sample time \[s\].
     pub ts: T,
     /// Time constant of each of the two lags \[s\]: some 20 samples, but well below the motor's own time constant.
     pub smoothing: T,
-    /// Lag of the current behind the command \[s\]; 0 where it is not known.
+    /// Lag of the current after the command \[s\]; 0 if unknown.
     pub lag: T,
-    /// Time over which the past fades \[s\].
+    /// Time over which the past is forgotten \[s\].
     pub memory: T,
     /// The largest speed, in the unit of the speed: a scale for the arithmetic, not a limit.
     pub speed: T,
 }
 
-/// A parameter set that is watched against a reference.
+/// Parameters watched against a reference.
 #[derive(Clone, Copy, Debug)]
 struct Watch<T> {
     reference: [T; TRACKED],
-    /// Deviations that are allowed, in the parameters' units.
+    /// Allowed deviations, in the parameters' units.
     tolerance: [T; TRACKED],
     in_a_row: [u8; TRACKED],
 }
@@ -58,7 +58,7 @@ struct Watch<T> {
 #[derive(Clone, Debug)]
 pub struct Tracker<T> {
     ts: T,
-    /// Share of the way that a lag goes in a sample; the command's first lag.
+    /// Weight of a new sample in a lag; and in the command's first lag.
     smoothing: T,
     lag: T,
     forget: T,
@@ -74,14 +74,14 @@ pub struct Tracker<T> {
     theta: [T; TRACKED],
     u: [[T; TRACKED]; TRACKED],
     d: [T; TRACKED],
-    /// Faded mean of the squared errors of prediction.
+    /// Exponentially forgotten mean of the squared prediction errors.
     squares: T,
     updates: usize,
     watch: Option<Watch<T>>,
 }
 
 impl<T: Real> Tracker<T> {
-    /// A tracker that knows nothing.
+    /// A tracker without any knowledge.
     ///
     /// # Errors
     /// Times or a speed that are not above 0 and finite, a lag below 0, a memory that is not longer than the smoothing.
@@ -105,7 +105,7 @@ impl<T: Real> Tracker<T> {
         let holds = of.memory > of.smoothing && of.smoothing >= of.ts;
         let expected = "at least a sample, and less than the memory";
         Refused::unless(holds, "smoothing", expected, of.smoothing.to_f64())?;
-        // one update for each time constant of the filters: between them hardly anything is new
+        // one update per time constant of the filters: in between there is hardly any new information
         let every = count_of(of.smoothing / of.ts);
         let step = T::from_count(every) * of.ts;
         let lag = if of.lag > T::ZERO {
@@ -137,7 +137,7 @@ impl<T: Real> Tracker<T> {
         Ok(tracker)
     }
 
-    /// Forgets everything but what it watches.
+    /// Forgets everything except what it watches.
     pub fn reset(&mut self) {
         self.first = [T::ZERO; 4];
         self.second = [T::ZERO; 4];
@@ -157,9 +157,9 @@ impl<T: Real> Tracker<T> {
         }
     }
 
-    /// Takes the mean speed over the sample before, and the command that acts from now on.
+    /// Takes the mean speed over the last sample, and the command that acts from now on.
     ///
-    /// A sample that is not finite is passed over, and the filters begin anew.
+    /// A sample that is not finite is skipped, and the filters start over.
     pub fn step(&mut self, u: T, y: T) {
         if !(u.is_finite() && y.is_finite()) {
             self.samples = 0;
@@ -188,7 +188,7 @@ impl<T: Real> Tracker<T> {
         } else {
             1
         };
-        // six time constants until what was before the start has faded
+        // six time constants, until everything before the start has faded
         if self.samples > 6 * self.every && self.samples.is_multiple_of(self.every) {
             self.update();
         }
@@ -202,7 +202,7 @@ impl<T: Real> Tracker<T> {
         let half = T::ONE / T::from_count(2);
         let raw = [
             half * (speed + speed_before),
-            // what the last lag went in this sample, without the difference of two large numbers
+            // the change of the last lag in this sample, without the difference of two large numbers
             self.smoothing * (lagged - speed_before) / self.ts,
             half * (sign + sign_before),
             one,
@@ -219,7 +219,7 @@ impl<T: Real> Tracker<T> {
         for (t, g) in self.theta.iter_mut().zip(gain) {
             *t += g * error / size;
         }
-        // the first errors are those of knowing nothing
+        // the first errors reflect missing knowledge
         self.updates = if self.updates < usize::MAX {
             self.updates + 1
         } else {
@@ -238,7 +238,7 @@ impl<T: Real> Tracker<T> {
         self.look();
     }
 
-    /// Bierman's update of `U` and `D`; the gain over its size.
+    /// Bierman's update of `U` and `D`; returns the gain and its divisor.
     fn gain(&mut self, phi: &[T; TRACKED]) -> ([T; TRACKED], T) {
         let mut gain = [T::ZERO; TRACKED];
         let mut size = self.forget;
@@ -253,7 +253,7 @@ impl<T: Real> Tracker<T> {
             let v = *d * f;
             let before = size;
             size += f * v;
-            // forgetting alone would let what is not excited grow without end
+            // forgetting alone would let directions without excitation grow without bound
             let next = *d * before / (size * self.forget);
             *d = if next < unknown { next } else { unknown };
             let turn = T::ZERO - f / before;
@@ -271,7 +271,7 @@ impl<T: Real> Tracker<T> {
         (gain, size)
     }
 
-    /// `k_v`, `k_a`, `k_s` and `offset`, in commands per unit of speed, per unit a second, and commands.
+    /// `k_v`, `k_a`, `k_s` and `offset`, in commands per unit of speed, commands per unit of acceleration, and commands.
     pub fn estimate(&self) -> [T; TRACKED] {
         let mut found = self.theta;
         for (t, scale) in found.iter_mut().zip(self.scales) {
@@ -280,7 +280,7 @@ impl<T: Real> Tracker<T> {
         found
     }
 
-    /// Their variances; infinite until something is known.
+    /// Their variances; infinite while nothing is known.
     pub fn variance(&self) -> [T; TRACKED] {
         if self.updates <= 4 * TRACKED {
             return [T::INFINITY; TRACKED];
@@ -296,7 +296,7 @@ impl<T: Real> Tracker<T> {
         found
     }
 
-    /// Watches from now on whether a parameter moves away from its reference by more than its tolerance, both in the
+    /// From now on, watches whether a parameter moves away from its reference by more than its tolerance, both in the
     /// units of [`estimate`](Self::estimate). The estimate itself is a good reference once its variance is small.
     ///
     /// # Errors
@@ -345,7 +345,7 @@ impl<T: Real> Tracker<T> {
     }
 }
 
-/// The whole part of a number of samples from 1 to 1,000, without the library's conversion, which may panic.
+/// The integer part of a number of samples from 1 to 1,000, without the library's conversion, which may panic.
 fn count_of<T: Real>(samples: T) -> usize {
     (1..1000)
         .take_while(|&n| T::from_count(n) <= samples)

@@ -7,7 +7,7 @@ use std::vec::Vec;
 
 const TS: f64 = 1e-3;
 
-/// `re + j im` as far as the tests need it.
+/// `re + j im`, as far as the tests need it.
 type Complex = (f64, f64);
 
 fn times((a, b): Complex, (c, d): Complex) -> Complex {
@@ -39,7 +39,7 @@ fn polynomial(n1: f64, n2: f64, v: f64) -> Complex {
     (1.0 - n2 * v * v, n1 * v)
 }
 
-/// Where the bilinear transform takes a frequency to, that of a pair of zeros or poles being kept, over that frequency.
+/// The frequency to which the bilinear transform maps `frequency` if it keeps `kept`, relative to `kept`.
 fn warped(frequency: f64, kept: f64) -> f64 {
     (0.5 * TAU * frequency * TS).tan() / (0.5 * TAU * kept * TS).tan()
 }
@@ -71,8 +71,8 @@ pub(crate) fn section<T: Real>((f, d, g, e, kind): (f64, f64, f64, f64, u8)) -> 
     made.unwrap()
 }
 
-/// Samples in which all that the sections remember fades by `exp(-fade)`, one after the other: a notch of 20 Hz and a
-/// hundredth of it wide takes a hundred times longer than the filters before it.
+/// Samples in which the memory of all sections fades by `exp(-fade)`, one after the other: a notch at 20 Hz with a
+/// width of a hundredth of it takes a hundred times longer than the filters before it.
 pub(crate) fn settling<T: Real>(cascade: &Cascade<T>, fade: f64) -> u32 {
     let slowest = |section: &Biquad<T>| {
         let (a1, a2) = (section.a1.to_f64(), section.a2.to_f64());
@@ -114,7 +114,7 @@ proptest! {
         let mut memory = Memory::new();
         memory.rest_at(from);
         let found: Vec<f64> = x.iter().map(|&x| memory.step(&sections, x)).collect();
-        // each section in direct form I on the deviation from where it stood
+        // each section in direct form I on the deviation from its resting level
         let mut signal: Vec<f64> = x.iter().map(|x| x - from).collect();
         for Biquad { c0, c1, a1, a2 } in sections {
             let b = [1.0 + c0, a1 + c1 - c0, a2 - c1];
@@ -153,7 +153,7 @@ proptest! {
 fn a_notch_takes_out_its_frequency() {
     let (re, im) = response(&Biquad::notch(60.0, 0.1, 0.5, TS).unwrap(), 60.0);
     assert!((re - 0.1).abs() < 1e-12 && im.abs() < 1e-12);
-    // a deep one has its 3 dB where the width says, but for the warping
+    // a deep notch has its 3 dB at its width, apart from the warping
     let deep = Biquad::notch(10.0, 0.0, 0.4, TS).unwrap();
     let gain = |f: f64| {
         let (re, im) = response(&deep, f);

@@ -1,4 +1,4 @@
-//! State feedback with an observer, integral action and a reference that is fed forward, one sample at a time.
+//! State feedback with an observer, integral action and reference feedforward, one sample at a time.
 //!
 //! The plant is a difference equation of up to four states in observer form, whose first state is the output
 //! (Astrom and Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, section 3.4):
@@ -19,8 +19,8 @@
 //! x    = A x' + b u                               prediction by the model
 //! ```
 //!
-//! The prediction takes the command as limited, so that the observer knows what the plant got; the integral stands while it
-//! would push further beyond a limit. `kr` makes the output of the model equal the reference without help of the integral.
+//! The prediction uses the limited command, so the observer knows what the plant received. The integral is held while it would push
+//! further beyond a limit. `kr` makes the output of the model equal the reference without help from the integral.
 
 mod design;
 #[cfg(test)]
@@ -34,7 +34,7 @@ pub use design::{Weights, lqg};
 /// The largest number of states.
 pub const STATES: usize = 4;
 
-/// The numbers of a [`StateFeedback`]; states that are not used have zeros.
+/// The numbers of a [`StateFeedback`]; unused states have zeros.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StateDesign<T> {
     /// Denominator of the plant without its leading 1.
@@ -51,9 +51,9 @@ pub struct StateDesign<T> {
     pub kr: T,
     /// Gain on the sum of errors, per sample \[u/y\].
     pub ki: T,
-    /// The reference is fed forward as it will be after so long at its present rate \[s\].
+    /// The reference is extrapolated by this time at its present rate \[s\].
     pub lead: T,
-    /// Largest change of the reference that is controlled to \[y/s\]; infinite for none.
+    /// Largest change of the ramped reference \[y/s\]; infinite for none.
     pub r_rate: T,
     /// Lower limit of the command \[u\].
     pub u_min: T,
@@ -63,11 +63,11 @@ pub struct StateDesign<T> {
     pub slew: T,
     /// Sample time \[s\].
     pub ts: T,
-    /// What the gains were made from; a step does not use it.
+    /// The design parameters of the gains; a step does not use them.
     pub weights: Weights<T>,
 }
 
-/// Numbers of a [`StateDesign`] that a device is sent: those of the step without the sample time.
+/// Numbers of a [`StateDesign`] sent to a device: those of the step, without the sample time.
 pub const NUMBERS: usize = 5 * STATES + 7;
 
 impl<T: Real> StateDesign<T> {
@@ -92,7 +92,7 @@ impl<T: Real> StateDesign<T> {
         check_limits((self.u_min, self.u_max))
     }
 
-    /// a, b, k, l, rest, then kr, ki, lead, `r_rate`, `u_min`, `u_max`, slew: as a device is sent them.
+    /// a, b, k, l, rest, then kr, ki, lead, `r_rate`, `u_min`, `u_max`, slew: the order in which a device receives them.
     pub fn numbers(&self) -> [T; NUMBERS] {
         let vectors = [self.a, self.b, self.k, self.l, self.rest];
         let rest = [
@@ -112,7 +112,7 @@ impl<T: Real> StateDesign<T> {
         all
     }
 
-    /// The place among [`numbers`](Self::numbers) of a setting that [`check`](Self::check) names.
+    /// The index among [`numbers`](Self::numbers) of a setting named by [`check`](Self::check).
     pub(crate) fn place_of(name: &str) -> u32 {
         let places = ["den", "num", "K", "L", "rest"];
         let vectors = (0..).step_by(STATES).zip(places);
@@ -121,7 +121,7 @@ impl<T: Real> StateDesign<T> {
         all.find(|(_, known)| *known == name).map_or(0, |(k, _)| k)
     }
 
-    /// The counterpart of [`numbers`](Self::numbers): `next` gives one after the other; `None` where they end too early.
+    /// The inverse of [`numbers`](Self::numbers): `next` returns them one by one; `None` if they end too early.
     pub fn from_numbers(mut next: impl FnMut() -> Option<T>, ts: T) -> Option<Self> {
         let mut vectors = [[T::ZERO; STATES]; 5];
         for place in vectors.as_flattened_mut() {
@@ -175,14 +175,14 @@ impl StateDesign<f64> {
     }
 }
 
-/// State feedback with an observer, at rest or under way.
+/// State feedback with an observer, and its state.
 #[derive(Clone, Debug)]
 pub struct StateFeedback<T> {
     design: StateDesign<T>,
     ramp: Ramp<T>,
-    /// `lead` in samples.
+    /// `lead` \[samples\].
     lead: T,
-    /// States as predicted for the next sample.
+    /// States predicted for the next sample.
     x: [T; STATES],
     /// Integral term \[u\].
     q: T,
@@ -190,7 +190,7 @@ pub struct StateFeedback<T> {
     r: T,
     /// Command at the last sample \[u\].
     u: T,
-    /// Output as observed at the last sample.
+    /// Observed output at the last sample.
     observed: T,
     started: bool,
 }
@@ -217,7 +217,7 @@ impl<T: Real> StateFeedback<T> {
         Ok(made)
     }
 
-    /// Back to the state before the first sample; the command, from which slew counts, is 0 or the limit next to it.
+    /// Back to the state before the first sample. The slew limit starts from a command of 0 or the nearest limit.
     pub fn reset(&mut self) {
         let StateDesign { u_min, u_max, .. } = self.design;
         self.ramp.reset();
@@ -227,10 +227,10 @@ impl<T: Real> StateFeedback<T> {
         self.started = false;
     }
 
-    /// From reference and measured output to the command, with a command that is added before the limits.
+    /// From reference and measured output to the command; `feedforward` is added before the limits.
     ///
-    /// Without a measurement that is finite the command stays and the observer goes on by the model; without a reference or an
-    /// addition that is finite the command stays and the observer is corrected all the same.
+    /// Without a finite measurement the command stays, and the observer continues by the model. Without a finite
+    /// reference or feedforward the command stays, but the observer is still corrected.
     pub fn step_with(&mut self, r: T, y: T, feedforward: T) -> T {
         let StateDesign {
             k, l, rest, kr, ki, ..
@@ -243,7 +243,7 @@ impl<T: Real> StateFeedback<T> {
         }
         let r = self.ramp.step(r, y);
         if !self.started {
-            // the plant has rested at what is measured first
+            // assume that the plant has rested at the first measurement
             self.x = rest.map(|x| x * y);
         }
         let before = if self.r.is_finite() { self.r } else { r };
@@ -282,7 +282,7 @@ impl<T: Real> StateFeedback<T> {
         self.u
     }
 
-    /// The states at the next sample, from those at this one and the command.
+    /// The states at the next sample, from the present ones and the command.
     fn predict(&mut self, x: [T; STATES]) {
         let StateDesign { a, b, .. } = self.design;
         let [x1, x2, x3, x4] = x;
@@ -293,8 +293,8 @@ impl<T: Real> StateFeedback<T> {
         }
     }
 
-    /// From numbers the step made none, so that its memory is to blame: a measurement near the largest number stands in it.
-    /// The observer begins again as if the plant had rested at `y`, and an integral term that is no number is 0.
+    /// Finite inputs gave a result that is not, so the memory is to blame: it holds a measurement near the largest number. The observer
+    /// starts over as if the plant had rested at `y`, and an integral term that is not finite becomes 0.
     #[cold]
     fn begin_again(&mut self, y: T) {
         self.x = self.design.rest.map(|x| x * y);
@@ -303,12 +303,12 @@ impl<T: Real> StateFeedback<T> {
         }
     }
 
-    /// The output as observed at the last step.
+    /// The observed output of the last step.
     pub fn filtered(&self) -> T {
         self.observed
     }
 
-    /// What it is made from.
+    /// The design.
     pub fn design(&self) -> &StateDesign<T> {
         &self.design
     }

@@ -1,14 +1,14 @@
 //! Consistent overhead byte stuffing of blocks of up to 254 bytes, in place.
 //!
-//! Cheshire and Baker, "Consistent Overhead Byte Stuffing", IEEE/ACM Transactions on Networking 7(2), 1999. Each code byte says
-//! how far the next one is; a code byte stands where a zero was, the first one in front. So short blocks need no byte to be
-//! moved, and no two stuffed blocks mean the same.
+//! Cheshire and Baker, "Consistent Overhead Byte Stuffing", IEEE/ACM Transactions on Networking 7(2), 1999. A code byte
+//! replaces each zero, with an additional one in front, and holds the distance to the next code byte. So in short
+//! blocks no byte is moved, and different stuffed blocks have different data.
 
-/// The longest data that one code byte in front can carry.
+/// The longest data that a single code byte in front can carry.
 pub const MAX_DATA: usize = 254;
 
-/// Stuff `block[1..]`; the code byte goes to `block[0]`. `None`, and nothing done, where there is no room for it or more than
-/// [`MAX_DATA`] bytes follow.
+/// Stuffs `block[1..]`; the code byte goes to `block[0]`. Returns `None` and does nothing if there is no room for it or
+/// more than [`MAX_DATA`] bytes follow.
 ///
 /// ```
 /// use sewfast_control::link::cobs::{stuff, unstuff};
@@ -37,9 +37,9 @@ pub fn stuff(block: &mut [u8]) -> Option<()> {
     Some(())
 }
 
-/// The data of a stuffed `block` without its closing zero; `None` where the code bytes do not lead to its end.
+/// The data of a stuffed `block` without its closing zero; `None` if the code bytes do not lead to its end.
 ///
-/// The block is what stands between two zeros and so has none; one that lies between code bytes would be passed on as data.
+/// The block lies between two zeros and so contains none; a zero between code bytes would be passed on as data.
 pub fn unstuff(block: &mut [u8]) -> Option<&[u8]> {
     if block.len() > MAX_DATA + 1 {
         return None;
@@ -71,7 +71,7 @@ mod tests {
         block
     }
 
-    /// The encoder as the paper lists it: blocks of up to 254 bytes, each after its code.
+    /// The encoder as listed in the paper: blocks of up to 254 bytes, each after its code.
     fn of_the_paper(data: &[u8]) -> Vec<u8> {
         let (mut out, mut start, mut code) = (std::vec![0], 0, 1u8);
         for (k, &byte) in data.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! What a host can say, read from the bodies of its frames.
+//! The commands of a host, read from the bodies of its frames.
 
 use super::Fields;
 use super::device::State;
@@ -10,16 +10,16 @@ use crate::{
 
 /// Shortest and longest time of a watchdog \[us\].
 const WATCHDOG: core::ops::RangeInclusive<u32> = 1_000..=10_000_000;
-/// Counts in a period that no counter of 32 bits exceeds.
+/// Counts in a period that no 32-bit counter exceeds.
 const MOST_COUNTS: f32 = 2_147_483_648.0;
 /// The longest body of ECHO.
 const MAX_ECHO: usize = 200;
-/// The kind of HELLO, which needs neither tag nor session.
+/// The kind of HELLO, the only one that needs neither tag nor session.
 pub(super) const HELLO: u8 = 0x01;
-/// The kind of the command that is executed whatever its number.
+/// The kind of the command that is executed for any sequence number.
 pub(super) const STOP: u8 = 0x06;
 
-/// Why a command was not done: result and detail of its reply.
+/// Why a command was refused: result and detail of its reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Refusal {
     pub(super) result: u8,
@@ -64,18 +64,18 @@ impl Refusal {
     pub(super) const NO_LIMITS: Self = Self::new(12, 0);
     pub(super) const KEY: Self = Self::new(13, 0);
 
-    /// `Ok` where `holds`.
+    /// `Ok` if `holds`.
     pub(super) fn unless(self, holds: bool) -> Result<(), Self> {
         if holds { Ok(()) } else { Err(self) }
     }
 }
 
-/// Values that are to be added to the profile.
+/// Values to be appended to the profile.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Upload<'a> {
     pub(super) table: u8,
     pub(super) offset: u32,
-    /// As they came: i16 or f32, by table.
+    /// As received: i16 or f32, depending on the table.
     pub(super) values: &'a [u8],
 }
 
@@ -84,16 +84,16 @@ pub(super) struct Upload<'a> {
 pub(super) struct Gains {
     /// Without its sample time, which is the device's.
     design: AnyDesign<f32>,
-    /// The schedule came and is none.
+    /// A schedule was received but is not valid.
     garbled: bool,
-    /// The body has the fields of a device that knows observer, ramp and schedule.
+    /// The body has the fields for devices with observer, ramp and schedule.
     pub(super) long: bool,
     /// Counts per second of one unit of feedback.
     pub(super) counts_per_unit: f32,
 }
 
 impl Gains {
-    /// The controller, whose output the volt limit clips as its own limits do, so that its integral knows.
+    /// The controller. The volt limit narrows its own limits, so that its integral takes that limit into account.
     ///
     /// # Errors
     /// The first setting that is outside its range.
@@ -101,14 +101,14 @@ impl Gains {
         self.design.bounded(volt, ts).controller()
     }
 
-    /// Biquads from the next start on; GAINS come without any.
+    /// Biquads from the next start on; GAINS has none.
     pub(super) fn set_biquads(&mut self, biquads: Cascade<f32>) {
         if let Some(design) = self.design.pid_mut() {
             design.biquads = biquads;
         }
     }
 
-    /// The settings are a PID's, which every device knows that has mode 1.
+    /// Whether the settings are a PID's, which every device with mode 1 can run.
     pub(super) fn are_pid(&self) -> bool {
         self.design.pid().is_some()
     }
@@ -118,7 +118,7 @@ impl Gains {
     pub(super) fn check(&self, volt: f32, ts: f32) -> Result<(), Refusal> {
         let refused = |volt| {
             let name = self.refused(volt, ts)?.name;
-            // the numbers of another kind follow its number and the counts per unit
+            // for another kind, its number and the counts per unit precede the numbers
             let place = self.design.place_of(name).map(|place| place + 2);
             Some(place.unwrap_or_else(|| index_of(name)))
         };
@@ -127,20 +127,20 @@ impl Gains {
             return Err(Refusal::value(field));
         }
         let unit = self.counts_per_unit * ts;
-        // a feedback that is not finite would leave the controller blind
+        // with a feedback that is not finite the controller would be blind
         let holds = unit > 0.0 && unit.is_finite() && (MOST_COUNTS / unit).is_finite();
         Refusal::value(if self.are_pid() { 11 } else { 1 }).unless(holds)?;
         refused(volt).map_or(Ok(()), |field| Err(Refusal::limit(field)))
     }
 
-    /// What keeps a controller from being made; in a frame of its own, as its parts fill much of a stack.
+    /// The reason why no controller can be made; a separate function, as the controller's parts fill much of a stack.
     #[inline(never)]
     pub(super) fn refused(&self, volt: f32, ts: f32) -> Option<Refused> {
         self.design.bounded(volt, ts).check().err()
     }
 }
 
-/// The index of the number of points, which stands for all of them.
+/// The index of the number of points; it represents all points.
 const SCHEDULE: u32 = 15;
 
 /// The index of a setting among the fields of GAINS.
@@ -175,7 +175,7 @@ pub(super) struct Start {
     pub(super) batch: u8,
 }
 
-/// A command with its fields, of the right length but otherwise as they came.
+/// A command with its fields, of the right length but otherwise unchecked.
 #[derive(Clone, Copy, Debug)]
 #[expect(
     clippy::large_enum_variant,
@@ -202,7 +202,7 @@ pub(super) enum Command<'a> {
     Gains(Gains),
     Start(Start),
     Echo(&'a [u8]),
-    /// The number of sections, and what they are where they make sense.
+    /// The number of sections and, if valid, the sections.
     Biquads(Result<Cascade<f32>, Refusal>),
 }
 
@@ -259,7 +259,7 @@ fn limits<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
 fn upload<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
     let (table, offset) = (fields.u8()?, fields.u32()?);
     let values = fields.rest();
-    // a table that does not exist is refused for that
+    // an unknown table is refused for that reason
     let width = if table == 0 { 2 } else { 4 };
     let whole = values.len() & (width - 1) == 0;
     whole.then_some(Command::Upload(Upload {
@@ -313,14 +313,14 @@ fn standard(fields: &mut Fields<'_>) -> Option<Standard<f32>> {
     })
 }
 
-/// A controller of another kind takes the place of the PID's gains.
+/// A controller of another kind replaces the PID's gains.
 fn controller<'a>(fields: &mut Fields<'a>) -> Result<Option<Command<'a>>, Refusal> {
     let (Some(kind), Some(counts_per_unit)) = (fields.u8(), fields.f32()) else {
         return Ok(None);
     };
     let whole = fields.len();
     let design = AnyDesign::from_numbers(kind, || fields.f32());
-    // no kind of this number: nothing of it was read
+    // an unknown kind: nothing of it was read
     Refusal::value(0).unless(design.is_some() || whole == 0 || fields.len() < whole)?;
     Ok(design.map(|design| {
         Command::Gains(Gains {
@@ -332,7 +332,7 @@ fn controller<'a>(fields: &mut Fields<'a>) -> Result<Option<Command<'a>>, Refusa
     }))
 }
 
-/// `None` where the body is too short for its points.
+/// `None` if the body is too short for its points.
 fn schedule(fields: &mut Fields<'_>) -> Option<Result<Schedule<f32>, Refused>> {
     let count = usize::from(fields.u8()?);
     let blank = Point {
@@ -343,7 +343,7 @@ fn schedule(fields: &mut Fields<'_>) -> Option<Result<Schedule<f32>, Refused>> {
             td: 0.0,
         },
     };
-    // one more than a schedule may have is refused like any number above
+    // room for one point too many, which is refused like any larger number
     let mut points = [blank; POINTS + 1];
     for place in points.iter_mut().take(count) {
         *place = Point {
@@ -356,7 +356,7 @@ fn schedule(fields: &mut Fields<'_>) -> Option<Result<Schedule<f32>, Refused>> {
     Some(Schedule::new(named))
 }
 
-/// `None` where the body is too short for its sections.
+/// `None` if the body is too short for its sections.
 fn biquads(fields: &mut Fields<'_>) -> Option<Result<Cascade<f32>, Refusal>> {
     let count = usize::from(fields.u8()?);
     let mut sections = [Biquad::NONE; BIQUADS];
@@ -412,7 +412,7 @@ pub(super) struct Heartbeat {
 }
 
 impl Heartbeat {
-    /// `None` where kind, length or a value is wrong.
+    /// `None` if kind, length or a value is wrong.
     pub(super) fn of(kind: u8, body: &[u8]) -> Option<Self> {
         let mut fields = Fields::new(body);
         let watchdog = fields.u32().filter(|time| WATCHDOG.contains(time))?;

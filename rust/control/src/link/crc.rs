@@ -1,12 +1,12 @@
 //! CRC-32 of IEEE 802.3, byte by byte.
 //!
-//! Reflected polynomial EDB88320, start and final exclusive or FFFFFFFF. Among up to 2,974 bits of data, more than a
-//! frame has, it finds every error of up to four bits (Koopman, "32-bit cyclic redundancy codes for internet
+//! Reflected polynomial EDB88320, initial value and final exclusive or FFFFFFFF. In up to 2,974 bits of data, more than
+//! a frame has, it detects every error of up to four bits (Koopman, "32-bit cyclic redundancy codes for internet
 //! applications", 2002) and every burst of up to 32 bits.
 
 const POLYNOMIAL: u32 = 0xEDB8_8320;
 
-// 1 KiB: what a microcontroller has to spare; the wider tables of hosts gain little on frames this short
+// 1 KiB, which a microcontroller can spare; the larger tables of hosts gain little on frames this short
 static TABLE: [u32; 256] = table();
 
 const fn table() -> [u32; 256] {
@@ -25,7 +25,7 @@ const fn table() -> [u32; 256] {
     table
 }
 
-/// A CRC-32 under way.
+/// A CRC-32 in progress.
 ///
 /// ```
 /// use sewfast_control::link::crc::Crc;
@@ -37,12 +37,12 @@ const fn table() -> [u32; 256] {
 pub struct Crc(u32);
 
 impl Crc {
-    /// The CRC of nothing yet.
+    /// The CRC of no bytes.
     pub const fn new() -> Self {
         Self(u32::MAX)
     }
 
-    /// With these bytes added.
+    /// Adds these bytes.
     #[must_use]
     #[inline]
     pub fn update(self, bytes: &[u8]) -> Self {

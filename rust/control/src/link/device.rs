@@ -1,4 +1,4 @@
-//! A device without its hardware: bytes and time in, bytes and command out (docs/PROTOCOL.md).
+//! A device without its hardware: bytes and time in, bytes and command out (docs/PROTOCOL.md). Begin reading at [`Device`].
 //!
 //! ```
 //! use sewfast_control::link::{Channel, Device, Encoding, Identity, Limits, Measurement, Source, State, capability};
@@ -44,23 +44,23 @@ use crate::{AnyController, Refused};
 /// Period of BEAT while not running \[us\].
 const BEAT: u64 = 200_000;
 
-/// What the hardware measured at a sample.
+/// The hardware's measurements at a sample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Measurement<'a> {
     /// The counter; it may wrap.
     pub counts: i32,
-    /// \[A\]; NaN where the device measures none.
+    /// \[A\]; NaN if the device measures none.
     pub current: f32,
-    /// What [`Source::Further`](super::Source::Further) names.
+    /// The values named by [`Source::Further`](super::Source::Further).
     pub further: &'a [f32],
 }
 
-/// What the hardware must do until the next output.
+/// What the hardware has to apply until the next output.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Output {
-    /// Command \[V\]; 0 where not enabled.
+    /// Command \[V\]; 0 if not enabled.
     pub u: f32,
-    /// Whether the drive may be on.
+    /// Whether the drive may be switched on.
     pub enabled: bool,
 }
 
@@ -72,19 +72,19 @@ impl Output {
     };
 }
 
-/// A run that is planned, under way or over.
+/// A run: planned, in progress or finished.
 #[derive(Clone, Debug)]
 struct Run {
     number: u32,
     start: Start,
-    /// When it shall begin; none once it has.
+    /// Planned start; `None` once it has begun.
     planned: Option<u64>,
     began: u64,
     samples: u32,
     /// The command of mode 2.
     drive: f32,
     controller: Option<AnyController<f32>>,
-    /// Most that a sample came late \[us\].
+    /// Largest delay of a sample \[us\].
     latest: u32,
     late_before: bool,
 }
@@ -112,10 +112,10 @@ impl Run {
 
 /// A device that holds `CAPACITY` values of a profile and `TRANSMIT` bytes of frames to be sent.
 ///
-/// Call all its methods from one context, or guard them: [`sample`](Self::sample) once each period,
-/// [`receive`](Self::receive) when bytes have come, then [`poll`](Self::poll), whose output must be applied, then
-/// [`transmit`](Self::transmit). Nothing is sent between a command that makes the output safe and the call that hands out
-/// that output. Time is in microseconds and must not run backwards; where it does, it stands still here.
+/// Call all methods from one context, or guard them: [`sample`](Self::sample) once each period,
+/// [`receive`](Self::receive) when bytes have arrived, then [`poll`](Self::poll), whose output must be applied, then
+/// [`transmit`](Self::transmit). Between a command that makes the output safe and the call that returns that output,
+/// nothing is sent. Time is in microseconds and must not run backwards; if it does, it stands still here.
 #[derive(Clone, Debug)]
 pub struct Device<const CAPACITY: usize, const TRANSMIT: usize = 2048> {
     deframer: Deframer,
@@ -133,9 +133,9 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Device<CAPACITY, TRANSMIT> {
         Ok(device)
     }
 
-    /// A device before its boot, for a static place: it can do nothing, and its limits are 0.
+    /// A device before its boot, for a static variable: it can do nothing, and its limits are 0.
     ///
-    /// Inlined, so that it is made where it shall be: as a constant to copy it would lie in flash once more, nearly all zeros.
+    /// Inlined, so that it is built in place: a constant to copy from would occupy flash once more, almost all zeros.
     #[inline(always)]
     pub const fn off() -> Self {
         Self {
@@ -144,10 +144,10 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Device<CAPACITY, TRANSMIT> {
         }
     }
 
-    /// Boots in place, where [`new`](Self::new) would need the device's size on the stack; what was before is forgotten.
+    /// Boots in place; [`new`](Self::new) would need the device's size on the stack. The previous state is forgotten.
     ///
     /// # Errors
-    /// As for [`new`](Self::new); nothing is changed then.
+    /// As for [`new`](Self::new); then nothing is changed.
     pub fn boot(&mut self, identity: Identity) -> Result<(), Refused> {
         identity.check()?;
         *self = Self::off();
@@ -155,7 +155,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Device<CAPACITY, TRANSMIT> {
         Ok(())
     }
 
-    /// Takes bytes that have come, in pieces of any length. Apply the output of [`poll`](Self::poll) afterwards.
+    /// Takes received bytes, in pieces of any length. Apply the output of [`poll`](Self::poll) afterwards.
     pub fn receive(&mut self, now: u64, bytes: &[u8]) {
         self.core.watch(now);
         let mut input = bytes;
@@ -167,16 +167,16 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Device<CAPACITY, TRANSMIT> {
         }
     }
 
-    /// Takes the measurement of a control period, gives the command until the next one.
+    /// Takes the measurement of a control period and returns the command until the next one.
     ///
-    /// `now` is when the sample was taken. A sample that was left out, or came much too late, ends a run, as its times
-    /// would be wrong.
+    /// `now` is the time of the sample. A sample that is missing or much too late ends a run, as its times would be
+    /// wrong.
     pub fn sample(&mut self, now: u64, measurement: &Measurement<'_>) -> Output {
         self.core.sample(now, measurement);
         self.hand_out()
     }
 
-    /// The command at any time between samples; checks the watchdog and that samples are being taken.
+    /// The command at any time between samples; checks the watchdog and whether samples are being taken.
     pub fn poll(&mut self, now: u64) -> Output {
         self.core.watch(now);
         self.core.beat();
@@ -188,7 +188,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Device<CAPACITY, TRANSMIT> {
         self.core.output
     }
 
-    /// Moves bytes that wait to be sent to `out`; how many.
+    /// Moves bytes to be sent to `out`; returns how many.
     pub fn transmit(&mut self, out: &mut [u8]) -> usize {
         if self.core.owed {
             return 0;
@@ -196,46 +196,46 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Device<CAPACITY, TRANSMIT> {
         self.core.transmit.take(out)
     }
 
-    /// Ends what is under way for a reason of the firmware's own. Apply the output of [`poll`](Self::poll) afterwards.
+    /// Ends the run in progress for a reason of the firmware. Apply the output of [`poll`](Self::poll) afterwards.
     pub fn trip(&mut self, now: u64, reason: Reason) {
         self.core.watch(now);
         self.core.trip(reason, 0.0);
     }
 
-    /// The connection is closed: half a frame is forgotten and time runs by itself again.
+    /// The connection is closed: a partial frame is dropped, and time no longer depends on credit.
     pub fn disconnect(&mut self) {
         self.deframer = Deframer::new();
         self.core.credit = None;
     }
 
-    /// What the device is about.
+    /// The device's state.
     pub fn state(&self) -> State {
         self.core.state
     }
 
-    /// Why it tripped last.
+    /// The reason of its last trip.
     pub fn reason(&self) -> Reason {
         self.core.reason
     }
 
-    /// Until when a host lets the time of a device on credit advance; `None` where it runs by itself.
+    /// The time up to which a host lets a device on credit advance; `None` if its time runs by itself.
     pub fn credit(&self) -> Option<u64> {
         self.core.credit
     }
 
-    /// How often ARM was executed since boot: where this has changed, a computed machine returns to its initial state before the
-    /// next sample.
+    /// How often ARM was executed since boot: when this changes, a computed machine returns to its initial state before
+    /// the next sample.
     pub fn armed_count(&self) -> u32 {
         self.core.armed
     }
 
-    /// What the device says about itself.
+    /// The device's description of itself.
     pub fn identity(&self) -> &Identity {
         &self.core.identity
     }
 }
 
-/// The state machine behind the frames.
+/// The state machine, without the framing of bytes.
 #[derive(Clone, Debug)]
 struct Core<const CAPACITY: usize, const TRANSMIT: usize> {
     identity: Identity,
@@ -256,11 +256,11 @@ struct Core<const CAPACITY: usize, const TRANSMIT: usize> {
     state: State,
     reason: Reason,
     output: Output,
-    /// A safe output has not been handed out yet.
+    /// Whether a safe output has not been returned yet.
     owed: bool,
-    /// The latest time that was heard.
+    /// The latest known time.
     now: u64,
-    /// When the last sample was due: the grid of a run, whatever the samples' jitter.
+    /// When the last sample was due: the grid of a run, independent of the samples' jitter.
     due: u64,
     last_beat: u64,
     good: u8,
@@ -301,7 +301,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         }
     }
 
-    /// From off, with an identity that has been checked.
+    /// Boots from off, with an identity that has been checked.
     fn boot(&mut self, identity: Identity) {
         self.identity = identity;
         self.schema = identity.schema();
@@ -314,7 +314,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         self.event(Event::Boot, Reason::None, 0.0);
     }
 
-    /// Lets time pass: the watchdog, and whether samples still come.
+    /// Advances time: checks the watchdog and whether samples still come.
     fn watch(&mut self, now: u64) {
         self.now = self.now.max(now);
         self.check_watchdog();
@@ -335,7 +335,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         }
     }
 
-    /// Ends what is under way; only CLEAR leads on.
+    /// Ends what is in progress; only CLEAR leads out of it.
     fn trip(&mut self, reason: Reason, value: f32) {
         match self.state {
             State::Boot => self.good = 0,
@@ -348,13 +348,13 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         }
     }
 
-    /// Ends what is under way.
+    /// Ends what is in progress.
     fn stop(&mut self, reason: Reason) {
         self.halt(State::Idle);
         self.event(Event::Stopped, reason, 0.0);
     }
 
-    /// The one way out of running and armed.
+    /// The only way out of running and armed.
     fn halt(&mut self, state: State) {
         self.owed |= self.output.enabled;
         self.output = Output::SAFE;
@@ -364,7 +364,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         self.profile.rewind();
     }
 
-    /// Sends the batch under way.
+    /// Sends the batch in progress.
     fn flush(&mut self) {
         if self.stream.is_empty() {
             return;
@@ -384,7 +384,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         self.send(Weight::Answer, 0xC1, &body);
     }
 
-    /// BEAT, where it is time for one.
+    /// Sends BEAT if it is due.
     fn beat(&mut self) {
         let due = self.now.saturating_sub(self.last_beat) >= BEAT;
         if self.state == State::Running || !due {
@@ -406,7 +406,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         self.identity.can(bits)
     }
 
-    /// The limits in force; before any are set, those of the device.
+    /// The limits in force: the device's own, until others are set.
     fn bounds(&self) -> Limits {
         self.limits.unwrap_or(self.identity.ceilings)
     }
@@ -416,7 +416,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
     }
 }
 
-/// What the device is about; values as in the protocol.
+/// The device's state; values as in the protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
     /// Waits for ten good samples in a row.
@@ -425,16 +425,16 @@ pub enum State {
     Idle = 1,
     /// Safe, ready to start.
     Armed = 2,
-    /// Commands.
+    /// Commands the drive.
     Running = 3,
     /// Safe until cleared.
     Tripped = 4,
 }
 
-/// Why a run ended before its time; values as in the protocol.
+/// Why a run ended early; values as in the protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reason {
-    /// It did not.
+    /// It did not end early.
     None = 0,
     /// The host fell silent.
     Watchdog = 1,
@@ -452,7 +452,7 @@ pub enum Reason {
     HostChanged = 7,
     /// A measurement was not finite.
     Measurement = 8,
-    /// A large command moved nothing.
+    /// A large command caused no motion.
     NoMotion = 9,
     /// The firmware's stop input.
     StopInput = 10,
@@ -462,7 +462,7 @@ pub enum Reason {
     Swinging = 12,
 }
 
-/// What is worth a frame of its own; values as in the protocol.
+/// An event that is sent in its own frame; values as in the protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Event {
     Boot = 1,

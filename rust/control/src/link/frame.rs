@@ -1,8 +1,8 @@
 //! Frames: header, body and CRC-32, stuffed by COBS and closed by a zero.
 //!
-//! What CRC-32 promises of a frame's bits it promises here: errors of one to four bits and bursts of up to 32 bits are
-//! always found. Damage that moves a zero of the stuffed bytes (a code byte hit, bytes lost or added, two frames joined)
-//! changes more; of that, 1 in 2^32 would pass, and less, as the code bytes must also lead to the end.
+//! The guarantees of CRC-32 hold for a frame's bits: errors of one to four bits and bursts of up to 32 bits are always detected. Damage
+//! that moves a zero of the stuffed bytes (a damaged code byte, bytes lost or added, two frames joined) changes more bits. Of that, less
+//! than 1 in 2^32 would pass, because the code bytes must also lead to the end.
 
 use super::cobs;
 use super::crc::Crc;
@@ -18,21 +18,21 @@ pub const MAX_WIRE: usize = MAX_FRAME + 2;
 
 const CHECK: usize = 4;
 
-/// What every frame begins with.
+/// The start of every frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Header {
-    /// What the frame is; bit 7 is set in what a device sends.
+    /// The kind of frame; bit 7 is set in a device's frames.
     pub kind: u8,
     /// The low 16 bits of the device's boot id.
     pub tag: u16,
-    /// The sender's count.
+    /// The sender's frame counter.
     pub sequence: u32,
-    /// The device's time in microseconds; a host's [`host_time`](Self::host_time).
+    /// The device's time in microseconds; in a host's frames [`host_time`](Self::host_time).
     pub time: u64,
 }
 
 impl Header {
-    /// What stands for the time in a host's frames: its own clock in microseconds, which wraps, and above that its session.
+    /// The time field of a host's frames: its own clock in microseconds, which wraps, and above it its session.
     ///
     /// ```
     /// use sewfast_control::link::Header;
@@ -78,7 +78,7 @@ impl Header {
 /// A frame that arrived whole.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Frame<'a> {
-    /// What every frame begins with.
+    /// The start of every frame.
     pub header: Header,
     /// 0 to [`MAX_BODY`] bytes.
     pub body: &'a [u8],
@@ -106,7 +106,7 @@ impl<'a> Frame<'a> {
     }
 }
 
-/// Why bytes were no frame.
+/// Why bytes were not a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rejected {
     /// More bytes without a zero than a frame can have.
@@ -115,13 +115,13 @@ pub enum Rejected {
     Stuffing,
     /// Fewer bytes than header and CRC.
     Short,
-    /// Another CRC than that of the bytes.
+    /// The CRC does not match the bytes.
     Checksum,
 }
 
-/// Write a frame with its closing zero to `out`; how many bytes that are, always `HEADER + body.len() + 6`.
+/// Writes a frame with its closing zero to `out`; returns its length, always `HEADER + body.len() + 6`.
 ///
-/// `None` where the body is longer than [`MAX_BODY`] or `out` too short.
+/// `None` if the body is longer than [`MAX_BODY`] or `out` is too short.
 #[must_use]
 pub fn encode(header: &Header, body: &[u8], out: &mut [u8]) -> Option<usize> {
     if body.len() > MAX_BODY {
@@ -141,9 +141,9 @@ pub fn encode(header: &Header, body: &[u8], out: &mut [u8]) -> Option<usize> {
     Some(length + 1)
 }
 
-/// Finds the frames in a stream of bytes, whatever the bytes are.
+/// Finds the frames in a stream of arbitrary bytes.
 ///
-/// Of damage it knows nothing after the next zero: a frame that follows a zero and is whole is found.
+/// Damage has no effect beyond the next zero: every whole frame after a zero is found.
 #[derive(Clone, Debug)]
 pub struct Deframer {
     block: [u8; MAX_FRAME + 1],
@@ -161,14 +161,14 @@ impl Deframer {
         }
     }
 
-    /// Take one byte; what it completed. An overlong run of bytes is reported as soon as it is one, and skipped up to the next
-    /// zero.
+    /// Takes one byte; returns what it completed. An overlong run of bytes is reported as soon as it is too long, then
+    /// skipped up to the next zero.
     #[inline]
     pub fn push(&mut self, byte: u8) -> Option<Result<Frame<'_>, Rejected>> {
         self.next(&mut &[byte][..])
     }
 
-    /// Take bytes from the front of `input` up to the end of the first block; what that was. `None` when `input` is used up.
+    /// Takes bytes from the front of `input` up to the end of the first block; returns what that was. `None` when `input` is used up.
     #[inline]
     pub fn next<'a>(&'a mut self, input: &mut &[u8]) -> Option<Result<Frame<'a>, Rejected>> {
         match self.block(input)? {
@@ -181,7 +181,7 @@ impl Deframer {
         }
     }
 
-    /// The next block that is closed and not empty.
+    /// The next complete block that is not empty.
     fn block(&mut self, input: &mut &[u8]) -> Option<Result<&mut [u8], Rejected>> {
         let mut length = 0;
         while length == 0 {
@@ -198,7 +198,7 @@ impl Deframer {
         self.block.get_mut(..length).map(Ok)
     }
 
-    /// False where the block becomes too long by `piece`.
+    /// False if `piece` makes the block too long.
     fn append(&mut self, piece: &[u8]) -> bool {
         if self.skipping {
             return true;
@@ -217,7 +217,7 @@ impl Deframer {
         !self.skipping
     }
 
-    /// End the block; its length, 0 where it was skipped.
+    /// Ends the block; returns its length, 0 if it was skipped.
     fn close(&mut self) -> usize {
         self.skipping = false;
         core::mem::take(&mut self.length)
@@ -230,7 +230,7 @@ impl Default for Deframer {
     }
 }
 
-/// What stands before the first zero, and whether there was one; both are taken from `input`.
+/// The bytes before the first zero, and whether there was a zero; both are taken from `input`.
 fn split<'a>(input: &mut &'a [u8]) -> (&'a [u8], bool) {
     let parts = zero(input).and_then(|at| input.split_at_checked(at));
     match parts.and_then(|(piece, rest)| rest.split_first().map(|(_, rest)| (piece, rest))) {
@@ -242,7 +242,7 @@ fn split<'a>(input: &mut &'a [u8]) -> (&'a [u8], bool) {
     }
 }
 
-/// Where the first zero is, eight bytes at a time.
+/// Index of the first zero, eight bytes at a time.
 ///
 /// `(w - 01..01) & !w & 80..80` has the top bit of the lowest zero byte as its lowest bit (Warren, Hacker's Delight, 6-1).
 fn zero(bytes: &[u8]) -> Option<usize> {

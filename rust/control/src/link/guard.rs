@@ -1,52 +1,52 @@
-//! The device's eye on the motor: speed and acceleration from counts, limits, motion, swinging.
+//! The device's watch over the motor: speed and acceleration from counts, limits, motion, swinging.
 //!
-//! **Acceleration.** The difference of two speeds over `W` samples that lie `D` samples apart shows a swing of frequency `f`
-//! by `sinc(f W Ts) sinc(f D Ts)` of its size: with 8 and 16 samples it is exact where the motor speeds up, and blind to a
-//! swing of 62.5 Hz. So shorter spans look as well, `c(k) - 2 c(k-s) + c(k-2s)` over `(s Ts)^2` for `s` of 8, 4 and 2, and over
-//! one sample the difference of fourth order, `(-1, 16, -30, 16, -1)/12`, which falls to no less than 3/4 up to 400 Hz at a
-//! period of 1 ms. The largest counts.
+//! **Acceleration.** The difference of two speeds over `W` samples each, `D` samples apart, shows a swing of frequency
+//! `f` with the factor `sinc(f W Ts) sinc(f D Ts)`. With 8 and 16 samples it is exact for a motor that speeds up, but
+//! blind to a swing of 62.5 Hz. So shorter spans are tested as well: `c(k) - 2 c(k-s) + c(k-2s)` over `(s Ts)^2` for
+//! `s` of 8, 4 and 2, and over one sample the fourth-order difference `(-1, 16, -30, 16, -1)/12`, whose factor stays
+//! above 3/4 up to 400 Hz at a period of 1 ms. The largest value counts.
 //!
-//! A count is a floor, and its error below 1: a difference with weights `w` is wrong by less than the sum of its positive
-//! weights, which is 2 counts, or 32/12 for the fourth order. That much is taken off, so that steps of the encoder
-//! alone are never an acceleration. The price: a swing that moves the encoder by a few counts only is seen too small.
+//! A count is a floor, so its error is below 1: a difference with weights `w` is wrong by less than the sum of its
+//! positive weights, which is 2 counts, or 32/12 for the fourth order. This bound is subtracted, so that encoder steps
+//! alone never count as acceleration. The price: a swing that moves the encoder by only a few counts appears too small.
 
 use super::device::Reason;
 use super::identity::Limits;
 
-/// Samples between the counts of which a speed is the difference.
+/// Samples between the two counts of a speed.
 const WINDOW: usize = 8;
-/// Samples between the speeds of which an acceleration is the difference.
+/// Samples between the two speeds of an acceleration.
 const APART: usize = 16;
 /// Samples of the spans of second differences.
 const SPANS: [usize; 3] = [8, 4, 2];
-/// What the steps of an encoder can make of a second difference \[counts\].
+/// Error of a second difference that encoder steps can cause \[counts\].
 const STEPS: i64 = 2;
-/// The same for the difference of fourth order \[counts/12\].
+/// The same for the fourth-order difference \[counts/12\].
 const STEPS_OF_4: i64 = 32;
-/// Part of the range between its limits within which a command is at one of them.
+/// A command this near to a limit, as a part of the range between both, counts as at it.
 const NEAR: f32 = 0.05;
-/// So many ways from one limit to the other in a row are a swing.
+/// Number of consecutive ways from one limit to the other that make a swing.
 const SWINGS: u32 = 8;
-/// Two of them that are further apart are not in a row \[us\].
+/// Two ways further apart than this are not consecutive \[us\].
 const SWING: u64 = 250_000;
 /// A power of two above all spans together.
 const HISTORY: usize = 32;
-/// ARM needs this long a standstill \[us\].
+/// Standstill that ARM requires \[us\].
 const STANDSTILL: u64 = 100_000;
-/// A large command may stay without motion for this long \[us\].
+/// Longest time that a large command may cause no motion \[us\].
 const PATIENCE: u64 = 250_000;
-/// Fewest samples, for a host, of a large command without motion, or between two ways that are not in a row.
+/// For a host: least number of samples of a large command without motion, or between two ways that are not consecutive.
 const LEAST: u64 = 10;
 
-/// Shorter spans over which a host sees a speed \[samples\], ...
+/// Shorter spans over which a host tests a speed \[samples\], ...
 const SHORT: [usize; 3] = [4, 2, 1];
-/// ... where it is that far above its limit.
+/// ... if it exceeds its limit by this factor.
 const FAR: f32 = 1.25;
 
-/// Why a run must end, with the value that passed its limit.
+/// Why a run must end, with the value that exceeded its limit.
 pub type Trip = (Reason, f32);
 
-/// The guard in front of a machine without a device of its own: a host gives it the counts and the command of each sample.
+/// The guard for a machine without its own device: a host passes it the counts and the command of each sample.
 #[derive(Clone, Debug)]
 pub struct Watch {
     guard: Guard,
@@ -55,7 +55,7 @@ pub struct Watch {
 }
 
 impl Watch {
-    /// A guard for a sample time \[s\]; `between` are the limits of a loop's command, which must not swing from one to the other.
+    /// A guard for a sample time \[s\]; `between` are the limits of a loop's command, between which it must not swing.
     pub fn new(ts: f32, counts_per_rev: f32, limits: Limits, between: Option<(f32, f32)>) -> Self {
         let period = (ts * 1e6) as u32;
         let mut guard = Guard::new(period, ts, counts_per_rev);
@@ -67,19 +67,19 @@ impl Watch {
         }
     }
 
-    /// Takes the counts of a sample, read before its command acts, which are wrong by less than `step`; a counter may wrap.
+    /// Takes the counts of a sample, read before its command acts, with an error below `step`; the counter may wrap.
     ///
     /// # Errors
-    /// A mean speed over 8 samples that is above its limit whatever the steps of the encoder.
+    /// A mean speed over 8 samples that exceeds its limit for any position of the encoder's steps.
     pub fn take(&mut self, counts: i32, step: u32) -> Result<(), Trip> {
         self.guard.take(counts);
         self.is_within(WINDOW, step, self.limits.speed)
     }
 
-    /// The same of a machine whose samples come on time: one that is far too fast is seen within a sample or two.
+    /// The same for a machine whose samples are on time: a speed far too high is detected within a sample or two.
     ///
     /// # Errors
-    /// As [`take`](Self::take), and a speed over 4, 2 or 1 samples that is far above its limit.
+    /// As [`take`](Self::take), and a speed over 4, 2 or 1 samples far above its limit.
     pub fn take_on_time(&mut self, counts: i32, step: u32) -> Result<(), Trip> {
         self.take(counts, step)?;
         let far = FAR * self.limits.speed;
@@ -98,7 +98,7 @@ impl Watch {
         Ok(())
     }
 
-    /// The next counts are the first ones, as after lost samples.
+    /// Treats the next counts as the first, as after lost samples.
     pub fn forget(&mut self) {
         self.guard.forget();
     }
@@ -106,7 +106,7 @@ impl Watch {
     /// Takes the command of the sample.
     ///
     /// # Errors
-    /// A command that moves nothing, or that swings between its limits.
+    /// A command that causes no motion, or that swings between its limits.
     pub fn sent(&mut self, u: f32) -> Result<(), Trip> {
         self.guard.expect_motion(&self.limits, u)?;
         match self.between {
@@ -115,13 +115,13 @@ impl Watch {
         }
     }
 
-    /// No count for a tenth of a second.
+    /// Whether there was no count for a tenth of a second.
     pub fn at_rest(&self) -> bool {
         self.guard.at_rest()
     }
 }
 
-/// The last counts, what follows from them.
+/// The last counts, and what follows from them.
 #[derive(Clone, Debug)]
 pub(super) struct Guard {
     counts: [i32; HISTORY],
@@ -138,9 +138,9 @@ pub(super) struct Guard {
     still: u32,
     /// Samples in a row with a large command and without a count.
     stuck: u32,
-    /// The limit at which the command was last: below 0, above 0, or none yet.
+    /// The limit at which the command was last: below 0, above 0, or 0 for none yet.
     side: i8,
-    /// Ways from limit to limit in a row.
+    /// Consecutive ways from limit to limit.
     swings: u32,
     /// Samples since the last of them, and since the first.
     since: u32,
@@ -169,12 +169,12 @@ impl Guard {
         }
     }
 
-    /// The next counts are the first ones: those before belong to another motion.
+    /// Treats the next counts as the first: the earlier ones belong to another motion.
     pub(super) fn forget(&mut self) {
         self.started = false;
     }
 
-    /// Takes the counts of a sample; a counter may wrap.
+    /// Takes the counts of a sample; the counter may wrap.
     pub(super) fn take(&mut self, counts: i32) {
         if !self.started {
             self.counts = [counts; HISTORY];
@@ -203,7 +203,7 @@ impl Guard {
         self.before(0)
     }
 
-    /// Counts since the sample before.
+    /// Counts since the previous sample.
     pub(super) fn change(&self) -> i32 {
         self.before(0).wrapping_sub(self.before(1))
     }
@@ -219,7 +219,7 @@ impl Guard {
         self.window(0) as f32 * self.rpm
     }
 
-    /// The largest acceleration that any span shows \[RPM/s\].
+    /// The largest acceleration over all spans \[RPM/s\].
     pub(super) fn acceleration(&self) -> f32 {
         let mut largest = self.slow_acceleration();
         let mut consider = |seen: f32| {
@@ -239,7 +239,7 @@ impl Guard {
         largest
     }
 
-    /// Difference of two speeds 16 samples apart \[RPM/s\]; exact in counts, where speeds would cancel.
+    /// Difference of two speeds 16 samples apart \[RPM/s\]; exact in counts, whereas speeds would cancel.
     fn slow_acceleration(&self) -> f32 {
         let change = i64::from(self.window(0)).wrapping_sub(self.window(APART).into());
         change as f32 * self.rpm * self.rate
@@ -251,13 +251,13 @@ impl Guard {
         self.before(ago).wrapping_sub(start).into()
     }
 
-    /// No count for long enough to arm.
+    /// Whether there was no count for long enough to arm.
     pub(super) fn at_rest(&self) -> bool {
         u64::from(self.still).saturating_mul(self.period) >= STANDSTILL
     }
 
     /// # Errors
-    /// The limit that is passed; a current of NaN is none.
+    /// The limit that is exceeded; a current of NaN has none.
     pub(super) fn check(&self, limits: &Limits, current: f32) -> Result<(), Trip> {
         let watched = [
             (Reason::Speed, self.speed(), limits.speed),
@@ -276,17 +276,17 @@ impl Guard {
         Ok(())
     }
 
-    /// The run begins: patience starts anew.
+    /// A run begins: patience starts anew.
     pub(super) fn begin(&mut self) {
         self.stuck = 0;
         (self.side, self.swings) = (0, 0);
     }
 
-    /// Watches a loop's command `u` between its limits `low` and `high`: one that goes from one to the other again and again
-    /// swings at them, and no limit of speed or acceleration need pass for a shaft to suffer.
+    /// Watches a loop's command `u` between its limits `low` and `high`. A command that goes from one to the other
+    /// again and again swings, and can damage a shaft without exceeding any limit of speed or acceleration.
     ///
     /// # Errors
-    /// The frequency \[Hz\], after eight ways from limit to limit with at most 250 ms from each to the next.
+    /// The frequency \[Hz\], after eight ways from limit to limit at most 250 ms apart.
     pub(super) fn expect_calm(&mut self, low: f32, high: f32, u: f32) -> Result<(), Trip> {
         let near = NEAR * (high - low);
         let side = i8::from(u >= high - near) - i8::from(u <= low + near);
@@ -313,7 +313,7 @@ impl Guard {
     }
 
     /// # Errors
-    /// The command `u`, where the motor has long ignored it: a lost encoder lets a controller push ever harder.
+    /// The command `u`, if the motor has long ignored it: with a lost encoder a controller would push ever harder.
     pub(super) fn expect_motion(&mut self, limits: &Limits, u: f32) -> Result<(), Trip> {
         let large = u.abs() >= 0.5 * limits.volt;
         self.stuck = if large && self.still > 0 {
@@ -328,7 +328,7 @@ impl Guard {
     }
 }
 
-/// What of `value` lies beyond `tolerance` to either side.
+/// The part of `value` beyond `tolerance` in either direction.
 fn beyond(value: i64, tolerance: i64) -> f32 {
     let beyond = value.saturating_abs().saturating_sub(tolerance).max(0);
     (beyond * value.signum()) as f32
@@ -358,14 +358,14 @@ mod tests {
             ..FREE
         };
         let watch = || Watch::new(1e-3, 1500.0, limits, Some((-20.0, 20.0)));
-        // 25 counts a millisecond are 1000 RPM, of 200 counts one is the encoder's step, and a counter may wrap
+        // 25 counts a millisecond are 1000 RPM; of 200 counts one is the encoder's step; a counter may wrap
         let mut turning = watch();
         let turned = |k: i32| (i32::MAX - 200).wrapping_add(26 * k);
         let fast = (0..20).position(|k| turning.take(turned(k), 1).is_err());
         assert_eq!(fast, Some(8));
         let said = turning.take(turned(9), 1).err();
         assert!(said.is_some_and(|(why, rpm)| why == Reason::Speed && (rpm - 1035.0).abs() < 0.01));
-        // 60 counts in a millisecond are far more, which exact samples show at once, and others in their mean
+        // 60 counts in a millisecond are far more: exact samples show it at once, others in their mean
         let leaps = |k: i32| if k < 5 { 0 } else { 60 * (k - 4) };
         let (mut exact, mut late) = (watch(), watch());
         let position = (0..20).position(|k| exact.take_on_time(leaps(k), 1).is_err());
@@ -390,7 +390,7 @@ mod tests {
         });
         assert_eq!(ended.map(|(reason, _)| reason), Some(Reason::Swinging));
         assert!(ended.is_some_and(|(_, hertz)| (hertz - 25.0).abs() < 1.0));
-        // at a period of a second ten samples pass before a motor is said to stand
+        // at a period of a second ten samples pass before a motor counts as standing
         let mut slow = Watch::new(1.0, 1500.0, limits, None);
         let stuck = (0..100).position(|_| slow.take(7, 1).and_then(|()| slow.sent(15.0)).is_err());
         assert_eq!(stuck, Some(10));
@@ -409,7 +409,7 @@ mod tests {
         assert!((guard.acceleration() - expected).abs() < 1e-4 * expected);
     }
 
-    /// The largest acceleration that is seen of a swing of the speed, over its largest true one.
+    /// The largest detected acceleration of a swinging speed, relative to its largest true one.
     ///
     /// `size` is the true acceleration [RPM/s], `phase` the part of a period at the first sample.
     fn seen(counts_per_rev: f64, frequency: f64, size: f64, base: f64, phase: f64) -> f64 {
@@ -421,7 +421,7 @@ mod tests {
             let angle = omega * t + core::f64::consts::TAU * phase;
             (counts_per_rev * (base / 60.0 * t + turns * angle.sin())).floor() as i32
         };
-        // the first second: the history is full, and a swing of 1 Hz has shown its largest
+        // the first second: the history is full, and a swing of 1 Hz has passed its maximum
         let samples = (0..1100).map(|k| {
             guard.take(count(k));
             if k < 40 {
@@ -433,7 +433,7 @@ mod tests {
         f64::from(samples.fold(0.0, f32::max)) / size
     }
 
-    /// Frequencies from 1 to 400 Hz, the blind one and fractions of the sample rate among them.
+    /// Frequencies from 1 to 400 Hz, including the blind one and fractions of the sample rate.
     fn frequencies() -> impl Iterator<Item = f64> {
         let odd = [
             62.5,
@@ -449,11 +449,11 @@ mod tests {
 
     #[test]
     fn sees_two_thirds_of_any_acceleration_from_1_to_400_hz_and_no_more_than_all() {
-        // So large a swing that the encoder's steps are nothing beside it.
+        // A swing so large that the encoder's steps do not matter.
         let (mut least, mut most) = (f64::INFINITY, 0.0_f64);
         for frequency in frequencies() {
             for phase in 0..8 {
-                // 2000 RPM to either side at most: its counter wraps beyond what a test counts
+                // at most 2000 RPM in either direction: beyond it the counter exceeds what a test counts
                 let size = (2000.0 * core::f64::consts::TAU * frequency).min(5e6);
                 let ratio = seen(1572e3, frequency, size, 500.0, f64::from(phase) / 16.0);
                 assert!(ratio > 1.0 / 1.5 && ratio < 1.02, "{frequency} Hz: {ratio}");
@@ -465,7 +465,7 @@ mod tests {
 
     #[test]
     fn sees_a_shaft_that_swings_at_62_hz_on_the_encoder_of_the_machine() {
-        // 138,000 RPM/s at 62.5 Hz, of which 3,600 were seen
+        // 138,000 RPM/s at 62.5 Hz, of which only 3,600 used to be detected
         for phase in 0..32 {
             let ratio = seen(1572.0, 62.5, 138_000.0, 300.0, f64::from(phase) / 64.0);
             assert!(ratio > 1.0 / 1.5 && ratio < 1.02, "{ratio}");
@@ -482,7 +482,7 @@ mod tests {
             counts_per_rev in 4.0..5000.0_f64, speed in -6000.0..6000.0_f64, phase in 0.0..1.0_f64, wobble in 0.0..20_000.0_f64,
             frequency in 1.0..400.0_f64,
         ) {
-            // what is seen is at most what is there, and the step of the widest span
+            // the detected value is at most the true one plus the step of the widest span
             let mut guard = Guard::new(1000, 1e-3, counts_per_rev as f32);
             let omega = core::f64::consts::TAU * frequency;
             let turns = wobble / 60.0 / (omega * omega);
@@ -510,7 +510,7 @@ mod tests {
         }
     }
 
-    /// The sample at which a square wave of `half` samples a side trips, and the frequency that is named.
+    /// The sample at which a square wave of `half` samples a side trips, and the reported frequency.
     fn swung(half: u32, size: f32) -> Option<(u32, f32)> {
         let mut guard = guard();
         guard.begin();
@@ -540,7 +540,7 @@ mod tests {
         assert_eq!(swung(251, 10.0), None);
         assert_eq!(swung(8, 8.9), None);
         let mut guard = guard();
-        // a command that stays at one limit, or comes back to it, does not swing
+        // a command that stays at one limit, or returns to it, does not swing
         let calm: Vec<_> = (0..400)
             .map(|k| guard.expect_calm(0.0, 10.0, [10.0, 5.0][k % 2]))
             .collect();

@@ -1,15 +1,15 @@
-//! What a device says about itself: names, period, ceilings, channels.
+//! The device's description of itself: names, period, ceilings, channels.
 
 use super::Body;
 use super::crc::Crc;
 use crate::Refused;
 
-/// The version of the protocol that is spoken here.
+/// The version of the protocol implemented here.
 pub const VERSION: u8 = 3;
-/// As many channels as the mask of START has bits.
+/// The number of channels is limited by the bits of START's mask.
 pub const MAX_CHANNELS: usize = 16;
 
-/// Far fewer counts in a turn would make a speed infinite, and infinite times 0 counts is a speed that no limit trips on.
+/// With far fewer counts per turn a speed would be infinite, and infinity times 0 counts is NaN, on which no limit trips.
 const COUNTS_PER_REV: core::ops::RangeInclusive<f32> = 1.0..=1e9;
 
 /// Bits of [`Identity::capabilities`].
@@ -18,26 +18,26 @@ pub mod capability {
     pub const PROFILE: u32 = 1;
     /// Runs the PID along uploaded references.
     pub const PID: u32 = 1 << 1;
-    /// Holds the command that the host sends.
+    /// Holds the command sent by the host.
     pub const DRIVE: u32 = 1 << 2;
-    /// Its time advances by the host's credit.
+    /// The host's credit advances its time.
     pub const CREDIT: u32 = 1 << 3;
     /// Measures the current.
     pub const CURRENT: u32 = 1 << 4;
-    /// A computed machine, which ARM takes back to its initial state.
+    /// A computed machine, which ARM resets to its initial state.
     pub const COMPUTED: u32 = 1 << 5;
     /// Its PID has observer, reference ramp and gain schedule.
     pub const DESIGN: u32 = 1 << 6;
     /// Its PID has biquads.
     pub const BIQUADS: u32 = 1 << 7;
-    /// Runs controllers of the kinds that CONTROLLER names along uploaded references, beside its PID.
+    /// Besides its PID, runs controllers of the kinds named by CONTROLLER along uploaded references.
     pub const KINDS: u32 = 1 << 8;
 }
 
-/// How a channel's samples are written.
+/// How a channel's samples are encoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Encoding {
-    /// The first as i32, each further one as i16 difference to the one before.
+    /// The first as i32, each further one as its i16 difference from the previous one.
     Counts = 0,
     /// i16 in steps of `1/steps_per_unit`.
     Steps = 1,
@@ -46,7 +46,7 @@ pub enum Encoding {
 }
 
 impl Encoding {
-    /// The bytes that so many samples take.
+    /// The bytes that `samples` samples take.
     pub(super) fn size(self, samples: usize) -> usize {
         match self {
             Self::Counts if samples == 0 => 0,
@@ -57,18 +57,18 @@ impl Encoding {
     }
 }
 
-/// Where the device takes a channel's value from.
+/// Source of a channel's value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Source {
     /// The counter.
     Counts,
-    /// The command as applied.
+    /// The applied command.
     Command,
     /// The measured current.
     Current,
-    /// The reference; NaN where the PID does not run.
+    /// The reference; NaN if the PID does not run.
     Reference,
-    /// The feedback after its filter; NaN where the PID does not run.
+    /// The filtered feedback; NaN if the PID does not run.
     Feedback,
     /// One of [`Measurement::further`](super::Measurement::further).
     Further(u8),
@@ -77,7 +77,7 @@ pub enum Source {
 /// A signal that can be streamed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Channel {
-    /// How its samples are written.
+    /// How its samples are encoded.
     pub encoding: Encoding,
     /// Steps per unit of [`Encoding::Steps`].
     pub steps_per_unit: u32,
@@ -85,20 +85,20 @@ pub struct Channel {
     pub name: &'static str,
     /// At most 7 bytes.
     pub unit: &'static str,
-    /// Where the value comes from.
+    /// Source of its value.
     pub source: Source,
 }
 
-/// What the device keeps within.
+/// The limits within which the device keeps.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
-    /// Largest command to either side \[V\].
+    /// Largest command in either direction \[V\].
     pub volt: f32,
-    /// Largest speed to either side \[RPM\].
+    /// Largest speed in either direction \[RPM\].
     pub speed: f32,
-    /// Largest acceleration to either side \[RPM/s\].
+    /// Largest acceleration in either direction \[RPM/s\].
     pub acceleration: f32,
-    /// Largest current to either side \[A\].
+    /// Largest current in either direction \[A\].
     pub current: f32,
 }
 
@@ -116,13 +116,13 @@ impl Limits {
     }
 }
 
-/// What a device is.
+/// The identity of a device.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Identity {
-    /// Another one, in its low 16 bits, than at the boot before.
+    /// Must differ, in its low 16 bits, from that of the previous boot.
     pub boot_id: u32,
-    /// Bits that nobody outside knows: of a random generator, of the noise of a converter; any where there is none. HELLO's key
-    /// is made of them, of the boot id and of when HELLO came.
+    /// Bits unknown to outsiders, from a random generator or a converter's noise; any value if there is neither.
+    /// HELLO's key is made from them, from the boot id and from the time of HELLO.
     pub entropy: u32,
     /// At most 24 bytes.
     pub name: &'static str,
@@ -134,14 +134,14 @@ pub struct Identity {
     pub counts_per_rev: f32,
     /// Bits of [`capability`].
     pub capabilities: u32,
-    /// The limits of the limits; infinite where there is none.
+    /// Upper bounds of the limits; infinite for none.
     pub ceilings: Limits,
-    /// The counter, the command, then what else there is.
+    /// The counter, the command, then any others.
     pub channels: &'static [Channel],
 }
 
 impl Identity {
-    /// Of a device that is off.
+    /// For a device that is off.
     pub(super) const NONE: Self = Self {
         boot_id: 0,
         entropy: 0,
@@ -213,7 +213,7 @@ impl Identity {
         Ok(())
     }
 
-    /// The reply to DESCRIBE after its result; `None` where there is no such channel.
+    /// The reply to DESCRIBE after its result; `None` if there is no such channel.
     pub(super) fn describe(&self, index: u8, body: &mut Body) -> Option<()> {
         let channel = self.channels.get(usize::from(index))?;
         body.u8(index).u8(channel.encoding as u8);

@@ -1,8 +1,8 @@
 //! The link between a drive and its host (docs/PROTOCOL.md).
 //!
-//! To read: [`frame`] with [`cobs`] and [`crc`] (bytes), [`wire`] and `command` (fields of a body), [`identity`] (what a device is),
-//! then [`device`] with what it asks: `session` (who speaks), `guard` (the motor's limits), `profile` (values to play), `stream`
-//! (what goes to the host).
+//! To read: [`frame`] with [`cobs`] and [`crc`] (bytes), [`wire`] and `command` (fields of a body), [`identity`] (the
+//! device's description of itself), then [`device`] with the parts it uses: `session` (the host), `guard` (the motor's
+//! limits), `profile` (values to play), `stream` (data for the host).
 //!
 //! ```
 //! use sewfast_control::link::{Deframer, Header, MAX_WIRE, encode};

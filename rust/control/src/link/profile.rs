@@ -1,22 +1,22 @@
-//! The uploaded commands or references: a ring of values, of which each is written once and played once.
+//! The uploaded commands or references: a ring of values, each written once and played once.
 
 use super::command::Refusal;
 
-/// What the values of a profile are.
+/// The kind of values in a profile.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Table {
     Commands = 0,
     References = 1,
 }
 
-/// Values `end - CAPACITY .. end` of a profile, by their number from its beginning.
+/// Values `end - CAPACITY .. end` of a profile, numbered from its beginning.
 #[derive(Clone, Debug)]
 pub(super) struct Profile<const CAPACITY: usize> {
     values: [f32; CAPACITY],
     table: Table,
     end: u32,
     played: u32,
-    /// Largest value to either side, since limits may change after the upload.
+    /// Largest magnitude, as limits may change after the upload.
     peak: f32,
 }
 
@@ -46,12 +46,12 @@ impl<const CAPACITY: usize> Profile<CAPACITY> {
         Self::ROOM.saturating_sub(self.end.saturating_sub(self.played))
     }
 
-    /// Largest value to either side.
+    /// Largest magnitude.
     pub(super) fn peak(&self) -> f32 {
         self.peak
     }
 
-    /// Whether a run can start: there are values of this kind, from the first on.
+    /// Whether a run can start: there are values of this kind, including the first.
     pub(super) fn holds(&self, table: Table) -> bool {
         self.table == table && (1..=Self::ROOM).contains(&self.end)
     }
@@ -64,10 +64,10 @@ impl<const CAPACITY: usize> Profile<CAPACITY> {
         self.peak = 0.0;
     }
 
-    /// How many of `count` values from `offset` on are there already.
+    /// How many of `count` values from `offset` on are already there.
     ///
     /// # Errors
-    /// A gap before `offset`, other values than those that are there, no room.
+    /// A gap before `offset`, values that differ from those already there, no room.
     pub(super) fn place(&self, table: Table, offset: u32, count: u32) -> Result<u32, Refusal> {
         if self.table != table {
             return Err(Refusal::order(0));
@@ -96,7 +96,7 @@ impl<const CAPACITY: usize> Profile<CAPACITY> {
         }
     }
 
-    /// The next value; `None` where the profile has run dry.
+    /// The next value; `None` if the profile has run dry.
     pub(super) fn play(&mut self) -> Option<f32> {
         if self.played >= self.end {
             return None;
@@ -106,7 +106,7 @@ impl<const CAPACITY: usize> Profile<CAPACITY> {
         value
     }
 
-    /// Back to the first value after a run; a profile whose first values were overwritten is forgotten.
+    /// Returns to the first value after a run; a profile whose first values were overwritten is cleared.
     pub(super) fn rewind(&mut self) {
         if self.end > Self::ROOM {
             self.clear(self.table);
@@ -134,7 +134,7 @@ mod tests {
     }
 
     proptest! {
-        /// However it is cut, repeated and overlapped, and however often the ring goes round.
+        /// In any pieces, repeated and overlapping, and for any number of turns of the ring.
         #[test]
         fn plays_what_was_uploaded(
             values in prop::collection::vec(-9.0f32..9.0, 1..200),

@@ -1,8 +1,8 @@
-//! The host as a device knows it: what it has said already, what it was answered last, how long to go on without it.
+//! The device's knowledge of the host: its last numbers, its last reply, and how long to go on without it.
 
 use super::{Body, Frame};
 
-/// Where a number stands to the last one.
+/// Order of a number relative to the last one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Order {
     New,
@@ -11,7 +11,7 @@ pub(super) enum Order {
 }
 
 impl Order {
-    /// Modulo 2^32, in half ranges.
+    /// Modulo 2^32, by half ranges.
     pub(super) fn of(sequence: u32, last: u32) -> Self {
         match sequence.wrapping_sub(last).cast_signed() {
             0 => Self::Repeated,
@@ -21,7 +21,7 @@ impl Order {
     }
 }
 
-/// The kind and body of a reply, to be given again.
+/// The kind and body of a reply, kept for repetition.
 #[derive(Clone, Debug)]
 pub(super) struct Reply {
     pub(super) kind: u8,
@@ -31,15 +31,15 @@ pub(super) struct Reply {
 /// A host that has said HELLO.
 #[derive(Clone, Debug)]
 pub(super) struct Session {
-    /// As the host chose it.
+    /// Chosen by the host.
     pub(super) number: u32,
-    /// What ARM must repeat: only who hears the device knows it.
+    /// ARM must repeat it: only a host that hears the device knows it.
     pub(super) key: u32,
-    /// The last command's.
+    /// The last command's number.
     pub(super) command: u32,
-    /// The last heartbeat's.
+    /// The last heartbeat's number.
     pub(super) heartbeat: u32,
-    /// To the last command.
+    /// Reply to the last command.
     pub(super) reply: Option<Reply>,
     /// Frames of other sessions since boot.
     pub(super) foreign: u32,
@@ -57,7 +57,7 @@ impl Session {
         }
     }
 
-    /// Whether a frame is of this session; others are counted.
+    /// Whether a frame belongs to this session; others are counted.
     pub(super) fn says(&mut self, frame: &Frame<'_>) -> bool {
         let own = frame.header.session() == self.number;
         if !own {
@@ -67,8 +67,8 @@ impl Session {
     }
 }
 
-/// A key out of what an outsider does not know; each bit of it hangs on every bit of `entropy`, `boot`, `session` and `now`
-/// (SplitMix64, twice).
+/// A key from values that an outsider does not know; each of its bits depends on every bit of `entropy`, `boot`,
+/// `session` and `now` (SplitMix64, twice).
 pub(super) const fn key(entropy: u32, boot: u32, session: u32, now: u64) -> u32 {
     let first = mixed(((entropy as u64) << 32) | boot as u64);
     (mixed(first ^ now.rotate_left(32) ^ session as u64) >> 32) as u32
@@ -81,7 +81,7 @@ const fn mixed(seed: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-/// Runs out by time, and by samples in case the clock stands still.
+/// Expires by time, and by samples in case the clock stands still.
 #[derive(Clone, Debug)]
 pub(super) struct Watchdog {
     period: u64,
@@ -91,7 +91,7 @@ pub(super) struct Watchdog {
 }
 
 impl Watchdog {
-    /// One that has run out.
+    /// A watchdog that has expired.
     pub(super) const fn new(period: u32) -> Self {
         Self {
             period: period as u64,
@@ -101,21 +101,21 @@ impl Watchdog {
         }
     }
 
-    /// Starts anew.
+    /// Restarts it.
     pub(super) fn feed(&mut self, now: u64, time: u32) {
         self.fed = now;
         self.time = time.into();
         self.samples = 0;
     }
 
-    /// A sample was taken.
+    /// Counts a sample.
     pub(super) fn count(&mut self) {
         self.samples = self.samples.saturating_add(1);
     }
 
-    /// Whether it has run out.
+    /// Whether it has expired.
     ///
-    /// Two samples more than fit the time may come by their jitter; with more than that the clock is wrong.
+    /// Jitter can add two samples to those that fit the time; with more the clock is wrong.
     pub(super) fn is_out(&self, now: u64) -> bool {
         let longest = self.time.saturating_add(2 * self.period);
         now.saturating_sub(self.fed) >= self.time

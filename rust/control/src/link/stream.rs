@@ -1,4 +1,4 @@
-//! What is on its way to the host: the batch of samples that fills, and the ring of frames that wait for the port.
+//! Data on its way to the host: the batch of samples being filled, and the ring of frames waiting for the port.
 
 use super::identity::{Channel, Encoding, Source};
 use super::{Body, Header, MAX_BODY, MAX_WIRE, encode};
@@ -8,7 +8,7 @@ const CLIPPED: u8 = 1;
 /// The transmit memory has overflowed since the last batch.
 const OVERFLOWED: u8 = 2;
 
-/// The batch under way, channel by channel.
+/// The batch in progress, channel by channel.
 #[derive(Clone, Debug)]
 pub(super) struct Stream {
     channels: &'static [Channel],
@@ -42,7 +42,7 @@ impl Stream {
         channels.filter_map(|(channel, on)| on.then_some(channel))
     }
 
-    /// Whether the mask names channels that are there.
+    /// Whether the mask names existing channels only.
     pub(super) fn knows(&self, mask: u16) -> bool {
         u32::from(mask) >> self.channels.len().min(16) == 0
     }
@@ -65,7 +65,7 @@ impl Stream {
         self.mask
     }
 
-    /// Whether nothing waits.
+    /// Whether nothing is waiting.
     pub(super) fn is_empty(&self) -> bool {
         self.taken == 0
     }
@@ -86,7 +86,7 @@ impl Stream {
         self.time
     }
 
-    /// Adds a sample that [`accepts`](Self::accepts) lets in.
+    /// Adds a sample that [`accepts`](Self::accepts) has allowed.
     pub(super) fn push(
         &mut self,
         time: u64,
@@ -126,7 +126,7 @@ impl Stream {
         }
     }
 
-    /// The body of the batch, which is empty afterwards.
+    /// Writes the batch to the body; the batch is empty afterwards.
     pub(super) fn flush(&mut self, overflowed: bool, body: &mut Body) {
         let flag = |on, bit| if on { bit } else { 0 };
         body.u8(flag(self.clipped, CLIPPED) | flag(overflowed, OVERFLOWED));
@@ -145,13 +145,13 @@ impl Stream {
     }
 }
 
-/// The nearest step, at an end where there is none; NaN is 0.
+/// The nearest step, or the end of the range; NaN is 0.
 pub(super) fn to_steps(value: f32, steps_per_unit: u32) -> i16 {
     let steps = value * steps_per_unit as f32;
     (steps + 0.5f32.copysign(steps)) as i16
 }
 
-/// A ring of whole frames as they go on the wire; one that does not fit is dropped and its number used up.
+/// A ring of whole frames as sent; a frame that does not fit is dropped, but its number is used up.
 #[derive(Clone, Debug)]
 pub(super) struct Transmit<const SIZE: usize> {
     bytes: [u8; SIZE],
@@ -160,11 +160,11 @@ pub(super) struct Transmit<const SIZE: usize> {
     tag: u16,
     sequence: u32,
     dropped: u32,
-    /// A frame was dropped since this was last taken back.
+    /// Whether a frame was dropped since this was last cleared.
     pub(super) overflowed: bool,
 }
 
-/// What may be lost rather than keep a reply from its place.
+/// Which frames may be lost so that a reply finds room.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Weight {
     Stream,
@@ -185,7 +185,7 @@ impl<const SIZE: usize> Transmit<SIZE> {
         }
     }
 
-    /// Sets the tag of all frames; a zero goes first, as one may have been cut short by the reset.
+    /// Sets the tag of all frames; sends a zero first, as the reset may have cut a frame short.
     pub(super) fn boot(&mut self, tag: u16) {
         self.tag = tag;
         self.append(&[0]);
@@ -196,7 +196,7 @@ impl<const SIZE: usize> Transmit<SIZE> {
         self.dropped
     }
 
-    /// Takes a frame; whether it found room. Streams leave room for a reply.
+    /// Takes a frame; returns whether it found room. Streams leave room for a reply.
     pub(super) fn send(&mut self, weight: Weight, kind: u8, time: u64, body: &[u8]) -> bool {
         let header = Header {
             kind,
@@ -233,7 +233,7 @@ impl<const SIZE: usize> Transmit<SIZE> {
         self.length = self.length.wrapping_add(frame.len());
     }
 
-    /// Moves the oldest bytes to `out`; how many.
+    /// Moves the oldest bytes to `out`; returns how many.
     pub(super) fn take(&mut self, out: &mut [u8]) -> usize {
         let count = self.length.min(out.len());
         let (before, after) = self.bytes.split_at_checked(self.first).unwrap_or_default();

@@ -1,8 +1,8 @@
-//! The little-endian fields of a body: a cursor that reads them, a buffer that takes them.
+//! The little-endian fields of a body: a cursor to read them, a buffer to write them.
 
 use super::frame::MAX_BODY;
 
-/// Reads the fields of a body from front to back; what is not there is `None`, and nothing is taken then.
+/// Reads the fields of a body from front to back; a field that is not there is `None`, and nothing is consumed.
 ///
 /// ```
 /// use sewfast_control::link::{Body, Fields};
@@ -31,7 +31,7 @@ macro_rules! read {
 }
 
 impl<'a> Fields<'a> {
-    /// All of `body` is still to be read.
+    /// Reads `body` from its start.
     pub const fn new(body: &'a [u8]) -> Self {
         Self { left: body }
     }
@@ -66,7 +66,7 @@ impl<'a> Fields<'a> {
         Some(text)
     }
 
-    /// Everything that is left.
+    /// All bytes that are left.
     pub fn rest(&mut self) -> &'a [u8] {
         core::mem::take(&mut self.left)
     }
@@ -81,7 +81,7 @@ impl<'a> Fields<'a> {
         self.left.is_empty()
     }
 
-    /// `Some` where nothing is left: a body of the right length has been read.
+    /// `Some` if nothing is left: a body of the right length has been read.
     pub fn end(&self) -> Option<()> {
         self.is_empty().then_some(())
     }
@@ -119,7 +119,7 @@ impl Body {
         u64 "an unsigned number of 8 bytes", i16 "a signed number of 2 bytes",
         i32 "a signed number of 4 bytes", f32 "an IEEE 754 number of 4 bytes");
 
-    /// Add bytes as they are.
+    /// Adds bytes unchanged.
     #[inline]
     pub fn add(&mut self, bytes: &[u8]) -> &mut Self {
         let room = self.bytes.get_mut(self.length..);
@@ -133,7 +133,7 @@ impl Body {
         self
     }
 
-    /// Add a text: its length in a byte, then UTF-8. One of more than `max` bytes does not fit.
+    /// Adds a text: its length in a byte, then UTF-8. A text of more than `max` bytes does not fit.
     pub fn text(&mut self, text: &str, max: usize) -> &mut Self {
         match u8::try_from(text.len()) {
             Ok(length) if text.len() <= max && text.len() < self.room() => {
@@ -161,13 +161,13 @@ impl Body {
         self.length == 0
     }
 
-    /// Start again.
+    /// Starts again.
     pub const fn clear(&mut self) {
         self.length = 0;
         self.overfull = false;
     }
 
-    /// What has been added; `None` where something did not fit.
+    /// The bytes added; `None` if something did not fit.
     pub fn bytes(&self) -> Option<&[u8]> {
         let whole = self.bytes.get(..self.length);
         whole.filter(|_| !self.overfull)

@@ -1,8 +1,8 @@
-//! Identified models one sample at a time, in memory of the caller: a plant beside the controller, on the processor.
+//! Identified models, one sample at a time, in memory of the caller: a plant model beside the controller, on the processor.
 //!
-//! The arithmetic is plain `+ - * /`, in one order, without fused multiply-add: the C that `sewfast deploy` writes has the
-//! same bits. In double precision they are also those of the free run on a computer's baseline (`SEWFAST_CPU=baseline`), but
-//! for state-space models of more than four states or with another output than the sum, which agree to rounding.
+//! The arithmetic is plain `+ - * /`, in one order, without fused multiply-add: the C written by `sewfast deploy` has the same bits. In
+//! double precision they also equal those of the free run on a computer's baseline (`SEWFAST_CPU=baseline`). Exceptions
+//! are state-space models with more than four states or an output function: these agree to rounding.
 //!
 //! ```
 //! use sewfast_control::model::{Equation, Linear, Model, Orders};
@@ -26,7 +26,7 @@ pub use output::Output;
 
 use crate::{Real, Refused};
 
-/// Hidden units whose sums run side by side, as in the lanes of a computer.
+/// Hidden units summed side by side, like the lanes of a computer.
 const LANES: usize = 8;
 
 /// `y(k) = -sum a(i) y(k-1-i) + sum b(j nb + i) u_j(k-nk-i) + offset`.
@@ -36,13 +36,13 @@ pub struct Linear<'a, T> {
     pub a: &'a [T],
     /// Numerators, one input after the other, `inputs * nb`.
     pub b: &'a [T],
-    /// What the output moves by per sample without any input.
+    /// The output's change per sample without any input.
     pub offset: T,
 }
 
-/// `y(k) = b2 + direct phi + sum w2(i) tanh(b1(i) + w1(i) phi)`, held within its limits.
+/// `y(k) = b2 + direct phi + sum w2(i) tanh(b1(i) + w1(i) phi)`, clipped to its limits.
 ///
-/// `phi` holds the last `na` outputs, the newest first, then `nb` values of each input.
+/// `phi` has the last `na` outputs, the newest first, then `nb` values of each input.
 #[derive(Clone, Copy, Debug)]
 pub struct Network<'a, T> {
     /// Row by row, `hidden * (na + inputs * nb)`.
@@ -97,16 +97,16 @@ pub enum Equation<'a, T> {
     States(StateSpace<'a, T>),
 }
 
-/// `(u - u_mean)/u_scale` before the equation and `y y_scale + y_mean` behind it.
+/// `(u - u_mean)/u_scale` before the equation and `y y_scale + y_mean` after it.
 #[derive(Clone, Copy, Debug)]
 pub struct Scaling<'a, T> {
-    /// What is taken off each input.
+    /// Subtracted from each input.
     pub u_mean: &'a [T],
-    /// What each input is then divided by.
+    /// Each input is then divided by it.
     pub u_scale: &'a [T],
-    /// What is added to the output.
+    /// Added to the scaled output.
     pub y_mean: T,
-    /// What the output is multiplied by before.
+    /// The equation's output is multiplied by it.
     pub y_scale: T,
 }
 
@@ -129,7 +129,7 @@ pub struct Model<'a, T> {
     orders: Orders,
     equation: Equation<'a, T>,
     scaling: Option<Scaling<'a, T>>,
-    /// Past outputs, the newest first, or states; in scaled units where there is a scaling.
+    /// Past outputs, the newest first, or states; in scaled units if there is a scaling.
     state: &'a mut [T],
     /// For each input its last `nk + nb` values, the newest first.
     waiting: &'a mut [T],
@@ -139,7 +139,7 @@ pub struct Model<'a, T> {
 }
 
 impl<'a, T: Real> Model<'a, T> {
-    /// Numbers that a model's memory holds.
+    /// Size of a model's memory, in numbers.
     pub fn room(orders: Orders, equation: &Equation<'_, T>) -> usize {
         let more = match equation {
             Equation::States(s) => s.bh.len() + orders.na,
@@ -148,10 +148,10 @@ impl<'a, T: Real> Model<'a, T> {
         orders.na + orders.inputs * (orders.nk + orders.nb) + more
     }
 
-    /// A model in `memory`, which holds at least [`room`](Self::room) numbers; all of them 0 before the first sample.
+    /// A model in `memory`, which has room for at least [`room`](Self::room) numbers; all of them are 0 before the first sample.
     ///
     /// # Errors
-    /// Too little memory, or coefficients of another number than the orders'.
+    /// Too little memory, or a number of coefficients that does not match the orders.
     pub fn new(
         orders: Orders,
         equation: Equation<'a, T>,
@@ -200,8 +200,8 @@ impl<'a, T: Real> Model<'a, T> {
         Ok(model)
     }
 
-    /// Before the first sample: `state` (past outputs in their unit, the newest first, or states), and inputs that were `u` for
-    /// as long as the model remembers. What is missing in either is 0.
+    /// Sets the memory before the first sample: `state` (past outputs in their unit, the newest first, or states), and
+    /// past inputs of constant `u`. Missing values are 0.
     pub fn begin(&mut self, state: &[T], u: &[T]) {
         let lagged = !matches!(self.equation, Equation::States(_));
         let scaling = self.scaling;
@@ -226,7 +226,7 @@ impl<'a, T: Real> Model<'a, T> {
         window.unwrap_or_default()
     }
 
-    /// Takes up the inputs of this sample, which act `nk` samples later, and gives its output.
+    /// Takes the inputs of this sample, which act `nk` samples later, and returns its output.
     pub fn step(&mut self, u: &[T]) -> T {
         let scaling = self.scaling;
         for j in 0..self.orders.inputs {
@@ -260,7 +260,7 @@ impl<'a, T: Real> Model<'a, T> {
     }
 }
 
-/// Row `i` of a matrix; empty where there is none. Slices in chunks would ask for a width that is not 0, with a panic.
+/// Row `i` of a matrix; empty if there is none. Chunked slices would panic for a width of 0.
 fn row<T>(matrix: &[T], i: usize, width: usize) -> &[T] {
     let start = i.wrapping_mul(width);
     let row = matrix.get(start..start.wrapping_add(width));
@@ -275,7 +275,7 @@ fn scaled<T: Real>(scaling: Option<Scaling<'_, T>>, j: usize, u: T) -> T {
     }
 }
 
-/// The newest value comes first, the oldest is lost.
+/// Puts the newest value first; the oldest is lost.
 fn push<T>(window: &mut [T], newest: T) {
     let mut carried = newest;
     for place in window {
@@ -283,7 +283,7 @@ fn push<T>(window: &mut [T], newest: T) {
     }
 }
 
-/// What of the inputs' windows acts now, input by input: `nb` values from `nk` on.
+/// The part of the inputs' windows that acts now, input by input: `nb` values from `nk` on.
 fn acting<T: Copy>(orders: Orders, waiting: &[T]) -> impl DoubleEndedIterator<Item = T> + '_ {
     let width = orders.nk + orders.nb;
     (0..orders.inputs).flat_map(move |j| {
@@ -292,7 +292,7 @@ fn acting<T: Copy>(orders: Orders, waiting: &[T]) -> impl DoubleEndedIterator<It
     })
 }
 
-/// Products of hidden units and their weights, summed as eight lanes are, with `first` in the first lane.
+/// Products of hidden units and their weights, summed like eight lanes, with `first` in the first lane.
 fn lanes<T: Real>(products: impl Iterator<Item = T>, first: T) -> T {
     let mut v = [T::ZERO; LANES];
     v[0] = first;
@@ -348,7 +348,7 @@ impl<T: Real> Linear<'_, T> {
 impl<T: Real> Network<'_, T> {
     fn output(&self, orders: Orders, past: &[T], waiting: &[T]) -> T {
         let width = self.direct.len();
-        // the newest output last: on a computer everything else is ready before it is known
+        // the newest output last: on a computer all other terms are ready before it is known
         let affine = |bias: T, weights: &[T]| {
             let phi = acting(orders, waiting)
                 .rev()

@@ -1,4 +1,4 @@
-//! What stands between a state-space model's sum and its output; the equations are those of docs/CONVENTIONS.md.
+//! The output function of a state-space model; the equations are in docs/CONVENTIONS.md.
 
 use crate::Real;
 
@@ -7,7 +7,7 @@ use crate::Real;
 pub enum Output<T> {
     /// `f(s) = s`.
     Linear,
-    /// Limits with soft corners.
+    /// Limits with smooth corners.
     Saturation {
         /// Lower limit.
         low: T,
@@ -42,7 +42,7 @@ fn size<T: Real>(x: T) -> T {
     if x < T::ZERO { -x } else { x }
 }
 
-/// The form of the nearer limit: the other would subtract large numbers.
+/// Expanded about the nearer limit: about the other one it would subtract large numbers.
 fn saturated<T: Real>(s: T, low: T, high: T, width: T) -> T {
     let middle = low + half::<T>() * (high - low);
     let (base, first, second) = if s < middle {
@@ -55,11 +55,11 @@ fn saturated<T: Real>(s: T, low: T, high: T, width: T) -> T {
 
 /// `log(1 + e^z) = max(z, 0) + log(1 + e^-|z|)`.
 fn softplus<T: Real>(z: T) -> T {
-    // e^-a = (1 - t)/(1 + t) with t = tanh(a/2); its last digits are small beside the result's
+    // e^-a = (1 - t)/(1 + t) with t = tanh(a/2); its rounding is small compared with the result
     let t = (half::<T>() * size(z)).tanh();
     let e = (T::ONE - t) / (T::ONE + t);
     let positive = if z > T::ZERO { z } else { T::ZERO };
-    // NaN is neither above 0 nor to be lost
+    // NaN is not above 0, but must not be lost
     let positive = if z.is_finite() { positive } else { z };
     positive + log_one_plus(e)
 }
@@ -84,7 +84,7 @@ fn hypotenuse<T: Real>(a: T, b: T) -> T {
         T::ZERO
     };
     let x = T::ONE + ratio * ratio;
-    // a straight line within 1 %, then Newton's (Heron's) steps, each of which doubles the digits
+    // a straight line within 1 %, then Newton's (Heron's) steps, each of which doubles the number of digits
     let line = T::from_count(42) / T::from_count(100) + T::from_count(59) / T::from_count(100) * x;
     large * (0..4).fold(line, |root, _| half::<T>() * (root + x / root))
 }

@@ -1,20 +1,20 @@
-//! The hyperbolic tangent of a microcontroller: a quotient of polynomials, with nothing but `+ - * /` and comparisons.
+//! The hyperbolic tangent for microcontrollers: a quotient of polynomials, using only `+ - * /` and comparisons.
 //!
-//! `tanh(x)/x = P(s)/Q(s)` with `s = x^2` (Remez's algorithm with 60 digits, `tests/golden/tanh.py`). All coefficients are
-//! positive: nothing cancels.
+//! `tanh(x)/x = P(s)/Q(s)` with `s = x^2` (Remez's algorithm with 60 digits, `tests/golden/tanh.py`). All coefficients
+//! are positive, so nothing cancels.
 
-/// A quotient's coefficients, the constant first, with a bound for its arguments.
+/// A quotient's coefficients, the constant first, with a bound for its argument.
 #[derive(Clone, Copy, Debug)]
 pub struct Quotient<T: 'static> {
     /// `P`.
     pub numerator: &'static [T],
     /// `Q`.
     pub denominator: &'static [T],
-    /// The largest size of an argument for which it was made.
+    /// The largest magnitude of an argument for which it was made.
     pub end: T,
 }
 
-/// Double precision where networks work, below 8: a relative error of 1.1e-17.
+/// Double precision for the usual arguments in networks, below 8: a relative error of 1.1e-17.
 pub const NEAR: Quotient<f64> = Quotient {
     numerator: &NEAR_NUMERATOR,
     denominator: &NEAR_DENOMINATOR,
@@ -88,9 +88,9 @@ pub const SINGLE_NUMERATOR: [f32; 5] = [1.0, 0.13346742, 0.0034549776, 1.99519e-
 /// Of [`SINGLE`].
 pub const SINGLE_DENOMINATOR: [f32; 5] = [1.0, 0.4668006, 0.025722131, 0.0003219611, 7.4098875e-07];
 
-/// `tanh(x)` in double precision, to the bit what networks compute on a processor without fused multiply-add.
+/// `tanh(x)` in double precision, bit for bit as networks compute it on a processor without fused multiply-add.
 ///
-/// Polynomials are summed in Estrin's form, as there: short chains.
+/// Polynomials are in Estrin's form, as there, for short chains.
 pub(crate) fn double(x: f64) -> f64 {
     let size = if x < 0.0 { -x } else { x };
     if size < NEAR.end { near(x) } else { far(x) }
@@ -100,7 +100,7 @@ fn near(x: f64) -> f64 {
     let s = x * x;
     let (s2, c) = (s * s, NEAR_DENOMINATOR);
     let s4 = s2 * s2;
-    // x goes into the numerator's coefficients; its square is summed meanwhile
+    // x is multiplied into the numerator's coefficients; meanwhile its square is computed
     eight(NEAR_NUMERATOR.map(|c| x * c), s, s2, s4) / eight(c, s, s2, s4)
 }
 

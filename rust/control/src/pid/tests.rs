@@ -1,4 +1,4 @@
-//! The controller against its definition as sums, its limits and its start.
+//! The controller compared with its definition by sums, its limits and its start.
 
 use super::*;
 use proptest::prelude::*;
@@ -102,7 +102,7 @@ fn reset_repeats_the_run() {
     assert_eq!(once(), once());
 }
 
-/// Samples from the moment at which the error changes sign until the output leaves its upper limit.
+/// Samples from the error's change of sign until the output leaves its upper limit.
 fn samples_until_released(tt: f64) -> usize {
     let s = Settings {
         u_min: -1.0,

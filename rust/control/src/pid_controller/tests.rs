@@ -1,4 +1,4 @@
-//! The whole controller: what it was before, changes without a bump, constant cost.
+//! The whole controller: its bits of before, changes without a bump, constant cost.
 
 use super::*;
 use crate::biquad::tests::{any_section, section, settling};
@@ -57,8 +57,8 @@ fn free() -> impl Strategy<Value = Design<f64>> {
     )
 }
 
-/// Samples in which all that a controller remembers fades by `exp(-fade)`, but for its integral: the ramp of a reference
-/// within 100, the moving average, derivative, filter, observer and sections, one after the other.
+/// Samples in which the controller's memory, except its integral, fades by `exp(-fade)`: the ramp of a reference within
+/// 100, then the moving average, derivative, filter, observer and sections, one after the other.
 fn fading<T: Real>(design: &Design<T>, fade: f64) -> u32 {
     let (pid, ts) = (&design.pid, design.pid.ts.to_f64());
     let all = design.schedule.points().iter().map(|p| p.gains);
@@ -75,7 +75,7 @@ fn fading<T: Real>(design: &Design<T>, fade: f64) -> u32 {
     own.ceil() as u32 + settling(&design.biquads, fade)
 }
 
-/// The integral's own move in one sample, at most.
+/// Largest move of the integral itself in one sample.
 fn creep(design: &Design<f64>, e: f64) -> f64 {
     let all = design.schedule.points().iter().map(|p| p.gains);
     let gains = all.chain([design.pid.gains]);
@@ -102,7 +102,7 @@ proptest! {
     fn a_change_on_a_ramp_of_the_output_moves_nothing_at_once(
         kp in 0.01..2.0, kp2 in 0.01..2.0_f64, td in 1e-3..0.05, td2 in 1e-3..0.05, n in 1.0..20.0, slope in -1.0..1.0_f64,
     ) {
-        // Without integral action only the proportional term moves on a ramp, by Kp slope a sample.
+        // Without integral action a ramp moves only the proportional term, by Kp slope a sample.
         let inf = f64::INFINITY;
         let old = Design::new(Settings { n, ..pid(kp, inf, td) });
         let new = Design::new(Settings { n, ..pid(kp2, inf, td2) });
@@ -213,7 +213,7 @@ fn feeds_back_the_filtered_output_and_skips_a_lost_measurement() {
 
 #[test]
 fn biquads_act_as_on_the_command() {
-    // linear in reference and output, so that they may stand behind the PID as well
+    // linear in reference and output, so they may come after the PID as well
     let gains = pid(0.7, 0.05, 0.004);
     let notch = Biquad::notch(60.0, 0.05, 0.6, TS).unwrap();
     let low_pass = Biquad::low_pass(200.0, 0.7, TS).unwrap();
@@ -263,7 +263,7 @@ fn biquads_filter_a_step_of_the_reference_at_the_first_sample() {
 
 #[test]
 fn a_lead_makes_no_bump_of_the_last_place() {
-    // the observer rests a unit in the last place beside its input, and the lead answers a step by 4e5
+    // the observer rests one unit in the last place away from its input, and the lead responds to a step by 4e5
     let lead = Biquad::resonance(0.5, 1.0, 499.0, 1.0, TS).unwrap();
     let lead = Cascade::new(&[lead]).unwrap();
     let observed = Design {
@@ -423,7 +423,7 @@ fn refuses_what_its_parts_refuse() {
     );
 }
 
-/// Everything on.
+/// Everything switched on.
 fn whole() -> Design<Counted> {
     let c = Counted;
     let gains = |kp| Standard {
@@ -519,9 +519,9 @@ fn a_step_costs_the_same_whatever_comes() {
     }
 }
 
-// Golden bits of filter and PID alone: a part that is switched off leaves no trace in them.
+// Golden bits of filter and PID alone: parts that are switched off do not change them.
 
-/// Numbers from -1 to 1, the same for ever.
+/// Numbers from -1 to 1, always the same.
 struct Noise(u64);
 
 impl Noise {

@@ -1,6 +1,6 @@
-//! A library that links only while no path through the link's frames and the controller can panic.
+//! A library that links only if no path through the link's frames and the controller can panic.
 //!
-//! The optimiser drops the panic handler where nothing calls it; the symbol that it asks for does not exist.
+//! The optimiser drops the panic handler if nothing calls it; the symbol that it needs does not exist.
 
 #![no_std]
 

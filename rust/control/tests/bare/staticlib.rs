@@ -1,6 +1,6 @@
-//! A library without the standard library: it links only while the controller crate needs none either.
+//! A library without the standard library: it links only if the controller crate does not need it either.
 //!
-//! Were std anywhere below, its panic handler and this one would collide.
+//! If std were used anywhere below, its panic handler would collide with this one.
 
 #![no_std]
 
@@ -13,7 +13,7 @@ fn halt(_: &PanicInfo<'_>) -> ! {
     loop {}
 }
 
-/// One control step with fixed gains, as firmware would call it; NaN where the settings are refused.
+/// One control step with fixed gains, as firmware would call it; NaN if the settings are refused.
 #[unsafe(no_mangle)]
 pub extern "C" fn one_step(r: f32, y: f32) -> f32 {
     let gains = Standard { kp: 0.02, ti: 0.25, td: 0.004 };

@@ -1,44 +1,44 @@
-//! Gains by least squares: the linear-quadratic regulator and the Kalman filter of a sampled plant.
+//! Optimal gains: the linear-quadratic regulator and the Kalman filter of a sampled plant.
 //!
-//! The regulator minimises the sum of `y^2 + rho u^2 + (integral Ts z)^2`, where `z` is the sum of errors; the filter is that
-//! of a plant whose command is disturbed by white noise of variance 1, and whose output is measured with noise of variance
-//! `noise`. Both are the stabilising solution `X` of a Riccati equation
+//! The regulator minimises the sum of `y^2 + rho u^2 + (integral Ts z)^2`, where `z` is the sum of errors. The filter
+//! is for a plant whose command is disturbed by white noise of variance 1 and whose output is measured with noise of
+//! variance `noise`. Both are the stabilising solution `X` of a Riccati equation
 //!
 //! ```text
 //! X = A' X A - A' X B (R + B' X B)^-1 B' X A + Q
 //! ```
 //!
 //! found by doubling (Chu, Fan, Lin and Wang, Int. J. Control 77, 2004): each step squares the closed loop's transition
-//! matrix, so that a pole at 1 - 1e-6 takes some 24 steps. In double precision, for a host: nothing of it gets into a firmware
-//! that does not call it.
+//! matrix, so a pole at 1 - 1e-6 takes some 24 steps. In double precision, for a host: firmware that does not call this
+//! code does not contain it.
 
 use super::{STATES, StateDesign};
 use crate::{Real, Refused};
 
-/// States of the plant, and the sum of errors.
+/// States of the plant, plus the sum of errors.
 const N: usize = STATES + 1;
 type Square = [[f64; N]; N];
 
 /// Doublings after which there is no solution.
 const DOUBLINGS: usize = 60;
-/// Relative change of the solution below which it stands.
+/// Relative change of the solution that counts as none.
 const CONVERGED: f64 = 1e-13;
 
-/// What the gains are made from.
+/// The design parameters of the gains.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights<T> {
-    /// Weight of the command's square beside that of the output's error \[(y/u)^2\].
+    /// Weight of the command's square relative to that of the output's error \[(y/u)^2\].
     pub rho: T,
     /// Weight of the error's integral \[1/s\]; 0 for no integral action.
     pub integral: T,
-    /// Variance of the measurement beside that of a disturbance of the command \[(y/u)^2\].
+    /// Variance of the measurement noise relative to that of a disturbance of the command \[(y/u)^2\].
     pub noise: T,
-    /// Set-point weight: 1 brings the model to the reference without help of the integral, less leaves it a share.
+    /// Set-point weight: 1 brings the model to the reference without help from the integral; less leaves it a share.
     pub reference: T,
 }
 
 impl<T: Real> Weights<T> {
-    /// Of gains that came without.
+    /// For gains that came without weights.
     pub(super) const NONE: Self = Self {
         rho: T::ZERO,
         integral: T::ZERO,
@@ -47,10 +47,10 @@ impl<T: Real> Weights<T> {
     };
 }
 
-/// `design` with the gains that `weights` give its plant `a`, `b`.
+/// `design` with the gains that follow from `weights` for its plant `a`, `b`.
 ///
 /// # Errors
-/// A weight that is outside its range, a plant whose output no command holds, or one for which there are no such gains.
+/// A weight that is outside its range, a plant whose output no command can hold, or a plant without such gains.
 pub fn lqg(
     mut design: StateDesign<f64>,
     weights: Weights<f64>,
@@ -137,7 +137,7 @@ fn transition(a: [f64; STATES]) -> Square {
     matrix
 }
 
-/// The stabilising solution for one input `b` of weight `r`; `None` where there is none.
+/// The stabilising solution for one input `b` of weight `r`; `None` if there is none.
 fn riccati(mut a: Square, b: [f64; N], r: f64, q: Square) -> Option<Square> {
     let mut g = outer(b, b.map(|b| b / r));
     let mut h = q;
@@ -164,7 +164,7 @@ fn riccati(mut a: Square, b: [f64; N], r: f64, q: Square) -> Option<Square> {
     None
 }
 
-/// `matrix^-1 right` by elimination with pivots; `None` for a singular matrix.
+/// `matrix^-1 right` by elimination with pivoting; `None` for a singular matrix.
 fn solved(mut matrix: Square, mut right: Square) -> Option<Square> {
     for i in 0..N {
         let larger = |&j: &usize, &k: &usize| matrix[j][i].abs().total_cmp(&matrix[k][i].abs());

@@ -1,4 +1,4 @@
-//! State feedback: the law of all controllers, gains with known answers, what it reaches on its own model.
+//! State feedback: the law of all controllers, gains with known answers, its behaviour on its own model.
 
 use super::*;
 use proptest::prelude::*;
@@ -36,7 +36,7 @@ fn motor() -> StateDesign<f64> {
     }
 }
 
-/// The plant of a design, from rest, with a command that is added behind the limits.
+/// The plant of a design, from rest, with a command added after the limits.
 struct Plant {
     past_u: [f64; STATES],
     past_y: [f64; STATES],
@@ -62,7 +62,7 @@ impl Plant {
     }
 }
 
-/// Outputs and commands along a reference, with what is added to the command at each sample.
+/// Outputs and commands along a reference; `added` is added to the command at each sample.
 fn run(design: &StateDesign<f64>, r: &[f64], load: impl Fn(usize) -> f64) -> Vec<(f64, f64)> {
     let (mut controller, mut plant) = (StateFeedback::new(*design).unwrap(), Plant::new());
     let mut step = |(k, &r): (usize, &f64)| {
@@ -157,8 +157,8 @@ macro_rules! laws {
                     for (r, y, feedforward) in garbage {
                         controller.step_with(r, y, feedforward);
                     }
-                    // a plant at rest at its reference; what the observer has seen fades by its poles, in 40,000
-                    // samples from 1e308
+                    // a plant at rest at its reference; the observer's memory fades by its poles, within 40,000 samples
+                    // from 1e308
                     let fade = ($float::MAX as f64).ln() - ($float::EPSILON as f64).ln();
                     let settled = (0..(40_000.0 * fade / 745.0) as u32).map(|_| controller.step(r, r)).last().unwrap();
                     let held = (r as f64) / 490.0;
@@ -174,7 +174,7 @@ laws!(f32);
 laws!(f64);
 
 proptest! {
-    /// Of a first-order plant both gains solve a quadratic equation.
+    /// For a first-order plant both gains solve a quadratic equation.
     #[test]
     fn gains_of_one_state_are_those_of_the_scalar_riccati_equation(
         pole in -0.99..1.2_f64, b in 0.01..10.0_f64, rho in 1e-3..1e3_f64, noise in 1e-3..1e3_f64,
@@ -196,7 +196,7 @@ proptest! {
         prop_assert_eq!(design.ki, 0.0);
     }
 
-    /// Whatever the weights, the loop around the model settles at the reference, under a load too.
+    /// For any weights the loop around the model settles at the reference, also under a load.
     #[test]
     fn the_loop_around_its_model_is_stable_and_exact(
         rho in 1e2..1e5_f64, integral in 3.0..100.0_f64, noise in 1e2..1e6_f64, reference in 0.0..1.2_f64, load in -2.0..2.0_f64,
@@ -225,7 +225,7 @@ fn the_model_comes_to_the_reference_without_help_of_the_integral() {
 #[test]
 fn a_limit_that_holds_for_long_winds_nothing_up() {
     let design = lqg(motor(), WEIGHTS).unwrap();
-    // 10 V are 4,900 RPM: 8,000 are out of reach, then 1,000 are asked for
+    // 10 V are 4,900 RPM: 8,000 are out of reach, then 1,000 are requested
     let after = |held: usize| {
         let r: Vec<f64> = (0..held + 1_000)
             .map(|k| if k < held { 8_000.0 } else { 1_000.0 })
@@ -255,7 +255,7 @@ fn the_observer_begins_as_if_the_plant_rested_at_the_first_measurement() {
         assert!((u - 1.0).abs() < 1e-9, "{u}");
         assert!((controller.filtered() - 490.0).abs() < 1e-9);
     }
-    // a measurement that is missing leaves the command and the model's way
+    // a missing measurement leaves the command and the model's course unchanged
     let u = controller.step(490.0, f64::NAN);
     assert!((u - 1.0).abs() < 1e-9);
     assert!((controller.step(490.0, 490.0) - 1.0).abs() < 1e-9);
@@ -274,7 +274,7 @@ fn the_reference_is_led_and_ramped() {
         ramp[599] - y
     };
     let shift = lag(plain) - lag(led);
-    // 5 ms of 2 RPM a sample, less what the integral takes back
+    // 5 ms of 2 RPM a sample, minus what the integral takes back
     assert!(shift > 1.0 && shift < 12.0, "{shift}");
     let slow = StateDesign {
         r_rate: 1_000.0,

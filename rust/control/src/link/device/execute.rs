@@ -1,4 +1,4 @@
-//! What the host says is done, or refused.
+//! Executes or refuses the host's commands.
 
 use super::{Core, Event, Reason, Run, State, Weight};
 use crate::Cascade;
@@ -44,7 +44,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             return self.send(Weight::Answer, reply.kind, &reply.body);
         }
         let order = Order::of(sequence, session.command);
-        // whoever asks for it, and however late: a stop that was not wanted is the smaller harm
+        // from any host, and however late: an unwanted stop is the lesser harm
         if stop && (!own || order == Order::Old) {
             let reply = self.answer(frame);
             return self.send(Weight::Answer, reply.kind, &reply.body);
@@ -158,7 +158,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         Ok(())
     }
 
-    /// Nothing that another host has said moves a motor, and his limits are not this one's.
+    /// Ensures that nothing said by another host moves a motor; its limits do not apply to this one.
     fn change_host(&mut self, number: u32) {
         match self.state {
             State::Running => self.trip(Reason::HostChanged, 0.0),
@@ -282,7 +282,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         Ok(())
     }
 
-    /// The largest value of a profile; a reference is a speed in the unit of the gains, in RPM before there are any.
+    /// The largest value of a profile; a reference is a speed in the unit of the gains, or in RPM before there are gains.
     fn profile_limit(&self, table: Table) -> f32 {
         let limits = self.bounds();
         match (table, &self.gains) {
@@ -298,7 +298,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
     #[inline(never)]
     fn set_gains(&mut self, gains: Gains) -> Done {
         self.allow(&[State::Idle, State::Armed])?;
-        // what a start was checked with does not change behind its back
+        // the settings that a planned start was checked with must not change
         Refusal::state(self.state).unless(self.run.planned.is_none())?;
         Refusal::unsupported(0).unless(self.can(capability::PID))?;
         Refusal::unsupported(13).unless(!gains.long || self.can(capability::DESIGN))?;
@@ -342,7 +342,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         Ok(())
     }
 
-    /// What the mode needs is there, and within the limits that are in force now.
+    /// Checks that the mode has what it needs, within the limits now in force.
     fn check_mode(&self, mode: u8) -> Done {
         let (needed, table) = match mode {
             0 => (capability::PROFILE, Some(Table::Commands)),
@@ -364,7 +364,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         Ok(())
     }
 
-    /// When the first sample at `at` or later is due, but not before the next one.
+    /// Due time of the first sample at `at` or later, but not before the next one.
     fn on_grid(&self, at: u64) -> u64 {
         let (period, ahead) = (self.period.get(), at.saturating_sub(self.due));
         let periods = (ahead.saturating_add(period - 1) / self.period).max(1);
@@ -372,7 +372,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
     }
 }
 
-/// Commands in volt or references, as they came.
+/// Commands in volt, or references, as received.
 fn values(table: Table, bytes: &[u8], steps: f32) -> impl Iterator<Item = f32> {
     let mut fields = Fields::new(bytes);
     core::iter::from_fn(move || match table {
@@ -381,7 +381,7 @@ fn values(table: Table, bytes: &[u8], steps: f32) -> impl Iterator<Item = f32> {
     })
 }
 
-/// The frame that answers another one.
+/// The reply to a frame.
 fn reply(frame: &Frame<'_>, result: &Done, content: &Body) -> Reply {
     let mut body = Body::new();
     body.u32(frame.header.sequence);

@@ -27,7 +27,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         self.beat();
     }
 
-    /// The firmware's measurements have become trustworthy.
+    /// Ends the boot once the firmware's measurements are trustworthy.
     fn settle(&mut self, measurement: &Measurement<'_>) {
         let good = self.is_good(measurement);
         self.good = if good { self.good.saturating_add(1) } else { 0 };
@@ -41,7 +41,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         current && measurement.further.iter().all(|value| value.is_finite())
     }
 
-    /// Sets when this sample was due. A run has a grid, off which it ends; without one the samples come as they come.
+    /// Sets when this sample was due. A run has a grid and ends if a sample is off it; without a run, samples come as they come.
     fn keep_time(&mut self, now: u64) {
         let planned = self.state == State::Armed && self.run.planned.is_some();
         if self.state != State::Running && !planned {
@@ -53,7 +53,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         let (late, early) = (now.saturating_sub(self.due), self.due.saturating_sub(now));
         self.run.latest = self.run.latest.max(u32::try_from(late).unwrap_or(u32::MAX));
         let half = late >= period / 2;
-        // a sample that was lost leaves all that follow a period late, less the jitter
+        // after a lost sample all that follow are a period late, less the jitter
         let off = late >= period || early > period / 2 || half && self.run.late_before;
         self.run.late_before = half;
         if !off {
@@ -100,7 +100,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         }
     }
 
-    /// Command, reference, whether the command was clipped.
+    /// Returns command, reference, and whether the command was clipped.
     fn command_for(&mut self, measurement: &Measurement<'_>) -> Result<(f32, f32, bool), Trip> {
         let limits = self.limits.unwrap_or(Limits::NONE);
         if !self.is_good(measurement) {
@@ -115,7 +115,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         }
         let u = self.in_whole_steps(wanted.max(-limits.volt).min(limits.volt), limits.volt);
         self.guard.expect_motion(&limits, u)?;
-        // a profile that swings is as its author wants it; without a limit of acceleration nothing is
+        // a profile may swing as its author wants; without a limit on acceleration there is no check either
         if self.run.start.mode != 0 && limits.acceleration.is_finite() {
             let (low, high) = self.range(limits.volt);
             self.guard.expect_calm(low, high, u)?;
@@ -125,13 +125,13 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         Ok((u, reference, wanted.abs() > limits.volt || limited))
     }
 
-    /// The limits of the loop's command: the controller's own, which lie within the volt limit, where it is here.
+    /// The limits of the loop's command: the controller's own, which lie within the volt limit, if there is a controller.
     fn range(&self, volt: f32) -> (f32, f32) {
         let own = self.run.controller.as_ref().map(Controller::limits);
         own.unwrap_or((-volt, volt))
     }
 
-    /// The command as it is recorded: what is applied is what the host gets to see.
+    /// The command in whole steps of its channel: the host sees exactly what is applied.
     fn in_whole_steps(&self, u: f32, limit: f32) -> f32 {
         let per_volt = self.identity.steps_per_volt();
         let steps = to_steps(u, per_volt as u32);

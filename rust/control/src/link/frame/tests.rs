@@ -1,5 +1,5 @@
-//! Frames as specified, streams cut anywhere; damaged frames refused, hostile bytes without harm, and one whole frame that brings
-//! the receiver back into step.
+//! Frames as specified and streams cut anywhere. Damaged frames are refused, hostile bytes do no harm, and one whole
+//! frame resynchronises the receiver.
 
 use super::*;
 use proptest::prelude::*;
@@ -204,7 +204,7 @@ impl Dice {
     }
 }
 
-/// `short` in every run of the tests, `soak` where SEWFAST_SOAK is set.
+/// `short` in every run of the tests, `soak` if SEWFAST_SOAK is set.
 pub(crate) fn trials(short: u64, soak: u64) -> u64 {
     if std::env::var_os("SEWFAST_SOAK").is_some() {
         soak
@@ -224,7 +224,7 @@ fn random_header(dice: &mut Dice) -> Header {
     }
 }
 
-/// Mostly as short as real ones; bodies of samples and commands are full of zeros.
+/// Mostly as short as real ones; bodies of samples and commands contain many zeros.
 fn random_frame(dice: &mut Dice) -> Copied {
     let length = match dice.below(8) {
         0 => dice.below(MAX_BODY + 1),
@@ -236,7 +236,7 @@ fn random_frame(dice: &mut Dice) -> Copied {
     (random_header(dice), body)
 }
 
-/// The ways in which bytes are damaged between two ends.
+/// The ways in which bytes are damaged between both ends.
 #[derive(Clone, Copy, Debug)]
 enum Damage {
     Flip,
@@ -284,7 +284,7 @@ fn range(dice: &mut Dice, length: usize, longest: usize) -> core::ops::Range<usi
     start..(start + 1 + dice.below(longest)).min(length)
 }
 
-/// Damage `bytes`, one frame with its closing zero; `other` is the frame that comes next.
+/// Damages `bytes`, one frame with its closing zero; `other` is the next frame.
 fn damage(dice: &mut Dice, how: Damage, bytes: &mut Vec<u8>, other: &[u8]) {
     let length = bytes.len();
     match how {
@@ -335,7 +335,7 @@ fn damage(dice: &mut Dice, how: Damage, bytes: &mut Vec<u8>, other: &[u8]) {
     }
 }
 
-/// Takes the stream in; how many frames are accepted and none of `sent`, and whether the last one sent came through.
+/// Feeds the stream; returns how many accepted frames were not in `sent`, and whether the last one sent came through.
 fn foreign(deframer: &mut Deframer, mut stream: &[u8], sent: &[&Copied]) -> (u64, bool) {
     let (mut strangers, mut last) = (0, false);
     while let Some(found) = deframer.next(&mut stream) {
@@ -347,11 +347,11 @@ fn foreign(deframer: &mut Deframer, mut stream: &[u8], sent: &[&Copied]) -> (u64
     (strangers, last)
 }
 
-/// 1e6 damaged frames, 1e8 in a soak: none is taken for a frame, and the second whole frame after the damage is
-/// always found, whether or not the damage hit a zero.
+/// 1e6 damaged frames, 1e8 in a soak: none is accepted, and the second whole frame after the damage is always found,
+/// whether or not the damage hit a zero.
 ///
-/// Flips, replacements and swaps that hit no code byte and make no zero are found with certainty up to four bits or 32 bits in
-/// a row (see below); the rest is found but for 1 in 2^32, so that 1e8 of them would let .02 through on average.
+/// Flips, replacements and swaps that hit no code byte and make no zero are always detected up to four bits or 32 bits
+/// in a row (see below). The rest is detected except for 1 in 2^32, so 1e8 of them would let .02 through on average.
 #[test]
 fn no_damaged_frame_is_accepted() {
     let mut dice = Dice(20);
@@ -382,7 +382,7 @@ fn no_damaged_frame_is_accepted() {
     }
 }
 
-/// The bits of a frame before stuffing, stuffed again after the damage.
+/// The bits of a frame before stuffing, stuffed again after damage.
 fn refused(frame: &[u8]) -> bool {
     let mut block = std::vec![0];
     block.extend(frame);

@@ -1,4 +1,4 @@
-//! The safety law: whatever comes, the command is finite, within its limits and its slew; and the controller finds back.
+//! The safety law: for any input the command is finite, within its limits and its slew; and the controller recovers.
 
 use super::fading;
 use crate::biquad::tests::{any_section, section};
@@ -6,9 +6,9 @@ use crate::{Cascade, Design, PidController, Point, Real, Schedule, Settings, Sta
 use proptest::prelude::*;
 use std::vec::Vec;
 
-/// What a command must keep to, in the number type's own arithmetic and without tolerance.
+/// The law for a command, in the number type's own arithmetic and without tolerance.
 ///
-/// Limits that were narrowed below the last command are reached at the slew rate, never away from them.
+/// Limits narrowed below the last command are approached at the slew rate, never left further.
 fn holds<T: Real>(settings: &Settings<T>, last: T, u: T) -> Result<(), TestCaseError> {
     let Settings { u_min, u_max, .. } = *settings;
     let change = settings.slew * settings.ts;
@@ -137,7 +137,7 @@ macro_rules! laws {
                     for (r, y, feedforward) in garbage {
                         controller.step_with(r, y, feedforward);
                     }
-                    // the largest number fades to nothing, whatever gain up to 2e4 it met
+                    // the largest number fades to nothing, even after a gain of up to 2e4
                     let fade = ($float::MAX as f64).ln() - ($float::EPSILON as f64).ln() + 10.0;
                     let u = (0..fading(&design, fade)).map(|_| controller.step(r, y)).last().unwrap();
                     let exact = kp * (r - y);

@@ -1,4 +1,4 @@
-//! Bytes that mean harm.
+//! Malicious bytes.
 
 use super::rig::*;
 use crate::Biquad;
@@ -7,7 +7,7 @@ use crate::link::identity::capability as can;
 use crate::link::{Deframer, Identity, MAX_BODY, Measurement, Reason, State};
 use std::vec::Vec;
 
-/// Numbers that break what can be broken.
+/// Numbers likely to break things.
 const HARMFUL: [f32; 12] = [
     f32::NAN,
     f32::INFINITY,
@@ -34,7 +34,7 @@ fn number(dice: &mut Dice, out: &mut Vec<u8>) {
     }
 }
 
-/// A body that a command could have; all but a few have no fault.
+/// A body that a command could have; only a few have a fault.
 fn body(dice: &mut Dice, kind: u8, now: u64) -> Vec<u8> {
     let watchdog = (1000 + dice.below(100_000) as u32).to_le_bytes();
     let mut body = match kind {
@@ -115,7 +115,7 @@ fn body(dice: &mut Dice, kind: u8, now: u64) -> Vec<u8> {
     body
 }
 
-/// Mostly what gets a run going and keeps it up.
+/// Mostly commands that start a run and keep it going.
 const KINDS: [u8; 27] = [
     0x0C, 0x01, 0x02, 0x03, 0x04, 0x04, 0x05, 0x05, 0x06, 0x07, 0x07, 0x08, 0x09, 0x0A, 0x0A, 0x0B,
     0x20, 0x20, 0x21, 0x22, 0xC0, 0x05, 0x0A, 0x0A, 0x20, 0x21, 0x22,
@@ -214,7 +214,7 @@ fn no_bytes_break_the_device() {
     assert!(whole > 100_000);
 }
 
-/// Time passes, mostly as it should.
+/// Time passes, mostly correctly.
 fn step(dice: &mut Dice, rig: &mut Rig) -> crate::link::Output {
     let before = rig.now;
     match dice.below(4000) {
@@ -228,7 +228,7 @@ fn step(dice: &mut Dice, rig: &mut Rig) -> crate::link::Output {
         }
         _ => rig.current = 0.0,
     }
-    // the device's time does not run backwards, nor may it come to its end
+    // the device's time does not run backwards, and must not reach its end either
     if rig.now > u64::MAX / 2 {
         rig.now = before;
     }

@@ -1,4 +1,4 @@
-//! What holds after every event, in any order, on a bad line.
+//! Laws that hold after every event, in any order, on a bad line.
 
 use super::rig::*;
 use crate::Biquad;
@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use std::vec;
 use std::vec::Vec;
 
-/// What becomes of a frame on its way.
+/// What happens to a frame on its way.
 #[derive(Clone, Copy, Debug)]
 enum Fate {
     Arrives,
@@ -23,11 +23,11 @@ enum Act {
     Say(u8, u32),
     Keep(u32),
     Drive(f32),
-    /// Arm and start as a host does.
+    /// Arms and starts like a host.
     BringUp(u8),
     Watched(usize),
     Silence(usize),
-    /// A frame of before, as a line with memory gives it back.
+    /// An earlier frame, repeated by a line with memory.
     Replay(u32),
     Turn(i32),
     Fault,
@@ -39,19 +39,19 @@ enum Act {
 /// A frame as a line keeps it: kind, tag, session, sequence, body.
 type Said = (u8, u16, u32, u32, Vec<u8>);
 
-/// What a bystander knows who sees the line and the motor but not the device.
+/// The knowledge of a bystander who sees the line and the motor but not the device.
 struct Bystander {
     rig: Rig,
     boot: u32,
     line: Vec<Said>,
     last_command: u32,
     last_beat: u32,
-    /// In force; 0 where there is none.
+    /// In force; 0 if there is none.
     session: u32,
     limited: bool,
-    /// Until when a word of the host covers motion.
+    /// Until when a message of the host permits motion.
     covered: u64,
-    /// CLEAR, ARM, START are still to come.
+    /// CLEAR, ARM, START have not been sent yet.
     clear: bool,
     arm: bool,
     start: bool,
@@ -137,7 +137,7 @@ impl Bystander {
         self.look();
     }
 
-    /// A frame reaches the device whole; what it must mean.
+    /// A frame reaches the device whole: records what it must cause.
     fn deliver(&mut self, (kind, tag, session, sequence, body): Said) {
         let (state, body) = (self.rig.device.state(), &body[..]);
         let present = core::mem::replace(&mut self.rig.session, session);
@@ -212,7 +212,7 @@ impl Bystander {
         }
     }
 
-    /// The bodies of the replies to a command among what the device now says.
+    /// The bodies of the replies to a command, among the device's new frames.
     fn replies(&mut self, kind: u8, sequence: u32) -> Vec<Vec<u8>> {
         let number = sequence.to_le_bytes();
         let came = self.listen();
@@ -222,7 +222,7 @@ impl Bystander {
         wanted.map(|came| came.body.clone()).collect()
     }
 
-    /// Frames have no gap; samples are those that were taken.
+    /// Frames are numbered without a gap; samples are those that were taken.
     fn listen(&mut self) -> Vec<Came> {
         let came = self.rig.listen();
         for came in &came {
@@ -326,7 +326,7 @@ impl Bystander {
         }
     }
 
-    /// The line remembers, the device does not; the host goes on with its session.
+    /// The line remembers, the device does not; the host continues its session.
     fn reset(&mut self) {
         let (line, session) = (core::mem::take(&mut self.line), self.session);
         *self = Self::new(self.boot + 1);
@@ -345,7 +345,7 @@ impl Bystander {
     }
 }
 
-/// A body of a command that could be right.
+/// A body that could be right for a command.
 fn command(kind: u8, value: u32, now: u64) -> Vec<u8> {
     let body = match kind {
         0x04 => return [VOLT, 4000.0, INF, 20.0].map(f32::to_le_bytes).concat(),

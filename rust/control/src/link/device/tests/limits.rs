@@ -1,4 +1,4 @@
-//! Limits hold, whatever is asked for.
+//! Limits hold for any request.
 
 use super::rig::*;
 use crate::Biquad;
@@ -110,7 +110,7 @@ fn speed_acceleration_and_current_trip() {
         trip(slow, |rig, _| rig.counts -= 26),
         (Some(8), Reason::Speed)
     );
-    // 25 counts a sample are the limit itself
+    // 25 counts a sample are exactly the limit
     assert_eq!(trip(slow, |rig, _| rig.counts += 25).0, None);
     assert_eq!(
         trip(smooth, |rig, _| rig.counts += 8).1,
@@ -152,7 +152,7 @@ fn profiles_beyond_the_limits_do_not_start() {
     let mut rig = Rig::ready();
     assert_eq!(rig.upload(0, &[0, 10_000, -10_000]).0, 0);
     assert_eq!(rig.upload(0, &[0, 10_000, -10_001]), (6, detail(2)));
-    // the refused one has left the first in place
+    // the refused one has left the first unchanged
     assert_eq!(rig.upload(3, &[1]).0, 0);
     for value in [4000.1, -4000.1, f32::NAN, INF, -INF] {
         assert_eq!(rig.references(0, &[0.0, value]), (6, detail(1)));
@@ -218,7 +218,7 @@ fn gains_that_make_no_sense_are_refused_by_field() {
     assert_eq!((set(12, 0.0, 0), set(12, 0.0, 65)), ((3, 12), (3, 12)));
     assert_eq!((set(1, 0.0, 1), set(11, 0.0, 1)), ((3, 1), (3, 11)));
     assert_eq!((set(11, INF, 1), set(11, 1e-35, 1)), ((3, 11), (3, 11)));
-    // the limits of the controller are on one side of those of the device
+    // the limits of the controller lie on one side of the device's
     assert_eq!(set(7, 11.0, 1), (6, 8));
 }
 

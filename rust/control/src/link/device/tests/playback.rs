@@ -1,4 +1,4 @@
-//! What was uploaded is what the motor gets, and what it did is what the host hears.
+//! The motor gets what was uploaded, and the host hears what the motor did.
 
 use super::rig::*;
 use crate::biquad::tests::{any_section, section};
@@ -12,7 +12,7 @@ use std::vec;
 use std::vec::Vec;
 
 proptest! {
-    /// In any pieces, overlapping, repeated, refused for room and sent again, while it plays.
+    /// In any pieces: overlapping, repeated, refused for lack of room and sent again, while it plays.
     #[test]
     fn a_profile_plays_as_uploaded(
         values in prop::collection::vec(-9_000i16..9_000, 1..300),
@@ -58,7 +58,7 @@ proptest! {
         prop_assert_eq!(rig.events().pop(), Some((4, 0)));
     }
 
-    /// The device's controller is the crate's, its command in whole steps.
+    /// The device's controller is the crate's own, with its command in whole steps.
     #[test]
     fn the_pid_is_the_controller(
         references in prop::collection::vec(0f32..3000.0, 1..60),
@@ -123,7 +123,7 @@ proptest! {
     }
 }
 
-/// A motor of 490 RPM/V behind state feedback, as a host sends it.
+/// A motor of 490 RPM/V with state feedback, as sent by a host.
 fn state_feedback() -> StateDesign<f64> {
     let none = [0.0; STATES];
     let weights = Weights {
@@ -174,7 +174,7 @@ proptest! {
         prop_assert_eq!(rig.references(0, &references).0, 0);
         let body = start(1, 0, references.len() as u32, 0b01_1011, 4);
         prop_assert_eq!(rig.command(0x0A, body.bytes().unwrap()).0, 0);
-        // the volt limit of the session clips what the host allows
+        // the session's volt limit clips what the host allows
         let clipped = StateDesign { u_min: -10.0, ..design };
         let mut controller = StateFeedback::new(clipped).unwrap();
         for (&reference, &count) in references.iter().zip(&moves) {

@@ -68,7 +68,7 @@ pub struct Came {
     pub body: Vec<u8>,
 }
 
-/// Result and rest of a reply.
+/// Result and remainder of a reply.
 pub type Answer = (u8, Vec<u8>);
 
 pub struct Rig {
@@ -106,7 +106,7 @@ impl Rig {
         }
     }
 
-    /// Through boot and standstill, with session and limits.
+    /// Passes boot and standstill; opens a session with limits.
     pub fn ready() -> Self {
         let mut rig = Self::new();
         rig.hello(77);
@@ -121,7 +121,7 @@ impl Rig {
         rig
     }
 
-    /// A frame of the session, whose number HELLO does not carry in its header.
+    /// A frame of the session; HELLO has no session number in its header.
     pub fn wire(&self, kind: u8, tag: u16, sequence: u32, body: &[u8]) -> Vec<u8> {
         let session = if kind == 0x01 { 0 } else { self.session };
         let header = Header {
@@ -144,7 +144,7 @@ impl Rig {
         self.put(&wire);
     }
 
-    /// What the device has sent since the last time.
+    /// All that the device has sent since the last call.
     pub fn listen(&mut self) -> Vec<Came> {
         self.device.poll(self.now);
         let mut new = Vec::new();
@@ -184,7 +184,7 @@ impl Rig {
         self.answer(kind, self.commands).unwrap()
     }
 
-    /// The last number again.
+    /// A command with the last number again.
     pub fn again(&mut self, kind: u8, body: &[u8]) -> Option<Answer> {
         self.say(kind, self.tag, self.commands, body);
         self.answer(kind, self.commands)
@@ -286,14 +286,14 @@ impl Rig {
         output
     }
 
-    /// So many periods without a word of the host.
+    /// Periods without a message from the host.
     pub fn samples(&mut self, count: usize) {
         for _ in 0..count {
             self.sample();
         }
     }
 
-    /// So many periods with a host that watches.
+    /// Periods with a host that watches.
     pub fn watched(&mut self, count: usize) {
         for _ in 0..count {
             self.keep();
@@ -301,7 +301,7 @@ impl Rig {
         }
     }
 
-    /// A run in mode 2 under way.
+    /// A run in mode 2 in progress.
     pub fn driving(u: f32) -> Self {
         let mut rig = Self::armed();
         assert_eq!(rig.start(2, 0, 0).0, 0);
@@ -318,7 +318,7 @@ impl Rig {
         events.map(|came| (came.body[0], came.body[2])).collect()
     }
 
-    /// Number, counts and command of every sample sent, in frames of the two first channels.
+    /// Number, counts and command of every sample sent, in frames of the first two channels.
     pub fn sent(&mut self) -> Vec<(u64, i32, i16)> {
         self.listen();
         let batches = self.came.iter().filter(|came| came.header.kind == 0xC0);
@@ -379,7 +379,7 @@ pub fn biquads(sections: &[Biquad<f32>]) -> Body {
     body
 }
 
-/// Time, counts and command of a batch of the two first channels.
+/// Time, counts and command of a batch of the first two channels.
 pub fn read(came: &Came) -> Vec<(u64, i32, i16)> {
     let samples = (came.body.len() - 3) / 4;
     let mut fields = Fields::new(&came.body[1..]);

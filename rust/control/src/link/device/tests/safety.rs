@@ -1,4 +1,4 @@
-//! Every way in which an output could stay on with nobody watching.
+//! Every way in which an output could stay on unwatched.
 
 use super::rig::*;
 use crate::link::{Measurement, Output, Reason, State};
@@ -91,7 +91,7 @@ fn after_a_trip_nothing_but_clear_arm_and_start_runs() {
     assert_eq!(rig.device.state(), State::Armed);
     assert_eq!(rig.start(2, 0, 0).0, 0);
     assert!(rig.sample().enabled);
-    // what was driven before the trip is not held
+    // the command driven before the trip is not held
     assert_eq!(rig.sample().u, 0.0);
 }
 
@@ -238,7 +238,7 @@ fn samples_that_stop_coming_are_noticed_by_poll() {
 
 #[test]
 fn samples_off_their_grid_trip() {
-    // a period late; half a period late for good; early; the clock back; the clock far ahead
+    // a period late; permanently half a period late; early; the clock back; the clock far ahead
     let cases: [&[i64]; 5] = [&[2000], &[1600, 1000], &[400], &[-100_000], &[i64::MAX / 2]];
     for steps in cases {
         let mut rig = Rig::driving(3.0);
@@ -387,7 +387,7 @@ fn a_device_that_is_not_sampled_is_safe() {
 fn stop_is_executed_whatever_its_number() {
     let mut rig = Rig::driving(3.0);
     let tag = identity().boot_id as u16;
-    // of a host that was replaced and had counted further
+    // from a host that was replaced and had counted further
     rig.say(0x03, tag, 5000, &[]);
     assert!(rig.sample().enabled);
     rig.say(0x06, tag, 7, &[]);
@@ -400,7 +400,7 @@ fn stop_is_executed_whatever_its_number() {
     );
 }
 
-/// Two hosts: the second drives, and the line still holds what the first has said, with far higher numbers.
+/// Two hosts: the second drives, and the line still holds the first one's frames, with far higher numbers.
 fn replaced(u: f32) -> Rig {
     let mut rig = Rig::ready();
     rig.new_session(78);
@@ -430,7 +430,7 @@ fn a_replaced_host_neither_drives_nor_feeds() {
         stale(&mut rig, 0x20, number + 1, &drive[..4]);
         assert_eq!(rig.sample().u, 3.0);
     }
-    // only the last word of the second host counts
+    // only the second host's last message counts
     rig.sample();
     tripped(&mut rig, Reason::Watchdog);
     let (_, status) = rig.command(0x03, &[]);
@@ -443,7 +443,7 @@ fn the_new_host_is_heard_after_high_numbers_of_the_old_one() {
     for k in 0..200 {
         stale(&mut rig, 0x20, 5_000_000 + k, &50_000u32.to_le_bytes());
         stale(&mut rig, 0x03, 5_000_000 + k, &[]);
-        // unknown, and with another tag: not even a refusal, and no trip
+        // unknown, with another tag: not even a refusal, and no trip
         stale(&mut rig, 0x1F, 6_000_000 + k, &[]);
         rig.tag ^= 1;
         stale(&mut rig, 0x03, 7_000_000 + k, &[]);

@@ -1,4 +1,4 @@
-//! The layout of what the device says.
+//! The layout of the device's messages.
 
 use super::rig::*;
 use crate::link::identity::capability as can;
@@ -52,7 +52,7 @@ fn arm_repeats_the_key_of_the_last_hello() {
         assert_eq!(rig.command(0x05, &body), (13, vec![0; 4]));
     }
     assert_eq!(rig.command(0x05, &watchdog), (2, vec![4, 0, 0, 0]));
-    // the session again keeps its key, another one and another boot have their own
+    // the same session again keeps its key; another session or another boot gets another key
     rig.hello(77);
     assert_eq!(rig.key(), key);
     let old = rig.arming(50_000);
@@ -81,7 +81,7 @@ fn hello_needs_a_common_version() {
     }
     rig.say(0x01, 0, 0, &[1]);
     assert_eq!(rig.listen().pop().unwrap().body[4..], [2, 1, 0, 0, 0]);
-    // session 0 is none
+    // session 0 does not exist
     assert_eq!(rig.hello(0), (3, vec![2, 0, 0, 0]));
 }
 
@@ -127,7 +127,7 @@ fn status_tells_the_run() {
             .is_some_and(|speed| (speed - 15.0).abs() < 1e-4)
     );
     assert_eq!(fields.i32(), Some(3));
-    // HELLO, LIMITS, ARM, START, STATUS and five heartbeats; one that was none; nothing dropped
+    // HELLO, LIMITS, ARM, START, STATUS and five heartbeats; one invalid frame; nothing dropped
     assert_eq!(
         (fields.u32(), fields.u32(), fields.u32()),
         (Some(10), Some(1), Some(0))
@@ -190,7 +190,7 @@ fn the_same_number_gets_the_same_reply_and_is_not_executed_again() {
     rig.say(0x03, tag, rig.commands - 1, &[]);
     assert!(rig.listen().is_empty());
     assert_eq!(rig.device.state(), State::Armed);
-    // a number far ahead is taken, and those before it are old from then on
+    // a number far ahead is accepted, and from then on those before it are old
     rig.commands = 0x7000_0000;
     assert_eq!(rig.stop().0, 0);
     rig.commands = 0xE000_0000;
@@ -223,7 +223,7 @@ fn a_device_on_credit_waits_for_its_host() {
     assert_eq!(rig.device.credit(), None);
     rig.hello(1);
     assert_eq!(rig.device.credit(), Some(rig.now));
-    // its counts start anew when it is armed, which is no motion
+    // its counts restart when it is armed, which is no motion
     rig.limits(10.0, 4000.0, INF, 20.0);
     rig.arm();
     assert_eq!(rig.device.armed_count(), 1);
