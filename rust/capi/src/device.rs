@@ -9,10 +9,10 @@ use sewfast_control::link::{
     Channel, Device, Encoding, Identity, Limits, Measurement, Output, Reason, Source,
 };
 
-/// Values of a profile that the device holds.
+/// Number of values of a profile that the device holds.
 pub const CAPACITY: usize = 2048;
 
-/// The device and what its identity refers to; the storage must not move.
+/// The device and the data its identity refers to; the storage must not move.
 #[derive(Debug)]
 pub struct Storage {
     device: Device<CAPACITY>,
@@ -27,7 +27,7 @@ pub struct CChannel {
     pub encoding: u8,
     /// `sewfast_source`.
     pub source: u8,
-    /// The index in `further`, where that is the source.
+    /// The index in `further`, if that is the source.
     pub further: u8,
     /// Steps per unit.
     pub steps_per_unit: u32,
@@ -55,23 +55,23 @@ pub struct CLimits {
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct CIdentity {
-    /// Another one at each boot.
+    /// Must differ from that of the previous boot.
     pub boot_id: u32,
-    /// Bits that nobody outside knows.
+    /// Bits unknown to outsiders.
     pub entropy: u32,
     /// UTF-8, closed by a zero.
     pub name: *const c_char,
     /// UTF-8, closed by a zero.
     pub firmware: *const c_char,
-    /// \[us\].
+    /// Control period \[us\].
     pub period: u32,
     /// Counts per turn.
     pub counts_per_rev: f32,
     /// Bits of the protocol.
     pub capabilities: u32,
-    /// The device's own limits.
+    /// Upper bounds of the limits.
     pub ceilings: CLimits,
-    /// `channel_count` of them.
+    /// Array of `channel_count` channels.
     pub channels: *const CChannel,
     /// 2 to 16.
     pub channel_count: usize,
@@ -83,9 +83,9 @@ pub struct CIdentity {
 pub struct CMeasurement {
     /// The counter.
     pub counts: i32,
-    /// \[A\]; NaN where none is measured.
+    /// \[A\]; NaN if none is measured.
     pub current: f32,
-    /// `further_count` of them.
+    /// Array of `further_count` values.
     pub further: *const f32,
     /// May be 0.
     pub further_count: usize,
@@ -97,7 +97,7 @@ pub struct CMeasurement {
 pub struct COutput {
     /// \[V\].
     pub u: f32,
-    /// Whether the drive may be on.
+    /// Whether the drive may be switched on.
     pub enabled: bool,
 }
 
@@ -107,7 +107,7 @@ impl From<Output> for COutput {
     }
 }
 
-/// Why there is no device: `sewfast_refusal`.
+/// Why no device was made: `sewfast_refusal`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(i32)]
 enum Refusal {
@@ -136,12 +136,12 @@ impl From<Refused> for Refusal {
 }
 
 /// # Safety
-/// `text` is null or a text closed by a zero that stays as it is for as long as the device is used.
+/// `text` is null or a text closed by a zero that stays unchanged as long as the device is used.
 unsafe fn text(text: *const c_char) -> Result<&'static str, Refusal> {
     if text.is_null() {
         return Err(Refusal::Text);
     }
-    // SAFETY: by contract a text that outlives the device.
+    // SAFETY: by contract, a text that outlives the device.
     let text = unsafe { CStr::from_ptr(text) };
     text.to_str().map_err(|_| Refusal::Text)
 }
@@ -178,7 +178,7 @@ impl CChannel {
 }
 
 /// # Safety
-/// `storage` can be written to; the texts and channels of `identity` are what they say.
+/// `storage` is writable; the texts and channels of `identity` are as documented in the header.
 unsafe fn init(storage: *mut Storage, identity: &CIdentity) -> Result<(), Refusal> {
     let count = identity.channel_count;
     if identity.channels.is_null() || count > MAX_CHANNELS {
@@ -186,7 +186,7 @@ unsafe fn init(storage: *mut Storage, identity: &CIdentity) -> Result<(), Refusa
     }
     // SAFETY: not null, and by contract that many.
     let given = unsafe { slice::from_raw_parts(identity.channels, count) };
-    // SAFETY: a field of storage that can be written to.
+    // SAFETY: a field of writable storage.
     let channels = unsafe { &raw mut (*storage).channels }.cast::<Channel>();
     for (index, channel) in given.iter().enumerate() {
         // SAFETY: by contract; below MAX_CHANNELS.
@@ -214,11 +214,11 @@ unsafe fn init(storage: *mut Storage, identity: &CIdentity) -> Result<(), Refusa
             acceleration,
             current,
         },
-        // SAFETY: written above, never again, and the caller keeps the storage where it is.
+        // SAFETY: written above and never again, and the caller does not move the storage.
         channels: unsafe { slice::from_raw_parts(channels, count) },
     };
-    // SAFETY: a field of storage that can be written to. It is written from a constant, as a microcontroller's stack has no
-    // room for a device.
+    // SAFETY: a field of writable storage. It is written from a constant, because a microcontroller's stack has no room
+    // for a device.
     let device = unsafe {
         let place = &raw mut (*storage).device;
         place.write(Device::off());
@@ -227,23 +227,23 @@ unsafe fn init(storage: *mut Storage, identity: &CIdentity) -> Result<(), Refusa
     Ok(device.boot(identity)?)
 }
 
-/// Bytes that a device takes.
+/// Size of a device in bytes.
 #[unsafe(no_mangle)]
 pub extern "C" fn sewfast_device_size() -> usize {
     size_of::<Storage>()
 }
 
-/// What the address of a device must be a multiple of.
+/// Alignment of a device.
 #[unsafe(no_mangle)]
 pub extern "C" fn sewfast_device_alignment() -> usize {
     align_of::<Storage>()
 }
 
-/// A device at boot in `storage`; null where it is refused.
+/// Makes a device at boot in `storage`; null if it is refused.
 ///
 /// # Safety
-/// `storage` is `size` bytes of memory that nothing else uses and that stays where it is; `identity` and its texts are what
-/// the header says; `refusal` is null or can be written to.
+/// `storage` is `size` bytes of memory that nothing else uses and that does not move; `identity` and its texts are as
+/// documented in the header; `refusal` is null or writable.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_device_init(
     storage: *mut c_void,
@@ -253,7 +253,7 @@ pub unsafe extern "C" fn sewfast_device_init(
 ) -> *mut Storage {
     let place = place::<Storage>(storage, size).filter(|_| !identity.is_null());
     let made = place.ok_or(Refusal::Storage).and_then(|place| {
-        // SAFETY: place is fit for a Storage; identity is not null and by contract what the header says.
+        // SAFETY: place is fit for a Storage; identity is not null and by contract as documented in the header.
         unsafe { init(place, &*identity) }.map(|()| place)
     });
     let code = made.err().unwrap_or(Refusal::None);
@@ -273,7 +273,7 @@ unsafe fn device<'a>(storage: *mut Storage) -> Option<&'a mut Device<CAPACITY>> 
 }
 
 /// # Safety
-/// `bytes` is null or `count` of them can be read.
+/// `bytes` is null, or `count` of them are readable.
 unsafe fn read<'a, T>(bytes: *const T, count: usize) -> &'a [T] {
     if bytes.is_null() {
         return &[];
@@ -285,7 +285,7 @@ unsafe fn read<'a, T>(bytes: *const T, count: usize) -> &'a [T] {
 /// [`Device::receive`].
 ///
 /// # Safety
-/// `device` came from [`sewfast_device_init`], used by one context at a time; `count` bytes can be read.
+/// `device` came from [`sewfast_device_init`] and is used by one context at a time; `count` bytes are readable.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_device_receive(
     device: *mut Storage,
@@ -300,10 +300,10 @@ pub unsafe extern "C" fn sewfast_device_receive(
     }
 }
 
-/// [`Device::sample`]; safe where there is no device.
+/// [`Device::sample`]; the safe output if there is no device.
 ///
 /// # Safety
-/// `device` as above; `measurement` is null or what the header says.
+/// `device` as above; `measurement` is null or as documented in the header.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_device_sample(
     device: *mut Storage,
@@ -336,7 +336,7 @@ pub unsafe extern "C" fn sewfast_device_sample(
     output.into()
 }
 
-/// [`Device::poll`]; safe where there is no device.
+/// [`Device::poll`]; the safe output if there is no device.
 ///
 /// # Safety
 /// `device` as above.
@@ -352,7 +352,7 @@ pub unsafe extern "C" fn sewfast_device_poll(device: *mut Storage, now: u64) -> 
 /// [`Device::transmit`].
 ///
 /// # Safety
-/// `device` as above; `size` bytes can be written to `out`.
+/// `device` as above; `size` bytes of `out` are writable.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_device_transmit(
     device: *mut Storage,
@@ -395,7 +395,7 @@ pub unsafe extern "C" fn sewfast_device_trip(device: *mut Storage, now: u64, rea
 /// [`Device::credit`]: whether there is one, and until when.
 ///
 /// # Safety
-/// `device` as above; `until` is null or can be written to.
+/// `device` as above; `until` is null or writable.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_device_credit(device: *mut Storage, until: *mut u64) -> bool {
     // SAFETY: by contract.
@@ -407,7 +407,7 @@ pub unsafe extern "C" fn sewfast_device_credit(device: *mut Storage, until: *mut
     credit.is_some()
 }
 
-/// [`Device::armed_count`]; 0 where there is no device.
+/// [`Device::armed_count`]; 0 if there is no device.
 ///
 /// # Safety
 /// `device` as above.
@@ -430,7 +430,7 @@ pub unsafe extern "C" fn sewfast_device_disconnect(device: *mut Storage) {
     }
 }
 
-/// [`Device::state`]; boot where there is no device.
+/// [`Device::state`]; boot if there is no device.
 ///
 /// # Safety
 /// `device` as above.

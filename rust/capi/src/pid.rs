@@ -26,7 +26,7 @@ pub struct CPoint {
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct CBiquad {
-    /// Answer to a step at its own sample, less 1.
+    /// Step response at the step's own sample, minus 1.
     pub c0: f32,
     /// The same a sample later, before the poles.
     pub c1: f32,
@@ -50,7 +50,7 @@ pub struct CSettings {
     pub alpha: f32,
     /// Share of the reference taken out of the derivative term.
     pub beta: f32,
-    /// The derivative's filter is `td/n`.
+    /// The derivative's filter has the time constant `td/n`.
     pub n: f32,
     /// Anti-windup \[s\].
     pub tt: f32,
@@ -70,17 +70,17 @@ pub struct CSettings {
     pub observer_time: f32,
     /// Ramp of the reference \[y/s\].
     pub r_rate: f32,
-    /// Points of the schedule that are used.
+    /// Number of points in the schedule.
     pub schedule_count: u8,
     /// Gains over speed.
     pub schedule: [CPoint; POINTS],
-    /// Biquads that are used.
+    /// Number of biquads.
     pub biquad_count: u8,
-    /// On reference and feedback.
+    /// Biquads on reference and feedback.
     pub biquads: [CBiquad; BIQUADS],
 }
 
-/// The number of the setting, in the header's order and from 1; 0 is none.
+/// The number of the setting, in the header's order from 1; 0 for none.
 fn number(name: &str) -> i32 {
     let names = [
         "Kp",
@@ -105,17 +105,17 @@ fn number(name: &str) -> i32 {
     found.map_or(-1, |(number, _)| number)
 }
 
-/// Bytes that a controller takes.
+/// Size of a controller in bytes.
 #[unsafe(no_mangle)]
 pub extern "C" fn sewfast_pid_size() -> usize {
     size_of::<PidController<f32>>()
 }
 
-/// A controller at rest in `storage`; null where it is refused.
+/// Makes a controller at rest in `storage`; null if it is refused.
 ///
 /// # Safety
-/// `storage` is `size` bytes of memory that nothing else uses; `settings` is null or can be read; `refusal` is null or can be
-/// written to.
+/// `storage` is `size` bytes of memory that nothing else uses; `settings` is null or readable; `refusal` is null or
+/// writable.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_pid_init(
     storage: *mut c_void,
@@ -162,7 +162,7 @@ impl CSettings {
                 gains: Standard { kp, ti, td },
             };
         }
-        // a count beyond the array is one point too many, and refused
+        // a count beyond the array means one point too many, and is refused
         let named = points.get(..self.schedule_count.into());
         Schedule::new(named.unwrap_or(&points))
     }
@@ -173,7 +173,7 @@ impl CSettings {
             let CBiquad { c0, c1, a1, a2 } = *section;
             *place = Biquad { c0, c1, a1, a2 };
         }
-        // a count beyond the array is one section too many, and refused
+        // a count beyond the array means one section too many, and is refused
         let named = sections.get(..self.biquad_count.into());
         Cascade::new(named.unwrap_or(&sections))
     }
@@ -206,10 +206,10 @@ impl CSettings {
     }
 }
 
-/// Whether `made` is a section, which is then in `place`.
+/// Whether `made` is a section; if so, it is written to `place`.
 ///
 /// # Safety
-/// `place` is null or can be written to.
+/// `place` is null or writable.
 unsafe fn put(place: *mut CBiquad, made: Result<Biquad<f32>, Refused>) -> bool {
     // SAFETY: by contract.
     let (Some(place), Ok(made)) = (unsafe { place.as_mut() }, made) else {
@@ -223,7 +223,7 @@ unsafe fn put(place: *mut CBiquad, made: Result<Biquad<f32>, Refused>) -> bool {
 /// [`Biquad::notch`].
 ///
 /// # Safety
-/// `biquad` is null or can be written to.
+/// `biquad` is null or writable.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_pid_notch(
     biquad: *mut CBiquad,
@@ -240,7 +240,7 @@ pub unsafe extern "C" fn sewfast_pid_notch(
 /// [`Biquad::low_pass`].
 ///
 /// # Safety
-/// `biquad` is null or can be written to.
+/// `biquad` is null or writable.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_pid_low_pass(
     biquad: *mut CBiquad,
@@ -256,7 +256,7 @@ pub unsafe extern "C" fn sewfast_pid_low_pass(
 /// [`Biquad::lead_lag`].
 ///
 /// # Safety
-/// `biquad` is null or can be written to.
+/// `biquad` is null or writable.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_pid_lead_lag(
     biquad: *mut CBiquad,
@@ -272,7 +272,7 @@ pub unsafe extern "C" fn sewfast_pid_lead_lag(
 /// [`Biquad::resonance`].
 ///
 /// # Safety
-/// `biquad` is null or can be written to.
+/// `biquad` is null or writable.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_pid_resonance(
     biquad: *mut CBiquad,
@@ -307,10 +307,10 @@ pub unsafe extern "C" fn sewfast_pid_resonance(
     unsafe { put(biquad, made) }
 }
 
-/// [`PidController::step`]; 0 where there is no controller.
+/// [`PidController::step`]; 0 if there is no controller.
 ///
 /// # Safety
-/// `pid` is null or came from [`sewfast_pid_init`], used by one context at a time.
+/// `pid` is null, or came from [`sewfast_pid_init`] and is used by one context at a time.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_pid_step(pid: *mut PidController<f32>, r: f32, y: f32) -> f32 {
     // SAFETY: by contract.
@@ -318,7 +318,7 @@ pub unsafe extern "C" fn sewfast_pid_step(pid: *mut PidController<f32>, r: f32, 
     pid.map_or(0.0, |pid| pid.step(r, y))
 }
 
-/// [`PidController::step_with`]; 0 where there is no controller.
+/// [`PidController::step_with`]; 0 if there is no controller.
 ///
 /// # Safety
 /// As for [`sewfast_pid_step`].
@@ -334,10 +334,10 @@ pub unsafe extern "C" fn sewfast_pid_step_with(
     pid.map_or(0.0, |pid| pid.step_with(r, y, feedforward))
 }
 
-/// [`PidController::set_design`]; 0, the number of the setting that is refused, or -1 where something is null.
+/// [`PidController::set_design`]; returns 0, the number of the refused setting, or -1 if a pointer is null.
 ///
 /// # Safety
-/// As for [`sewfast_pid_step`]; `settings` is null or can be read.
+/// As for [`sewfast_pid_step`]; `settings` is null or readable.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_pid_change(
     pid: *mut PidController<f32>,
@@ -352,7 +352,7 @@ pub unsafe extern "C" fn sewfast_pid_change(
     done.map_or_else(|refused| number(refused.name), |()| 0)
 }
 
-/// [`PidController::set_manual`]; whether `u` is finite.
+/// [`PidController::set_manual`]; returns whether `u` is finite.
 ///
 /// # Safety
 /// As for [`sewfast_pid_step`].

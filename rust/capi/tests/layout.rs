@@ -1,8 +1,8 @@
-//! The structs of `include/sewfast.h` lie in memory as the library reads them: the size and the place of every field, by the C
-//! compiler.
+//! Checks with the C compiler that the structs of `include/sewfast.h` have the memory layout that the library reads:
+//! size and offset of every field.
 //!
-//! What Rust says is written as assertions behind the header and compiled: a field that is missing, has another name, another size
-//! or another place does not compile. Offsets are those of this machine; `#[repr(C)]` makes the rule the same on every target.
+//! Rust's layout is written as assertions after the header and compiled: a field that is missing or has another name, size or offset does
+//! not compile. Offsets are those of this machine; `#[repr(C)]` gives the same rule on every target.
 
 use std::fmt::Write;
 use std::io::Write as _;
@@ -12,8 +12,8 @@ use std::process::{Command, Stdio};
 use sewfast_capi::device::{CAPACITY, CChannel, CIdentity, CLimits, CMeasurement, COutput};
 use sewfast_capi::pid::{CBiquad, CPoint, CSettings};
 
-/// Size of a struct, and size and place of its fields, as assertions in C. A field that is new in Rust has to be named here, for
-/// the pattern has no `..`.
+/// Size of a struct, and size and offset of its fields, as assertions in C. A new field in Rust must be named here,
+/// because the pattern has no `..`.
 macro_rules! layout {
     ($text:expr, $c:literal, $rust:ident { $($field:ident),+ }) => {
         let text: &mut String = $text;
@@ -22,7 +22,7 @@ macro_rules! layout {
             let $rust { $($field),+ } = value;
             [$((stringify!($field), offset_of!($rust, $field), size_of_val($field))),+]
         };
-        // SAFETY: numbers, pointers and bools, for all of which zeros are a value.
+        // SAFETY: numbers, pointers and bools, for all of which zeros are valid.
         for (field, offset, size) in each(&unsafe { std::mem::zeroed() }) {
             writeln!(text, "_Static_assert(offsetof({}, {field}) == {offset}, \"place of {field}\");", $c).unwrap();
             writeln!(text, "_Static_assert(sizeof((({} *)0)->{field}) == {size}, \"size of {field}\");", $c).unwrap();
@@ -117,7 +117,7 @@ fn assertions() -> String {
     text
 }
 
-/// What the compiler says of a file; `None` where there is no compiler.
+/// The compiler's messages about a file; `None` if there is no compiler.
 fn complaints(source: &str) -> Option<String> {
     let compiler = std::env::var("CC").unwrap_or_else(|_| "cc".to_owned());
     let include = concat!(env!("CARGO_MANIFEST_DIR"), "/include");
@@ -157,7 +157,7 @@ fn the_header_has_the_structs_of_the_library() {
         return;
     };
     assert_eq!(said, "", "the header and the library differ; change both");
-    // and a difference is seen
+    // and a difference is detected
     for (one, other) in [
         ("(sewfast_limits) == 16", "(sewfast_limits) == 20"),
         ("_pid_settings, beta) == 16", "_pid_settings, beta) == 12"),

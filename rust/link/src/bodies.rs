@@ -1,7 +1,7 @@
-//! The host's side of the bodies in docs/PROTOCOL.md: what it says, and what a device's replies say to it.
+//! The host's side of the bodies in docs/PROTOCOL.md: commands to a device, and its replies.
 //!
-//! Each command is written by the function of its name. A reply is read by the `of` of its value from the fields behind
-//! sequence and result; `None` is a body that is too short.
+//! Each command is written by the function of its name. Each reply is read by `of` of its struct, from the fields after
+//! sequence and result; `None` means that the body is too short.
 
 use sewfast_control::link::crc::Crc;
 use sewfast_control::link::identity::VERSION;
@@ -13,43 +13,43 @@ fn written(write: impl FnOnce(&mut Body)) -> Body {
     body
 }
 
-/// HELLO of a host that speaks one version.
+/// HELLO of a host that supports one version.
 #[must_use]
 pub fn hello(session: u32) -> Body {
     written(|b| _ = b.u8(VERSION).u8(VERSION).u32(session))
 }
 
-/// ARM, with the key that HELLO was answered with.
+/// ARM, with the key from the reply to HELLO.
 #[must_use]
 pub fn arm(watchdog: u32, key: u32) -> Body {
     written(|b| _ = b.u32(watchdog).u32(key))
 }
 
-/// KEEP: the device may go on for `watchdog` \[us\].
+/// KEEP: the device may continue for `watchdog` \[us\].
 #[must_use]
 pub fn keep(watchdog: u32) -> Body {
     written(|b| _ = b.u32(watchdog))
 }
 
-/// DRIVE: the command of a direct run, which is a heartbeat too.
+/// DRIVE: the command of a direct run; also a heartbeat.
 #[must_use]
 pub fn drive(watchdog: u32, u: f64) -> Body {
     written(|b| _ = b.u32(watchdog).f32(u as f32))
 }
 
-/// CREDIT: the device's time may advance to `until` \[us\]; a heartbeat too.
+/// CREDIT: the device's time may advance to `until` \[us\]; also a heartbeat.
 #[must_use]
 pub fn credit(watchdog: u32, until: u64) -> Body {
     written(|b| _ = b.u32(watchdog).u64(until))
 }
 
-/// LIMITS: volt, speed, acceleration, current; zeros ask for those in force.
+/// LIMITS: volt, speed, acceleration, current; zeros ask for the limits in force.
 #[must_use]
 pub fn limits(values: [f64; 4]) -> Body {
     written(|b| numbers(b, &values))
 }
 
-/// UPLOAD of values as they are in the table, from its value `offset` on.
+/// UPLOAD of values in the table's encoding, from its value `offset` on.
 #[must_use]
 pub fn upload(table: u8, offset: u32, values: &[u8]) -> Body {
     written(|b| _ = b.u8(table).u32(offset).add(values))
@@ -64,7 +64,7 @@ pub fn gains(values: [f64; 12], filter_samples: u8) -> Body {
     })
 }
 
-/// What follows the gains for a device that knows observer, ramp and schedule (speed, Kp, Ti, Td each).
+/// The fields after the gains, for a device with observer, ramp and schedule (speed, Kp, Ti, Td each).
 pub fn design(body: &mut Body, observer_time: f64, r_rate: f64, schedule: &[[f64; 4]]) {
     numbers(body, &[observer_time, r_rate]);
     body.u8(u8::try_from(schedule.len()).unwrap_or(u8::MAX));
@@ -94,25 +94,25 @@ pub fn controller(kind: u8, counts_per_unit: f64, values: &[f64]) -> Body {
     })
 }
 
-/// What single precision holds of each; beyond its range that is infinite.
+/// Each value in single precision; infinite beyond its range.
 fn numbers(body: &mut Body, values: &[f64]) {
     for &value in values {
         body.f32(value as f32);
     }
 }
 
-/// START of a run: its mode, its place in time (0 for the next sample), its length and what is streamed of it.
+/// START of a run: its mode, its start (0 for the next sample), its length and the streamed channels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Start {
     /// 0 commands, 1 controller, 2 direct.
     pub mode: u8,
     /// Time of the watchdog \[us\].
     pub watchdog: u32,
-    /// Device's time of the first sample \[us\]; 0 for the next one.
+    /// Device time of the first sample \[us\]; 0 for the next one.
     pub at: u64,
     /// Samples.
     pub length: u32,
-    /// A bit for each channel that is streamed.
+    /// A bit for each streamed channel.
     pub mask: u16,
     /// Samples in a frame.
     pub batch: u8,
@@ -129,12 +129,12 @@ impl Start {
     }
 }
 
-/// The head of every reply: the command's number and 0, or why it was refused. What is left is the reply itself.
+/// The head of every reply: the command's number and 0, or why it was refused. The remaining fields are the reply itself.
 pub fn reply(fields: &mut Fields<'_>) -> Option<(u32, u8)> {
     Some((fields.u32()?, fields.u8()?))
 }
 
-/// A text; what is not UTF-8 in it is shown as such.
+/// A text; invalid UTF-8 in it is shown as such.
 fn text(fields: &mut Fields<'_>) -> Option<String> {
     let length = fields.u8()?;
     let bytes = fields.take(length.into())?;
@@ -144,31 +144,31 @@ fn text(fields: &mut Fields<'_>) -> Option<String> {
 /// The reply to HELLO.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Greeting {
-    /// Of the protocol.
+    /// Version of the protocol.
     pub version: u8,
-    /// Another one after a reset.
+    /// Boot id, different after each reset.
     pub boot: u32,
     /// CRC-32 of the channels, see [`schema`].
     pub schema: u32,
-    /// When it was asked.
+    /// The device's state at that time.
     pub state: u8,
-    /// How many.
+    /// Number of channels.
     pub channels: u8,
     /// Control period \[us\].
     pub period: u32,
     /// Bits of `sewfast_control::link::capability`.
     pub capabilities: u32,
-    /// Values that its profile memory holds.
+    /// Number of values that its profile memory holds.
     pub capacity: u32,
-    /// Of the encoder.
+    /// Encoder counts per turn.
     pub counts_per_rev: f32,
-    /// Of the device.
+    /// The device's name.
     pub name: String,
-    /// Its version.
+    /// Its firmware's version.
     pub firmware: String,
-    /// Whose HELLO it answers.
+    /// The session whose HELLO it answers.
     pub session: u32,
-    /// What ARM repeats.
+    /// The key that ARM repeats.
     pub key: u32,
 }
 
@@ -196,13 +196,13 @@ impl Greeting {
 /// The reply to DESCRIBE.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Description {
-    /// Of the channel.
+    /// Number of the channel.
     pub number: u8,
-    /// How its samples are written.
+    /// Encoding of its samples.
     pub encoding: u8,
-    /// Of encoding 1.
+    /// Steps per unit, for encoding 1.
     pub steps_per_unit: u32,
-    /// Of the quantity.
+    /// Name of the quantity.
     pub name: String,
     /// Its unit.
     pub unit: String,
@@ -221,7 +221,7 @@ impl Description {
     }
 }
 
-/// CRC-32 of version, period and the replies to all DESCRIBE, which HELLO has announced.
+/// CRC-32 of version, period and the replies to all DESCRIBE, as announced by HELLO.
 #[must_use]
 pub fn schema<'a>(version: u8, period: u32, replies: impl IntoIterator<Item = &'a [u8]>) -> u32 {
     let head = Crc::new().update(&[version]).update(&period.to_le_bytes());
@@ -229,16 +229,16 @@ pub fn schema<'a>(version: u8, period: u32, replies: impl IntoIterator<Item = &'
     all.value()
 }
 
-/// The reply to STATUS; of the run that is under way, or of the last one.
+/// The reply to STATUS: about the run in progress, or the last one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Status {
     /// The device's state.
     pub state: u8,
     /// Reason of its last trip.
     pub reason: u8,
-    /// Of the run.
+    /// Mode of the run.
     pub mode: u8,
-    /// Channels that are streamed.
+    /// Streamed channels.
     pub mask: u16,
     /// Its number.
     pub run: u32,
@@ -246,7 +246,7 @@ pub struct Status {
     pub start: u64,
     /// Samples taken in it.
     pub samples: u32,
-    /// Of so many.
+    /// Length of the run \[samples\].
     pub length: u32,
     /// End of the profile.
     pub end: u32,
@@ -254,15 +254,15 @@ pub struct Status {
     pub speed: f32,
     /// The counter.
     pub counts: i32,
-    /// Frames that it received.
+    /// Received frames.
     pub received: u32,
-    /// Frames that it refused.
+    /// Refused frames.
     pub refused: u32,
-    /// Frames that it dropped, as its transmit memory was full.
+    /// Frames dropped because its transmit memory was full.
     pub dropped: u32,
     /// Its latest control period \[us late\].
     pub late: u32,
-    /// Whose session it is in.
+    /// The session it is in.
     pub session: u32,
     /// Frames of other sessions.
     pub foreign: u32,
@@ -307,25 +307,25 @@ pub fn started(fields: &mut Fields<'_>) -> Option<(u32, u64)> {
     Some((fields.u32()?, fields.u64()?))
 }
 
-/// The reply to UPLOAD: end of the profile, values that fit behind it.
+/// The reply to UPLOAD: end of the profile, and number of further values that fit.
 pub fn uploaded(fields: &mut Fields<'_>) -> Option<(u32, u32)> {
     Some((fields.u32()?, fields.u32()?))
 }
 
-/// Something that happened on the device, `samples` into a run.
+/// An event on the device, `samples` into a run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Event {
-    /// What.
+    /// The code of the event.
     pub code: u8,
-    /// The state that it led to.
+    /// The resulting state.
     pub state: u8,
-    /// Of a trip.
+    /// Reason of a trip.
     pub reason: u8,
     /// The run.
     pub run: u32,
     /// Its samples so far.
     pub samples: u32,
-    /// What tripped it.
+    /// The value that tripped it.
     pub value: f32,
 }
 
@@ -343,7 +343,7 @@ impl Event {
     }
 }
 
-/// What a device says of itself while it does not run.
+/// The status that a device sends while it does not run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Beat {
     /// Its boot id.
@@ -355,7 +355,7 @@ pub struct Beat {
 }
 
 impl Beat {
-    /// The fields of a beat; the speed behind them is not read.
+    /// The fields of a beat; the speed after them is not read.
     pub fn of(fields: &mut Fields<'_>) -> Option<Self> {
         Some(Self {
             boot: fields.u32()?,

@@ -1,16 +1,16 @@
 //! A host's end of a session with a device, without port or clock: bytes and time in, frames and events out.
 //!
-//! It is the one client of the protocol (docs/PROTOCOL.md): the loop on the host and the bindings both drive it. What it
-//! holds is the session: its number, key and tag; the count of commands and that of heartbeats; the command under way with
-//! its repeats; the newest time of the device and when a frame came last. Whoever owns it has the port and the clock:
+//! It is the only client of the protocol (docs/PROTOCOL.md): the loop on the host and the bindings both use it. It
+//! holds the session: its number, key and tag, the counters of commands and of heartbeats, the pending command with its
+//! repeats, the newest time of the device and when the last frame came. Its owner has the port and the clock:
 //!
-//! 1. [`receive`](Client::receive) what came, then take each [`event`](Client::event);
-//! 2. [`expire`](Client::expire) what was repeated in vain;
-//! 3. write what [`transmit`](Client::transmit) gives, by [`due`](Client::due) at the latest;
+//! 1. [`receive`](Client::receive) incoming bytes, then take each [`event`](Client::event);
+//! 2. [`expire`](Client::expire) commands repeated in vain;
+//! 3. write what [`transmit`](Client::transmit) returns, by [`due`](Client::due) at the latest;
 //! 4. while a motor may turn, write a heartbeat ([`keep`](Client::keep), [`drive`](Client::drive) or
 //!    [`grant`](Client::grant)) every quarter of the watchdog time.
 //!
-//! All times are the host's, in microseconds of a clock that does not run backwards, unless they are the device's.
+//! Unless they are the device's, all times are the host's, in microseconds of a clock that does not run backwards.
 //!
 //! ```
 //! use sewfast_control::link::Body;
@@ -49,24 +49,24 @@ pub mod kind {
     pub const BEAT: u8 = 0xC2;
 }
 
-/// How long a reply is waited for before a command is repeated.
+/// How long to wait for a reply before a command is repeated.
 pub const REPEAT: u64 = 100_000;
 /// The same for STOP, within any usual watchdog time.
 pub const STOP_REPEAT: u64 = 10_000;
-/// How long a command is repeated before it is given up, where the watchdog's time is not longer: a motor may turn for that
-/// long, and STOP must not be given up before.
+/// How long a command is repeated before it is given up, if the watchdog's time is not longer: a motor may turn for
+/// that long, and STOP must not be given up earlier.
 pub const PATIENCE: u64 = 1_000_000;
-/// Events and beats that wait for a caller who takes none; later ones are dropped.
+/// Most events and beats kept for a caller who takes none; later ones are dropped.
 const ROOM: usize = 256;
 
-/// What a device answered.
+/// A device's reply.
 #[derive(Clone, Debug)]
 pub struct Reply {
     /// Kind of the command.
     pub kind: u8,
     /// 0, or why it was refused.
     pub result: u8,
-    /// Of a refusal.
+    /// Detail of a refusal.
     pub detail: u32,
     /// Empty in a refusal.
     pub body: Body,
@@ -74,41 +74,41 @@ pub struct Reply {
     pub time: u64,
     /// When the command was sent first.
     pub sent: u64,
-    /// From then to the reply, where the command was sent once only.
+    /// Time from then to the reply, if the command was sent only once.
     pub round_trip: Option<u64>,
 }
 
-/// What a device said.
+/// Something received from a device.
 #[derive(Clone, Debug)]
 #[expect(
     clippy::large_enum_variant,
     reason = "a reply in a box would be allocated while a motor turns"
 )]
 pub enum Event {
-    /// The reply to the command under way, or to HELLO.
+    /// The reply to the pending command, or to HELLO.
     Reply(Reply),
-    /// Something happened on the device, at this time of its own \[us\].
+    /// An event on the device, at this device time \[us\].
     Happened(bodies::Event, u64),
-    /// What a device says while it does not run.
+    /// The device's status while it does not run.
     Beat(Beat),
-    /// It has booted anew: it knows nothing of this session, and its motor is without command.
+    /// The device has rebooted: it knows nothing of this session, and its motor has no command.
     Reset,
 }
 
 /// A command that was repeated in vain.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Unanswered {
-    /// Of the command.
+    /// Its kind.
     pub kind: u8,
     /// How often it was sent.
     pub attempts: u64,
-    /// For how long it was waited \[us\].
+    /// How long the host waited \[us\].
     pub waited: u64,
-    /// Whole frames that came meanwhile.
+    /// Whole frames received meanwhile.
     pub others: u64,
 }
 
-/// A command under way: repeated unchanged until its reply comes or it is given up.
+/// A pending command: repeated unchanged until its reply comes or it is given up.
 #[derive(Clone, Debug)]
 struct Request {
     kind: u8,
@@ -117,12 +117,12 @@ struct Request {
     /// How often it is sent before it is given up.
     tries: u64,
     sent: u64,
-    /// When it was sent first; repeats carry this time too.
+    /// When it was first sent; repeats carry the same time.
     first: Option<u64>,
     last: u64,
-    /// From when on its tries count: anew after the session was confirmed on a port that had vanished.
+    /// When its tries began to count: they restart after the session was confirmed on a port that had vanished.
     since: u64,
-    /// Whole frames that had come by then.
+    /// Number of whole frames received by then.
     frames: u64,
 }
 
@@ -149,13 +149,13 @@ impl Request {
         }
     }
 
-    /// Whether the last try has waited long enough. Tries are counted, not time: a host that was not given the processor for
-    /// a while has waited, but not asked.
+    /// Whether the last try has waited long enough. Tries count, not time: a host that did not get the processor for a
+    /// while has waited, but not asked.
     fn is_exhausted(&self, now: u64) -> bool {
         self.sent >= self.tries && now >= self.due()
     }
 
-    /// Notes that it is sent now; the time in its frame.
+    /// Notes that it is sent now; returns the time for its frame.
     fn send(&mut self, now: u64, frames: u64) -> u64 {
         if self.sent == 0 {
             (self.since, self.frames) = (now, frames);
@@ -196,7 +196,7 @@ fn repeat(kind: u8) -> u64 {
     }
 }
 
-/// A reply before it is known whose it is.
+/// A reply that has not been assigned to a request yet.
 struct Answer {
     sequence: u32,
     result: u8,
@@ -206,7 +206,7 @@ struct Answer {
 }
 
 impl Answer {
-    /// None for a body that is no reply: a refusal has its detail and nothing else.
+    /// `None` for a body that is no reply: a refusal has its detail and nothing else.
     fn of(frame: &Frame<'_>) -> Option<Self> {
         let mut fields = Fields::new(frame.body);
         let (sequence, result) = bodies::reply(&mut fields)?;
@@ -231,7 +231,7 @@ impl Answer {
     }
 }
 
-/// A session with a device; see the module.
+/// A session with a device; see the module's documentation.
 #[derive(Clone, Debug)]
 pub struct Client {
     receiver: Receiver,
@@ -240,7 +240,7 @@ pub struct Client {
     wire: [u8; 1 + MAX_WIRE],
 }
 
-/// Everything but the receiver, which lends out the frame that changes this.
+/// Everything except the receiver, which lends the frame while this is changed.
 #[derive(Clone, Debug)]
 struct Session {
     number: u32,
@@ -258,8 +258,8 @@ struct Session {
 }
 
 impl Client {
-    /// A session that has not been greeted: `session` is its number, not 0, and `watchdog` for how long the device may go on
-    /// without a heartbeat \[us\].
+    /// A session before HELLO: `session` is its number, not 0; `watchdog` is how long the device may continue without a
+    /// heartbeat \[us\].
     pub fn new(session: u32, watchdog: u32) -> Self {
         Self {
             receiver: Receiver::new(),
@@ -280,8 +280,8 @@ impl Client {
         }
     }
 
-    /// A session that somebody else has greeted and led so far: the device's tag and key, and the numbers of the last command
-    /// and of the last heartbeat.
+    /// A session that another client has opened and used so far: the device's tag and key, and the numbers of the last
+    /// command and of the last heartbeat.
     #[must_use]
     pub fn continued(mut self, tag: u16, key: u32, command: u32, heartbeat: u32) -> Self {
         (self.session.tag, self.session.key) = (Some(tag), key);
@@ -289,25 +289,25 @@ impl Client {
         self
     }
 
-    /// Goes on after these numbers, which somebody else has reached. What the device has said meanwhile is not missing.
+    /// Continues after these numbers, which another client has reached. Frames of the device missed meanwhile do not count as lost.
     pub fn go_on(&mut self, command: u32, heartbeat: u32) {
         (self.session.command, self.session.heartbeat) = (command, heartbeat);
         self.session.request = None;
         self.receiver = Receiver::new();
     }
 
-    /// For how long the device may go on without a heartbeat, from the next one on \[us\].
+    /// How long the device may continue without a heartbeat, from the next one on \[us\].
     pub fn set_watchdog(&mut self, watchdog: u32) {
         self.watchdog = watchdog;
     }
 
-    // --- what comes in ------------------------------------------------------------------------------
+    // --- incoming -----------------------------------------------------------------------------------
 
-    /// Takes bytes as they came.
+    /// Takes received bytes.
     pub fn receive(&mut self, now: u64, bytes: &[u8]) {
         let session = &mut self.session;
         let before = *self.receiver.counters();
-        // a device that was reset is to be heard while it is greeted, and so is what a line has kept
+        // during HELLO a device that was reset must be heard, and so are frames kept by a line
         let expected = session.tag.filter(|_| session.hello.is_none());
         let mut foreign = false;
         self.receiver.feed(bytes, |frame| {
@@ -328,12 +328,12 @@ impl Client {
         }
     }
 
-    /// The next thing that the device said.
+    /// The next event.
     pub fn event(&mut self) -> Option<Event> {
         self.session.events.pop_front()
     }
 
-    /// The samples' side: what is streamed, columns, counters.
+    /// The receiver of samples: streamed channels, columns, counters.
     pub fn receiver(&mut self) -> &mut Receiver {
         &mut self.receiver
     }
@@ -343,21 +343,21 @@ impl Client {
         self.receiver.counters()
     }
 
-    // --- what goes out ------------------------------------------------------------------------------
+    // --- outgoing -----------------------------------------------------------------------------------
 
-    /// Puts HELLO under way, before anything else: until it is answered, or for `patience` \[us\]. The same session again
+    /// Sends HELLO before anything else, until it is answered or for `patience` \[us\]. HELLO of the same session
     /// changes nothing on the device.
     pub fn greet(&mut self, patience: u64) {
         let body = bodies::hello(self.session.number);
         self.session.hello = Some(Request::new(kind::HELLO, 0, body, patience));
     }
 
-    /// Sends HELLO no more; what was under way before it goes on.
+    /// Stops sending HELLO; an earlier pending command continues.
     pub fn end_greeting(&mut self) {
         self.session.hello = None;
     }
 
-    /// Puts a command under way, instead of one that may be.
+    /// Makes a command pending; replaces one that may be.
     pub fn begin(&mut self, kind: u8, body: Body) {
         let session = &mut self.session;
         session.command = session.command.wrapping_add(1);
@@ -365,17 +365,17 @@ impl Client {
         session.request = Some(Request::new(kind, session.command, body, patience));
     }
 
-    /// Puts ARM under way, with the session's key.
+    /// Makes ARM pending, with the session's key.
     pub fn arm(&mut self) {
         self.begin(kind::ARM, bodies::arm(self.watchdog, self.session.key));
     }
 
-    /// Forgets the command under way.
+    /// Drops the pending command.
     pub fn forget(&mut self) {
         self.session.request = None;
     }
 
-    /// Gives up what was repeated long enough.
+    /// Gives up a request that was repeated long enough.
     pub fn expire(&mut self, now: u64) -> Option<Unanswered> {
         let frames = self.counters().frames;
         let under_way = self.session.under_way()?;
@@ -387,7 +387,7 @@ impl Client {
             .map(|request| request.given_up(now, frames))
     }
 
-    /// The frame to write now, or nothing: the command under way, where it is new or to be repeated.
+    /// The frame to write now, or nothing: the pending command, if it is new or due for a repeat.
     pub fn transmit(&mut self, now: u64) -> &[u8] {
         let frames = self.counters().frames;
         let due = self.session.under_way().and_then(Option::as_mut);
@@ -399,8 +399,8 @@ impl Client {
         self.frame(kind, sequence, first, &body)
     }
 
-    /// When [`transmit`](Self::transmit) or [`expire`](Self::expire) is to be called at the latest; none while nothing is
-    /// under way.
+    /// When [`transmit`](Self::transmit) or [`expire`](Self::expire) must be called at the latest; `None` if nothing is
+    /// pending.
     pub fn due(&self) -> Option<u64> {
         let session = &self.session;
         let request = session.hello.as_ref().or(session.request.as_ref());
@@ -412,12 +412,12 @@ impl Client {
         self.heartbeat(kind::KEEP, now, &bodies::keep(self.watchdog))
     }
 
-    /// The command of a direct run \[V\]; a heartbeat too.
+    /// The command of a direct run \[V\]; also a heartbeat.
     pub fn drive(&mut self, now: u64, u: f64) -> &[u8] {
         self.heartbeat(kind::DRIVE, now, &bodies::drive(self.watchdog, u))
     }
 
-    /// Lets the time of a device on credit advance to `until`; a heartbeat too.
+    /// Lets the time of a device on credit advance to `until`; also a heartbeat.
     pub fn grant(&mut self, now: u64, until: u64) -> &[u8] {
         self.heartbeat(kind::CREDIT, now, &bodies::credit(self.watchdog, until))
     }
@@ -428,7 +428,7 @@ impl Client {
     }
 
     fn frame(&mut self, kind: u8, sequence: u32, now: u64, body: &Body) -> &[u8] {
-        // HELLO names neither boot nor session, and the zero before it ends what a line has kept of another frame
+        // HELLO carries neither boot nor session; the zero before it ends any partial frame kept by a line
         let (greets, session) = (kind == kind::HELLO, &self.session);
         let tag = session.tag.filter(|_| !greets).unwrap_or(0);
         let time = if greets {
@@ -448,19 +448,19 @@ impl Client {
         self.wire.get(usize::from(!greets)..end).unwrap_or_default()
     }
 
-    // --- where the session stands -------------------------------------------------------------------
+    // --- state of the session -----------------------------------------------------------------------
 
-    /// Whether a command is under way.
+    /// Whether a command is pending.
     pub fn is_busy(&self) -> bool {
         self.session.request.is_some()
     }
 
-    /// The greatest time that any of the device's frames carried \[us\]; none of another boot than the one that was greeted.
+    /// The latest time in any of the device's frames \[us\], of the boot that HELLO found.
     pub fn newest(&self) -> u64 {
         self.session.newest
     }
 
-    /// When any of its frames came last.
+    /// When its last frame came.
     pub fn heard(&self) -> Option<u64> {
         self.session.heard
     }
@@ -472,7 +472,7 @@ impl Client {
 }
 
 impl Session {
-    /// The request whose turn it is: nothing else is sent before HELLO is answered.
+    /// The request whose turn it is: nothing else is sent until HELLO is answered.
     fn under_way(&mut self) -> Option<&mut Option<Request>> {
         let requests = [&mut self.hello, &mut self.request];
         requests.into_iter().find(|request| request.is_some())
@@ -482,7 +482,7 @@ impl Session {
         self.heard = Some(now);
         self.newest = self.newest.max(frame.header.time);
         let mut fields = Fields::new(frame.body);
-        // a frame too short for its kind says nothing
+        // a frame too short for its kind is ignored
         let _ = match frame.header.kind {
             kind::EVENT => self.happened(&mut fields, frame.header.time),
             kind::BEAT => Beat::of(&mut fields).map(|beat| self.add(Event::Beat(beat))),
@@ -506,7 +506,7 @@ impl Session {
         }
     }
 
-    /// Takes the reply to what is under way; any other one is a repeat, or another host's.
+    /// Takes the reply to the pending request; any other reply is a repeat, or another host's.
     fn reply(&mut self, now: u64, kind: u8, frame: &Frame<'_>) -> Option<()> {
         let answer = Answer::of(frame)?;
         if kind == kind::HELLO {
@@ -520,7 +520,7 @@ impl Session {
         Some(())
     }
 
-    /// A reply to HELLO does not carry the sender's session in its header: one to another host is told by its body.
+    /// A reply to HELLO has no session in its header: its body shows whether it is for another host.
     fn greeted(&mut self, now: u64, answer: Answer) -> Option<()> {
         self.hello.as_ref()?;
         if answer.result == 0 {
@@ -530,7 +530,7 @@ impl Session {
             }
             let tag = Some(greeting.boot as u16);
             if self.tag != tag {
-                // what waited in the port may have been of another boot
+                // frames that waited in the port may have been of another boot
                 self.newest = answer.time;
             }
             (self.tag, self.key) = (tag, greeting.key);

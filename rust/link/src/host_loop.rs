@@ -1,11 +1,11 @@
-//! A controller on the host, for plants slow enough: one thread, absolute deadlines, its lateness on record.
+//! A controller on the host, for plants slow enough: one thread, absolute deadlines, its delays recorded.
 //!
-//! The device owns the millisecond in every other mode. Here the host decides each command and says it in a DRIVE heartbeat
-//! (docs/PROTOCOL.md, mode 2), so that the jitter of its kernel and of the link is in the loop. What that jitter was is part
-//! of the result; that it stays within a bound is promised by nobody.
+//! In every other mode the device owns the millisecond. Here the host decides each command and sends it in a DRIVE
+//! heartbeat (docs/PROTOCOL.md, mode 2), so the jitter of its kernel and of the link is in the loop. The result
+//! includes that jitter; nothing bounds it.
 //!
-//! Here is what goes in and comes out. [`HostLoop::tick`] (`tick`) is the loop without port or clock; [`run`] (`port`) is the
-//! thread around it; `history` holds the samples that came.
+//! This file has the settings and results. [`HostLoop::tick`] (`tick`) is the loop without port or clock; [`run`]
+//! (`port`) is the thread around it; `history` keeps the samples.
 
 mod history;
 #[cfg(unix)]
@@ -21,7 +21,7 @@ pub use tick::HostLoop;
 #[cfg(unix)]
 pub use port::run;
 
-/// Room that is made for samples and ticks before the start, so that none is made during all but the longest runs.
+/// Memory allocated for samples and ticks before the start, so that only the longest runs allocate later.
 const ROOM: usize = 4_000_000;
 
 /// The longest watchdog time of the protocol \[us\].
@@ -29,14 +29,14 @@ const LONGEST_WATCHDOG: u32 = 10_000_000;
 /// The shortest watchdog time of the protocol \[us\].
 const SHORTEST_WATCHDOG: u32 = 1_000;
 
-/// Numbers of the loop.
+/// The settings of the loop.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
     /// The device's sample time \[us\].
     pub device_period: u32,
     /// Samples of the device in one period of the loop.
     pub ratio: u32,
-    /// For how long the device may go on without a command, and the host without a sample \[us\].
+    /// How long the device may continue without a command, and the host without a sample \[us\].
     pub watchdog: u32,
     /// Samples in a frame.
     pub batch: u8,
@@ -52,8 +52,8 @@ impl Settings {
         u64::from(self.device_period) * u64::from(self.ratio)
     }
 
-    /// Refuses what no loop can run with: `channels` is how many are streamed, `ticks` the reference's
-    /// length, `ts` the controller's sample time \[s\].
+    /// Refuses settings with which no loop can run: `channels` is the number of streamed channels, `ticks` the
+    /// reference's length, `ts` the controller's sample time \[s\].
     ///
     /// # Errors
     /// `ErrorKind::Setting` for the first number outside its range.
@@ -126,18 +126,18 @@ fn require(
     )))
 }
 
-/// The ends that a loop knows; the samples up to there are kept in every one.
+/// How a loop can end; all samples up to then are kept in each case.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Outcome {
     /// The whole reference was run.
     Completed,
-    /// A stop was asked for.
+    /// A stop was requested.
     Interrupted,
-    /// The device tripped, for this reason of the protocol; what passed the limit, where the device's event came through.
+    /// The device tripped, for this reason of the protocol.
     Tripped {
         /// The protocol's number of the reason.
         reason: u8,
-        /// What passed the limit; NaN where that is not known.
+        /// The value that exceeded the limit; NaN if the device's event did not arrive.
         value: f32,
     },
     /// The device ended the run before the reference did.
@@ -148,7 +148,7 @@ pub enum Outcome {
         command: u8,
         /// The protocol's number of the result.
         result: u8,
-        /// What the result says more.
+        /// The detail of the result.
         detail: u32,
     },
     /// A command of this kind was repeated and never answered.
@@ -157,7 +157,7 @@ pub enum Outcome {
     Silent,
     /// The device has reset.
     Reset,
-    /// The port failed, in the system's words.
+    /// The port failed, with the system's message.
     PortLost(String),
 }
 
@@ -183,13 +183,13 @@ impl Outcome {
 pub struct Tick {
     /// Its number in the reference.
     pub number: usize,
-    /// How long after its deadline the loop awoke \[us\].
+    /// Delay after its deadline at which the loop woke \[us\].
     pub late: u64,
-    /// Age of the newest sample \[us\]; none before the first.
+    /// Age of the newest sample \[us\]; `None` before the first.
     pub age: Option<u64>,
-    /// True where a sample has come since the tick before.
+    /// True if a sample has arrived since the last tick.
     pub fresh: bool,
-    /// Measured speed; NaN where there was none.
+    /// Measured speed; NaN if there was none.
     pub y: f64,
     /// The speed after the feedback filter.
     pub feedback: f64,
@@ -200,16 +200,16 @@ pub struct Tick {
 /// All ticks of a run.
 #[derive(Clone, Debug, Default)]
 pub struct Ticks {
-    /// Those that were run, in order.
+    /// The ticks that were run, in order.
     pub run: Vec<Tick>,
-    /// Those that were skipped, as the loop awoke more than a period late.
+    /// The number skipped, because the loop woke more than a period late.
     pub missed: u64,
-    /// Commands that did not leave, as the port took no more bytes.
+    /// Commands that were not sent because the port took no more bytes.
     pub unsent: u64,
 }
 
 impl Ticks {
-    /// Nothing yet, with room for `ticks`.
+    /// Empty, with memory for `ticks`.
     pub fn with_capacity(ticks: usize) -> Self {
         Self {
             run: Vec::with_capacity(ticks),
@@ -228,10 +228,10 @@ impl Ticks {
 pub struct Locked(());
 
 impl Locked {
-    /// Locks what there is and what is to come.
+    /// Locks all present and future memory.
     ///
     /// # Errors
-    /// The system's words where it refuses: without privilege `RLIMIT_MEMLOCK` bounds the process.
+    /// The system's message if it refuses: without privilege `RLIMIT_MEMLOCK` limits the process.
     pub fn new() -> Result<Self, String> {
         lock().map(|()| Self(()))
     }
@@ -251,7 +251,7 @@ fn lock() -> Result<(), String> {
 
 #[cfg(target_os = "linux")]
 fn unlock() {
-    // Memory that stays locked does no harm.
+    // Memory that stays locked is harmless.
     let _ = rustix::mm::munlockall();
 }
 

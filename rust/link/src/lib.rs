@@ -1,8 +1,8 @@
-//! The host's end of the link to a drive (docs/PROTOCOL.md), as parts without a port of their own.
+//! The host's end of the link to a drive (docs/PROTOCOL.md), in parts without a port of their own.
 //!
-//! To read: [`bodies`] (what is said), [`receiver`] with [`sequence`] and [`samples`] (what has come, in order, as columns),
-//! [`client`] (a session), [`upload`] (values ahead of a run), [`host_loop`] (a controller on the host); [`server`] is the other
-//! end, the virtual sewing machine behind a port.
+//! To read: [`bodies`] (messages), [`receiver`] with [`sequence`] and [`samples`] (received data, in order, as
+//! columns), [`client`] (a session), [`upload`] (values sent ahead of a run), [`host_loop`] (a controller on the host).
+//! [`server`] is the other end, the virtual sewing machine behind a port.
 
 pub mod bodies;
 pub mod client;
@@ -19,7 +19,7 @@ pub use receiver::{Anomaly, Counters, Kind, Receiver};
 pub use samples::{Channel, Encoding};
 pub use upload::Upload;
 
-/// A device for the tests of the host's end: two channels, a period of a millisecond.
+/// A device for tests of the host's end: two channels, a period of a millisecond.
 #[cfg(test)]
 mod bench {
     use sewfast_control::link::{Channel, Encoding, Identity, Limits, Source, capability};

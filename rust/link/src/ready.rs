@@ -1,29 +1,29 @@
-//! Waiting for a port until bytes can go.
+//! Waiting until a port is ready.
 
 #[cfg(unix)]
 pub use unix::{Ready, wait};
 
-/// What a port is waited for.
+/// What to wait for.
 #[derive(Clone, Copy, Debug)]
 pub struct Interest {
-    /// Bytes from the other side can be taken.
+    /// Bytes from the other side.
     pub read: bool,
-    /// Bytes for the other side are there.
+    /// Room for bytes to the other side.
     pub write: bool,
 }
 
 impl Interest {
-    /// In bytes from the other side alone.
+    /// Only bytes from the other side.
     pub const READ: Self = Self {
         read: true,
         write: false,
     };
 }
 
-/// By `poll`, and by `select` on Apple's systems.
+/// By `poll`; on Apple's systems by `select`.
 ///
-/// Apple's poll(2) says under BUGS that it does not support devices, and terminals are reported to come back with `POLLNVAL`;
-/// its select(2) knows them. The tests run both on the system at hand; on Apple's nothing of this was run.
+/// Under BUGS, Apple's poll(2) says that it does not support devices, and terminals are reported to return `POLLNVAL`;
+/// its select(2) supports them. The tests run both on the present system; nothing of this was run on Apple's.
 #[cfg(unix)]
 mod unix {
     use std::os::fd::{AsRawFd, BorrowedFd};
@@ -40,18 +40,18 @@ mod unix {
     /// What a port is ready for.
     #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
     pub struct Ready {
-        /// Bytes are there, or a caller.
+        /// Bytes have arrived, or a caller.
         pub read: bool,
-        /// Bytes are taken.
+        /// Bytes can be written.
         pub write: bool,
-        /// The other side has gone; bytes of it may still be there.
+        /// The other side has gone; some of its bytes may still be there.
         pub gone: bool,
     }
 
-    /// Sleeps until a port is ready, and at most for `timeout`; a signal ends it early, with nothing ready.
+    /// Sleeps until a port is ready, at most for `timeout`; a signal ends it early with nothing ready.
     ///
     /// # Errors
-    /// Where the system cannot wait for these ports.
+    /// The system cannot wait for these ports.
     pub fn wait<const N: usize>(
         ports: [(BorrowedFd<'_>, Interest); N],
         timeout: Duration,
@@ -88,7 +88,7 @@ mod unix {
         }))
     }
 
-    /// A port whose other side has gone is readable here and has no bytes: both look the same, and only the bytes are counted.
+    /// A port whose other side has gone is readable here without bytes: it looks like a ready one, so the bytes are counted.
     fn by_select<const N: usize>(
         ports: [(BorrowedFd<'_>, Interest); N],
         timeout: Duration,
@@ -101,13 +101,13 @@ mod unix {
         let empty = vec![FdSetElement::default(); fd_set_num_elements(N, above)];
         let (mut readable, mut writable) = (empty.clone(), empty);
         for (port, interest) in ports {
-            // what is waited for only to be written to may go meanwhile
+            // a port to be written to may vanish meanwhile
             fd_set_insert(&mut readable, port.as_raw_fd());
             if interest.write {
                 fd_set_insert(&mut writable, port.as_raw_fd());
             }
         }
-        // SAFETY: every descriptor in the sets is borrowed, and so open, until the call has returned.
+        // SAFETY: every descriptor in the sets is borrowed, so it stays open until the call has returned.
         unsafe {
             select(
                 above,
@@ -120,7 +120,7 @@ mod unix {
         Ok(ports.map(|(port, interest)| {
             let has = |set: &[FdSetElement]| FdSetIter::new(set).any(|fd| fd == port.as_raw_fd());
             let readable = has(&readable);
-            // a port that takes callers has no bytes to count
+            // a listening port has no bytes to count
             let gone = readable && matches!(ioctl_fionread(port), Ok(0) | Err(Errno::IO));
             Ready {
                 read: readable && !gone && interest.read,

@@ -1,5 +1,5 @@
-//! The receiving side of the host: bytes in; frames, columns of samples and everything that went wrong out, counted without end and
-//! listed within bounds.
+//! The receiving side of the host: bytes in; frames, columns of samples and anomalies out. Anomalies are all counted,
+//! and listed up to a bound.
 
 use std::collections::VecDeque;
 
@@ -10,13 +10,13 @@ use crate::client::kind::SAMPLES;
 use crate::samples::{Batch, Channel, Columns, Samples};
 use crate::sequence::{Sequence, Verdict};
 
-/// Set in the kind of every frame of a device.
+/// Set in the kind of every frame from a device.
 const OF_A_DEVICE: u8 = 0x80;
 
-/// Receives what a device sends.
+/// Receives a device's frames.
 ///
-/// A frame that is damaged, repeated or late is counted and listed, and not used. What is kept for a caller that takes
-/// nothing is bounded: [`Samples::ROOM`] samples and [`LISTED`] anomalies.
+/// A damaged, repeated or late frame is counted and listed, but not used. If a caller takes nothing, at most
+/// [`Samples::ROOM`] samples and [`LISTED`] anomalies are kept.
 ///
 /// ```
 /// use sewfast_control::link::{Header, MAX_WIRE, encode};
@@ -40,7 +40,7 @@ pub struct Receiver {
     intake: Intake,
 }
 
-/// What becomes of the frames.
+/// The processing of frames.
 #[derive(Clone, Debug, Default)]
 struct Intake {
     sequence: Sequence,
@@ -49,29 +49,29 @@ struct Intake {
 }
 
 impl Receiver {
-    /// Takes the first whole frame as the start.
+    /// Starts with the first whole frame.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// The channels that are streamed from now on, in their order, sampled every `period` microseconds. Samples that have not been
-    /// taken are dropped.
+    /// The channels streamed from now on, in their order, sampled every `period` microseconds. Samples that have not
+    /// been taken are dropped.
     ///
     /// # Errors
-    /// Channels or a period that cannot be.
+    /// Impossible channels or period.
     pub fn expect(&mut self, channels: &[Channel], period: u32) -> Result<()> {
         self.intake.samples = Some(Samples::new(channels, period)?);
         Ok(())
     }
 
-    /// Take bytes as they came. Frames other than samples go to `other`, and samples too while no channels are expected.
+    /// Takes received bytes. Frames other than samples go to `other`; while no channels are expected, samples do, too.
     pub fn feed(&mut self, mut bytes: &[u8], mut other: impl FnMut(&Frame<'_>)) {
         while let Some(found) = self.deframer.next(&mut bytes) {
             self.intake.take(found, &mut other);
         }
     }
 
-    /// Times and columns of the samples since the last call; no column while no channels are expected.
+    /// Times and columns of the samples since the last call; no columns while no channels are expected.
     pub fn take(&mut self) -> Columns {
         self.intake
             .samples
@@ -80,8 +80,8 @@ impl Receiver {
             .unwrap_or_default()
     }
 
-    /// Appends times and columns of the samples since the last call to `columns`, which has one for each channel; both keep
-    /// their memory.
+    /// Appends times and columns of the samples since the last call to `columns`, which has one for each channel; both
+    /// keep their memory.
     pub fn append_to(&mut self, columns: &mut Columns) {
         if let Some(samples) = self.intake.samples.as_mut() {
             samples.append_to(columns);
@@ -93,12 +93,12 @@ impl Receiver {
         self.intake.samples.as_ref().and_then(Samples::newest)
     }
 
-    /// How often everything has happened.
+    /// All counters.
     pub const fn counters(&self) -> &Counters {
         &self.intake.log.counters
     }
 
-    /// What went wrong since the last call, oldest first.
+    /// The anomalies since the last call, oldest first.
     pub fn anomalies(&mut self) -> impl ExactSizeIterator<Item = Anomaly> + '_ {
         self.intake.log.drain()
     }
@@ -124,7 +124,7 @@ impl Intake {
         }
     }
 
-    /// Whether the frame is to be used.
+    /// Whether to use the frame.
     fn in_order(&mut self, frame: &Frame<'_>) -> bool {
         let (expected, number) = (self.sequence.expected(), frame.header.sequence);
         match self.sequence.judge(frame.header.tag, number) {
@@ -163,27 +163,27 @@ impl Intake {
     }
 }
 
-/// The longest list that is kept for a caller that does not take it.
+/// Most list entries kept for a caller that takes none.
 pub const LISTED: usize = 1 << 14;
 
-/// What went wrong.
+/// Kinds of anomalies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// Frames from this number on had not come when the one after them came.
+    /// When a frame came, the frames from this number up to it were missing.
     Missing,
     /// A frame came again.
     Repeated,
     /// A frame came after a later one.
     Late,
-    /// The device has booted; the count is that of the boot's frames before the first that came.
+    /// The device has rebooted; the count is the number of its frames before the first one received.
     Reset,
-    /// Bytes were no frame; the number is the one expected then.
+    /// Bytes that were no frame; the number is the one expected at that time.
     Rejected,
-    /// A frame of a host came back.
+    /// A frame of a host was returned.
     Echoed,
-    /// A batch of samples whose length fits no number of samples.
+    /// A batch whose length does not match any number of samples.
     Malformed,
-    /// Samples for which there was no room, as nobody took the earlier ones.
+    /// Samples without room, because earlier ones were not taken.
     Untaken,
 }
 
@@ -203,45 +203,45 @@ impl Kind {
     }
 }
 
-/// One thing that went wrong.
+/// An anomaly.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Anomaly {
-    /// What it was.
+    /// Its kind.
     pub kind: Kind,
-    /// The number of the (first) frame that it concerns.
+    /// The number of the (first) frame concerned.
     pub sequence: u32,
-    /// How many; frames, or samples where they were not taken.
+    /// Number of frames, or of samples for `Untaken`.
     pub count: u32,
 }
 
-/// How often everything has happened.
+/// The counters.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Whole frames of a device, used or not.
+    /// Whole frames from a device, used or not.
     pub frames: u64,
     /// Samples that entered the columns.
     pub samples: u64,
     /// Blocks of bytes that were no frame.
     pub rejected: u64,
-    /// Frames that had not come when a later one came; those that came late are among them.
+    /// Frames missing when a later one came, including those that came late.
     pub missing: u64,
     /// Frames that came again.
     pub repeated: u64,
     /// Frames that came after a later one.
     pub late: u64,
-    /// Boots seen, without the first.
+    /// Reboots seen.
     pub resets: u64,
-    /// Frames of a host that came back.
+    /// Frames of a host that were returned.
     pub echoed: u64,
-    /// Batches whose length fits no number of samples.
+    /// Batches whose length does not match any number of samples.
     pub malformed: u64,
-    /// Samples for which there was no room.
+    /// Samples without room.
     pub untaken: u64,
     /// Batches with a clipped command.
     pub clipped: u64,
-    /// Batches before which the device's transmit memory had overflowed.
+    /// Batches before which the device's transmit memory overflowed.
     pub overflows: u64,
-    /// Anomalies that were counted but found no room in the list.
+    /// Anomalies counted but not listed for lack of room.
     pub unlisted: u64,
 }
 
@@ -282,13 +282,13 @@ impl Counters {
 /// Counters and list together.
 #[derive(Clone, Debug, Default)]
 struct Log {
-    /// How often everything has happened.
+    /// The counters.
     counters: Counters,
     list: VecDeque<Anomaly>,
 }
 
 impl Log {
-    /// Count and list what went wrong. What repeats at the same place, as noise does, is one entry.
+    /// Counts and lists an anomaly. Repetitions at the same place, as from noise, are one entry.
     fn note(&mut self, kind: Kind, sequence: u32, count: u32) {
         *self.counters.of(kind) += if kind == Kind::Reset { 1 } else { count.into() };
         let last = self.list.back_mut();
@@ -305,7 +305,7 @@ impl Log {
         }
     }
 
-    /// What went wrong since the last call, oldest first.
+    /// The anomalies since the last call, oldest first.
     fn drain(&mut self) -> impl ExactSizeIterator<Item = Anomaly> + '_ {
         self.list.drain(..)
     }

@@ -3,10 +3,10 @@
 use sewfast_control::link::{Fields, MAX_BODY};
 use sewfast_core::{Error, Result};
 
-/// How a channel's samples are written.
+/// How a channel's samples are encoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Encoding {
-    /// The first as i32, each further one as i16 difference to the one before.
+    /// The first as i32, each further one as its i16 difference from the previous one.
     Counts,
     /// i16, in steps of `1/steps_per_unit`.
     Steps,
@@ -17,17 +17,17 @@ pub enum Encoding {
 /// A streamed channel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Channel {
-    /// How its samples are written.
+    /// How its samples are encoded.
     pub encoding: Encoding,
-    /// How many steps one unit has, where the encoding is in steps.
+    /// Steps per unit, if the encoding is in steps.
     pub steps_per_unit: u32,
 }
 
 impl Channel {
-    /// The channel as DESCRIBE states it.
+    /// The channel as described by DESCRIBE.
     ///
     /// # Errors
-    /// An unknown encoding, or no steps per unit where they are needed.
+    /// An unknown encoding, or missing steps per unit.
     pub fn described(encoding: u8, steps_per_unit: u32) -> Result<Self> {
         let encoding = match encoding {
             0 => Encoding::Counts,
@@ -58,7 +58,7 @@ impl Channel {
     }
 }
 
-/// Counts that go on beyond 32 bits.
+/// Counts continued beyond 32 bits.
 #[derive(Clone, Copy, Debug, Default)]
 struct Unwrapped {
     last: Option<i32>,
@@ -76,21 +76,21 @@ impl Unwrapped {
     }
 }
 
-/// What became of a batch.
+/// The result of adding a batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Batch {
-    /// So many samples are in the columns; the flags of the batch.
+    /// The number of samples added to the columns, and the flags of the batch.
     Taken(usize, u8),
-    /// So many samples found no room.
+    /// The number of samples without room.
     NoRoom(usize),
-    /// The length fits no number of samples.
+    /// The length does not match any number of samples.
     Malformed,
 }
 
 /// Device times in microseconds and a column for each channel.
 pub type Columns = (Vec<i64>, Vec<Vec<f64>>);
 
-/// The samples of some channels as columns that grow until they are taken.
+/// The samples of some channels, as columns that grow until they are taken.
 #[derive(Clone, Debug)]
 pub struct Samples {
     channels: Vec<Channel>,
@@ -100,15 +100,15 @@ pub struct Samples {
 }
 
 impl Samples {
-    /// The most samples that are kept for a caller that does not take them.
+    /// Most samples kept for a caller that does not take them.
     pub const ROOM: usize = 1 << 17;
-    /// The most channels: one for each bit of the mask.
+    /// Most channels: one for each bit of the mask.
     pub const CHANNELS: usize = 16;
 
-    /// Nothing received yet of these `channels`, sampled every `period` microseconds.
+    /// Empty columns of these `channels`, sampled every `period` microseconds.
     ///
     /// # Errors
-    /// No or too many channels, a sample that fits no frame, a period of zero.
+    /// No or too many channels, a sample that does not fit a frame, a period of zero.
     pub fn new(channels: &[Channel], period: u32) -> Result<Self> {
         if channels.is_empty() || channels.len() > Self::CHANNELS {
             return Err(Error::setting(format!(
@@ -130,12 +130,12 @@ impl Samples {
         })
     }
 
-    /// Counts start anew with the next batch.
+    /// Counts restart with the next batch.
     pub fn restart(&mut self) {
         self.counts.fill(Unwrapped::default());
     }
 
-    /// How many samples a body of this length has.
+    /// Number of samples in a body of this length.
     fn samples_in(&self, length: usize) -> Option<usize> {
         let counters = self
             .channels
@@ -147,7 +147,7 @@ impl Samples {
         whole.then(|| values / size)
     }
 
-    /// Take the body of a SAMPLES frame whose first sample was taken at `time`.
+    /// Takes the body of a SAMPLES frame whose first sample was taken at `time`.
     pub fn add(&mut self, time: u64, body: &[u8]) -> Batch {
         let Some(count) = self.samples_in(body.len()) else {
             return Batch::Malformed;

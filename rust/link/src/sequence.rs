@@ -1,27 +1,27 @@
-//! The count of a device's frames: which are in order, which are missing, which came twice or late.
+//! The sequence of a device's frames: which are in order, missing, repeated or late.
 
-/// How far back a repeat is told from a late frame.
+/// How far back a repeat can be distinguished from a late frame.
 const WINDOW: u32 = 4096;
 const HALF: u32 = 1 << 31;
-/// So many frames in a row with the tag of the boot before are a boot whose tag happens to be the same.
+/// This many consecutive frames with the previous boot's tag are a new boot that happens to have the same tag.
 const INSISTENT: u32 = 16;
 
-/// What the number of a frame says about it.
+/// The verdict on a frame's number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// The number that was expected, or the first one seen.
+    /// The expected number, or the first one seen.
     InOrder,
-    /// So many frames before this one have not come.
+    /// The number of frames missing before this one.
     Missing(u32),
-    /// Another boot; so many of its frames came before this one.
+    /// Another boot; the number of its frames missing before this one.
     Reset(u32),
-    /// It has come before and is not to be used.
+    /// Received before; not to be used.
     Repeated,
-    /// A frame after it, or of the next boot, has come before it; it is not to be used.
+    /// A later frame, or one of the next boot, was received before; not to be used.
     Late,
 }
 
-/// Compares each frame of a device with the number that is expected, modulo 2^32, in half ranges.
+/// Compares each frame's number with the expected one, modulo 2^32, by half ranges.
 #[derive(Clone, Debug)]
 pub struct Sequence {
     tag: Option<u16>,
@@ -30,7 +30,7 @@ pub struct Sequence {
     former: Former,
 }
 
-/// The boot before, whose frames may still be under way.
+/// The previous boot, whose frames may still arrive.
 #[derive(Clone, Copy, Debug, Default)]
 struct Former {
     tag: Option<u16>,
@@ -39,7 +39,7 @@ struct Former {
 }
 
 impl Sequence {
-    /// Takes whatever comes first as the start.
+    /// Starts with the first number received.
     pub const fn new() -> Self {
         Self {
             tag: None,
@@ -53,12 +53,12 @@ impl Sequence {
         }
     }
 
-    /// The number that is expected next.
+    /// The next expected number.
     pub const fn expected(&self) -> u32 {
         self.expected
     }
 
-    /// Take the number of a frame that has come.
+    /// Judges the number of a received frame.
     #[inline]
     pub fn judge(&mut self, tag: u16, sequence: u32) -> Verdict {
         match self.tag {
@@ -113,7 +113,7 @@ impl Sequence {
         self.expected = sequence.wrapping_add(1);
     }
 
-    /// Note whether a number of the window has come; whether it had.
+    /// Marks whether a number of the window was received; returns its previous mark.
     fn mark(&mut self, sequence: u32, came: bool) -> bool {
         let at = sequence % WINDOW;
         let (word, bit) = (&mut self.seen[at as usize / 64], 1 << (at % 64));
@@ -130,7 +130,7 @@ impl Default for Sequence {
 }
 
 impl Former {
-    /// Whether its frames follow one another for so long that they are no leftovers.
+    /// Whether its frames have followed one another for so long that they cannot be leftovers.
     fn insists(&mut self, sequence: u32) -> bool {
         let follows = sequence == self.next;
         self.in_a_row = if follows { self.in_a_row + 1 } else { 1 };
@@ -145,7 +145,7 @@ mod tests {
     use proptest::prelude::*;
     use std::collections::HashSet;
 
-    /// The rule in its plainest form, without modulo and without a window.
+    /// The rule in its simplest form, without modulo and without a window.
     fn by_sets(numbers: &[u64]) -> Vec<Verdict> {
         let (mut came, mut expected) = (HashSet::new(), numbers[0]);
         let judge = |&number: &u64| {

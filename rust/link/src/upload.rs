@@ -1,18 +1,18 @@
-//! A run's values as the device stores them, uploaded ahead of it piece by piece.
+//! A run's values in the device's encoding, uploaded piece by piece ahead of playback.
 
 use sewfast_control::link::{Body, MAX_BODY};
 
 use crate::bodies;
 
-/// Results of UPLOAD that are no error of the values: not in this state (the run has ended), no room yet, and the number from
-/// which the device wants to go on.
+/// Results of UPLOAD that do not mean wrong values: not in this state (the run has ended), no room yet, and the number
+/// at which the device wants to continue.
 const NOT_NOW: u8 = 4;
 const NO_ROOM: u8 = 7;
 const OUT_OF_ORDER: u8 = 9;
-/// Bytes of an UPLOAD before its values: table and offset.
+/// Bytes of UPLOAD before its values: table and offset.
 const HEAD: usize = 5;
 
-/// Values in the device's steps, and how far they have been uploaded.
+/// Values in the device's steps, and how many have been uploaded.
 #[derive(Clone, Debug)]
 pub struct Upload {
     table: u8,
@@ -22,7 +22,7 @@ pub struct Upload {
 }
 
 impl Upload {
-    /// Commands, rounded to steps of the device's command channel and not beyond `limit` after that.
+    /// Commands, rounded to steps of the device's command channel and then clipped to `limit`.
     ///
     /// ```
     /// use sewfast_link::Upload;
@@ -41,7 +41,7 @@ impl Upload {
         Self::new(0, values.iter().map(steps))
     }
 
-    /// References, not beyond `limit`, in single precision.
+    /// References in single precision, clipped to `limit`.
     #[must_use]
     pub fn references(values: &[f64], limit: f64) -> Self {
         let single = |&value: &f64| (value.max(-limit).min(limit) as f32).to_le_bytes();
@@ -57,17 +57,17 @@ impl Upload {
         }
     }
 
-    /// How many values the device has.
+    /// Number of values that the device has.
     pub const fn end(&self) -> usize {
         self.end
     }
 
-    /// How many there are.
+    /// Number of all values.
     pub fn len(&self) -> usize {
         self.bytes.len() / self.width
     }
 
-    /// Whether there is none.
+    /// Whether there are no values.
     pub fn is_empty(&self) -> bool {
         self.bytes.is_empty()
     }
@@ -77,7 +77,7 @@ impl Upload {
         self.end >= self.len()
     }
 
-    /// Body of the next UPLOAD, where a full frame or the rest has room.
+    /// Body of the next UPLOAD, if there is room for a full frame or for the rest.
     pub fn piece(&self, room: usize) -> Option<Body> {
         let left = self.bytes.get(self.width * self.end..)?;
         let length = left.len().min((MAX_BODY - HEAD) / self.width * self.width);
@@ -92,7 +92,7 @@ impl Upload {
         ))
     }
 
-    /// Takes the reply to an UPLOAD: its end, or where the device wants to go on. False where it refuses the values.
+    /// Takes the reply to an UPLOAD: its end, or where the device wants to continue. False if it refuses the values.
     pub fn answered(&mut self, result: u8, detail: u32, end: Option<u32>) -> bool {
         match (result, end) {
             (0, Some(end)) => self.end = end as usize,

@@ -1,4 +1,4 @@
-//! What has changed in a machine, from a run and earlier ones.
+//! Bindings of the search for what has changed in a machine, from a run and earlier runs.
 
 use numpy::PyReadonlyArray1;
 use pyo3::prelude::*;

@@ -1,5 +1,5 @@
-//! Bindings of the core's control: whatever Python calls a plant, the closed loop, the first-order-plus-dead-time fit and the
-//! tuning rules; the controller and tuning in files of their own.
+//! Bindings of the core's control: plants from Python, the closed loop, the first-order-plus-dead-time fit and the
+//! tuning rules; controller and tuning have their own files.
 
 pub mod controller;
 mod tuning;
@@ -217,7 +217,7 @@ fn named<'py, const N: usize>(
     Ok(dict)
 }
 
-/// The Python object's value, which work on other threads may use.
+/// The core's value of a Python object, which can be used on other threads.
 enum Model {
     Identified(Arc<dyn model::Model>),
     Machine(Box<machine::Machine>),

@@ -1,4 +1,4 @@
-//! Bindings of the virtual machine, and of the device that serves one.
+//! Bindings of the virtual machine, and of the device that serves it.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -162,7 +162,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Machine>()
 }
 
-/// Samples between two looks at a stop request, a few milliseconds of work.
+/// Samples between two checks for a stop request: a few milliseconds of work.
 const CHUNK: usize = 4096;
 
 /// The virtual sewing machine; see docs/CONVENTIONS.md for its parameters.
@@ -252,7 +252,7 @@ impl Machine {
         Ok((array1(py, counts), array1(py, speed)))
     }
 
-    /// What pickle and copy make another of: the parameters, and the memory.
+    /// For pickle and copy: the parameters, and the memory.
     #[expect(clippy::type_complexity, reason = "the protocol's own tuple")]
     fn __reduce__<'py>(
         slf: PyRef<'py, Self>,

@@ -1,4 +1,4 @@
-//! Bindings of what is made from a measured frequency response: a machine with shafts, and the search for gains and filters.
+//! Bindings for measured frequency responses: a machine with shafts, and the search for gains and filters.
 
 use numpy::{Complex64, PyArray1, PyArray2, PyReadonlyArray1};
 use pyo3::prelude::*;

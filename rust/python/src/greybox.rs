@@ -1,4 +1,4 @@
-//! Bindings of the grey-box motor, alone and with a network for what its equations leave, and of the tracker.
+//! Bindings of the grey-box motor, alone and with a network for what its equations leave unexplained, and of the tracker.
 
 use std::sync::Arc;
 
@@ -143,7 +143,7 @@ fn greybox_normal<'py>(
     ))
 }
 
-/// Estimates, and what has moved.
+/// Estimates, and which parameters have moved.
 type Followed<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<bool>>);
 
 #[pyclass(module = "sewfast._core")]

@@ -1,4 +1,4 @@
-//! The device's guard, in front of machines that have no device.
+//! The device's guard, for machines without a device.
 
 use numpy::PyReadonlyArray1;
 use pyo3::prelude::*;
@@ -12,7 +12,7 @@ pub struct Guard {
     watch: Watch,
     /// A power of two.
     scale: f64,
-    /// All counts so far were whole: they are those of an encoder with steps.
+    /// All counts so far were whole numbers: those of an encoder with steps.
     whole: bool,
 }
 
@@ -23,11 +23,11 @@ fn seen((reason, value): Trip) -> Seen {
     (format!("{reason:?}"), value.into())
 }
 
-/// Counts that a turn has at least: what counts turns or radians is no counter of whole steps.
+/// Least number of counts per turn in the counter: an input in turns or radians does not count whole steps.
 const FINE: f64 = 4096.0;
 
 impl Guard {
-    /// As a counter of 32 bits that wraps, like a device's, with its step.
+    /// As a 32-bit counter that wraps, like a device's, with the size of its step.
     fn counter(&mut self, counts: f64) -> (i32, u32) {
         self.whole &= counts.fract() == 0.0;
         let step = if self.whole { self.scale } else { 1.0 };
@@ -75,7 +75,7 @@ impl Guard {
     ) -> PyResult<Option<(usize, Seen)>> {
         let (u, counts) = (slice(&u, "u")?, slice(&counts, "counts")?);
         for (k, (u, counts)) in u.iter().zip(counts).enumerate() {
-            // a sample that a link has lost
+            // a sample lost by the link
             if !(u.is_finite() && counts.is_finite()) {
                 self.watch.forget();
                 continue;

@@ -77,7 +77,7 @@ fn run(port: i32, looped: &mut HostLoop, monitor: &sewfast_core::Monitor) -> Res
             "expected an open port's descriptor, got {port}"
         )));
     }
-    // SAFETY: the caller keeps the descriptor open for the length of this statement; what runs owns a duplicate.
+    // SAFETY: the caller keeps the descriptor open for this statement; the run owns a duplicate.
     let port = unsafe { BorrowedFd::borrow_raw(port) }
         .try_clone_to_owned()
         .map_err(|lost| {
@@ -144,7 +144,7 @@ fn outcome<'py>(py: Python<'py>, outcome: Option<&Outcome>) -> PyResult<Bound<'p
     Ok(told)
 }
 
-/// A column for each field of the ticks; an age that is not known is NaN.
+/// A column for each field of the ticks; an unknown age is NaN.
 fn ticks<'py>(py: Python<'py>, ticks: &[Tick]) -> PyResult<Bound<'py, PyDict>> {
     let columns = PyDict::new(py);
     let column = |of: fn(&Tick) -> f64| array1(py, ticks.iter().map(of).collect());

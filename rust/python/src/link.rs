@@ -1,4 +1,4 @@
-//! Bindings of the link: frames and their bodies out, received bytes to frames, replies and columns of samples.
+//! Bindings of the link: frames and their bodies to bytes; received bytes to frames, replies and columns of samples.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -72,7 +72,7 @@ impl LinkBodies {
     const VERSION: u8 = VERSION;
     #[classattr]
     const MAX_BODY: usize = MAX_BODY;
-    /// Bytes of a frame on the wire beside its body.
+    /// Bytes of a frame on the wire in addition to its body.
     #[classattr]
     const AROUND: usize = MAX_WIRE - MAX_BODY;
 
@@ -244,7 +244,7 @@ impl LinkBodies {
 /// Receives what a device sends; see docs/PROTOCOL.md.
 #[pyclass(frozen, module = "sewfast._core")]
 struct LinkReceiver {
-    // a live view reads the counters from another thread than the one that feeds
+    // a live view reads the counters on another thread than the one that feeds
     core: Mutex<Receiver>,
 }
 
@@ -334,7 +334,7 @@ fn anomalies(receiver: &mut Receiver) -> Vec<Listed> {
 /// A session with a device; see docs/PROTOCOL.md.
 #[pyclass(frozen, module = "sewfast._core")]
 struct LinkClient {
-    // a live view reads the counters from another thread than the one that takes turns
+    // a live view reads the counters on another thread than the one that uses the client
     core: Mutex<Client>,
 }
 

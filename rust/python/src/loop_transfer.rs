@@ -129,7 +129,7 @@ fn margins<'py>(
     den: Values<'py>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let (num, den) = (slice(&num, "num")?, slice(&den, "den")?);
-    // half a millisecond: on a busy computer a thread of its own waits for longer
+    // this takes half a millisecond: on a busy computer starting a thread takes longer
     let found = py
         .detach(|| {
             let plant = Plant::new(num, den)?;

@@ -1,4 +1,4 @@
-//! Bindings of the core's models: what all kinds share, the guard, and models in the form of a microcontroller.
+//! Bindings of the core's models: the part common to all kinds, the guard, and models in a microcontroller's form.
 
 use std::sync::Arc;
 
@@ -17,7 +17,7 @@ use linear::LinearModel;
 use neural::NeuralOE;
 use neural_ss::{Experiments, NeuralSS, recordings};
 
-/// The methods of a fit: those that each has, and its own. PyO3 takes one block of methods a class.
+/// The methods of a fit: common ones, and its own. PyO3 allows one block of methods per class.
 macro_rules! fit_methods {
     ($fit:ident { $($own:tt)* }) => {
         #[pymethods]
@@ -52,7 +52,7 @@ macro_rules! fit_methods {
     };
 }
 
-/// The methods of a fit that was chosen among starts.
+/// The methods of a fit that was chosen from several starts.
 macro_rules! started_fit_methods {
     ($fit:ident { $($own:tt)* }) => {
         fit_methods!($fit {
@@ -104,11 +104,11 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
 /// A model of any kind: the class below which each kind adds its parameters.
 #[pyclass(frozen, subclass, module = "sewfast._core")]
 pub struct Model {
-    /// The model itself, as whoever needs no more than a model knows it.
+    /// The model as the trait object that most code needs.
     pub inner: Arc<dyn model::Model>,
 }
 
-/// A kind of model in Python: its own value beside the one in [`Model`].
+/// A kind of model in Python: it adds its own value to the one in [`Model`].
 pub trait Kind: PyClass<BaseType = Model> + Sized {
     type Inner: model::Model + 'static;
 
@@ -123,7 +123,7 @@ pub trait Kind: PyClass<BaseType = Model> + Sized {
         PyClassInitializer::from(base).add_subclass(Self::of(inner))
     }
 
-    /// A new object of Python's.
+    /// A new Python object.
     fn object(py: Python<'_>, inner: Self::Inner) -> PyResult<Py<Self>> {
         Py::new(py, Self::wrapped(inner))
     }

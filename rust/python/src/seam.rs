@@ -1,5 +1,5 @@
-//! The seam: arrays borrowed in and owned out, core errors as the package's exceptions; long work on its own thread while the
-//! interpreter stays free, so that progress is shown and Ctrl-C is heard.
+//! The seam: arrays borrowed in and owned out, core errors as the package's exceptions. Long work runs on its own
+//! thread while the interpreter stays free, so that progress is shown and Ctrl-C is noticed.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
@@ -13,7 +13,7 @@ use pyo3::types::{PyTuple, PyType};
 use sewfast_core::data::Samples;
 use sewfast_core::{Error, ErrorKind, Monitor, Record, Result};
 
-/// Turns a core error into the exception class of `sewfast.errors` that stands for its kind.
+/// Turns a core error into the exception class of `sewfast.errors` for its kind.
 pub fn raise(py: Python<'_>, error: Error) -> PyErr {
     let class = match error.kind {
         ErrorKind::Data => "DataError",
@@ -58,7 +58,7 @@ fn not_contiguous(py: Python<'_>, name: &str) -> PyErr {
     raise(py, Error::data(message))
 }
 
-/// An experiment as Python hands it over, borrowed: `(u, y)`, or `(u, y, weights)` where its samples have weights.
+/// An experiment passed by Python, borrowed: `(u, y)`, or `(u, y, weights)` if its samples have weights.
 pub struct Experiment<'py, Y> {
     /// Inputs, time first.
     pub u: PyReadonlyArray2<'py, f64>,
@@ -83,7 +83,7 @@ impl<'a, 'py, Y: FromPyObjectOwned<'py>> FromPyObject<'a, 'py> for Experiment<'p
 }
 
 impl<Y> Experiment<'_, Y> {
-    /// Weights of the samples, where they have any.
+    /// Weights of the samples, if they have any.
     pub fn weights(&self) -> PyResult<Option<&[f64]>> {
         self.weights
             .as_ref()
@@ -95,7 +95,7 @@ impl<Y> Experiment<'_, Y> {
 /// A list of experiments of one output.
 pub type Experiments<'py> = Vec<Experiment<'py, PyReadonlyArray1<'py, f64>>>;
 
-/// The experiments with their shapes checked, their values not looked at.
+/// The experiments with their shapes checked but not their values.
 pub fn samples<'a>(py: Python<'_>, experiments: &'a Experiments<'_>) -> PyResult<Vec<Samples<'a>>> {
     let samples = |experiment: &'a Experiment<'_, PyReadonlyArray1<'_, f64>>| {
         let ((u, channels), y) = (rows(&experiment.u, "u")?, slice(&experiment.y, "y")?);
@@ -129,15 +129,15 @@ pub fn array2(
     PyArray1::from_vec(py, values).reshape([rows, columns])
 }
 
-/// How long Ctrl-C may go unheard.
+/// Longest time until Ctrl-C is noticed.
 const PERIOD: Duration = Duration::from_millis(20);
 
-/// Runs `work` on a thread of its own, calls `progress(done, total, best_cost)` meanwhile and forwards Ctrl-C.
+/// Runs `work` on its own thread; meanwhile calls `progress(done, total, best_cost)` and forwards Ctrl-C.
 ///
-/// After Ctrl-C the work is asked to stop and its best result so far is returned, marked as interrupted by
-/// the work itself; where it has none, or was done before it heard, `KeyboardInterrupt` is raised. A child class of it, which `progress`
-/// raises at a deadline, does the same, but a result that was done before the work heard is whole and is returned. Any other exception, of a
-/// signal handler or of `progress`, stops the work and is raised.
+/// After Ctrl-C the work is asked to stop and returns its best result so far, which it marks as interrupted. If it has no result, or
+/// finished before it noticed the request, `KeyboardInterrupt` is raised. A subclass of `KeyboardInterrupt`, which `progress` raises at a
+/// deadline, does the same, except that a result finished before the request is whole and is returned. Any other exception, from a signal
+/// handler or from `progress`, stops the work and is raised.
 pub fn watched<T: Send>(
     py: Python<'_>,
     progress: Option<&Bound<'_, PyAny>>,
@@ -153,7 +153,7 @@ pub fn watched<T: Send>(
             result
         });
         let mut raised = None;
-        // A worker that panics never says that it is done, but it finishes.
+        // A worker that panics never reports that it is done, but its thread finishes.
         while !done.load(Ordering::Acquire) && !worker.is_finished() {
             py.detach(|| thread::park_timeout(PERIOD));
             if raised.is_none() {
@@ -176,16 +176,16 @@ pub fn watched<T: Send>(
     })
 }
 
-/// Whether an exception is Ctrl-C itself, and not a child class of it.
+/// Whether an exception is exactly Ctrl-C, not a subclass of it.
 pub fn is_ctrl_c(py: Python<'_>, error: &PyErr) -> bool {
     error.get_type(py).is(py.get_type::<PyKeyboardInterrupt>())
 }
 
-/// So many samples of one loop or machine take a few milliseconds, in which nobody misses Ctrl-C.
+/// This many samples of a loop or machine take a few milliseconds, during which Ctrl-C can wait.
 const BRIEF: usize = 5_000;
 
-/// [`watched`] for work over so many samples of a loop or a machine; brief work is done where it was asked for, since a
-/// thread of its own would take longer than some of it.
+/// [`watched`] for work over `samples` of a loop or a machine. Brief work runs on the calling thread, because a new
+/// thread would take longer than some of it.
 pub fn watched_over<T: Send>(
     py: Python<'_>,
     samples: usize,

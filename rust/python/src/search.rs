@@ -1,5 +1,5 @@
-//! The core's optimisers on functions of Python's, for whoever wants to use them alone or compare them with others: least squares
-//! with residuals and Jacobians, and the searches.
+//! Bindings of the core's optimisers, to use them alone or compare them with others: least squares with residuals and
+//! Jacobians, and the searches.
 
 use std::sync::Mutex;
 
@@ -19,7 +19,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(least_squares_fit, module)?)
 }
 
-/// A function of Python's over the unit box; what it raises ends the search.
+/// A Python function over the unit box; an exception in it ends the search.
 struct Function {
     function: Py<PyAny>,
     dimensions: usize,
@@ -28,7 +28,7 @@ struct Function {
 }
 
 impl Function {
-    /// What the function returns; `None` once it has raised.
+    /// The function's result; `None` once it has raised.
     fn at<T>(
         &self,
         point: &[f64],
@@ -122,7 +122,7 @@ fn options(evaluations: usize, seed: u64, tolerance: f64) -> Options {
     }
 }
 
-/// The most coordinates and objectives.
+/// Most coordinates, and most objectives.
 const MOST: usize = 1000;
 
 fn bounded(count: usize) -> sewfast_core::Result<()> {
@@ -220,14 +220,14 @@ fn search_front<'py>(
 
 type Vector<'py> = PyReadonlyArray1<'py, f64>;
 
-/// Python's functions as residuals. Every call gets arrays of its own, so that a function may keep them.
+/// Python functions as residuals. Every call gets its own arrays, so that a function may keep them.
 struct Functions<'a, 'py> {
     py: Python<'py>,
     fun: &'a Bound<'py, PyAny>,
     jac: &'a Bound<'py, PyAny>,
     parameters: usize,
     residuals: usize,
-    /// Residuals at the start, which are known already.
+    /// Residuals at the start, which are already known.
     first: Option<Vec<f64>>,
     monitor: &'a Monitor,
     raised: Option<PyErr>,
@@ -339,7 +339,7 @@ fn least_squares_fit<'py>(
     };
     let solution = least_squares::solve(&mut functions, start, &settings, &monitor);
     match functions.raised {
-        // Exactly this class: Ctrl-C keeps the best point, every other exception is the caller's.
+        // Exactly this class: Ctrl-C keeps the best point; every other exception goes to the caller.
         Some(error) if !is_ctrl_c(py, &error) => Err(error),
         _ => story(py, solution.map_err(|e| raise(py, e))?),
     }
@@ -370,7 +370,7 @@ fn story(py: Python<'_>, solution: Solution) -> PyResult<Bound<'_, PyDict>> {
     Ok(story)
 }
 
-/// SciPy's numbers where it has one; failures that it does not tell apart are below zero.
+/// SciPy's status numbers, where it has one; failures that it does not distinguish are below zero.
 fn status(termination: Termination) -> i32 {
     match termination {
         Termination::SmallGradient => 1,

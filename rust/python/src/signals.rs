@@ -1,4 +1,4 @@
-//! Bindings of the core's signals, and of its ways from counts to speed.
+//! Bindings of the core's signals, and of its methods from counts to speed.
 
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::prelude::*;

@@ -1,4 +1,4 @@
-//! The client against the state machine of a real device, over a line that loses, repeats, damages and delays.
+//! The client with the state machine of a real device, over a line that loses, repeats, damages and delays frames.
 
 use proptest::prelude::*;
 use sewfast_control::link::{
@@ -12,11 +12,11 @@ use crate::samples::Channel;
 
 const LIMITS: u8 = 0x04;
 const UPLOAD: u8 = 0x08;
-/// The longest of the protocol, so that nothing but STOP ends a run.
+/// The longest of the protocol, so that only STOP ends a run.
 const WATCHDOG: u32 = 10_000_000;
 const COUNTS: i32 = 70_000;
 
-/// What a line does to each frame, in so many of a thousand.
+/// What a line does to frames, each in so many of a thousand.
 #[derive(Clone, Copy, Debug)]
 struct Faults {
     lost: u64,
@@ -34,7 +34,7 @@ struct Line {
 }
 
 impl Line {
-    /// SplitMix64; true in so many of a thousand.
+    /// SplitMix64; true in `of_a_thousand` of 1,000 calls.
     fn happens(&mut self, of_a_thousand: u64) -> bool {
         self.next() % 1000 < of_a_thousand
     }
@@ -47,7 +47,7 @@ impl Line {
         z ^ (z >> 31)
     }
 
-    /// What arrives of whole frames that were sent.
+    /// The frames that arrive.
     fn pass(&mut self, bytes: &[u8]) -> Vec<u8> {
         let mut out = Vec::new();
         for frame in bytes.split_inclusive(|&byte| byte == 0) {
@@ -124,7 +124,7 @@ impl World {
         Self::new(none, 1)
     }
 
-    /// Milliseconds of the device; what it says reaches the client. The reply that came.
+    /// Lets milliseconds pass on the device, with its frames delivered to the client. Returns the reply that came.
     fn pass(&mut self, milliseconds: u32) -> Option<Reply> {
         let mut found = None;
         for _ in 0..milliseconds {
@@ -157,7 +157,7 @@ impl World {
         self.device.poll(self.now);
     }
 
-    /// Takes turns until what is under way is answered or given up.
+    /// Takes turns until the pending request is answered or given up.
     fn finish(&mut self) -> Result<Reply, Unanswered> {
         loop {
             if let Some(unanswered) = self.client.expire(self.now) {
@@ -189,7 +189,7 @@ impl World {
         self.ask(LIMITS, body);
     }
 
-    /// A direct run of 300 samples at 1 V, stopped by the host; its first sample's time and what the device has to say.
+    /// A direct run of 300 samples at 1 V, stopped by the host; returns its first sample's time and the device's status.
     fn run(&mut self) -> (i64, Status) {
         let channels =
             [(0, 1), (1, 1000)].map(|(code, steps)| Channel::described(code, steps).unwrap());
@@ -232,7 +232,7 @@ fn faults() -> impl Strategy<Value = Faults> {
     })
 }
 
-/// So many cases, as one of these takes long; with `PROPTEST_CASES` as many as that says.
+/// `few` cases, because each is slow; `PROPTEST_CASES`, if set, overrides it.
 fn cases(few: u32) -> ProptestConfig {
     match std::env::var_os("PROPTEST_CASES") {
         Some(_) => ProptestConfig::default(),
@@ -243,7 +243,7 @@ fn cases(few: u32) -> ProptestConfig {
 proptest! {
     #![proptest_config(cases(48))]
 
-    /// An upload is refused where the one before was executed twice or not at all.
+    /// An upload is refused if the one before was executed twice or not at all.
     #[test]
     fn each_command_is_executed_once_whatever_the_line_does(faults in faults(), seed in any::<u64>()) {
         let mut world = World::new(faults, seed);
@@ -263,7 +263,7 @@ proptest! {
         prop_assert_eq!(world.client.sequences(), (41, 0));
     }
 
-    /// What came is right and in order, and what did not is known.
+    /// All that arrived is right and in order, and all that did not is counted.
     #[test]
     fn each_sample_has_come_or_is_missing(faults in faults(), seed in any::<u64>()) {
         let mut world = World::new(faults, seed);
@@ -286,7 +286,7 @@ proptest! {
         prop_assert!(world.client.newest() <= world.now);
     }
 
-    /// Bytes of anybody, at any clock, end in events within bounds.
+    /// Arbitrary bytes, at any time, lead to events within bounds.
     #[test]
     fn any_bytes_are_endured(
         calls in prop::collection::vec((any::<u64>(), prop::collection::vec(any::<u8>(), 0..400)), 0..40),

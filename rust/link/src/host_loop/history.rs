@@ -1,8 +1,8 @@
-//! Every sample that came during a run: the speed that its counts say, and how old it is on the host's clock.
+//! Every sample received during a run: the speed from its counts, and its age on the host's clock.
 
 use crate::samples::Columns;
 
-/// Samples in the order in which they came; a gap shows in their times.
+/// Samples in order of arrival; a gap shows in their times.
 #[derive(Clone, Debug, Default)]
 pub struct History {
     /// Device times \[us\] and a column for each channel of the mask, counts first.
@@ -33,7 +33,7 @@ impl History {
         self.times().last().copied()
     }
 
-    /// Drops what was taken before `start`, and what a run of `samples` cannot have.
+    /// Drops samples from before `start`, and those beyond the run's `samples`.
     pub fn keep(&mut self, start: i64, samples: usize) {
         let before = self
             .times()
@@ -49,10 +49,10 @@ impl History {
         }
     }
 
-    /// Counts a second over `span` \[us\] up to the newest sample; NaN where too few samples came.
+    /// Counts a second over `span` \[us\] up to the newest sample; NaN if too few samples arrived.
     ///
-    /// Where the sample `span` before the newest is lost, the next older one within another span stands in. Before
-    /// `start`, when the drive was armed, the motor stood.
+    /// If the sample `span` before the newest is lost, the next older one within another span replaces it. Before
+    /// `start`, when the drive was armed, the motor stood still.
     pub fn rate(&self, span: i64, start: i64) -> f64 {
         let (Some(newest), Some(&counts)) = (self.newest(), self.counts().last()) else {
             return f64::NAN;
@@ -79,13 +79,13 @@ impl History {
     }
 }
 
-/// How long an arrival counts \[us\]; clocks that differ by 100 ppm part by .2 ms in two of them.
+/// How long an arrival counts \[us\]; in two of them, clocks that differ by 100 ppm drift apart by .2 ms.
 const WINDOW: u64 = 1_000_000;
 
 /// The least difference between a sample's arrival on the host's clock and its time on the device's.
 ///
-/// It is the difference of the clocks and the link's least delay together: an age taken from it leaves out that delay,
-/// which the round trip of a command bounds. The window forgets, so that clocks may drift.
+/// It is the difference of the clocks plus the link's least delay: an age computed from it omits that delay, which is
+/// at most a command's round trip. Old arrivals are forgotten, so the clocks may drift.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Age {
     began: u64,
@@ -94,7 +94,7 @@ pub struct Age {
 }
 
 impl Age {
-    /// A sample of device time `sampled` has come at `now`.
+    /// A sample of device time `sampled` has arrived at `now`.
     pub fn arrived(&mut self, now: u64, sampled: i64) {
         if self.lately.is_none() || now.saturating_sub(self.began) >= WINDOW {
             self.before = self.lately.take();
@@ -107,7 +107,7 @@ impl Age {
         );
     }
 
-    /// Age at `now` of a sample of device time `sampled` \[us\]; none before the first arrival.
+    /// Age at `now` of a sample of device time `sampled` \[us\]; `None` before the first arrival.
     pub fn of(&self, now: u64, sampled: i64) -> Option<u64> {
         let least = self.lately?.min(self.before.unwrap_or(i64::MAX));
         let difference = now.cast_signed().wrapping_sub(sampled);

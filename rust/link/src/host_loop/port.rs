@@ -12,17 +12,17 @@ use super::Outcome;
 use super::tick::HostLoop;
 use crate::ready::{Interest, wait};
 
-/// The longest time between two looks at a stop request \[us\].
+/// The longest time between two checks for a stop request \[us\].
 const LOOK: u64 = 20_000;
-/// Bytes that may wait for a port that takes none: a few commands, the last of which counts.
+/// Most bytes kept for a port that takes none: a few commands, of which only the last counts.
 const BACKLOG: usize = 256;
 /// More than a terminal's input memory.
 const CHUNK: usize = 8192;
 
-/// Runs the loop on an open port until it is done; every failure of the port is an outcome.
+/// Runs the loop on an open port until it is done; every failure of the port becomes an outcome.
 ///
-/// Between deadlines the thread sleeps; it never spins. Deadlines are instants of the monotonic clock, so that a
-/// late one does not move the next.
+/// Between deadlines the thread sleeps; it never spins. Deadlines are instants of the monotonic clock, so a late one
+/// does not delay the next.
 pub fn run(port: BorrowedFd<'_>, host_loop: &mut HostLoop, monitor: &Monitor) {
     let outcome = Port::new(port).and_then(|mut port| port.serve(host_loop, monitor));
     if let Err(lost) = outcome {
@@ -30,14 +30,14 @@ pub fn run(port: BorrowedFd<'_>, host_loop: &mut HostLoop, monitor: &Monitor) {
     }
 }
 
-/// The host's monotonic clock \[us\], the one of Python's `time.monotonic`.
+/// The host's monotonic clock \[us\], the same as Python's `time.monotonic`.
 pub fn now() -> u64 {
     let time = clock_gettime(ClockId::Monotonic);
     let seconds = u64::try_from(time.tv_sec).unwrap_or(0);
     seconds * 1_000_000 + u64::try_from(time.tv_nsec).unwrap_or(0) / 1000
 }
 
-/// A port that never blocks, and what it has not taken yet.
+/// A port that never blocks, and the bytes it has not taken yet.
 struct Port<'a> {
     port: BorrowedFd<'a>,
     flags: OFlags,
@@ -77,7 +77,7 @@ impl<'a> Port<'a> {
         Ok(())
     }
 
-    /// Sends what was left over and `frame`; false where too much is left over to take it on.
+    /// Sends the remaining bytes and `frame`; false if too many bytes remain to add it.
     fn send(&mut self, frame: &[u8]) -> Result<bool, Errno> {
         let fits = self.unsent.len() + frame.len() <= self.unsent.capacity();
         if fits {
@@ -99,7 +99,7 @@ impl<'a> Port<'a> {
         Ok(())
     }
 
-    /// Sleeps until bytes come, but at most until `wake`; how many bytes those are.
+    /// Sleeps until bytes come, but at most until `wake`; returns how many came.
     fn wait(&self, wake: u64, chunk: &mut [u8]) -> Result<usize, Errno> {
         let interest = Interest {
             read: true,
@@ -113,7 +113,7 @@ impl<'a> Port<'a> {
         Ok(0)
     }
 
-    /// Readable without bytes is how a port that has gone looks.
+    /// A port that has vanished is readable, but has no bytes.
     fn read(&self, chunk: &mut [u8]) -> Result<usize, Errno> {
         match read(self.port, chunk) {
             Ok(0) => Err(Errno::IO),
@@ -126,15 +126,15 @@ impl<'a> Port<'a> {
 
 impl Drop for Port<'_> {
     fn drop(&mut self) {
-        // A port that has gone has no flags to restore.
+        // A port that has vanished has no flags to restore.
         let _ = fcntl_setfl(self.port, self.flags);
     }
 }
 
-/// Asks the kernel not to gather this thread's timers with others, which costs up to 50 us.
+/// Asks the kernel not to coalesce this thread's timers with others, which costs up to 50 us.
 #[cfg(target_os = "linux")]
 fn punctual() {
-    // Without it the loop is later, which its histogram shows.
+    // Without it the loop is later, as its histogram shows.
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
 }
 

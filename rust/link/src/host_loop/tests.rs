@@ -1,4 +1,4 @@
-//! The loop against a device of a few lines, in computed time.
+//! The loop with a minimal device, in computed time.
 
 use proptest::prelude::*;
 use sewfast_control::link::{Body, Deframer, Fields, Header, MAX_WIRE, encode};
@@ -14,7 +14,7 @@ const PERIOD: u64 = 10_000;
 const TAG: u16 = 7;
 const SESSION: u32 = 0x8000_0009;
 
-/// A motor `dx/dt = (400 u - x) / .1 s` \[counts/s\] behind a device that does as it is told.
+/// A motor `dx/dt = (400 u - x) / .1 s` \[counts/s\] behind a device that simply obeys.
 struct Peer {
     deframer: Deframer,
     out: Vec<u8>,
@@ -216,7 +216,7 @@ impl World {
         }
     }
 
-    /// Lets time go on to `now`, then calls the loop once.
+    /// Lets time pass until `now`, then calls the loop once.
     fn call(&mut self, now: u64) {
         self.now = now;
         self.peer.advance(now + 4_000_000);
@@ -229,7 +229,7 @@ impl World {
         self.peer.hear(&said);
     }
 
-    /// Calls the loop as its thread does, until `until` or its end.
+    /// Calls the loop like its thread, until `until` or its end.
     fn serve(&mut self, until: u64) {
         while !self.looped.done() && self.now < until {
             let wake = self.looped.wake().clamp(self.now + 100, self.now + 1000);
@@ -518,7 +518,7 @@ fn refuses_what_cannot_run_and_names_it() {
             .contains("counts (bit 0)")
     );
 }
-/// What happens between two calls.
+/// Something that happens between two calls.
 #[derive(Clone, Debug)]
 enum Happening {
     Wait(u64),

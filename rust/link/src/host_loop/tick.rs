@@ -1,4 +1,4 @@
-//! The loop without port or clock: time and bytes in, at most one frame out; and what it makes of what the device says.
+//! The loop without port or clock: time and bytes in, at most one frame out; and its reactions to the device.
 
 use sewfast_control::PidController;
 use sewfast_control::link::{Body, Fields};
@@ -11,10 +11,10 @@ use crate::client::{Client, Event, Reply, kind};
 use crate::receiver::Counters;
 use crate::samples::Channel;
 
-/// How long after the usual arrival of samples a tick comes \[us\]: what their delay may vary by.
+/// How long after the usual arrival of samples a tick comes \[us\]: the permitted variation of their delay.
 const MARGIN: u64 = 1000;
 
-/// Within this an armed device says something, every 200 ms \[us\].
+/// An armed device sends something every 200 ms, so it must be heard within this time \[us\].
 const ARMED_SILENCE: u64 = 250_000;
 
 /// What the loop is waiting for.
@@ -28,7 +28,7 @@ enum Phase {
     Done,
 }
 
-/// A controller that drives a device in mode 2: arms and starts it, says a command each period, stops it.
+/// A controller that drives a device in mode 2: it arms and starts the device, sends a command each period, and stops it.
 #[derive(Debug)]
 pub struct HostLoop {
     pub(super) client: Client,
@@ -53,11 +53,11 @@ pub struct HostLoop {
 }
 
 impl HostLoop {
-    /// A loop at rest that has sent nothing, in a session that `client` has greeted; `channels` are those of the mask, counts
-    /// first, and `reference` has a value for each of its periods.
+    /// A loop at rest that has sent nothing, in a session that `client` has opened. `channels` are those of the mask,
+    /// counts first; `reference` has a value for each of its periods.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for settings that no loop can run with.
+    /// `ErrorKind::Setting` for settings with which no loop can run.
     pub fn new(
         mut client: Client,
         settings: Settings,
@@ -94,9 +94,9 @@ impl HostLoop {
         })
     }
 
-    /// Takes what was received up to `now` \[us\] and gives the frame to send, or nothing.
+    /// Takes the bytes received up to `now` \[us\] and returns the frame to send, or nothing.
     ///
-    /// A call before [`wake`](Self::wake) only listens. A deadline missed by more than a period is skipped and counted.
+    /// A call before [`wake`](Self::wake) only takes bytes. A deadline missed by more than a period is skipped and counted.
     pub fn tick(&mut self, now: u64, received: &[u8]) -> &[u8] {
         self.listen(now, received);
         let u = self.drive(now);
@@ -107,7 +107,7 @@ impl HostLoop {
         }
     }
 
-    /// When [`tick`](Self::tick) is to be called at the latest \[us\].
+    /// When [`tick`](Self::tick) must be called at the latest \[us\].
     pub fn wake(&self) -> u64 {
         let due = self.client.due().unwrap_or(0);
         match self.phase {
@@ -118,43 +118,43 @@ impl HostLoop {
         }
     }
 
-    /// Counts a command that did not leave.
+    /// Counts a command that was not sent.
     pub fn unsent(&mut self) {
         self.ticks.unsent += 1;
     }
 
-    /// True once everything has been said and answered, or given up.
+    /// True once everything has been sent and answered, or given up.
     pub fn done(&self) -> bool {
         self.phase == Phase::Done
     }
 
-    /// Ends the loop without another word: there is no port to say it on.
+    /// Ends the loop without sending anything: there is no port.
     pub fn abandon(&mut self, why: Outcome) {
         self.stop(why);
         self.phase = Phase::Done;
     }
 
-    /// How it ended; none while it runs.
+    /// How it ended; `None` while it runs.
     pub fn outcome(&self) -> Option<&Outcome> {
         self.outcome.as_ref()
     }
 
-    /// What was decided at each tick.
+    /// The decisions of each tick.
     pub fn ticks(&self) -> &Ticks {
         &self.ticks
     }
 
-    /// Every sample of the run that came.
+    /// Every received sample of the run.
     pub fn history(&self) -> &History {
         &self.history
     }
 
-    /// What the device says of the run that has ended, where that answer came.
+    /// The device's status after the run, if that reply came.
     pub fn status(&self) -> Option<&Status> {
         self.status.as_ref()
     }
 
-    /// Device time of the run's first sample \[us\]; 0 where it never began.
+    /// Device time of the run's first sample \[us\]; 0 if it never began.
     pub fn start(&self) -> i64 {
         self.start
     }
@@ -174,19 +174,19 @@ impl HostLoop {
         self.stopped
     }
 
-    /// Sequences of the last command and of the last heartbeat, from which the session goes on.
+    /// Sequence numbers of the last command and of the last heartbeat, from which the session continues.
     pub fn sequences(&self) -> (u32, u32) {
         self.client.sequences()
     }
 
-    /// Ticks that are over, and how many there are in all.
+    /// Number of finished ticks, and of all ticks.
     pub fn progress(&self) -> (usize, usize) {
         (self.next, self.reference.len())
     }
 }
 
 impl HostLoop {
-    /// Repeats the command under way, or gives it up; feeds the watchdog of an armed device meanwhile.
+    /// Repeats the pending command or gives it up; meanwhile feeds the watchdog of an armed device.
     fn ask(&mut self, now: u64) -> &[u8] {
         if let Some(unanswered) = self.client.expire(now) {
             self.give_up(unanswered.kind);
@@ -209,8 +209,8 @@ impl HostLoop {
         }
     }
 
-    /// When an armed device needs the next heartbeat; never once it has long not been heard, so that its watchdog ends what it
-    /// may be doing.
+    /// When an armed device needs the next heartbeat; never once it has long been silent, so that its watchdog ends
+    /// whatever it may be doing.
     fn keep_due(&self) -> u64 {
         let due = self.fed + u64::from(self.settings.watchdog / 4);
         let deaf_after = ARMED_SILENCE.max(self.settings.watchdog.into());
@@ -221,7 +221,7 @@ impl HostLoop {
         }
     }
 
-    /// A tick, where its deadline has come: measure, control; the command. None where there is none, or the loop ends.
+    /// Runs a tick if its deadline has come: measure, control; returns the command. `None` if no tick is due, or the loop ends.
     fn drive(&mut self, now: u64) -> Option<f64> {
         if self.phase != Phase::Running || now < self.deadline {
             return None;
@@ -245,12 +245,12 @@ impl HostLoop {
         Some(u)
     }
 
-    /// The command for this tick, from the speed over the newest period; without a new sample the last command stays.
+    /// The command for this tick, from the speed over the newest period; without a new sample the last command is kept.
     fn control(&mut self, now: u64, late: u64, r: f64) -> f64 {
         let newest = self.history.newest();
         let fresh = newest > self.used;
         let y = match newest {
-            // ARM is refused unless the motor stands.
+            // ARM is refused unless the motor stands still.
             None if self.next == 0 => 0.0,
             Some(_) if fresh => {
                 let period = self.settings.period().cast_signed();
@@ -272,7 +272,7 @@ impl HostLoop {
         u
     }
 
-    /// Ends the loop, for the first reason that is given: the next frame out is STOP, and no command to the motor follows it.
+    /// Ends the loop for the first reason given: the next frame is STOP, and no command to the motor follows it.
     pub fn stop(&mut self, why: Outcome) {
         if self.outcome.is_none() {
             self.outcome = Some(why);
@@ -283,8 +283,8 @@ impl HostLoop {
         }
     }
 
-    /// Sets the grid of deadlines shortly after the first samples, so that all ticks find fresh ones; without samples it begins
-    /// when half the watchdog time is over.
+    /// Sets the grid of deadlines shortly after the first samples, so that all ticks find fresh ones; without samples
+    /// it begins after half the watchdog time.
     fn set_grid(&mut self, now: u64, sampled: bool) {
         self.deadline = if sampled {
             now + (self.settings.period() / 16).min(MARGIN)
@@ -293,7 +293,7 @@ impl HostLoop {
         };
     }
 
-    /// START of mode 2, at the next sample; the host stops it before it ends by itself.
+    /// START of mode 2, at the next sample; the host stops the run before it ends by itself.
     fn start_body(&self) -> Body {
         let s = &self.settings;
         let start = bodies::Start {
@@ -307,7 +307,7 @@ impl HostLoop {
         start.body()
     }
 
-    /// Most samples of the device in the run: the reference, the batch before its first tick, and a period for what is late.
+    /// Most samples of the run: the reference, the batch before its first tick, and a period for delays.
     fn length(&self) -> u32 {
         let periods = self.reference.len() as u64 + 1;
         let samples = periods * u64::from(self.settings.ratio) + u64::from(self.settings.batch);
@@ -326,7 +326,7 @@ const DISARMED: u8 = 5;
 const TRIP: u8 = 6;
 
 impl HostLoop {
-    /// Takes what the device says and the samples in `received`.
+    /// Takes the device's frames and the samples in `received`.
     fn listen(&mut self, now: u64, received: &[u8]) {
         self.client.receive(now, received);
         while let Some(event) = self.client.event() {
@@ -344,7 +344,7 @@ impl HostLoop {
         self.take(now);
     }
 
-    /// Looks at the samples that have come; those of an earlier run are dropped.
+    /// Takes the new samples; those of an earlier run are dropped.
     fn take(&mut self, now: u64) {
         if matches!(self.phase, Phase::Arming) {
             self.history.keep(i64::MAX, 0);
@@ -374,7 +374,7 @@ impl HostLoop {
             return self.refused(reply);
         }
         let mut fields = Fields::new(reply.body.bytes().unwrap_or_default());
-        // a body too short for its kind is as good as none: it would come again as it is
+        // a body too short for its kind counts as no reply: a repeat would be the same
         if self.done_with(now, &mut fields).is_none() {
             self.give_up(reply.kind);
         }
@@ -424,7 +424,7 @@ impl HostLoop {
         }
     }
 
-    /// The device's own count says whether a run that it ended was whole.
+    /// The device's own count shows whether a run that it ended was complete.
     fn conclude(&mut self, status: Status) {
         self.phase = Phase::Done;
         self.status = Some(status);
@@ -432,7 +432,7 @@ impl HostLoop {
             self.outcome = None;
             self.finished();
         }
-        // a trip whose event was lost; STOP leaves a tripped device tripped, so that the host may have taken it for the end
+        // a trip whose event was lost: STOP leaves a tripped device tripped, so the host may have mistaken it for the end
         let ended = matches!(self.outcome, Some(Outcome::Ended | Outcome::Completed));
         if ended && status.state == TRIPPED {
             let (reason, value) = (status.reason, f32::NAN);
@@ -440,7 +440,7 @@ impl HostLoop {
         }
     }
 
-    /// The device has run to the end, before which the last ticks were due.
+    /// The device ran to the end; the last ticks were due before that.
     fn finished(&mut self) {
         self.ticks.missed += (self.reference.len() - self.next) as u64;
         self.next = self.reference.len();
@@ -465,7 +465,7 @@ impl HostLoop {
         }
     }
 
-    /// Said while not running, so that an event that was lost is noticed.
+    /// Sent while not running, so that a lost event is noticed.
     fn beat(&mut self, beat: &Beat) {
         if self.phase == Phase::Running {
             match beat.state {
@@ -476,7 +476,7 @@ impl HostLoop {
         }
     }
 
-    /// A device that has reset is safe, and knows nothing of this session.
+    /// A device that has reset is safe, but knows nothing of this session.
     fn reset(&mut self) {
         self.stop(Outcome::Reset);
         self.phase = Phase::Done;

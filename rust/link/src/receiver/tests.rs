@@ -1,4 +1,4 @@
-//! Every drop, repeat, late frame and reset is flagged, and no sample enters twice, whatever the link does.
+//! Every drop, repeat, late frame and reset is detected, and no sample enters twice, whatever the link does.
 
 use super::*;
 use crate::receiver::LISTED;
@@ -37,16 +37,16 @@ fn trials(short: u64, soak: u64) -> u64 {
     }
 }
 
-/// A frame of the device and what the receiver should make of it.
+/// A frame of the device and what the receiver should report about it.
 #[derive(Clone)]
 struct Sent {
     wire: Vec<u8>,
     sequence: u32,
-    /// Its samples, by their number since the test began; none in a beat.
+    /// Its samples, numbered since the test began; none in a beat.
     samples: std::ops::Range<u64>,
 }
 
-/// Sends batches and beats; each sample's counts are its own number, so that none can pass for another.
+/// Sends batches and beats; each sample's counts are its own number, so that no two look alike.
 struct Device {
     tag: u16,
     sequence: u32,
@@ -90,7 +90,7 @@ impl Device {
     }
 }
 
-/// What the link delivers, and what the receiver has to say about it.
+/// The frames that the link delivers, and what the receiver should report.
 #[derive(Default)]
 struct Story {
     stream: Vec<u8>,
@@ -172,7 +172,7 @@ impl Story {
         self.clean(device, dice, 1..=1);
     }
 
-    /// The end of a frame is lost, zero and all: the next whole frame is joined to it, and the one after is in step.
+    /// The end of a frame is lost, including its zero: the next whole frame is joined to it, and the one after is in step.
     fn tear(&mut self, device: &mut Device, dice: &mut Dice) {
         let (torn, joined) = (device.send(dice), device.send(dice));
         let kept = 1 + dice.below(torn.wire.len() as u64 - 1) as usize;
@@ -214,8 +214,8 @@ fn fed(receiver: &mut Receiver, dice: &mut Dice, mut stream: &[u8]) -> Vec<u32> 
     beats
 }
 
-/// 1e5 injected faults, 1e6 in a soak: every one is flagged with its place and number, nothing else is, and what was
-/// whole and in order has come out, once.
+/// 1e5 injected faults, 1e6 in a soak: every one is reported with its place and number, nothing else is, and all whole
+/// frames in order come out once.
 #[test]
 fn every_injected_fault_is_flagged() {
     let mut dice = Dice(31);

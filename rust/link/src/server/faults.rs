@@ -1,4 +1,4 @@
-//! Injected faults: how often, how long, when, the same for a seed and a given traffic; their counts and their log.
+//! Injected faults: how often, how long and when, reproducible for a seed and given traffic; with their counts and their log.
 
 use std::fs::File;
 use std::io::{self, LineWriter, Write};
@@ -11,24 +11,24 @@ use sewfast_core::{Error, Result};
 
 use super::line::Direction;
 
-/// What can go wrong on the way between a device and its host.
+/// Faults on the way between a device and its host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
     /// The frame does not arrive.
     Drop,
-    /// One bit of the frame is inverted, its closing zero included.
+    /// One bit of the frame, including its closing zero, is inverted.
     Flip,
     /// The frame arrives twice.
     Duplicate,
-    /// The frame arrives after the one behind it.
+    /// The frame arrives after the next one.
     Reorder,
-    /// The frame and those behind it arrive late.
+    /// The frame and those after it arrive late.
     Delay,
-    /// Nothing passes either way for a time.
+    /// Nothing passes in either direction for a time.
     Stall,
-    /// The device boots anew; its motor is off.
+    /// The device reboots; its motor is off.
     Reset,
-    /// The port is gone for a time.
+    /// The port vanishes for a time.
     Unplug,
 }
 
@@ -74,7 +74,7 @@ impl Fault {
         })
     }
 
-    /// Its duration where none is said; `None` where it has none.
+    /// Its default duration; `None` if it has none.
     fn lasts(self) -> Option<Duration> {
         match self {
             Self::Delay => Some(Duration::from_millis(20)),
@@ -102,7 +102,7 @@ impl Default for Faults {
 }
 
 impl Faults {
-    /// Rates as `drop=.001,flip=1e-4,stall=1e-4:0.2`: a probability per frame, and seconds behind a colon.
+    /// Rates such as `drop=.001,flip=1e-4,stall=1e-4:0.2`: a probability per frame, and after a colon the seconds.
     ///
     /// ```
     /// use sewfast_link::server::{Fault, Faults};
@@ -113,8 +113,8 @@ impl Faults {
     /// ```
     ///
     /// # Errors
-    /// A setting error for an unknown or repeated kind, a rate outside 0 to 1, and a duration that is not above 0 and at
-    /// most 60 s or belongs to a kind that takes no time.
+    /// A setting error for an unknown or repeated kind, a rate outside 0 to 1, a duration that is not above 0 and at
+    /// most 60 s, or a duration for a kind that takes no time.
     pub fn parse(text: &str) -> Result<Self> {
         let mut faults = Self::default();
         let mut seen = [false; KINDS];
@@ -157,7 +157,7 @@ impl Faults {
         self.rates[fault as usize]
     }
 
-    /// How long a kind lasts; zero where it takes no time.
+    /// How long a kind lasts; zero if it takes no time.
     pub fn duration(&self, fault: Fault) -> Duration {
         self.durations[fault as usize]
     }
@@ -174,18 +174,18 @@ fn malformed(item: &str) -> Error {
     ))
 }
 
-/// What befalls one frame.
+/// The faults of one frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Fate {
-    /// What is done to the frame itself, at most one kind.
+    /// The fault of the frame itself, at most one.
     pub frame: Option<Fault>,
-    /// What is done to the link or the device at that moment.
+    /// The faults of the link or the device at that moment.
     pub events: [Option<Fault>; 3],
     /// Chooses the bit of a flip.
     pub chance: u64,
 }
 
-/// Draws the fate of each frame of one direction.
+/// Draws the faults of each frame of one direction.
 #[derive(Clone, Debug)]
 pub struct Injector {
     faults: Faults,
@@ -194,7 +194,7 @@ pub struct Injector {
 }
 
 impl Injector {
-    /// `stream` tells the directions apart.
+    /// `stream` distinguishes the directions.
     pub fn new(faults: Faults, seed: u64, stream: u64) -> Self {
         Self {
             faults,
@@ -203,7 +203,7 @@ impl Injector {
         }
     }
 
-    /// The fate of the next frame; always as many random numbers, so that it depends on the frame's place alone.
+    /// The faults of the next frame; always uses as many random numbers, so the result depends only on the frame's index.
     pub fn next(&mut self) -> Fate {
         if self.quiet {
             return Fate::default();
@@ -221,10 +221,10 @@ impl Injector {
     }
 }
 
-/// Counts by way and kind.
+/// Counts by direction and kind.
 pub type Counts = [[u64; KINDS]; 2];
 
-/// The count of faults, and the file that names each one.
+/// The counts of faults, and the file that lists each of them.
 #[derive(Debug, Default)]
 pub struct FaultLog {
     counts: Counts,
@@ -236,10 +236,10 @@ pub struct FaultLog {
 }
 
 impl FaultLog {
-    /// With a file where `path` names one.
+    /// With a file if `path` names one.
     ///
     /// # Errors
-    /// Where the file cannot be made.
+    /// The file cannot be created.
     pub fn new(path: Option<&Path>) -> io::Result<Self> {
         let file = path.map(File::create).transpose()?;
         Ok(Self {
@@ -259,7 +259,7 @@ impl FaultLog {
         self.counts[direction as usize][fault as usize]
     }
 
-    /// A fault that befell `frame`, as it was before.
+    /// Records a fault of `frame`, given as it was before.
     pub fn record(&mut self, fault: Fault, direction: Direction, frame: &[u8]) {
         self.counts[direction as usize][fault as usize] += 1;
         let Some(file) = &mut self.file else { return };
@@ -338,7 +338,7 @@ mod tests {
             fates.iter().filter(|fate| wanted(fate)).count() as f64 / fates.len() as f64
         };
         assert!((share(|fate| fate.frame == Some(Fault::Drop)) - 0.1).abs() < 0.01);
-        // a flip is not drawn where the frame is dropped
+        // no flip is drawn for a dropped frame
         assert!((share(|fate| fate.frame == Some(Fault::Flip)) - 0.18).abs() < 0.01);
         assert!((share(|fate| fate.events[1].is_some()) - 0.05).abs() < 0.01);
     }

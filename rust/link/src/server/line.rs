@@ -1,17 +1,17 @@
-//! One direction of the link between device and port: frame by frame, with faults and at the rate of a serial line.
+//! One direction of the link between device and port: frame by frame, with faults, at the rate of a serial line.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use super::faults::{Fate, Fault, FaultLog, Faults, Injector};
 
-/// What is longer without a zero is no frame and passes as it is.
+/// Longer runs of bytes without a zero are no frame and pass unchanged.
 const LONGEST: usize = 512;
 
-/// How long a frame waits for the one that is to overtake it.
+/// How long a frame waits for the one that should overtake it.
 const PATIENCE: Duration = Duration::from_millis(20);
 
-/// The way of a line.
+/// The direction of a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Direction {
     /// From the device.
@@ -37,21 +37,21 @@ struct Packet {
     bytes: Vec<u8>,
 }
 
-/// Bytes under way in one direction.
+/// Bytes in transit in one direction.
 #[derive(Debug)]
 pub struct Line {
     direction: Direction,
     injector: Injector,
     delay: Duration,
-    /// Faults to come, whatever the injector says.
+    /// Faults to come, regardless of the injector.
     forced: VecDeque<Fault>,
-    /// A frame whose zero has not come yet.
+    /// A frame whose zero has not arrived yet.
     partial: Vec<u8>,
-    /// A frame that the next one overtakes.
+    /// A frame to be overtaken by the next one.
     overtaken: Option<Packet>,
     late: VecDeque<Packet>,
     ready: VecDeque<u8>,
-    /// The frame before lost its closing zero: the next one is damaged with it.
+    /// The previous frame lost its closing zero: the next one is damaged with it.
     joined: bool,
     bucket: Option<Bucket>,
 }
@@ -79,12 +79,12 @@ impl Line {
         }
     }
 
-    /// Does `fault` to the next frame.
+    /// Applies `fault` to the next frame.
     pub fn force(&mut self, fault: Fault) {
         self.forced.push_back(fault);
     }
 
-    /// Takes bytes in; what they do to link and device goes to `events`.
+    /// Takes bytes; their faults of link and device go to `events`.
     pub fn push(
         &mut self,
         mut bytes: &[u8],
@@ -104,10 +104,10 @@ impl Line {
         }
     }
 
-    /// Sends the frame in `partial` on its way.
+    /// Sends the frame in `partial`.
     fn frame(&mut self, now: Instant, log: &mut FaultLog, events: &mut Vec<Fault>) {
         let bytes = std::mem::take(&mut self.partial);
-        // a lone zero brings the other side into step; it is no frame
+        // a lone zero resynchronises the other side; it is no frame
         if bytes.len() > 1 {
             let fate = self.fate();
             for event in fate.events.into_iter().flatten() {
@@ -157,7 +157,7 @@ impl Line {
         self.overtake(now, log);
     }
 
-    /// Sends a frame, and the one that it overtakes behind it.
+    /// Sends a frame, followed by the one that it overtakes.
     fn pass(&mut self, bytes: &[u8], now: Instant, log: &mut FaultLog) {
         self.emit(bytes, now, log);
         self.overtake(now, log);
@@ -183,7 +183,7 @@ impl Line {
         }
     }
 
-    /// Lets pass what is due.
+    /// Passes on what is due.
     pub fn settle(&mut self, now: Instant, log: &mut FaultLog) {
         if self.overtaken.as_ref().is_some_and(|held| held.due <= now) {
             self.overtake(now, log);
@@ -194,7 +194,7 @@ impl Line {
         }
     }
 
-    /// How many bytes lie in it, whole frames and parts.
+    /// Number of bytes in it, of whole and partial frames.
     pub fn backlog(&self) -> usize {
         let late: usize = self.late.iter().map(|packet| packet.bytes.len()).sum();
         self.ready.len() + self.partial.len() + late
@@ -206,29 +206,29 @@ impl Line {
         bucket.map_or(usize::MAX, |bucket| bucket.allowance(now))
     }
 
-    /// So many bytes have passed at the line's rate.
+    /// Counts bytes that have passed at the line's rate.
     pub fn spend(&mut self, bytes: usize) {
         if let Some(bucket) = &mut self.bucket {
             bucket.spend(bytes);
         }
     }
 
-    /// What has arrived at the far end, in one piece.
+    /// The bytes at the far end, as one slice.
     pub fn arrived(&mut self) -> &[u8] {
         self.ready.make_contiguous()
     }
 
-    /// Removes the first `bytes` of what has arrived.
+    /// Removes the first `bytes` from those at the far end.
     pub fn consume(&mut self, bytes: usize) {
         self.ready.drain(..bytes);
     }
 
-    /// Whether anything has arrived.
+    /// Whether there are bytes at the far end.
     pub fn has_arrived(&self) -> bool {
         !self.ready.is_empty()
     }
 
-    /// When to look again although nothing comes in: something is due, or the rate lets more pass.
+    /// When to look again if nothing comes in: something is due, or the rate lets more pass.
     pub fn wakes_in(&self, now: Instant, paced: bool) -> Option<Duration> {
         let late = self.late.front().map(|packet| packet.due);
         let held = self.overtaken.as_ref().map(|packet| packet.due);
@@ -238,7 +238,7 @@ impl Line {
         due.into_iter().chain(refill.map(Bucket::refilled_in)).min()
     }
 
-    /// Loses what is under way: the cable is out.
+    /// Drops everything in transit: the cable is unplugged.
     pub fn clear(&mut self) {
         self.partial.clear();
         self.overtaken = None;
@@ -248,7 +248,7 @@ impl Line {
     }
 }
 
-/// Bits on the line for one byte: start, eight, stop.
+/// Bits on the line per byte: start, eight, stop.
 const BITS_PER_BYTE: f64 = 10.0;
 
 /// Bytes that may pass now; over any time `T` at most `rate T + burst`.
@@ -262,7 +262,7 @@ struct Bucket {
 }
 
 impl Bucket {
-    /// For `baud` bits a second. The burst is what passes in 2 ms, and at least the 16 bytes of a common transmitter's memory.
+    /// For `baud` bits a second. The burst is 2 ms of bytes, at least the 16 bytes of a common transmitter's memory.
     fn new(baud: u32, now: Instant) -> Self {
         let rate = f64::from(baud) / BITS_PER_BYTE;
         Self {
@@ -281,7 +281,7 @@ impl Bucket {
         self.level as usize
     }
 
-    /// So many bytes have passed.
+    /// Counts bytes that have passed.
     fn spend(&mut self, bytes: usize) {
         self.level -= bytes as f64;
     }
@@ -320,7 +320,7 @@ mod tests {
         line.push(&frame(sequence), now, log, &mut Vec::new());
     }
 
-    /// Sends frames 0, 1, 2 with a fault in the second and lets `wait` pass.
+    /// Sends frames 0, 1, 2 with a fault in the second, then lets `wait` pass.
     fn sent(fault: Fault, wait: Duration) -> (Vec<u8>, FaultLog) {
         let (mut line, mut log, now) = (line(""), FaultLog::default(), Instant::now());
         push(&mut line, 0, now, &mut log);

@@ -1,10 +1,10 @@
 //! The virtual sewing machine behind a pty or TCP port, with the state machine of a real device.
 //!
-//! A [`Server`] owns a thread that serves the drive until it is stopped. Time is real, or advances by the host's credit; faults
-//! and the rate of a serial line lie between device and port.
+//! A [`Server`] owns a thread that serves the drive until it is stopped. Time is real, or advances by the host's
+//! credit; faults and the rate of a serial line apply between device and port.
 //!
-//! To read: `rig` (the device), `port` and `pty` (where a host connects), `line` and `faults` (what lies between), `serving` (the
-//! loop that moves bytes), `trace` (its account of the output).
+//! To read: `rig` (the device), `port` and `pty` (where a host connects), `line` and `faults` (the path between them),
+//! `serving` (the loop that moves bytes), `trace` (its log of the output).
 
 mod faults;
 mod line;
@@ -35,48 +35,48 @@ pub use line::Direction;
 pub use rig::{CAPACITY, PERIOD};
 pub use trace::{Entry, Happening, Heartbeat};
 
-/// Where the drive is served.
+/// Where to serve the drive.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Endpoint {
-    /// A pseudo-terminal, with a symbolic link to it where one is named.
+    /// A pseudo-terminal; with a path, a symbolic link to it.
     Pty(Option<PathBuf>),
     /// A TCP port.
     Tcp {
-        /// As `127.0.0.1:0`.
+        /// Such as `127.0.0.1:0`.
         address: String,
-        /// Whether it may be one that other computers reach: whoever reaches it can start the motor.
+        /// Whether other computers may reach it: whoever reaches it can start the motor.
         anyone: bool,
     },
 }
 
-/// What is served, where and how.
+/// What to serve, where and how.
 #[derive(Clone, Debug)]
 pub struct Settings {
     /// The drive's machine.
     pub machine: Machine,
-    /// The name that the device gives; beyond 24 bytes it is cut.
+    /// The device's name; cut after 24 bytes.
     pub name: String,
     /// The port.
     pub endpoint: Endpoint,
-    /// Time advances by the host's credit.
+    /// Whether time advances by the host's credit.
     pub fast: bool,
-    /// Bits a second in both directions; `None` as fast as the port is.
+    /// Bits a second in both directions; `None` for no limit.
     pub baud: Option<u32>,
-    /// What goes wrong.
+    /// The faults to inject.
     pub faults: Faults,
     /// The seed of the faults.
     pub seed: u64,
-    /// Ends when the first host has gone.
+    /// End when the first host has gone.
     pub once: bool,
-    /// Ends after this time.
+    /// End after this time.
     pub duration: Option<Duration>,
-    /// A line of JSON for each fault.
+    /// File with a line of JSON for each fault.
     pub fault_log: Option<PathBuf>,
-    /// A line of JSON for each change of the output and of who is there.
+    /// File with a line of JSON for each change of the output or of the connection.
     pub trace: Option<PathBuf>,
 }
 
-/// A drive that is being served.
+/// A drive being served.
 #[derive(Debug)]
 pub struct Server {
     shared: Arc<Shared>,
@@ -84,10 +84,10 @@ pub struct Server {
 }
 
 impl Server {
-    /// Opens the port and serves the drive on a thread of its own.
+    /// Opens the port and serves the drive on a new thread.
     ///
     /// # Errors
-    /// Where the port, a file or the thread cannot be had.
+    /// The port, a file or the thread cannot be created.
     pub fn start(settings: Settings) -> io::Result<Self> {
         let began = Instant::now();
         let port = opened(&settings.endpoint)?;
@@ -116,17 +116,17 @@ impl Server {
         })
     }
 
-    /// What a host opens; a pseudo-terminal without a link has another name after it was unplugged.
+    /// The name that a host opens; a pseudo-terminal without a link has another name after it was unplugged.
     pub fn port(&self) -> String {
         self.shared.port()
     }
 
-    /// Waits for the end of serving, at most for `timeout`; whether it has come.
+    /// Waits for the end of serving, at most for `timeout`; returns whether it has ended.
     pub fn wait(&self, timeout: Duration) -> bool {
         self.shared.wait(timeout)
     }
 
-    /// Causes a fault: stall, reset and unplug within 20 ms, the others with the next frame from the device.
+    /// Causes a fault: stall, reset and unplug within 20 ms, others with the next frame from the device.
     pub fn cause(&self, fault: Fault, lasts: Option<Duration>) {
         self.shared.order(Order::Fault(fault, lasts));
     }
@@ -136,17 +136,17 @@ impl Server {
         self.shared.faults()
     }
 
-    /// How serving went so far.
+    /// Statistics so far.
     pub fn statistics(&self) -> Statistics {
         self.shared.statistics()
     }
 
-    /// The account of the output so far.
+    /// The log of the output so far.
     pub fn trace(&self) -> Vec<Entry> {
         self.shared.entries()
     }
 
-    /// Why a log file ended early, where one did.
+    /// Why a log file ended early, if one did.
     pub fn problem(&self) -> Option<String> {
         self.shared.problem()
     }
@@ -154,7 +154,7 @@ impl Server {
     /// Ends serving and removes the port.
     ///
     /// # Errors
-    /// Where the serving thread had died.
+    /// The serving thread has panicked.
     pub fn stop(&self) -> io::Result<()> {
         self.shared.stop.store(true, Ordering::Relaxed);
         let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
@@ -173,7 +173,7 @@ impl Drop for Server {
     }
 }
 
-/// Says that serving has ended, in whatever way.
+/// Reports that serving has ended, however it ended.
 struct End<'a>(&'a Shared);
 
 impl Drop for End<'_> {
@@ -195,7 +195,7 @@ fn opened(endpoint: &Endpoint) -> io::Result<Box<dyn Port>> {
     }
 }
 
-/// A device's name lives as long as the program, as it does in a firmware.
+/// A device's name lives as long as the program, as in firmware.
 fn kept(name: &str) -> &'static str {
     let end = (0..=name.len().min(24))
         .rev()
@@ -203,7 +203,7 @@ fn kept(name: &str) -> &'static str {
     Box::leak(name[..end.unwrap_or(0)].into())
 }
 
-/// A boot id out of the time, whose low 16 bits are not 0, the tag of HELLO.
+/// A boot id from the time; its low 16 bits are not 0, the tag of HELLO.
 fn first_boot() -> u32 {
     let time = SystemTime::now()
         .duration_since(UNIX_EPOCH)
@@ -213,30 +213,30 @@ fn first_boot() -> u32 {
     (mixed >> 32) as u32 | 1
 }
 
-/// Entries of the account kept in memory; the oldest go first.
+/// Log entries kept in memory; the oldest are dropped first.
 const KEPT: usize = 1 << 16;
 
-/// What the owner may ask for while the drive is served.
+/// Requests of the owner while the drive is served.
 #[derive(Clone, Copy, Debug)]
 enum Order {
-    /// One fault now, or with the next frame from the device; with a duration of its own.
+    /// A fault now, or with the next frame from the device; with its own duration.
     Fault(Fault, Option<Duration>),
 }
 
-/// How serving went so far.
+/// Statistics of serving.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Statistics {
     /// Samples taken.
     pub samples: u64,
-    /// Samples that were taken a period or more after they were due.
+    /// Samples taken a period or more after they were due.
     pub late: u64,
-    /// The latest sample [us].
+    /// The largest delay of a sample [us].
     pub latest_us: u64,
-    /// How often the clock was set back because catching up was hopeless.
+    /// How often the clock was set back because it could not catch up.
     pub set_back: u64,
-    /// Bytes that went to hosts.
+    /// Bytes sent to hosts.
     pub bytes_to_host: u64,
-    /// Hosts that were sent away because one was there.
+    /// Hosts turned away because another one was connected.
     pub refused: u64,
 }
 
@@ -251,7 +251,7 @@ struct Report {
     ended: bool,
 }
 
-/// Flags and the last report.
+/// Flags and the last report, shared between the threads.
 #[derive(Debug, Default)]
 struct Shared {
     /// Set to end serving.
@@ -266,7 +266,7 @@ impl Shared {
         self.report.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes the orders that have come.
+    /// Takes the new orders.
     fn orders(&self) -> Vec<Order> {
         match self.ordered.swap(false, Ordering::Acquire) {
             true => std::mem::take(&mut self.lock().orders),
@@ -280,7 +280,7 @@ impl Shared {
         self.ordered.store(true, Ordering::Release);
     }
 
-    /// The port's name, now.
+    /// Sets the port's new name.
     fn renamed(&self, port: String) {
         self.lock().port = port;
     }
@@ -290,7 +290,7 @@ impl Shared {
         self.lock().port.clone()
     }
 
-    /// Publishes how serving goes.
+    /// Publishes the present statistics and logs.
     fn report(&self, statistics: &Statistics, log: &FaultLog, trace: &mut Trace) {
         let mut report = self.lock();
         report.statistics = *statistics;
@@ -304,7 +304,7 @@ impl Shared {
         }
     }
 
-    /// How serving went so far.
+    /// Statistics so far.
     fn statistics(&self) -> Statistics {
         self.lock().statistics
     }
@@ -314,7 +314,7 @@ impl Shared {
         self.lock().faults
     }
 
-    /// The account so far.
+    /// The log so far.
     fn entries(&self) -> Vec<Entry> {
         self.lock().entries.clone()
     }
@@ -324,13 +324,13 @@ impl Shared {
         self.lock().problem.clone()
     }
 
-    /// Says that serving has ended.
+    /// Reports that serving has ended.
     fn ended(&self) {
         self.lock().ended = true;
         self.end.notify_all();
     }
 
-    /// Waits for the end of serving, at most for `timeout`; whether it has come.
+    /// Waits for the end of serving, at most for `timeout`; returns whether it has ended.
     fn wait(&self, timeout: Duration) -> bool {
         let report = self.lock();
         let waited = self

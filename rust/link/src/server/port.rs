@@ -1,4 +1,4 @@
-//! The place where a host connects: what every port is, the TCP port, and who is heard on it.
+//! Where a host connects: the interface of every port, the TCP port, and the gate that decides who is heard.
 
 use std::fmt::Debug;
 use std::io::{self, ErrorKind, Read, Write};
@@ -9,41 +9,41 @@ use sewfast_control::link::Deframer;
 
 use crate::ready::Interest;
 
-/// A port with at most one host; nothing in it blocks but [`Port::wait`].
+/// A port with at most one host; nothing in it blocks except [`Port::wait`].
 pub trait Port: Debug + Send {
-    /// What a host opens.
+    /// The name that a host opens.
     fn name(&self) -> String;
 
-    /// Looks who is there; true while a host is.
+    /// Checks the connection; true while a host is connected.
     fn connected(&mut self) -> bool;
 
-    /// Bytes from the host; 0 where none are there. A host that has gone shows in [`Port::connected`] next.
+    /// Reads bytes from the host; 0 if there are none. [`Port::connected`] then reports whether the host has gone.
     fn read(&mut self, buffer: &mut [u8]) -> usize;
 
-    /// Bytes to the host; how many went.
+    /// Writes bytes to the host; returns how many.
     fn write(&mut self, bytes: &[u8]) -> usize;
 
-    /// Sleeps until `interest` can be served, and at most for `timeout`.
+    /// Sleeps until `interest` can be served, at most for `timeout`.
     fn wait(&mut self, interest: Interest, timeout: Duration);
 
     /// Makes the port vanish.
     fn unplug(&mut self);
 
-    /// Makes it come back.
+    /// Makes it return.
     ///
     /// # Errors
-    /// Where the system does not give it.
+    /// The system does not provide it.
     fn plug(&mut self) -> io::Result<()>;
 
-    /// Whether others than this computer's users may reach it, a web page among them.
+    /// Whether it can be reached by others than this computer's users, for example a web page.
     fn is_network(&self) -> bool {
         false
     }
 
-    /// Sends the host that is there away.
+    /// Disconnects the present host.
     fn hang_up(&mut self) {}
 
-    /// Hosts that were sent away, as one was there or as they were none.
+    /// Hosts turned away, because another was connected or because they were no hosts.
     fn refused(&self) -> u64 {
         0
     }
@@ -54,22 +54,22 @@ pub fn explained(error: &io::Error, what: &str) -> io::Error {
     io::Error::new(error.kind(), format!("{what}: {error}"))
 }
 
-/// A listener and the client that is there.
+/// A listener and the connected client.
 #[derive(Debug)]
 pub struct Tcp {
     address: SocketAddr,
     listener: Option<TcpListener>,
     client: Option<TcpStream>,
-    /// The client has gone and nobody has looked since.
+    /// The client has gone, and this has not been reported yet.
     gone: bool,
     refused: u64,
 }
 
 impl Tcp {
-    /// Listens on `address`, as `127.0.0.1:5000`; port 0 takes a free one. `anyone`: on one that other computers reach, too.
+    /// Listens on `address`, such as `127.0.0.1:5000`; port 0 takes a free one. `anyone` permits an address that other computers reach.
     ///
     /// # Errors
-    /// Where the address is none of this computer, in use or not allowed; where others reach it and that was not said.
+    /// The address is not this computer's, in use or not permitted; or others can reach it without `anyone`.
     pub fn listen(address: &str, anyone: bool) -> io::Result<Self> {
         let resolved = address
             .to_socket_addrs()
@@ -93,7 +93,7 @@ impl Tcp {
         Ok(tcp)
     }
 
-    /// Takes the first client; the others are told by a closed connection.
+    /// Accepts the first client; for others the connection is closed.
     fn accept(&mut self) {
         let Some(listener) = &self.listener else {
             return;
@@ -131,7 +131,7 @@ fn prepared(client: TcpStream) -> io::Result<TcpStream> {
     Ok(client)
 }
 
-/// A client whose computer is gone without a word makes room for another after some seconds.
+/// A client whose computer vanished silently makes room for another after some seconds.
 #[cfg(unix)]
 fn keep_alive(client: &TcpStream) -> io::Result<()> {
     use rustix::net::sockopt;
@@ -152,7 +152,7 @@ impl Port for Tcp {
     }
 
     fn connected(&mut self) -> bool {
-        // one that comes as another goes is another one: what that one has said must not count for it
+        // a client that arrives as another leaves is a new one: the old one's bytes must not count for it
         if std::mem::take(&mut self.gone) {
             return false;
         }
@@ -190,7 +190,7 @@ impl Port for Tcp {
             .listener
             .as_ref()
             .map(|listener| (listener.as_fd(), Interest::READ));
-        // a failure is seen when bytes are read
+        // a failure shows when bytes are read
         match (client, listener) {
             (Some(client), Some(listener)) => drop(wait([client, listener], timeout)),
             (Some(port), None) | (None, Some(port)) => drop(wait([port], timeout)),
@@ -212,7 +212,7 @@ impl Port for Tcp {
         let open = || {
             let listener = TcpListener::bind(self.address)?;
             listener.set_nonblocking(true)?;
-            // port 0 was a wish for any; the one given stays the same from here on
+            // port 0 meant any port; the one assigned stays the same from here on
             Ok((listener.local_addr()?, listener))
         };
         let opened = open().map_err(|e: io::Error| {
@@ -241,24 +241,24 @@ impl Port for Tcp {
     }
 }
 
-// Who may speak to a device behind a network: whoever speaks its protocol, and of this device.
+// Who may talk to a device on a network: whoever speaks its protocol, with this device's tag.
 //
-// A browser can be made to send any bytes to a port of its own computer, behind the head of its request. That head is no
-// frame, and a page does not hear what the device says.
+// A browser can be made to send arbitrary bytes to a port of its own computer, after the head of its request. That head
+// is no frame, and a page cannot read the device's replies.
 
-/// So many frames with the tag of another device close a connection.
+/// This many frames with another device's tag close a connection.
 const WRONG_TAGS: u32 = 8;
-/// The kind of the frame that carries no tag.
+/// The kind of the only frame without a tag.
 const HELLO: u8 = 0x01;
 
-/// What a connection has said so far.
+/// What a connection has sent so far.
 #[derive(Debug)]
 pub struct Gate {
     deframer: Deframer,
-    /// The first block was a frame.
+    /// Whether the first block was a frame.
     speaks: bool,
     wrong: u32,
-    /// The device's tags since the connection was made: after a reset a host goes on with the one before until it hears of it.
+    /// The device's tags since the connection was made: after a reset a host uses the old one until it learns of the reset.
     tags: Vec<u16>,
 }
 
@@ -273,7 +273,7 @@ impl Gate {
         }
     }
 
-    /// Whether a connection that says `bytes` to the device of this `tag` may go on; none of them counts where it may not.
+    /// Whether a connection that sends `bytes` to the device of this `tag` may continue; if not, none of them is passed on.
     pub fn admits(&mut self, mut bytes: &[u8], tag: u16) -> bool {
         if self.tags.last() != Some(&tag) {
             self.tags.push(tag);
@@ -285,7 +285,7 @@ impl Gate {
                     let named = frame.header.kind != HELLO;
                     self.wrong += u32::from(named && !self.tags.contains(&frame.header.tag));
                 }
-                // damage on the way happens to a host that was understood before
+                // damage in transit is tolerated from a host that was understood before
                 Err(_) if !self.speaks => return false,
                 Err(_) => {}
             }

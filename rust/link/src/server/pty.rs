@@ -1,4 +1,4 @@
-//! A pseudo-terminal as a serial port, with a stable name where one is wanted.
+//! A pseudo-terminal as a serial port, with a stable name if requested.
 
 use std::fs;
 use std::io;
@@ -16,7 +16,7 @@ use rustix::termios::{OptionalActions, QueueSelector, tcflush, tcgetattr, tcseta
 use super::port::{Port, explained};
 use crate::ready::{Interest, Ready, wait};
 
-/// The master's side. The server keeps no slave open, so that it sees a host hang up.
+/// The master side. The server keeps no slave open, so it sees a host hang up.
 #[derive(Debug)]
 pub struct Pty {
     master: Option<OwnedFd>,
@@ -26,10 +26,10 @@ pub struct Pty {
 }
 
 impl Pty {
-    /// A new pseudo-terminal; `link` becomes a symbolic link to it while it is there.
+    /// A new pseudo-terminal; while it exists `link` is a symbolic link to it.
     ///
     /// # Errors
-    /// Where the system has none left, or `link` is something else than a symbolic link or cannot be made.
+    /// The system has none left; or `link` exists and is no symbolic link, or cannot be created.
     pub fn open(link: Option<PathBuf>) -> io::Result<Self> {
         let mut pty = Self {
             master: None,
@@ -52,17 +52,17 @@ impl Pty {
         })
     }
 
-    /// A host that comes later must not read what was meant for this one.
+    /// Clears the line: a later host must not read what was meant for this one.
     fn hung_up(&mut self) {
         self.connected = false;
         if self.master.is_some() {
-            // failure leaves stale bytes, which the host's receiver drops by their sequence
+            // on failure stale bytes remain, which the host's receiver drops by their sequence
             let _ = prepare(&self.slave);
         }
     }
 }
 
-/// Sets the slave raw and empties it. Opening and closing it also marks the master as hung up, which an unused one is not.
+/// Sets the slave to raw mode and empties it. Opening and closing it also marks the master as hung up, which an unused one is not.
 fn prepare(slave: &Path) -> io::Result<()> {
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC | OFlags::NONBLOCK;
     let slave = rustix::fs::open(slave, flags, Mode::empty())?;
@@ -84,7 +84,7 @@ fn create() -> io::Result<(OwnedFd, PathBuf)> {
     Ok((master, slave))
 }
 
-/// Replaces the symbolic link `link` at once; anything else of that name is left alone.
+/// Replaces the symbolic link `link` atomically; anything else of that name is left alone.
 fn point(link: &Path, target: &Path) -> io::Result<()> {
     if fs::symlink_metadata(link).is_ok_and(|found| !found.is_symlink()) {
         return Err(io::Error::new(
@@ -111,7 +111,7 @@ impl Port for Pty {
     fn connected(&mut self) -> bool {
         if !self.connected {
             let state = self.state();
-            // bytes without a host are those of one that was there for a moment
+            // bytes without a host come from one that was connected for a moment
             self.connected = !state.gone || state.read;
         }
         self.connected
@@ -137,10 +137,10 @@ impl Port for Pty {
     fn wait(&mut self, interest: Interest, timeout: Duration) {
         let idle = !interest.read && !interest.write;
         let Some(master) = self.master.as_ref().filter(|_| self.connected && !idle) else {
-            // a hung-up terminal is always ready, so that waiting for it would be no waiting
+            // a hung-up terminal is always ready, so waiting for it would not wait
             return thread::sleep(timeout);
         };
-        // a failure is seen when bytes are read
+        // a failure shows when bytes are read
         let _ = wait([(master.as_fd(), interest)], timeout);
     }
 

@@ -1,4 +1,4 @@
-//! The virtual drive: the computed sewing machine behind the state machine of a device, and its clock.
+//! The virtual drive: the simulated sewing machine with the state machine of a device, and its clock.
 
 use std::time::{Duration, Instant};
 
@@ -8,7 +8,7 @@ use sewfast_control::link::{
 use sewfast_core::machine::Machine;
 use sewfast_core::{Error, Result};
 
-/// Values that the profile's memory holds: 8 s of commands, so that longer signals must be fed while they run.
+/// Values that the profile's memory holds: 8 s of commands, so longer signals must be uploaded while they run.
 pub const CAPACITY: usize = 8192;
 
 /// Control period [us], the sample time of the machine.
@@ -48,11 +48,11 @@ const fn channel(
     }
 }
 
-/// The machine, the device before it and the device's place in time.
+/// The machine, its device, and the device's time.
 pub struct Rig {
     device: Box<Device<CAPACITY>>,
     machine: Machine,
-    /// What the counter showed at the machine's last return to its initial state.
+    /// The counter's value when the machine last returned to its initial state.
     counted: i64,
     /// When the next sample is due [us].
     next: u64,
@@ -60,10 +60,10 @@ pub struct Rig {
 }
 
 impl Rig {
-    /// A drive that boots now; `credit` says whether the host may grant it time.
+    /// A drive that boots now; `credit`: whether the host may grant it time.
     ///
     /// # Errors
-    /// A setting error for a machine that a device cannot stand for.
+    /// A setting error for a machine that a device cannot represent.
     pub fn new(machine: Machine, name: &'static str, boot_id: u32, credit: bool) -> Result<Self> {
         let identity = Identity {
             boot_id,
@@ -90,7 +90,7 @@ impl Rig {
         })
     }
 
-    /// Boots anew: another boot id, time and counter from 0, the motor without command and the machine as it stands.
+    /// Reboots: another boot id, time and counter from 0, the motor without command, the machine in its present state.
     pub fn reboot(&mut self) {
         let boot_id = following(self.boot_id());
         let identity = *self.device.identity();
@@ -121,17 +121,17 @@ impl Rig {
         self.device.state()
     }
 
-    /// How far the host lets time advance; `None` where no session is open.
+    /// How far the host lets time advance; `None` without an open session.
     pub fn credit(&self) -> Option<u64> {
         self.device.credit()
     }
 
-    /// What the device's output was last.
+    /// The device's last output.
     pub fn output(&self) -> Output {
         self.output
     }
 
-    /// Takes the sample that is due and lets the machine go on for a period.
+    /// Takes the sample that is due and advances the machine by a period.
     pub fn sample(&mut self) {
         let speed = self.machine.speed_rpm() as f32;
         let measured = Measurement {
@@ -153,24 +153,24 @@ impl Rig {
         self.counted + self.machine.counts() as i64
     }
 
-    /// Gives the device one frame, or a part of one, that has come.
+    /// Passes the device a received frame, or a part of one.
     pub fn receive(&mut self, now: u64, frame: &[u8]) {
         let armed = self.device.armed_count();
         self.device.receive(now, frame);
         if self.device.armed_count() != armed {
-            // the counter goes on, so that the device sees no motion where there was none
+            // the counter continues, so the device sees no motion where there was none
             self.counted = self.counts();
             self.machine.reset();
         }
         self.output = self.device.poll(now);
     }
 
-    /// The host has gone.
+    /// Reports that the host has gone.
     pub fn disconnect(&mut self) {
         self.device.disconnect();
     }
 
-    /// Moves bytes for the host into `buffer`; how many.
+    /// Moves bytes for the host into `buffer`; returns how many.
     pub fn transmit(&mut self, buffer: &mut [u8]) -> usize {
         self.device.transmit(buffer)
     }
@@ -181,13 +181,13 @@ fn booted(identity: Identity) -> Result<Device<CAPACITY>> {
     device.map_err(|refused| Error::setting(refused.to_string()))
 }
 
-/// Random bits of the system, by way of the keys that it gives to hash tables.
+/// Random bits of the system, from the keys that it gives to hash tables.
 fn entropy() -> u32 {
     use std::hash::{BuildHasher, RandomState};
     RandomState::new().hash_one(0) as u32
 }
 
-/// The next boot id whose low 16 bits are neither those of this one nor 0, the tag of HELLO.
+/// The next boot id whose low 16 bits are neither this one's nor 0, the tag of HELLO.
 fn following(boot_id: u32) -> u32 {
     let next = boot_id.wrapping_add(1);
     if next as u16 == 0 {
@@ -201,12 +201,12 @@ fn following(boot_id: u32) -> u32 {
 #[derive(Clone, Copy, Debug)]
 pub struct Clock {
     time: u64,
-    /// When it showed `time`; `None` while it stands still.
+    /// When it showed `time`; `None` while it is stopped.
     since: Option<Instant>,
 }
 
 impl Clock {
-    /// Zero now, running.
+    /// Starts at zero now.
     pub fn new(now: Instant) -> Self {
         Self {
             time: 0,
@@ -214,7 +214,7 @@ impl Clock {
         }
     }
 
-    /// What it shows.
+    /// The time it shows.
     pub fn read(&self, now: Instant) -> u64 {
         let passed = self
             .since
@@ -222,17 +222,17 @@ impl Clock {
         self.time + passed.as_micros() as u64
     }
 
-    /// Stands still at `time`.
+    /// Stops at `time`.
     pub fn stand(&mut self, time: u64) {
         *self = Self { time, since: None };
     }
 
-    /// Runs on from what it shows.
+    /// Continues from the time it shows.
     pub fn run(&mut self, now: Instant) {
         self.since.get_or_insert(now);
     }
 
-    /// Shows `time` now and runs on from there.
+    /// Shows `time` now and continues from there.
     pub fn set(&mut self, time: u64, now: Instant) {
         *self = Self {
             time,
@@ -240,7 +240,7 @@ impl Clock {
         };
     }
 
-    /// How long until it shows `time`; `None` while it stands still.
+    /// How long until it shows `time`; `None` while it is stopped.
     pub fn until(&self, time: u64, now: Instant) -> Option<Duration> {
         let due = self.since? + Duration::from_micros(time.saturating_sub(self.time));
         Some(due.saturating_duration_since(now))

@@ -11,22 +11,22 @@ use super::trace::{Happening, Trace};
 use super::{Order, Settings, Shared, Statistics};
 use crate::ready::Interest;
 
-/// How long a stop request may go unheard.
+/// Longest time until a stop request is noticed.
 const ATTENTION: Duration = Duration::from_millis(20);
 
-/// Samples on credit between two looks at the port.
+/// Samples on credit between two checks of the port.
 const BATCH: usize = 512;
 
-/// Behind by more than this the clock gives up catching up and is set back [us].
+/// Delay beyond which the clock is set back instead of catching up [us].
 const HOPELESS: u64 = 1_000_000;
 
-/// Bytes for the host that wait outside the device: a serial port's own memory is small, so that the device's memory is
-/// what overflows. On credit time waits instead.
+/// Bytes for the host kept outside the device: a serial port's own memory is small, so the device's memory should be
+/// the one that overflows. On credit, time waits instead.
 const WAITING_PACED: usize = 256;
 const WAITING: usize = 4096;
 const WAITING_ON_CREDIT: usize = 16_384;
 
-/// A served drive: everything that the loop owns.
+/// A drive being served: everything that the loop owns.
 pub struct Serving<'a> {
     shared: &'a Shared,
     port: Box<dyn Port>,
@@ -44,14 +44,14 @@ pub struct Serving<'a> {
     ends: Option<Instant>,
     room: usize,
     connected: bool,
-    /// Of the connection, where it comes by a network.
+    /// The connection's gate, on a network.
     gate: Option<Gate>,
-    /// A host has gone by itself, and none has come since.
+    /// A host has disconnected by itself, and none has come since.
     left: bool,
     stalled: Option<Instant>,
     unplugged: Option<Instant>,
     statistics: Statistics,
-    /// How late this turn is, by the first sample that it finds due [us].
+    /// Delay of this turn, from the first sample that it finds due [us].
     behind: u64,
 }
 
@@ -104,7 +104,7 @@ impl<'a> Serving<'a> {
         }
     }
 
-    /// Serves until asked to stop.
+    /// Serves until a stop is requested.
     pub fn run(mut self) {
         while !self.finished() {
             self.orders();
@@ -123,11 +123,11 @@ impl<'a> Serving<'a> {
     fn finished(&self) -> bool {
         self.shared.stop.load(Ordering::Relaxed)
             || self.ends.is_some_and(|ends| Instant::now() >= ends)
-            // the watchdog is given the time to end what was left running
+            // leave the watchdog the time to end what was left running
             || self.once && self.left && !self.rig.output().enabled
     }
 
-    /// Does what the owner of the server has asked for.
+    /// Carries out the requests of the server's owner.
     fn orders(&mut self) {
         for order in self.shared.orders() {
             match order {
@@ -145,7 +145,7 @@ impl<'a> Serving<'a> {
         let now = Instant::now();
         self.stalled = self.stalled.filter(|&until| until > now);
         if self.unplugged.is_some_and(|until| until <= now) {
-            // the name may be taken for a moment: then it is tried again
+            // the name may be taken for a moment: then try again
             let plugged = self.port.plug().is_ok();
             self.unplugged = (!plugged).then_some(now + Duration::from_millis(50));
             if plugged {
@@ -166,7 +166,7 @@ impl<'a> Serving<'a> {
         self.outbound.clear();
         self.gate = (connected && self.port.is_network()).then(Gate::new);
         if connected {
-            // what the last host did not read to its end stops here
+            // whatever the last host did not read is dropped here
             self.outbound
                 .push(&[0], Instant::now(), &mut self.log, &mut self.events);
             self.note(Happening::Connected);
@@ -180,7 +180,7 @@ impl<'a> Serving<'a> {
         self.connected && self.stalled.is_none()
     }
 
-    /// From the port through the line to the device, frame by frame.
+    /// Moves bytes from the port through the line to the device, frame by frame.
     fn receive(&mut self) {
         let now = Instant::now();
         if self.flows() && self.inbound.backlog() < WAITING {
@@ -209,7 +209,7 @@ impl<'a> Serving<'a> {
         }
     }
 
-    /// Gives the device at most so many of the frames that have arrived.
+    /// Passes the device at most `frames` of those that have arrived.
     fn deliver(&mut self, time: u64, frames: usize) {
         let boot_id = self.rig.boot_id();
         let mut length = 0;
@@ -225,13 +225,13 @@ impl<'a> Serving<'a> {
         self.inbound.consume(length);
     }
 
-    /// How far the host lets time advance; `None` where it runs by itself.
+    /// How far the host lets time advance; `None` if it runs by itself.
     fn credit(&self) -> Option<u64> {
         let granted = (self.fast && self.connected).then(|| self.rig.credit());
         granted.flatten()
     }
 
-    /// Sets the clock running or has it stand, and takes the samples that are due by it.
+    /// Starts or stops the clock, and takes the samples that are due.
     fn keep_time(&mut self) {
         let now = Instant::now();
         self.log.time = self.clock.read(now);
@@ -251,10 +251,10 @@ impl<'a> Serving<'a> {
         self.catch_up(self.clock.read(now));
     }
 
-    /// Takes the samples that are due at `time`.
+    /// Takes the samples due at `time`.
     ///
-    /// Heartbeats that waited while this thread was late had come in the meantime, nobody knows when: they are spread over it
-    /// evenly, so that a busy computer alone does not make a watchdog trip.
+    /// Heartbeats that waited while this thread was late arrived at unknown times in between. They are spread evenly
+    /// over that time, so that a busy computer alone does not trip a watchdog.
     fn catch_up(&mut self, time: u64) {
         let due = (time + u64::from(PERIOD)).saturating_sub(self.rig.next()) / u64::from(PERIOD);
         let waiting = match due > 1 && self.flows() {
@@ -301,7 +301,7 @@ impl<'a> Serving<'a> {
         }
     }
 
-    /// From the device into the line; into the void where nobody is there.
+    /// Moves bytes from the device into the line; without a host they are dropped.
     fn collect(&mut self) {
         let mut buffer = [0; 1024];
         while self.outbound.backlog() < self.room {
@@ -317,7 +317,7 @@ impl<'a> Serving<'a> {
         }
     }
 
-    /// From the line to the port.
+    /// Moves bytes from the line to the port.
     fn transmit(&mut self) {
         self.collect();
         let now = Instant::now();
@@ -338,7 +338,7 @@ impl<'a> Serving<'a> {
         self.statistics.bytes_to_host += written as u64;
     }
 
-    /// What the lines' faults do to link and device.
+    /// Carries out the lines' faults of link and device.
     fn happen(&mut self) {
         for fault in std::mem::take(&mut self.events) {
             self.strike(fault, None);
@@ -412,7 +412,8 @@ fn each_frame(bytes: &[u8]) -> impl Iterator<Item = &[u8]> {
     bytes.split_inclusive(|&byte| byte == 0)
 }
 
-/// How many heartbeats stand before the first command. What has no zero in front is stuffed as it is, so that the kind can be seen.
+/// Number of heartbeats before the first command. COBS leaves a frame's first bytes unchanged if they contain no zero,
+/// so the kind is visible.
 fn heartbeats(bytes: &[u8]) -> usize {
     let is_heartbeat = |frame: &&[u8]| matches!(frame, [2..=255, 0x20..=0x22, ..]);
     each_frame(bytes).take_while(is_heartbeat).count()

@@ -1,4 +1,4 @@
-//! The server's own account: when the output went on and off, and when the last heartbeat before it had come.
+//! The server's own log: when the output was switched on and off, and when the last heartbeat before that had arrived.
 
 use std::fs::File;
 use std::io::{self, LineWriter, Write};
@@ -9,7 +9,7 @@ use sewfast_control::link::{Deframer, Fields, State};
 
 use super::rig::Clock;
 
-/// What happened.
+/// A logged event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Happening {
     /// The output was enabled.
@@ -20,13 +20,13 @@ pub enum Happening {
     Connected,
     /// The host went.
     Gone,
-    /// Nothing passes from here on.
+    /// Nothing passes from now on.
     Stalled,
     /// The port vanished.
     Unplugged,
     /// The port came back.
     Plugged,
-    /// The device booted anew.
+    /// The device rebooted.
     Reset,
 }
 
@@ -49,29 +49,29 @@ impl Happening {
 /// The last intact frame with a watchdog time that reached the device since its boot.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Heartbeat {
-    /// When it came, by the device's clock [us].
+    /// Time of arrival by the device's clock [us].
     pub device_us: u64,
-    /// When it came, in seconds since the server began.
+    /// Time of arrival in seconds since the server began.
     pub seconds: f64,
     /// Its watchdog time [us].
     pub watchdog_us: u32,
 }
 
-/// One line of the account.
+/// One line of the log.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Entry {
-    /// What happened.
+    /// The event.
     pub happening: Happening,
-    /// When, by the device's clock [us].
+    /// Its time by the device's clock [us].
     pub device_us: u64,
-    /// When, in seconds since the server began.
+    /// Its time in seconds since the server began.
     pub seconds: f64,
     /// The device's state after it.
     pub state: u8,
-    /// The heartbeat before it.
+    /// The last heartbeat before it.
     pub heartbeat: Option<Heartbeat>,
-    /// How late the server was at most since that heartbeat, by the samples that it had to catch up with, and at this entry: the
-    /// device's clock does not tell, as it is the server that keeps it [us].
+    /// Largest delay of the server since that heartbeat and at this entry, from the samples that it had to catch up
+    /// with [us]. The device's clock does not show it, because the server drives that clock.
     pub late_us: u64,
 }
 
@@ -94,17 +94,17 @@ impl Entry {
     }
 }
 
-/// The account as it grows. Heartbeats are found by a receiver of its own, not asked of the device that it watches.
+/// The growing log. It finds heartbeats with its own receiver instead of asking the device that it watches.
 #[derive(Debug)]
 pub struct Trace {
     began: Instant,
     entries: Vec<Entry>,
     file: Option<LineWriter<File>>,
     deframer: Deframer,
-    /// Of the last HELLO.
+    /// Session of the last HELLO.
     session: u32,
     heartbeat: Option<Heartbeat>,
-    /// Since that heartbeat.
+    /// Largest delay since that heartbeat.
     late_us: u64,
     enabled: bool,
     /// Why the file ended early.
@@ -112,10 +112,10 @@ pub struct Trace {
 }
 
 impl Trace {
-    /// With a file where `path` names one.
+    /// With a file if `path` names one.
     ///
     /// # Errors
-    /// Where the file cannot be made.
+    /// The file cannot be created.
     pub fn new(path: Option<&Path>, began: Instant) -> io::Result<Self> {
         let file = path.map(File::create).transpose()?;
         Ok(Self {
@@ -131,18 +131,18 @@ impl Trace {
         })
     }
 
-    /// Takes the entries since the last time.
+    /// Takes the entries since the last call.
     pub fn fresh(&mut self) -> impl Iterator<Item = Entry> + '_ {
         self.entries.drain(..)
     }
 
-    /// The server is late by this much.
+    /// Notes that the server is late by this much.
     #[inline]
     pub fn late(&mut self, late_us: u64) {
         self.late_us = self.late_us.max(late_us);
     }
 
-    /// Looks at bytes that reach the device of boot id `boot_id` at `device_us`, and came at any time within the `late_us` before.
+    /// Looks at bytes that reach the device of boot id `boot_id` at `device_us` and arrived some time within the last `late_us`.
     pub fn observe(
         &mut self,
         mut bytes: &[u8],
@@ -191,7 +191,7 @@ impl Trace {
         }
     }
 
-    /// Notes anything, at `device_us`, which `clock` may have left behind.
+    /// Notes any event at `device_us`; `clock` may be ahead of that.
     pub fn note(&mut self, happening: Happening, device_us: u64, clock: &Clock, state: State) {
         let now = Instant::now();
         self.late(clock.read(now).saturating_sub(device_us));
@@ -212,7 +212,7 @@ impl Trace {
         }
     }
 
-    /// Forgets the heartbeats of the boot before.
+    /// Forgets the heartbeats of the previous boot.
     pub fn rebooted(&mut self) {
         self.heartbeat = None;
         self.late_us = 0;

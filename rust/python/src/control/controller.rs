@@ -1,4 +1,4 @@
-//! The controller, one sample at a time, in double precision and in that of most microcontrollers.
+//! Bindings of the controller, one sample at a time, in double precision and in the single precision of most microcontrollers.
 
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -30,7 +30,7 @@ pub struct SingleController {
     core: Core<f32>,
 }
 
-/// A controller of any kind, as Python gives it.
+/// A controller of any kind, as passed by Python.
 #[derive(FromPyObject)]
 pub enum AnyGiven<'py> {
     Pid(Bound<'py, Controller>),
@@ -38,7 +38,7 @@ pub enum AnyGiven<'py> {
 }
 
 impl AnyGiven<'_> {
-    /// What it is made from.
+    /// Its design.
     pub fn design(&self) -> AnyDesign<f64> {
         match self {
             Self::Pid(controller) => (*controller.borrow().core.design()).into(),
@@ -129,7 +129,7 @@ fn single(design: &Design<f64>) -> Result<Design<f32>, Refused> {
     })
 }
 
-/// What a controller does in either precision, beside methods of its own.
+/// The methods common to both precisions; each class adds its own.
 macro_rules! controller_methods {
     ($class:ident, $float:ty { $($own:tt)* }) => {
         #[pymethods]
@@ -142,7 +142,7 @@ macro_rules! controller_methods {
             }
 
             fn set_design(&mut self, py: Python<'_>, other: &Bound<'_, Self>) -> PyResult<()> {
-                // a controller takes its own design as well, which a second borrow would not allow
+                // the argument may be this controller itself, which cannot be borrowed a second time
                 let design = match other.try_borrow() {
                     Ok(other) => *other.core.design(),
                     Err(_) => *self.core.design(),
@@ -396,7 +396,7 @@ state_feedback_methods!(StateFeedback, f64 {
         Ok(SingleStateFeedback { core })
     }
 
-    /// What a device is sent, before the counts per unit and second.
+    /// The numbers sent to a device, before the counts per unit and second.
     fn sent(&self) -> Vec<f64> {
         self.core.design().numbers().to_vec()
     }

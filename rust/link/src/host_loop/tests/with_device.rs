@@ -1,4 +1,4 @@
-//! The loop against the state machine of a real device and the virtual sewing machine, in computed time.
+//! The loop with the state machine of a real device and the virtual sewing machine, in computed time.
 
 use sewfast_control::link::{
     Body, Deframer, Device, Header, MAX_WIRE, Measurement, Reason, State, encode,
@@ -37,7 +37,7 @@ fn reference() -> Vec<f64> {
         .collect()
 }
 
-/// The same loop without a link: measured and applied at once.
+/// The same loop without a link: measurement and command take effect at once.
 fn simulated() -> Vec<f64> {
     let (mut machine, mut controller) =
         (Machine::new(Parameters::default()).unwrap(), controller());
@@ -58,7 +58,7 @@ struct Bench {
     device: Device<8>,
     machine: Machine,
     now: u64,
-    /// Of the reply to HELLO.
+    /// Fields of the reply to HELLO.
     key: u32,
 }
 
@@ -105,7 +105,7 @@ impl Bench {
         self.device.poll(time);
     }
 
-    /// Lets milliseconds pass; what the device says meanwhile.
+    /// Lets milliseconds pass; returns what the device sends meanwhile.
     fn pass(&mut self, milliseconds: u32) -> Vec<u8> {
         let mut said = Vec::new();
         for _ in 0..milliseconds {
@@ -158,7 +158,7 @@ fn host_loop(key: u32) -> HostLoop {
     HostLoop::new(client, settings, &channels, controller(), reference()).unwrap()
 }
 
-/// Serves the loop to its end; `disturb` is called before each millisecond.
+/// Runs the loop to its end; `disturb` is called before each millisecond.
 fn serve(bench: &mut Bench, looped: &mut HostLoop, mut disturb: impl FnMut(&mut Bench, u64)) {
     for k in 0..20_000 {
         disturb(bench, k);
@@ -188,7 +188,7 @@ fn tracks_as_the_simulated_loop_does() {
         .zip(&simulated)
         .map(|(tick, y)| tick.y - y);
     let rms = (difference.map(|d| d * d).sum::<f64>() / 100.0).sqrt();
-    // A batch before the first tick, some samples of age, and what the machine's ripple makes of it.
+    // A batch before the first tick, some samples of age, and the effect of the machine's ripple on both.
     assert!(rms < 5.0, "{rms} RPM");
     assert!((looped.ticks().run[99].y - 1500.0).abs() < 40.0);
 }

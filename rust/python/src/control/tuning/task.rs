@@ -1,4 +1,4 @@
-//! What is to be tuned, as Python gives it and as the core takes it.
+//! The task of tuning: as passed by Python, and as the core takes it.
 
 use std::collections::BTreeMap;
 
@@ -21,7 +21,7 @@ type Wanted = (String, Option<(f64, f64)>);
 /// Reference, disturbance, band and samples of the mean of a load step.
 type Load<'py> = (Values<'py>, Values<'py>, f64, usize);
 
-/// A limit in numbers, or what another controller does on each plant.
+/// A limit as a number, or the result of another controller on each plant.
 #[derive(FromPyObject)]
 enum Most<'py> {
     Number(f64),
@@ -40,7 +40,7 @@ struct Limits<'py> {
     load: Option<Most<'py>>,
 }
 
-/// What tuning, comparing and the front have in common, as Python gives it.
+/// The arguments common to tuning, comparing and the front, as passed by Python.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct Asked<'py> {
@@ -129,7 +129,7 @@ impl OwnedMost {
         }
     }
 
-    /// The limit in numbers, where a rival did `did` on a plant that it is a measure on.
+    /// The limit as a number; `did` is the rival's result on a plant for which it counts.
     fn limit(most: &Option<Self>, did: Option<f64>) -> f64 {
         match most {
             Some(Self::Number(limit)) => *limit,
@@ -250,7 +250,7 @@ impl Given {
         work(&task)
     }
 
-    /// What is added to the measurement of each plant in each of its variations; none if no plant has noise.
+    /// The measurement noise of each plant in each of its variations; empty if no plant has noise.
     fn noise(&self) -> Vec<Vec<f64>> {
         if self.noise.iter().all(|deviation| *deviation == 0.0) {
             return Vec::new();
@@ -261,14 +261,14 @@ impl Given {
             .collect()
     }
 
-    /// Whether a rival is a measure on plant `k`: on plants as they are, where these are among the variations.
+    /// Whether the rival counts on plant `k`: only on plants without variation, if these are among the variations.
     fn is_compared(&self, k: usize) -> bool {
         let as_it_is = (1.0, 0);
         let own = self.variations[k % self.variations.len()];
         own == as_it_is || !self.variations.contains(&as_it_is)
     }
 
-    /// What each plant may do under the load steps.
+    /// Limits for each plant under the load steps.
     fn load_limits(
         &self,
         task: &Task<'_, Varied<AnyPlant<'_>>>,
@@ -291,7 +291,7 @@ impl Given {
             let recovery = did.as_ref().and_then(compared);
             let load = other.as_ref().or(did.as_ref()).and_then(compared);
             LoadLimit {
-                // One that is never beyond the band has recovered within a sample.
+                // A rival that never leaves the band recovers within a sample.
                 recovery: OwnedMost::limit(&self.recovery, recovery.map(|r| r.recovery)).max(least),
                 load: OwnedMost::limit(&self.load, load.map(|l| l.load)),
             }
@@ -328,7 +328,7 @@ fn variables(wanted: &[Wanted], start: &AnyDesign<f64>) -> Result<Vec<Variable>>
     wanted.iter().map(variable).collect()
 }
 
-/// A cost from its weights by name; those left out keep their defaults.
+/// A cost from its weights by name; others keep their defaults.
 fn cost(changes: &BTreeMap<String, f64>) -> Result<Cost> {
     let mut cost = Cost::default();
     for (name, &value) in changes {
