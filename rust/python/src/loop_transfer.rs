@@ -20,7 +20,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(tolerance, module)?)
 }
 
-/// The feedback path of a controller: what of it lies in the loop. Gains in standard form.
+/// The part of a controller that is in the loop: its feedback path. Gains in standard form.
 #[pyclass(module = "sewfast._core", frozen)]
 pub struct LoopPath(pub Path);
 

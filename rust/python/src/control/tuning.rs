@@ -77,7 +77,7 @@ fn options(evaluations: usize, seed: u64, threads: usize) -> Options {
     }
 }
 
-/// The best controller, and the story of its search.
+/// The best controller, and how the search found it.
 #[pyfunction]
 #[pyo3(signature = (task, *, method, evaluations, seed, threads, progress=None))]
 fn tune<'py>(

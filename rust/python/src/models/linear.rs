@@ -101,7 +101,7 @@ impl LinearModel {
     }
 }
 
-/// A fitted linear model with the story of its fit.
+/// A fitted linear model and how the fit went.
 #[pyclass(frozen, module = "sewfast._core")]
 pub struct LinearFit {
     inner: linear::LinearFit,

@@ -99,7 +99,7 @@ impl NeuralOE {
     }
 }
 
-/// A trained network with the story of its training.
+/// A trained network and how the training went.
 #[pyclass(frozen, module = "sewfast._core")]
 pub struct NeuralFit {
     inner: neural::NeuralFit,

@@ -262,7 +262,7 @@ pub(super) fn recordings<'a>(
     experiments.iter().map(recording).collect()
 }
 
-/// A trained model with the story of its training.
+/// A trained model and how the training went.
 #[pyclass(frozen, module = "sewfast._core")]
 pub struct NeuralSSFit {
     inner: neural_ss::NeuralSSFit,

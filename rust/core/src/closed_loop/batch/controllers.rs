@@ -414,7 +414,7 @@ pub(crate) struct StateLanes<V> {
     rest: [V; STATES],
     kr: V,
     ki: V,
-    /// [samples]
+    /// `lead` \[samples\].
     lead: V,
     /// Largest change of the reference in one sample; `None` if no lane has a ramp.
     ramp: Option<V>,
