@@ -256,8 +256,8 @@ impl<T: Real> Ramp<T> {
 // v(k) = v(k-1) + b/Ts r(k)
 // ```
 //
-// leaves `p(k) - x(k) = (1 - a) r(k)`, so the innovation follows from itself and the measured speed: `r(k) = (1 - a)
-// r(k-1) + Ts (y(k) - v(k-1))`. With `s = r/Ts` both the position and the sample time drop out:
+// leaves `p(k) - x(k) = (1 - a) r(k)`, so the innovation follows from itself and the measured speed:
+// `r(k) = (1 - a) r(k-1) + Ts (y(k) - v(k-1))`. With `s = r/Ts` both the position and the sample time drop out:
 //
 // ```text
 // s(k) = (1 - a) s(k-1) + y(k) - v(k-1)

@@ -1,10 +1,10 @@
 //! What has changed in a machine: finds the single change of a simple motor that explains a run best.
 //!
-//! The motor is of first order with delay, Coulomb friction and a constant load, `T w' = K (u(t - L) + bias - friction
-//! sgn w) - w`, at rest before each run. It is fitted to earlier runs or, if there are none, to the run itself before
-//! the change. Then one thing changes at one sample ([`Change`]): each pair of change and sample is simulated and
-//! compared with the counts, and the smallest error names the cause. The simulation uses the recorded command, so a
-//! loop need not be known.
+//! The motor is of first order with delay, Coulomb friction and a constant load,
+//! `T w' = K (u(t - L) + bias - friction sgn w) - w`, at rest before each run. It is fitted to earlier runs or, if
+//! there are none, to the run itself before the change. Then one thing changes at one sample ([`Change`]): each pair of
+//! change and sample is simulated and compared with the counts, and the smallest error names the cause. The simulation
+//! uses the recorded command, so a loop need not be known.
 
 use crate::least_squares::{self, Residuals, Settings};
 use crate::{Error, Monitor, Result};

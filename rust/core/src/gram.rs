@@ -26,9 +26,9 @@
 //!    row i+1  |  sums   |  sums   |  sums   |      AVX2:    6 x 1,  baseline: 2 x 1
 //! ```
 //!
-//! Gains of the variants, end to end (processor time of a training; each variant removed, least and median of 7): leaving out the corner
-//! of the diagonal saves half a tile in each panel, 7 to 10 % of a training of 49 parameters (Zen 4, `training_8` of the kernels'
-//! example), 1 % with 155. Panels and blocks of 128 rows save loads: `J'J` of 155 parameters 330 -> 290 ns a sample on an Intel Xeon
+//! Gains of the variants, end to end (processor time of a training; each variant removed, least and median of 7): the special corner on
+//! the diagonal saves half a tile in each panel, 7 to 10 % of a training of 49 parameters (Zen 4, `training_8` of the kernels' example),
+//! 1 % with 155. Panels and blocks of 128 rows save loads: `J'J` of 155 parameters 330 -> 290 ns a sample on an Intel Xeon
 //! (docs/PERFORMANCE.md). A Zen 4 processes its wide registers in halves, has loads to spare and shows no gain (-0.4 to 0 %).
 
 use crate::simd::{self, F64x8, Kernel, LANES};

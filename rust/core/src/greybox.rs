@@ -308,9 +308,9 @@ struct Equations<const N: usize> {
     share: Dual<N>,
     /// Weight of the start in the drive's mean over a step.
     memory: Dual<N>,
-    /// Response to the goal's change over a step, beyond the response to a goal held at its value in the middle: `1/2 -
-    /// tau/h + exp(-h/tau) (1/2 + tau/h)`, one half without a lag. Without this term drive and current would be those
-    /// of half a step earlier.
+    /// Response to the goal's change over a step, beyond the response to a goal held at its value in the middle:
+    /// `1/2 - tau/h + exp(-h/tau) (1/2 + tau/h)`, one half without a lag. Without this term drive and current would be
+    /// those of half a step earlier.
     bend: Dual<N>,
     step: f64,
 }
@@ -496,8 +496,8 @@ impl<const N: usize> Equations<N> {
         free.plus(-free.value.signum(), &most)
     }
 
-    /// The drive after a step towards `goal`, which changes by `change` during the step, and the drive's mean; `x +
-    /// share drop(x) = x_0 + share (goal - x_0) + bend change`.
+    /// The drive after a step towards `goal`, which changes by `change` during the step, and the drive's mean;
+    /// `x + share drop(x) = x_0 + share (goal - x_0) + bend change`.
     #[inline(always)]
     fn driven(&self, from: &Dual<N>, goal: &Dual<N>, change: &Dual<N>) -> (Dual<N>, Dual<N>) {
         let aim = from

@@ -115,8 +115,8 @@ impl Bent {
     }
 }
 
-/// `g` from the logarithms `d` of its pieces' slopes over the first one's: with `s = softmax(0, d)` piece `i` rises by `(high - low)
-/// (LEAST_SLOPE/n + (1 - LEAST_SLOPE) s_i)`. It increases strictly for every `d`, so no constraint is needed.
+/// `g` from the logarithms `d` of its pieces' slopes over the first one's: with `s = softmax(0, d)` piece `i` rises by
+/// `(high - low) (LEAST_SLOPE/n + (1 - LEAST_SLOPE) s_i)`. It increases strictly for every `d`, so no constraint is needed.
 #[derive(Clone, Debug)]
 struct Rising {
     knots: Knots,
@@ -379,8 +379,8 @@ impl Parametric for HammersteinWiener {
         })
     }
 
-    /// With `x` as above, `dy = g'(x) dx + (dg/dd)(x)`; a past `x = g^-1(y)` gives `dx/dy = 1/g'` and `dx/dd =
-    /// -(dg/dd)/g'`.
+    /// With `x` as above, `dy = g'(x) dx + (dg/dd)(x)`; a past `x = g^-1(y)` gives `dx/dy = 1/g'` and
+    /// `dx/dd = -(dg/dd)/g'`.
     fn gradient(&self, phi: &[f64], by_theta: &mut [f64], by_phi: &mut [f64]) -> f64 {
         let (Lags { na, nb, .. }, parts) = (self.lags, self.parts());
         // Derivatives of the curves are sums over several terms of phi, so they begin at 0; a and b have one term each.

@@ -22,11 +22,11 @@ const ROUNDING: f64 = 1e-9;
 
 /// Fits `LinearModel` by simple refined instrumental variables over all experiments.
 ///
-/// Each iteration filters inputs and outputs by `1/A` of the previous model and solves `sum z(k) (y_f(k) - phi_f(k)'
-/// theta) = 0`. The instruments `z` are the regressors with the model's own free run instead of the measured outputs
-/// (Young 1976; Young 2011, section 6.4). If the noise is white and added to the output, a fixed point is
-/// asymptotically as good as output error. The unknown state before each experiment is estimated as well. The iteration
-/// starts at the ARX model; poles outside the unit circle are mirrored into it.
+/// Each iteration filters inputs and outputs by `1/A` of the previous model and solves
+/// `sum z(k) (y_f(k) - phi_f(k)' theta) = 0`. The instruments `z` are the regressors with the model's own free run
+/// instead of the measured outputs (Young 1976; Young 2011, section 6.4). If the noise is white and added to the
+/// output, a fixed point is asymptotically as good as output error. The unknown state before each experiment is
+/// estimated as well. The iteration starts at the ARX model; poles outside the unit circle are mirrored into it.
 ///
 /// The outcome is `SmallStep` if the free run no longer changes; `Stalled` if that is only because a pole was mirrored;
 /// `RankDeficient` if the instruments do not determine the parameters; or `MaxIterations`. In all but the first case

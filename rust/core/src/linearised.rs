@@ -10,8 +10,8 @@ use crate::{Error, Result};
 /// `x+ = A x + B v`, `y = C x + D v` for small signals, where `v(k) = u(k - nk)`: the delay is not part of the state.
 ///
 /// Inputs and outputs are in the data's units. The state of a [`NeuralSS`] is its own, in scaled units. The state of a
-/// lagged model consists of the past outputs `y(k-1) .. y(k-na)` and, input by input, the past values `v(k-1) ..
-/// v(k-nb+1)`.
+/// lagged model consists of the past outputs `y(k-1) .. y(k-na)` and, input by input, the past values
+/// `v(k-1) .. v(k-nb+1)`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Linearised {
     /// `dx+/dx`, row by row.

@@ -1,7 +1,7 @@
 //! Levenberg-Marquardt on normal equations, with named outcomes.
 //!
-//! Minimises `1/2 |e(theta)|^2` through `(J'J + mu D) d = J'e`, with `J` the derivative of the model's output and `e =
-//! y - yhat`. A trial costs a simulation; only an accepted step costs a Jacobian. `mu` is multiplied by 4 after a
+//! Minimises `1/2 |e(theta)|^2` through `(J'J + mu D) d = J'e`, with `J` the derivative of the model's output and
+//! `e = y - yhat`. A trial costs a simulation; only an accepted step costs a Jacobian. `mu` is multiplied by 4 after a
 //! rejected trial and divided by 5 after an accepted one (Levenberg 1944, Marquardt 1963).
 
 use crate::Monitor;

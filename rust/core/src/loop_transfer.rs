@@ -82,8 +82,8 @@ impl<'a> Loop<'a> {
 pub struct Path {
     /// Gains in standard form.
     pub gains: Standard<f64>,
-    /// Gain that a schedule adds to the proportional gain \[u/y\]: if `Kp` depends on the output, so does `-Kp alpha
-    /// r`, and `alpha r dKp/dy` acts on the output's deviation.
+    /// Gain that a schedule adds to the proportional gain \[u/y\]: if `Kp` depends on the output, so does
+    /// `-Kp alpha r`, and `alpha r dKp/dy` acts on the output's deviation.
     pub slope: f64,
     /// The derivative is filtered with time constant `Td/N`; infinite for no filter.
     pub n: f64,

@@ -204,8 +204,8 @@ impl NeuralSS {
         Ok((run, dense.rows))
     }
 
-    /// The output `horizon` steps ahead: an extended Kalman filter follows the measured outputs up to sample `k -
-    /// horizon`, then the model runs free. Outputs that are NaN are not used.
+    /// The output `horizon` steps ahead: an extended Kalman filter follows the measured outputs up to sample
+    /// `k - horizon`, then the model runs free. Outputs that are NaN are not used.
     ///
     /// # Errors
     /// `ErrorKind::Data` for wrong shapes, `ErrorKind::Setting` for a horizon of 0, `ErrorKind::Fit` as in free run.

@@ -96,9 +96,9 @@ fn interpolate(ratio: f64) -> [f64; 5] {
 
 /// SIMC: `Kc = T/(K (tau_c + L))`, `tau_I = min(T, 4 (tau_c + L))`, and with `derivative` `tau_D = L/3`.
 ///
-/// The PID is in series form with the derivative on the output only, `Kc (1 + 1/(tau_I s)) (r - (1 + tau_D s) y)`. In standard form, `f =
-/// 1 + tau_D/tau_I` gives `Kp = Kc f`, `Ti = tau_I f`, `Td = tau_D/f`, `alpha = 1 - 1/f`, `beta = 1`.
-/// (S. Skogestad, *J. Process Control* 13, 2003; `L/3`: C. Grimholt, S. Skogestad, *J. Process Control* 70, 2018.)
+/// The PID is in series form with the derivative on the output only, `Kc (1 + 1/(tau_I s)) (r - (1 + tau_D s) y)`. In
+/// standard form, `f = 1 + tau_D/tau_I` gives `Kp = Kc f`, `Ti = tau_I f`, `Td = tau_D/f`, `alpha = 1 - 1/f`, `beta = 1`. (S.
+/// Skogestad, *J. Process Control* 13, 2003; `L/3`: C. Grimholt, S. Skogestad, *J. Process Control* 70, 2018.)
 ///
 /// # Errors
 /// `ErrorKind::Setting` for invalid numbers of the plant, or a `tau_c + L` that is not above 0.
@@ -124,8 +124,8 @@ pub fn simc(k: f64, t: f64, l: f64, tau_c: f64, derivative: bool) -> Result<Rule
     })
 }
 
-/// AMIGO: `Kp = (.2 + .45 T/L)/K`, `Ti = L (.4 L + .8 T)/(L + .1 T)`, `Td = .5 L T/(.3 L + T)`, `beta = 1`, and `alpha
-/// = 1` if `L/(L + T)` is at most .5, else 0.
+/// AMIGO: `Kp = (.2 + .45 T/L)/K`, `Ti = L (.4 L + .8 T)/(L + .1 T)`, `Td = .5 L T/(.3 L + T)`, `beta = 1`, and
+/// `alpha = 1` if `L/(L + T)` is at most .5, else 0.
 ///
 /// (K. J. Astrom, T. Hagglund, "Revisiting the Ziegler-Nichols step response method for PID control", *J. Process
 /// Control* 14, 2004.)

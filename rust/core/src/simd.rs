@@ -136,9 +136,9 @@ pub(crate) trait F64x8: Arithmetic {
 
     /// The step that closes the chain of a free run: `y = 1'(direct + second h)`, `z = rest + weights y`.
     ///
-    /// In this form eight numbers are summed to one (3 dependent additions), which is broadcast again and multiplied. If a level can, it
-    /// uses another order: after two foldings all lanes hold one of two partial sums `p`, `q` with `y = p + q`, and `z = (rest + weights
-    /// p) + weights q` needs neither the last addition nor the way back from scalar to vector.
+    /// In this form eight numbers are summed to one (3 dependent additions), which is broadcast again and multiplied. If a
+    /// level can, it uses another order: after two foldings all lanes hold one of two partial sums `p`, `q` with `y = p + q`,
+    /// and `z = (rest + weights p) + weights q` needs neither the last addition nor the way back from scalar to vector.
     ///
     /// Returns the output `y` of hidden units `self`, which is the sum of `direct + second self`, and the next
     /// arguments `rest + weights y`. The rounding is that of the shortest order on this level.

@@ -117,8 +117,8 @@ struct Block {
     /// Entries of the regressor, then ones.
     // Contiguous over the samples, as a group of columns passes over them; scalars, broadcast when used.
     scales: Vec<[f64; BLOCK]>,
-    /// Slopes of the output with respect to each hidden unit's argument; hidden outputs; and `[1, linear's regressor, 0
-    /// ..]`, the source of the columns after the hidden units.
+    /// Slopes of the output with respect to each hidden unit's argument; hidden outputs; and
+    /// `[1, linear's regressor, 0 ..]`, the source of the columns after the hidden units.
     //   sources   | r: a group of units each | h: a group each | tail: b2, linear |      `BLOCK` samples each
     // The kinds of columns of W1 and b1 share the source r; only their scale differs.
     sources: Vec<[Lanes; BLOCK]>,

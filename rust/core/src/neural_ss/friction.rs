@@ -6,8 +6,8 @@
 //! `v+ = a v + b u + d - c sign(v)`,
 //!
 //! and three positions, `m` samples apart, show how the speed changed. This is the integral form of the equation error:
-//! the longer `m`, the less noise matters (Ljung 1999, section 7.3). At rest friction balances the drive: `v+ = z - c
-//! sat(z/c)` with `z = a v + b u + d`, and a hidden unit of slope `1/c` stands for `sat`.
+//! the longer `m`, the less noise matters (Ljung 1999, section 7.3). At rest friction balances the drive:
+//! `v+ = z - c sat(z/c)` with `z = a v + b u + d`, and a hidden unit of slope `1/c` stands for `sat`.
 
 use nalgebra::{DMatrix, DVector};
 

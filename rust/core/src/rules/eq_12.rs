@@ -144,8 +144,8 @@ impl Locus {
     /// The largest `Kp` with these times for which the loop is stable and `max |S|` is `ms`; `None` if only `Kp = 0` has it.
     ///
     /// With `L = Kp x` a frequency forbids the gains between the roots of `1 + 2 Kp Re x + Kp^2 |x|^2 = 1/ms^2`.
-    /// Neighbouring frequencies together forbid one range, and high frequencies forbid all gains above `Kp Td = 1 -
-    /// 1/ms`. Between the ranges nothing meets -1, so either all gains there are stable or none is.
+    /// Neighbouring frequencies together forbid one range, and high frequencies forbid all gains above
+    /// `Kp Td = 1 - 1/ms`. Between the ranges nothing meets -1, so either all gains there are stable or none is.
     pub(super) fn largest(&self, ti: f64, td: f64, ms: f64) -> Option<Standard<f64>> {
         let beyond = 1.0 - 1.0 / (ms * ms);
         let mut ranges = self.forbidden(|n| n.forbids(ti, td, beyond));
