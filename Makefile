@@ -199,9 +199,10 @@ licences: ## LICENSE-THIRD-PARTY, from the licences of the crates in a wheel
 killed: $(DEV) firmware ## kills the host of the emulated board 100 times; its output goes off in time
 	SEWFAST_TRIALS=100 $(BIN)/python -m pytest tests/system/test_emulated.py -k killed
 
+OLDEST := $(shell sed -n 's/^rust-version = "\(.*\)"/\1/p' Cargo.toml)
 board:
-	@if [ -x /usr/bin/rustc ] && [ -d /usr/lib/rustlib/src/rust ] && command -v arm-none-eabi-gcc >/dev/null; then $(MAKE) --no-print-directory firmware; \
-	else echo 'no compilers for the emulated boards here (see make firmware): their checks are left out'; fi
+	@if [ -x /usr/bin/rustc ] && printf '%s\n' 'rustc $(OLDEST)' "$$(/usr/bin/rustc --version)" | sort --version-sort --check=silent && [ -d /usr/lib/rustlib/src/rust ] && command -v arm-none-eabi-gcc >/dev/null; then $(MAKE) --no-print-directory firmware; \
+	else echo 'no compilers for the emulated boards here, or rustc before $(OLDEST) (see make firmware): their checks are left out'; fi
 
 # the library is the M4's: an M7 runs it as it is, and its external memory lies elsewhere
 M4 = thumbv7em-none-eabihf
