@@ -808,6 +808,23 @@ def shaft_response(theta: _F, hertz: _F, *, Ts: float, counted: bool) -> NDArray
 def shaft_fraction(theta: _F, *, Ts: float) -> tuple[_F, _F]:
     """num, den in powers of z^-1 of the same machine's speed at the samples."""
 
+def changed(experiments: Sequence[tuple[_F, _F]]) -> tuple[int, int, float, int, float] | None:
+    """Experiment and sample from which on a record has another sign, scale or time; gain, shift, error left."""
+
+_Experiment = tuple[_F, _F, _F, NDArray[np.bool_], _F]
+"""Inputs, computed output, residual, which samples count, sensitivities."""
+_Tested = tuple[list[int], list[list[int]], _F, _F, float, float, int, float, float]
+"""Lags, series, correlations, limits, statistic, p-value, degrees of freedom, threshold, explained share."""
+
+def residual_tests(experiments: list[_Experiment], *, memory: int, one_step: bool) -> list[_Tested]:
+    """Tests of residuals, in the order of `sewfast.evidence.residual_tests`. A series is a product of inputs."""
+
+def parameter_test(experiments: list[_Experiment], *, trained: int) -> _Tested:
+    """Whether other parameters would do better; the sensitivities' significant directions are its lags."""
+
+def coloured_information(experiments: list[_Experiment], *, spent: float) -> _F:
+    """Psi'R Psi, R the covariance matrix of the residuals, of which parameters took ``spent`` degrees of freedom."""
+
 def fit_shaft(
     hertz: _F, value: NDArray[np.complex128], sigma: _F, *, Ts: float, counted: bool,
     resonance: bool | None,

@@ -29,10 +29,8 @@ from sewfast.evidence import (
     residual_tests,
     with_training_evidence,
 )
-from sewfast.evidence.correlations import chi2_quantile, chi2_tail, normal_quantile
 from sewfast.evidence.operating import linearise
 from sewfast.evidence.parameters import Criteria
-from sewfast.evidence.residuals import Noise, fast_length
 from sewfast.models import NeuralOE
 from sewfast.models.base import Ensemble
 from sewfast.storage import Fields
@@ -75,61 +73,6 @@ def test_a_level_that_no_band_has_is_refused(level: Any) -> None:
         with pytest.raises(SettingError) as refused:
             use(linear_model(), linear_data(100), level=level)
         assert refused.value.name == "level"
-
-
-def test_chi_square_tail_of_even_freedom_is_a_poisson_sum() -> None:
-    for freedom in (2, 4, 10, 50, 200):
-        for x in (0.01, 1.0, 7.5, 40.0, 300.0):
-            terms = [
-                math.exp(i * math.log(x / 2) - x / 2 - math.lgamma(i + 1))
-                for i in range(freedom // 2)
-            ]
-            assert chi2_tail(x, freedom) == pytest.approx(math.fsum(terms), rel=1e-11, abs=1e-14)
-
-
-def test_chi_square_of_one_is_a_squared_normal() -> None:
-    for x in (1e-6, 0.5, 3.84, 30.0, 200.0):
-        assert chi2_tail(x, 1) == pytest.approx(math.erfc(math.sqrt(x / 2)), rel=1e-11)
-    assert normal_quantile(0.025) == pytest.approx(1.959963984540054)
-
-
-@given(st.floats(1e-6, 0.999), st.integers(1, 500))
-def test_chi_square_quantile_is_the_inverse_of_the_tail(tail: float, freedom: int) -> None:
-    assert chi2_tail(chi2_quantile(tail, freedom), freedom) == pytest.approx(tail, rel=1e-9)
-
-
-def test_chi_square_at_the_ends() -> None:
-    assert chi2_tail(0.0, 3) == 1.0
-    assert chi2_tail(math.inf, 3) == 0.0
-    for bad in (-0.1, 0.0, 1.0, 1.1):
-        with pytest.raises(ValueError, match="probability"):
-            chi2_quantile(bad, 3)
-    with pytest.raises(ValueError, match="degree"):
-        chi2_tail(1.0, 0)
-
-
-@given(st.integers(1, 10**7))
-def test_fast_lengths(n: int) -> None:
-    found = fast_length(n)
-    assert n <= found < 2 * n + 2
-    odd = found // (found & -found)
-    assert odd in (1, 3, 5)
-
-
-def test_noise_finds_the_colour_and_its_covariance() -> None:
-    rng = np.random.default_rng(5)
-    e = np.zeros(20_000)
-    for k in range(1, len(e)):
-        e[k] = 0.9 * e[k - 1] + rng.standard_normal()
-    noise = Noise.fit([(e, np.ones(len(e), dtype=bool))])
-    exact = 0.9 ** np.arange(5) / (1 - 0.81)
-    # the standard deviation of an estimated variance is 2 R(0)^2 (1 + a^2)/(1 - a^2)/N: 3 % here
-    np.testing.assert_allclose(noise.autocovariance(5, len(e)), exact, rtol=0.15)
-    z = rng.standard_normal((300, 2))
-    lags = np.abs(np.subtract.outer(np.arange(300), np.arange(300)))
-    direct = z.T @ noise.autocovariance(300, 300)[lags] @ z
-    shaped = noise.shaped(z)
-    np.testing.assert_allclose(shaped.T @ shaped, direct, rtol=1e-6)
 
 
 def test_a_good_model_passes_and_the_card_says_so() -> None:

@@ -1,17 +1,15 @@
 """Evidence that a model can be trusted: tests, covariance, bands, region, linearisation.
 
 Read in this order: `checking` (`check`), `card` and `verdicts` (the report card and its lines), and
-the evidence behind them: `residuals`, `correlations` and `portmanteau` (tests), `parameters`
-(covariance), `simulation_bands`, `region` (the training region), `operating` (linearisation),
-`figures`.
+the evidence behind them: `residuals` and `portmanteau` (tests), `parameters` (covariance),
+`simulation_bands`, `region` (the training region), `operating` (linearisation), `figures`.
 """
 
 from .card import Line, ReportCard
 from .checking import check, training_evidence, with_training_evidence
-from .correlations import ResidualTest
 from .operating import OperatingPoint, OperatingRange, operating_range
 from .parameters import Parameters, estimate
-from .portmanteau import residual_tests
+from .portmanteau import ResidualTest, residual_tests
 from .region import Region, TrainingRegion, training_region
 from .residuals import Residuals
 from .simulation_bands import Bands, bands

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 if TYPE_CHECKING:
     from ..dataset import FloatArray
-    from .correlations import ResidualTest
     from .operating import OperatingRange
     from .parameters import Criteria, Parameters
+    from .portmanteau import ResidualTest
     from .residuals import HorizonScores, Run
     from .simulation_bands import Bands
 

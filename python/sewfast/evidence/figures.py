@@ -16,7 +16,7 @@ from ..errors import SettingError
 from ..plotting import DPI, Drawing, Panel, lettered, stacked, style, thin
 from ..storage import making, replace_files
 from .card import ReportCard
-from .correlations import ResidualTest
+from .portmanteau import ResidualTest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

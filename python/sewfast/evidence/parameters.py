@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from ..arrays import gram
+from .. import _core
 from ..dataset import FloatArray
 from ..dynamic_model import DynamicModel
-from .residuals import Noise, Residuals, representative
+from .residuals import Residuals, representative
 
 # --- Information criteria -------------------------------------------------------------------------
 
@@ -208,8 +208,8 @@ def estimate(model: DynamicModel, residuals: Residuals) -> Parameters | None:
     information = Information.of(model, residuals)
     inverse = information.inverse()
     effective = float(np.trace(inverse @ information.gram))
-    noise = residuals.noise(spent=effective)
-    covariance = inverse @ _meat(residuals, noise) @ inverse
+    coloured = _core.coloured_information(residuals.columns(), spent=effective)
+    covariance = inverse @ coloured @ inverse
     values, names = _values(model, residuals)
     condition, lost = information.conditioning()
     return Parameters(values, covariance, effective, condition, lost, names)
@@ -250,15 +250,6 @@ def _state_space_decay(model: DynamicModel) -> tuple[FloatArray, float]:
 
 
 _DECAYED = {"neural_oe": _network_decay, "neural_ss": _state_space_decay}
-
-
-def _meat(residuals: Residuals, noise: Noise) -> FloatArray:
-    """Psi'R Psi over all experiments: the middle factor of the sandwich covariance."""
-    total = np.zeros((residuals.width, residuals.width))
-    for run in residuals.runs:
-        shaped = noise.shaped(run.sensitivity)
-        total += gram(shaped)
-    return total
 
 
 def _values(model: DynamicModel, residuals: Residuals) -> tuple[FloatArray, tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Residuals of a model, a model of their noise, and scores over the horizon."""
+"""Residuals of a model, and scores over the horizon."""
 
 from __future__ import annotations
 
@@ -12,146 +12,12 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import _core
 from ..arrays import gram, product
 from ..dataset import Dataset, Experiment, FloatArray, require_dataset
 from ..dynamic_model import INIT, DynamicModel, FreeRunJacobian, require_init
 from ..errors import DataError, FitError
 from ..validation import Scores
-
-LARGEST_ORDER = 40
-
-
-@dataclass(frozen=True, eq=False)
-class Noise:
-    """e(k) = sum_i ar[i] e(k-1-i) + w(k), w white. `ar` is (p,), and p = 0 is white; `innovation`
-    is the variance of w, `variance` that of e.
-    """
-
-    ar: FloatArray
-    innovation: float
-    variance: float
-
-    @classmethod
-    def fit(
-        cls,
-        series: Sequence[tuple[FloatArray, NDArray[np.bool_]]],
-        spent: float = 0.0,
-        sparing: bool = False,
-    ) -> Noise:
-        """Least squares, the order by Akaike's criterion. `series` has per experiment the values
-        (N,) and whether each of them counts (N,); `spent` parameters estimated on these samples
-        cost a degree of freedom each. `sparing` takes Schwarz's criterion, for a series that is
-        white unless there is strong evidence.
-        """
-        n = sum(int(known.sum()) for _, known in series)
-        squares = sum(float(e[known] @ e[known]) for e, known in series)
-        free = max(n - spent, 0.5 * n, 1.0)
-        order = _largest_order(series)
-        if order == 0 or squares <= 0.0:
-            return cls(np.zeros(0), squares / free, squares / free)
-        ar, ratio = _autoregression(_gram(series, order), np.log(n) if sparing else 2.0)
-        return cls(ar, squares / free * ratio, squares / free)
-
-    @property
-    def is_white(self) -> bool:
-        return len(self.ar) == 0
-
-    def spectrum(self, length: int) -> FloatArray:
-        """Power at the frequencies of a real Fourier transform of `length` samples."""
-        whitening = np.concatenate([[1.0], -self.ar])
-        power: FloatArray = self.innovation / np.abs(np.fft.rfft(whitening, length)) ** 2
-        return power
-
-    def autocovariance(self, lags: int, length: int) -> FloatArray:
-        """R(0) .. R(lags - 1) of a series of `length` samples."""
-        size = fast_length(2 * max(length, lags))
-        found: FloatArray = np.fft.irfft(self.spectrum(size), size)[:lags]
-        return found
-
-    def whole(self, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Where w(k) depends only on known values, shape (N,)."""
-        p = len(self.ar)
-        found: NDArray[np.bool_] = np.convolve(known, np.ones(p + 1))[: len(known)] > p + 0.5
-        return found
-
-    def whitened(self, columns: FloatArray) -> FloatArray:
-        """w(k) of every column (N, m), with zeros before the first sample."""
-        n = len(columns)
-        size = fast_length(n + len(self.ar))
-        gain = np.fft.rfft(np.concatenate([[1.0], -self.ar]), size)
-        found = np.empty_like(columns)
-        for j in range(columns.shape[1]):
-            found[:, j] = np.fft.irfft(gain * np.fft.rfft(columns[:, j], size), size)[:n]
-        return found
-
-    def shaped(self, columns: FloatArray) -> FloatArray:
-        """Columns V (M, m), M > N, with V'V = Z'RZ, R the covariance matrix of the noise.
-        `columns` Z (N, m) is zero where a sample does not count.
-        """
-        if self.is_white:
-            scaled: FloatArray = columns * self.innovation**0.5
-            return scaled
-        size = fast_length(2 * len(columns) if len(columns) < 4096 else len(columns) + 4096)
-        root = np.sqrt(self.spectrum(size))
-        found = np.empty((size, columns.shape[1]))
-        for j in range(columns.shape[1]):
-            found[:, j] = np.fft.irfft(root * np.fft.rfft(columns[:, j], size), size)
-        return found
-
-
-def fast_length(n: int) -> int:
-    """The smallest 2^a, 3 2^a or 5 2^a that is at least `n`, for a fast transform."""
-    return min(f << max(0, (-(-n // f) - 1).bit_length()) for f in (1, 3, 5))
-
-
-WINDOWS = 1 << 17
-"""Windows that are copied at a time."""
-
-
-def _largest_order(series: Sequence[tuple[FloatArray, NDArray[np.bool_]]]) -> int:
-    longest = max((int(known.sum()) for _, known in series), default=0)
-    return min(LARGEST_ORDER, int(10.0 * np.log10(max(longest, 1))), longest // 20)
-
-
-def _gram(series: Sequence[tuple[FloatArray, NDArray[np.bool_]]], order: int) -> FloatArray:
-    """Sums of e(k-i) e(k-j), i, j = 0 .. order, over whole windows; last row: their number."""
-    total = np.zeros((order + 2, order + 1))
-    for e, known in series:
-        if len(e) <= order:
-            continue
-        rows = np.lib.stride_tricks.sliding_window_view(e, order + 1)[:, ::-1]
-        windows = np.lib.stride_tricks.sliding_window_view(known, order + 1)
-        whole = np.asarray(windows.all(axis=1))
-        # a copy of all windows of a long record is larger than everything else together
-        for k in range(0, len(rows), WINDOWS):
-            kept = rows[k : k + WINDOWS][whole[k : k + WINDOWS]]
-            total[:-1] += gram(kept)
-            total[-1, 0] += len(kept)
-    return total
-
-
-def _autoregression(gram: FloatArray, price: float) -> tuple[FloatArray, float]:
-    """Coefficients of the best order, and the innovation's share of the variance."""
-    sums, n = gram[:-1], gram[-1, 0]
-    best, found, ratio = np.inf, np.zeros(0), 1.0
-    if n < 2 * len(sums) or sums[0, 0] <= 0.0:
-        return found, ratio
-    for p in range(len(sums)):
-        ar = _solve(sums[1 : p + 1, 1 : p + 1], sums[1 : p + 1, 0])
-        left = (sums[0, 0] - ar @ sums[1 : p + 1, 0]) / sums[0, 0]
-        criterion = n * np.log(max(left, 1e-14)) + price * p
-        if criterion < best:
-            best, found, ratio = criterion, ar, max(left, 1e-14) * n / max(n - p, 1.0)
-    return found, float(min(ratio, 1.0))
-
-
-def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    if len(right) == 0:
-        return np.zeros(0)
-    ridge = 1e-12 * np.trace(matrix) / len(matrix)
-    found: FloatArray = np.linalg.solve(matrix + ridge * np.eye(len(matrix)), right)
-    return found
-
 
 # --- `Residuals`, with their sensitivity to every parameter ---------------------------------------
 
@@ -272,19 +138,19 @@ class Residuals:
         found: FloatArray = np.sum([gram(r.sensitivity) for r in self.runs], axis=0)
         return found
 
-    @property
+    @cached_property
     def errors(self) -> list[FloatArray]:
         """Residuals without mean and initial state's effect, one array (N,) per experiment."""
         errors = [r.without_state(r.error) for r in self.runs]
         mean = self.mean
         return [e - mean * one for e, one in zip(errors, self.constants, strict=True)]
 
-    @property
+    @cached_property
     def constants(self) -> list[FloatArray]:
         """A constant with the initial state's effect projected out, one array (N,) per run."""
         return [r.without_state(r.counts.astype(np.float64)) for r in self.runs]
 
-    @property
+    @cached_property
     def mean(self) -> float:
         """Mean residual without the initial state's effect; 0 if that explains a constant."""
         ones = self.constants
@@ -299,10 +165,13 @@ class Residuals:
         size = sum(float(np.sum(np.square(r.y[r.counts]))) for r in self.runs)
         return power <= 1e-20 * size
 
-    def noise(self, values: Sequence[FloatArray] | None = None, spent: float = 0.0) -> Noise:
-        """Noise model of the residuals, or of other series of the same samples."""
-        series = self.errors if values is None else values
-        return Noise.fit([(v, r.counts) for v, r in zip(series, self.runs, strict=True)], spent)
+    def columns(self, sensitivity: Sequence[FloatArray] | None = None) -> list[_core._Experiment]:
+        """Per experiment inputs, computed output, residual, which samples count, sensitivity."""
+        psi = sensitivity or [r.sensitivity for r in self.runs]
+        return [
+            (r.u, r.yhat, e, r.counts, z)
+            for r, e, z in zip(self.runs, self.errors, psi, strict=True)
+        ]
 
 
 def representative(model: DynamicModel) -> DynamicModel:

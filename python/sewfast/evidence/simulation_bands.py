@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from numbers import Real
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from ..arrays import gram
 from ..dataset import Dataset, FloatArray
 from ..dynamic_model import INIT, DynamicModel
 from ..errors import FitError, SettingError
-from .correlations import normal_quantile
 from .parameters import Information, Parameters, estimate
 from .region import RegionRuns, region_runs
 from .residuals import Residuals
@@ -61,8 +61,9 @@ class Uncertainty:
 
     def quantile(self, probability: float) -> float:
         """Quantile of e/s, interpolated on the scale of a normal variable."""
-        at = [-normal_quantile(float(p)) for p in self.probabilities]
-        return float(np.interp(-normal_quantile(probability), at, self.quantiles))
+        normal = NormalDist().inv_cdf
+        at = [normal(float(p)) for p in self.probabilities]
+        return float(np.interp(normal(probability), at, self.quantiles))
 
     def to_json(self) -> dict[str, Any]:
         """As JSON values."""

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from .. import _core
 from ..arrays import in_unit
 from ..dataset import Dataset, FloatArray
 from ..dataset.faults import faults
@@ -16,9 +17,9 @@ from ..dataset.standing import SIGMAS, standing
 from ..dynamic_model import DynamicModel
 from ..validation import FAIR, Scores, judged
 from .card import Line, Verdict
-from .correlations import LEVEL, ResidualTest
 from .operating import OperatingRange
 from .parameters import Criteria, Parameters, StoredInformation
+from .portmanteau import LEVEL, ResidualTest
 from .residuals import HorizonScores, Residuals, fit_text
 from .simulation_bands import Bands
 
@@ -171,9 +172,9 @@ _OFFSET: tuple[Verdict, str] = (
 def bias(residuals: Residuals) -> Line:
     """Line on the mean residual, without the initial state's effect, compared with chance."""
     ones, mean = residuals.constants, residuals.mean
-    noise = residuals.noise()
     length = max(float(sum(one @ one for one in ones)), 1e-300)
-    error = math.sqrt(sum(float(np.square(noise.shaped(o[:, None])).sum()) for o in ones)) / length
+    columns = residuals.columns([one[:, None] for one in ones])
+    error = math.sqrt(_core.coloured_information(columns, spent=0.0)[0, 0]) / length
     power = residuals_power(residuals)
     shown = f"{mean:.3g} +- {2.58 * error:.2g} {residuals.unit}".rstrip()
     share = mean**2 / max(power, 1e-300)

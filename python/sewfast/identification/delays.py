@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -406,7 +407,7 @@ def _of_input(
     correlation, samples = _prewhitened_correlation(data, j, lags)
     # significance of each of L lags such that all together keep the level (Sidak)
     each = 1.0 - (1.0 - confidence ** (1.0 / len(lags))) / 2.0
-    bound = _normal_quantile(each) / math.sqrt(samples)
+    bound = NormalDist().inv_cdf(each) / math.sqrt(samples)
     beyond = np.flatnonzero(np.abs(correlation) > bound)
     return InputDelay(
         name=data.input_names[j],
@@ -446,10 +447,3 @@ def _autoregression(series: list[FloatArray]) -> FloatArray:
     # the ridge bounds the filter for inputs that few parameters describe (steps, sines)
     ridge = 1e-8 * sums[0, 0] * np.eye(order)
     return np.concatenate([[1.0], -np.linalg.solve(sums[1:, 1:] + ridge, sums[1:, 0])])
-
-
-def _normal_quantile(p: float) -> float:
-    """Inverse of the normal distribution function."""
-    from statistics import NormalDist
-
-    return NormalDist().inv_cdf(p)

@@ -6,6 +6,7 @@
 
 pub mod arx;
 pub mod causes;
+pub mod changes;
 pub mod closed_loop;
 mod colour;
 pub mod data;
@@ -13,6 +14,7 @@ mod descent;
 pub mod embedded;
 pub mod error;
 pub mod fopdt;
+mod fourier;
 mod gram;
 pub mod greybox;
 pub mod guard;
@@ -36,6 +38,7 @@ pub mod oe;
 pub mod output_error;
 pub mod proposal;
 pub mod random;
+pub mod residuals;
 pub mod rules;
 pub mod search;
 pub mod shaft;

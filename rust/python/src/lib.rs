@@ -10,6 +10,8 @@ mod host_loop;
 mod link;
 mod loop_transfer;
 mod models;
+mod records;
+mod residuals;
 mod seam;
 mod search;
 mod signals;
@@ -31,6 +33,8 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     loop_transfer::register(module)?;
     frequency::register(module)?;
     link::register(module)?;
+    records::register(module)?;
+    residuals::register(module)?;
     causes::register(module)?;
     guard::register(module)?;
     device::register(module)
