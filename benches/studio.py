@@ -16,8 +16,8 @@ import numpy as np
 from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
 
-from sewfast.studio import Project, Studio, make_demo
-from sewfast.studio.server import PAGE
+from sewfast_studio import Project, Studio, make_demo
+from sewfast_studio.server import PAGE
 
 PRESSES = 150
 DRAG_EVENTS = 300

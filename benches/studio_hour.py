@@ -22,7 +22,7 @@ import numpy as np
 import studio_stops
 from sewfast.link import VirtualDevice
 from sewfast.readers import read_table
-from sewfast.studio import Project, Studio, line
+from sewfast_studio import Project, Studio, line
 from studio import browser
 from studio_stops import arm, press, until
 
@@ -37,7 +37,7 @@ FILE = "hour.mcap"
 LONG = """
 import numpy as np
 from sewfast import signals
-from sewfast.studio import bench
+from sewfast_studio import bench
 bench.LEASE = {lease}
 once = signals.excitation
 signals.excitation = lambda *a: np.resize(once(*a), {samples})
@@ -53,7 +53,7 @@ document.addEventListener("frame", () => {
 
 def serve(folder: str, seconds: float) -> None:
     """The studio, whose drive plays an excitation again and again for so long."""
-    before = "from sewfast.studio.bench import main"
+    before = "from sewfast_studio.bench import main"
     line._PROGRAM = line._PROGRAM.replace(
         before, f"exec({LONG.format(samples=round(1000 * seconds), lease=LEASE_S)!r}); {before}"
     )

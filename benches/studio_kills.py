@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from sewfast.link import VirtualDevice
-from sewfast.studio import Project, Studio
+from sewfast_studio import Project, Studio
 from studio import browser, spread
 from studio_stops import WATCHDOG_MS, arm, press, until
 

@@ -16,7 +16,7 @@ from typing import Any
 from selenium.webdriver.common.keys import Keys
 
 from sewfast.link import VirtualDevice
-from sewfast.studio import Project, Studio
+from sewfast_studio import Project, Studio
 from studio import browser, spread
 
 LISTEN = """

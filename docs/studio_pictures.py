@@ -43,7 +43,7 @@ def draw_studio(place: Path) -> list[Path]:
     """Draw the pictures into a folder; the files."""
     from selenium import webdriver
 
-    from sewfast.studio import Project, Studio, make_demo
+    from sewfast_studio import Project, Studio, make_demo
 
     options = webdriver.ChromeOptions()
     options.binary_location = str(shutil.which("chromium"))

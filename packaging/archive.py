@@ -25,7 +25,7 @@ def sources(dependencies: Path) -> set[Path]:
 
 
 def package() -> set[Path]:
-    folder = ROOT / "python" / "sewfast"
+    folder = ROOT / "python"
     made = {"__pycache__", "_core.abi3.so"}
     return {p.relative_to(ROOT) for p in folder.rglob("*") if p.is_file() and not made & {*p.parts}}
 

@@ -190,11 +190,24 @@ def __getattr__(name: str) -> Any:
         value = getattr(import_module(f".{_HOME_OF[name]}", __name__), name)
     elif name in __all__:
         value = import_module(f".{name}", __name__)
-    else:
+    elif name.startswith("_") or _is_module(name):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    else:
+        from sewfast.plugins import public_name
+
+        value = public_name(name)
     globals()[name] = value
     return value
 
 
+def _is_module(name: str) -> bool:
+    """`from . import units` asks for an attribute first; the metadata of all packages take long."""
+    from importlib.machinery import PathFinder
+
+    return PathFinder.find_spec(f"{__name__}.{name}", __path__) is not None
+
+
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    from sewfast.plugins import public_names
+
+    return sorted({*globals(), *__all__, *public_names()})

@@ -535,7 +535,7 @@ def test_a_command_that_does_not_hear_ctrl_c_ends_in_time(tmp_path: Path) -> Non
 def test_interrupted_before_the_command_is_known(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupted() -> None:
+    def interrupted(given: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, "build_parser", interrupted)

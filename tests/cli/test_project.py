@@ -20,8 +20,8 @@ from effort import FULL
 from sewfast.cli.project import NAME, find, load
 from sewfast.errors import SettingError
 from sewfast.readers import read_table, roles
-from sewfast.studio.project import Project, Step
 from sewfast.units import split_unit, unit_in_name
+from sewfast_studio.project import Project, Step
 
 LIMITS = "volt = 8\nspeed = 3500\nacceleration = 40000\ncurrent = 15\n"
 

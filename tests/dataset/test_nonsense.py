@@ -15,7 +15,7 @@ from sewfast import diagnose
 from sewfast.dataset import Dataset
 from sewfast.dataset.faults import faults
 from sewfast.report.commissioned import _judged
-from sewfast.studio.project import Project, Step
+from sewfast_studio.project import Project, Step
 
 SEEDS = range(HELD, HELD + (12 if FULL else 1))
 

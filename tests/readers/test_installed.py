@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import sewfast
+from installed import installed as as_installed
 from refusals import refuses
 from sewfast.errors import DataError, SettingError
 from sewfast.readers import read_table
@@ -47,16 +48,7 @@ ROWS = np.column_stack([np.arange(40.0) % 7, np.arange(40.0) ** 2])
 def installed(
     folder: Path, monkeypatch: pytest.MonkeyPatch, points: str, package: str = "drive-logger"
 ) -> None:
-    """A package as an installer leaves it: its module and its metadata on the path."""
-    module = package.replace("-", "_")
-    metadata = folder / f"{module}-1.0.dist-info"
-    metadata.mkdir(parents=True)
-    (folder / f"{module}.py").write_text(WORKING, encoding="utf-8")
-    (metadata / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n", encoding="utf-8"
-    )
-    (metadata / "entry_points.txt").write_text(f"[sewfast.readers]\n{points}\n", encoding="utf-8")
-    monkeypatch.syspath_prepend(folder)
+    as_installed(folder, monkeypatch, WORKING, points, "sewfast.readers", package)
 
 
 def written(path: Path) -> Path:

@@ -12,7 +12,7 @@ import sewfast as api
 from cli import call, called
 from deceivers import held, lag
 from sewfast.readers import read, roles
-from sewfast.studio.project import Project, Step
+from sewfast_studio.project import Project, Step
 
 Rows = list[str]
 N = 1000

@@ -626,7 +626,7 @@ def test_json_that_is_no_log_is_refused(tmp_path: Path, text: str) -> None:
 
 
 def test_the_studio_offers_logs_and_no_models(tmp_path: Path) -> None:
-    from sewfast.studio.project import Project
+    from sewfast_studio.project import Project
 
     for name in ("a.log", "b.jsonl", "c.json"):
         (tmp_path / name).write_text(as_json("lines"))

@@ -1,7 +1,8 @@
 """What must work where only numpy is installed; run by `make package` in a clean environment."""
 
 import sys
-from importlib.metadata import distributions
+from importlib.metadata import distributions, entry_points
+from importlib.resources import files
 
 has_lock = getattr(sys, "_is_gil_enabled", lambda: True)()
 
@@ -13,6 +14,12 @@ assert "numpy" not in sys.modules, "import sewfast alone should load nothing"
 
 for name in sewfast.__all__:
     getattr(sewfast, name)
+
+plugins = entry_points(group="sewfast.commands")
+assert {point.name for point in plugins} >= {"studio"}
+for point in plugins:
+    point.load()
+assert files("sewfast_studio").joinpath("page/index.html").is_file()
 
 machine = sewfast.VirtualMachine(1)
 u = sewfast.signals.excitation("step")

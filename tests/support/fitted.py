@@ -1,7 +1,7 @@
 """Models, controllers and commissionings that several tests share: made once per build.
 
 `fitted(recipe, *arguments)` calls the recipe once for all workers and keeps what it returns in
-`target/fitted`, by the hash of the compiled core, of `python/sewfast`, of `tests/support` and of
+`target/fitted`, by the hash of the compiled core, of `python`, of `tests/support` and of
 the recipe's file. A test that is about fitting itself does not take its result from here.
 """
 
@@ -27,7 +27,7 @@ except ImportError:  # Windows: two workers may make the same thing; either is r
 
 T = TypeVar("T")
 FOLDER = Path(__file__).resolve().parents[2] / "target" / "fitted"
-_PRODUCT = Path(sewfast.__file__).parent
+_PRODUCT = sorted(Path(sewfast.__file__).parents[1].glob("sewfast*"))
 
 
 def fitted(recipe: Callable[..., T], *arguments: object) -> T:
@@ -74,7 +74,8 @@ def build() -> str:
     """Hash of all that a fit may depend on."""
     found = hashlib.sha256()
     # templates, pages and tables as well
-    product = [p for p in _PRODUCT.rglob("*") if p.is_file() and "__pycache__" not in p.parts]
+    files = (path for folder in _PRODUCT for path in folder.rglob("*"))
+    product = [p for p in files if p.is_file() and "__pycache__" not in p.parts]
     for path in sorted([*product, *Path(__file__).parent.glob("*.py")]):
         found.update(str(path.name).encode())
         found.update(path.read_bytes())

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sewfast.studio import Studio
+from sewfast_studio import Studio
 
 websockets = pytest.importorskip("websockets.sync.client")
 

@@ -7,6 +7,7 @@ and those for types too: they are the ones that hide a knot.
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -16,12 +17,12 @@ import pytest
 import sewfast
 
 ORDER = """
-    errors kinds units arrays written storage tables plotting progress threads speed signals
+    errors plugins kinds units arrays written storage tables plotting progress threads speed signals
     recordfile dataset readers benchmarks gains machine live recording
     causes equilibrium dynamic_model validation comparison evidence models
     motorfit identification sklearn
     rules control tuning trust analysis frequency deployment fleets
-    link greybox report commissioning experiment studio cli __main__
+    link greybox report commissioning experiment cli __main__
 """
 
 LEFT: frozenset[tuple[str, str]] = frozenset()
@@ -76,3 +77,30 @@ def test_imports_point_down() -> None:
     up = {(m, u) for m, u in _arrows() if u not in place or place[u] > place[m.split(".")[0]]}
     assert up - LEFT == set(), "move what is imported down, or hand the value in"
     assert LEFT - up == set(), "mended: take it out of LEFT"
+
+
+# --- Plug-ins: packages beside `sewfast` in the same wheel ----------------------------------------
+
+
+BESIDE = {f.parent.name: f.parent for f in ROOT.parent.glob("sewfast_*/__init__.py")}
+
+
+def _packages_named(folder: Path) -> set[tuple[str, str]]:
+    """(file, package beside the core that its text names), in a folder.
+
+    The text has more than the imports at any depth: also names for `import_module`, and programs
+    for other processes.
+    """
+    name = re.compile(rf"\b({'|'.join(BESIDE)})\b")
+    files = [file for file in folder.rglob("*.py") if "__pycache__" not in file.parts]
+    return {(f.name, n) for f in files for n in name.findall(f.read_text(encoding="utf-8"))}
+
+
+def test_the_core_names_no_plugin() -> None:
+    assert len(BESIDE) >= 1
+    assert _packages_named(ROOT) == set()
+
+
+@pytest.mark.parametrize("plugin", sorted(BESIDE))
+def test_a_plugin_names_no_other(plugin: str) -> None:
+    assert {name for _, name in _packages_named(BESIDE[plugin])} <= {plugin}

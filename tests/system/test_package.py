@@ -54,6 +54,17 @@ def test_help_loads_no_arithmetic() -> None:
     assert not loaded & {"numpy", "scipy", "matplotlib", "sewfast._core"}
 
 
+def test_every_package_of_the_folder_is_shipped_and_checked() -> None:
+    folder = licences.ROOT / "python"
+    packages = {f.parent.name for f in folder.glob("*/__init__.py")}
+    assert all((folder / package / "py.typed").is_file() for package in packages)
+    text = (licences.ROOT / "pyproject.toml").read_text()
+    for listed in re.findall(r"^(?:python-)?packages = (\[.*\])$", text, re.MULTILINE):
+        assert set(ast.literal_eval(listed)) == packages
+    _, _, covered = (licences.ROOT / "tests/support/coverage.ini").read_text().partition("_pkgs =")
+    assert set(covered.partition("parallel")[0].split()) == packages
+
+
 @pytest.mark.skipif(shutil.which("cargo") is None, reason="needs cargo")
 def test_the_licences_of_what_is_linked_are_shipped() -> None:
     """Written anew where a crate came, went or changed: `make licences`."""

@@ -53,7 +53,7 @@ FIELDS = ("name", "expected", "received", "remedy")
 
 @cache
 def messages() -> tuple[str, ...]:
-    files = sorted((ROOT / "python" / "sewfast").rglob("*.py"))
+    files = sorted((ROOT / "python").rglob("*.py"))
     found = [t for f in files for t in _texts(ast.parse(f.read_text(encoding="utf-8")))]
     return (*found, *_explained())
 

@@ -82,7 +82,7 @@ def _carried_out(args: argparse.Namespace) -> int:
 
 def _parsed(argv: Sequence[str] | None) -> tuple[argparse.Namespace, project.Project]:
     """The parsed command line, and the project with defaults for it."""
-    parser = build_parser()
+    parser = build_parser(sys.argv[1:] if argv is None else argv)
     try:
         found = project.find()
     except SewfastError:

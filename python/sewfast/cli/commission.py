@@ -1,4 +1,4 @@
-"""`sewfast demo`, `commission`, `report`, `studio`: all the way to a controller."""
+"""`sewfast demo`, `commission`, `report`: all the way to a controller."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import Interrupted, SettingError
+from ..errors import Interrupted
 from ..progress import Progress
 from .arguments import Commands, add_command, add_overwrite
 from .drive import add_drive, is_port, machine_of, opened, require_no_drive_options
@@ -237,72 +237,3 @@ def report_command(args: argparse.Namespace) -> None:
         print_json({"report": str(page)})
     else:
         print(page)
-
-
-# --- `sewfast studio`: from a recording to a controller on a local page ---------------------------
-
-
-STUDIO = """\
-Open a page in the browser: look at recordings, identify a model, validate it, draw Bode plots,
-tune a controller, record, run and commission a drive.
-Every step can be copied as Python or as commands, and its result is a file for the command line
-(model.json, controller.json).
-It needs the package websockets: pip install "sewfast[studio]". Only this computer can reach the
-page, and only with the printed address; nothing is loaded from the network.
-"""
-
-STUDIO_EXAMPLES = """\
-examples:
-  sewfast studio                            the recordings of this folder
-  sewfast studio recordings/run.csv         one of them first
-  sewfast studio drive.json                 sliders for the controller of a model
-  sewfast studio /dev/ttyUSB0               a drive, with this folder for its recordings
-  sewfast studio --demo                     the same with a virtual machine, in a folder that
-                                            is deleted afterwards
-  sewfast studio --no-browser --port 8377   with ssh -L 8377:127.0.0.1:8377 from elsewhere
-"""
-
-
-def add_studio(commands: Commands) -> None:
-    parser = add_command(
-        commands, "studio", studio_command,
-        summary="look, identify, validate, tune on a local page",
-        text=STUDIO, examples=STUDIO_EXAMPLES,
-    )  # fmt: skip
-    parser.add_argument(
-        "place", nargs="?", metavar="FOLDER|FILE|PORT",
-        help="project folder (this one), a recording or model in it, or the port of a drive",
-    )  # fmt: skip
-    parser.add_argument(
-        "--demo", action="store_true", help="records and a model of the virtual machine"
-    )
-    parser.add_argument("--port", type=int, default=0, metavar="N", help="default: a free one")
-    parser.add_argument(
-        "--no-browser", dest="browser", action="store_false", help="only print the address"
-    )
-
-
-def studio_command(args: argparse.Namespace) -> None:
-    import contextlib
-    import tempfile
-    import threading
-    import webbrowser
-
-    from ..studio import Project, Studio, make_demo
-
-    if args.demo and args.place is not None:
-        raise SettingError(f"--demo: expected no folder, received {args.place}; leave one out")
-    with contextlib.ExitStack() as left, contextlib.suppress(KeyboardInterrupt):
-        port = args.place if args.place is not None and is_port(args.place) else None
-        place = "." if port is not None else args.place or "."
-        if args.demo:
-            place = left.enter_context(tempfile.TemporaryDirectory(prefix="sewfast-"))
-            make_demo(place)
-        studio = left.enter_context(Studio(Project(place, demo=args.demo, port=port), args.port))
-        if args.json:
-            print_json({"address": studio.address, "folder": str(studio.project.folder)})
-        else:
-            print(f"{studio.address}\nCtrl-C ends it", flush=True)
-        if args.browser:
-            webbrowser.open(studio.address)
-        threading.Event().wait()

@@ -9,7 +9,8 @@ import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from ..errors import not_installed
+from .. import plugins
+from ..errors import SewfastError, not_installed
 from . import (
     check,
     commission,
@@ -104,8 +105,15 @@ def meant(given: Iterable[str], known: Sequence[str]) -> str:
     return f"; did you mean {' '.join(names)}?" if names else ""
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The parser of the command line; a parsed command has its function as `command`."""
+GROUP = "sewfast.commands"
+"""Entry points of plug-ins: the name of a command, and a function that adds it."""
+
+
+def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """The parser of the command line; a parsed command has its function as `command`.
+    `given` are the arguments that it is to parse. If they begin with a command of the package, no
+    plug-in is looked for: that takes longer than all the rest.
+    """
     parser = Parser(prog="sewfast", description=DESCRIPTION, epilog=EPILOG, formatter_class=Help)
     parser.add_argument("--version", action=_Version, help="print the version and exit")
     commands: Commands = parser.add_subparsers(  # type: ignore[assignment]
@@ -133,7 +141,6 @@ def build_parser() -> argparse.ArgumentParser:
         deploy.add,
         deploy.add_pil,
         identify.add_fleet,
-        commission.add_studio,
         drive.add_ports,
         drive.add_doctor,
         drive.add,
@@ -142,7 +149,29 @@ def build_parser() -> argparse.ArgumentParser:
     )
     for add in makers:
         add(commands)
+    if not commands.choices.keys() & given[:1]:
+        _add_plugins(commands, given)
     return parser
+
+
+def _add_plugins(commands: Commands, given: Sequence[str]) -> None:
+    """Add the commands of plug-ins behind the package's own: the given one, otherwise all, by name.
+    One that cannot be added gets a line on standard error; the others work.
+    """
+    points = [p for p in plugins.points(GROUP) if p.name not in commands.choices]
+    points = [p for p in points if p.name in given[:1]] or points
+    for name in dict.fromkeys(p.name for p in points):
+        place, task = f"command {name}", "that adds it"
+        try:
+            point = plugins.only(tuple(p for p in points if p.name == name), place, task)
+            add = plugins.function(point, place, task)
+            try:
+                add(commands)
+            except Exception as e:
+                # a function of another package can raise anything
+                raise plugins.unusable(point, place, task, plugins.told(e)) from e
+        except SewfastError as e:
+            print(f"sewfast: {e}", file=sys.stderr)
 
 
 class _Version(argparse.Action):

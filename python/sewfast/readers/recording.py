@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import logging
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from .. import plugins
 from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.experiment import as_weights, require_some_weight
 from ..errors import (
@@ -33,10 +34,6 @@ from .jsonlog import is_json, read_json
 from .logs import is_log, read_log
 from .roles import recognised
 from .timebase import TOLERANCE, Grid, time_base
-
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
-
 
 LOG = logging.getLogger("sewfast")
 
@@ -79,8 +76,7 @@ def read_mcap(path: Path, raw: bytes) -> Table:
 
 # An entry point `sewfast.readers` of any installed package reads a file. Its name is the file's
 # ending without the dot, its object a function of the path that returns a table in memory (as for
-# `table_of`) or a `Table`. Nothing is registered: the metadata of the installed packages are the
-# list, searched for a file whose ending is not in `OWN`.
+# `table_of`) or a `Table`. It is searched for a file whose ending is not in `OWN`.
 
 GROUP = "sewfast.readers"
 OWN = frozenset({"csv", "tsv", "txt", "mat", "npz", "npy", "parquet", "mcap", "xls", "xlsx"})
@@ -95,49 +91,24 @@ def read_installed(path: Path) -> Table | None:
     ending = path.suffix.lower().removeprefix(".")
     if not ending or ending in OWN:
         return None
-    # imported here: it loads parsers for mail and archives, which reading CSV does not need
-    from importlib.metadata import entry_points
-
-    found = tuple(entry_points(group=GROUP, name=ending))
+    found = plugins.points(GROUP, ending)
     if not found:
         return None
-    if len(found) > 1:
-        raise SettingError(
-            name=str(path), expected=f"one installed package that reads .{ending}",
-            received=" and ".join(sorted(map(_package, found))),
-            remedy="uninstall one, or read the table with one of them and pass it on: read(table)",
-        )  # fmt: skip
-    (point,) = found
+    task = f"that reads .{ending}"
+    remedy = "uninstall one, or read the table with one of them and pass it on: read(table)"
+    point = plugins.only(found, str(path), task, remedy)
+    read = plugins.function(point, str(path), task)
     try:
-        return _installed_table(path, _function(path, point)(path))
+        return _installed_table(path, read(path))
     except SewfastError:
         raise
     except Exception as e:
         # a function of another package can raise anything
+        package = plugins.package(point)
         raise DataError(
-            name=str(path), expected=f"a file that {_package(point)} can read",
-            received=f"{type(e).__name__}: {printable(str(e))[:200]}",
-            remedy=f"see the documentation of {_package(point)}",
+            name=str(path), expected=f"a file that {package} can read",
+            received=plugins.told(e), remedy=f"see the documentation of {package}",
         ) from e  # fmt: skip
-
-
-def _function(path: Path, point: EntryPoint) -> Callable[[Path], Any]:
-    try:
-        function = point.load()
-    except Exception as e:
-        # importing runs code of another package
-        raise _unusable(path, point, f"{type(e).__name__}: {printable(str(e))[:200]}") from e
-    if not callable(function):
-        raise _unusable(path, point, f"{point.value}, a {type(function).__name__}")
-    read: Callable[[Path], Any] = function
-    return read
-
-
-def _unusable(path: Path, point: EntryPoint, received: str) -> SettingError:
-    return SettingError(
-        name=str(path), expected=f"a function of {_package(point)} that reads .{point.name}",
-        received=received, remedy=f"update {_package(point)}, or uninstall it",
-    )  # fmt: skip
 
 
 def _installed_table(path: Path, found: Any) -> Table:
@@ -150,10 +121,6 @@ def _installed_table(path: Path, found: Any) -> Table:
             name=str(path), expected="a table from the package that reads it",
             received=type(found).__name__, remedy="its function returns a mapping of name to array",
         ) from e  # fmt: skip
-
-
-def _package(point: EntryPoint) -> str:
-    return point.dist.name if point.dist is not None else point.value
 
 
 # --- One file of any known format -> Table; recognised by its first bytes, then by its extension

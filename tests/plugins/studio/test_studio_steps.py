@@ -18,10 +18,10 @@ from cli import environment
 from commissioned import SMALL, short
 from moments import until
 from sewfast.frequency import load_response
-from sewfast.studio import Commission, Project, Step, Studio
-from sewfast.studio.loops import shown_loop, shown_response
-from sewfast.studio.project import Upload
-from sewfast.studio.requests import carry_out
+from sewfast_studio import Commission, Project, Step, Studio
+from sewfast_studio.loops import shown_loop, shown_response
+from sewfast_studio.project import Upload
+from sewfast_studio.requests import carry_out
 from studio_page import Page
 
 MOVE = {"model": "drive.json", "values": {"Kp": 0.03, "Ti": 0.07}}

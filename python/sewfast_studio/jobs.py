@@ -23,7 +23,8 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import Interrupted, SettingError
+from sewfast.errors import Interrupted, SettingError
+
 from .bench import error_text
 from .loops import shown_loop, shown_response
 from .project import Project, checked_name
@@ -31,8 +32,8 @@ from .requests import COMMISSIONED, Commission, Step, carry_out
 from .tuning import Found, Search, Tuning
 
 if TYPE_CHECKING:
-    from ..dataset import FloatArray
-    from ..frequency import FrequencyResponse
+    from sewfast.dataset import FloatArray
+    from sewfast.frequency import FrequencyResponse
 
 
 BETWEEN_REPORTS = 0.05
@@ -47,7 +48,7 @@ LAST_WORDS = 5.0
 CANCELLED = "cancelled; nothing was written"
 LATE = "cancelled after its files had been written; they are complete"
 
-_PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.studio.jobs import main; main()"
+_PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast_studio.jobs import main; main()"
 
 
 class Jobs:
@@ -263,7 +264,7 @@ def tune(
 
 def commission(folder: Path, report: Report, asked: Commission) -> dict[str, Any]:
     """The commissioning of a virtual machine into the folder `commissioned`."""
-    from ..machine import VirtualMachine
+    from sewfast.machine import VirtualMachine
 
     machine = VirtualMachine.from_name(asked.machine)
     return carry_out(asked, machine, folder, report, writing=report.writing)
@@ -271,7 +272,7 @@ def commission(folder: Path, report: Report, asked: Commission) -> dict[str, Any
 
 def write_report(folder: Path, report: Report) -> dict[str, Any]:
     """The HTML report of a commissioning."""
-    from ..report import report as write
+    from sewfast.report import report as write
 
     report(0, 1, "report")
     with report.writing():

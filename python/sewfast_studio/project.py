@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from ..errors import SettingError, unwritable
+from sewfast.errors import SettingError, unwritable
+
 from .requests import (
     COMMISSIONED,
     MODEL,
@@ -27,8 +28,9 @@ from .requests import (
 )
 
 if TYPE_CHECKING:
-    from ..dataset import Dataset
-    from ..frequency import FrequencyResponse
+    from sewfast.dataset import Dataset
+    from sewfast.frequency import FrequencyResponse
+
     from .tuning import Tuning
 
 
@@ -62,11 +64,11 @@ def make_demo(folder: str | os.PathLike[str]) -> None:
     ModelFileError
         If the folder is not writable.
     """
-    from .. import signals
-    from ..control.machine import record
-    from ..identification import identify
-    from ..machine import VirtualMachine
-    from ..models import Ensemble
+    from sewfast import signals
+    from sewfast.control.machine import record
+    from sewfast.identification import identify
+    from sewfast.machine import VirtualMachine
+    from sewfast.models import Ensemble
 
     members = []
     for k in range(DEMO_MEMBERS):
@@ -137,7 +139,7 @@ class Project:
 
     def _format_of(self, path: Path) -> str:
         """The format of a file, cached until the file changes."""
-        from .. import storage
+        from sewfast import storage
 
         try:
             found = path.stat()
@@ -181,7 +183,7 @@ class Project:
         return path
 
     def state(self) -> dict[str, Any]:
-        from .. import signals
+        from sewfast import signals
 
         return {
             "folder": self.folder.name or str(self.folder),
@@ -216,8 +218,9 @@ class Project:
         ------
         SettingError, ModelFileError, FitError
         """
-        from ..control.files import load_pid
-        from ..models import load_model
+        from sewfast.control.files import load_pid
+        from sewfast.models import load_model
+
         from .tuning import Tuning
 
         paths = [self.document(model, MODEL_FORMAT)]
@@ -252,7 +255,7 @@ class Project:
 
     def columns(self, step: Step) -> dict[str, Any]:
         """Columns of a recording, and its input and output where names and units show them."""
-        from ..readers import read_table, roles
+        from sewfast.readers import read_table, roles
 
         table = read_table(self.path_of(step.file))
         found = roles(table)
@@ -274,7 +277,7 @@ class Project:
         writing: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> dict[str, Any]:
         """A model from the recording, written to `model.json`."""
-        from ..identification import identify
+        from sewfast.identification import identify
 
         require_writable(self.folder)
         data = self._read(step)
@@ -291,9 +294,9 @@ class Project:
 
     def validate(self, step: Step) -> dict[str, Any]:
         """Measured output and free run, with the report card of `sewfast check`."""
-        from ..evidence import check
-        from ..models import load_model
-        from ..validation import validate
+        from sewfast.evidence import check
+        from sewfast.models import load_model
+        from sewfast.validation import validate
 
         if not (self.folder / MODEL).is_file():
             raise SettingError(f"expected {MODEL} in the project folder; identify a model first")
@@ -325,8 +328,8 @@ class Project:
         segment : int, optional
             Samples; see `sewfast.bode`.
         """
-        from ..commissioning import bode, unsmoothed
-        from ..readers import read
+        from sewfast.commissioning import bode, unsmoothed
+        from sewfast.readers import read
 
         columns = self._columns(step, reference)
         data = read(self.path_of(step.file), **columns)
@@ -348,13 +351,13 @@ class Project:
         return commands(step, name, self._columns(step), reference, segment)
 
     def _read(self, step: Step) -> Dataset:
-        from ..readers import read
+        from sewfast.readers import read
 
         data = read(self.path_of(step.file), **self._columns(step))
         return data if step.resample is None else data.resample(step.resample)
 
     def _columns(self, step: Step, reference: str | None = None) -> dict[str, Any]:
-        from ..readers import read_table
+        from sewfast.readers import read_table
 
         return step.columns(read_table(self.path_of(step.file)), reference)
 
@@ -449,7 +452,7 @@ class Upload:
         Raises `SettingError` for fewer bytes than announced, a name taken meanwhile, or a model, a
         controller or another file that states its format; then the file is deleted.
         """
-        from .. import storage
+        from sewfast import storage
 
         try:
             if self.received != self.size:

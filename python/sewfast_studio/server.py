@@ -18,7 +18,8 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any, cast
 from weakref import WeakSet
 
-from ..errors import SettingError, not_installed
+from sewfast.errors import SettingError, not_installed
+
 from .bench import error_text
 from .driving import checked_recording
 from .jobs import Jobs, Steps
@@ -118,7 +119,7 @@ class Studio:
             raise not_installed("websockets", "the studio", "sewfast[studio]") from e
         if not 0 <= port < 65536:
             raise SettingError(f"port: expected 0 to 65535, received {port}")
-        silent = logging.Logger("sewfast.studio")
+        silent = logging.Logger("sewfast_studio")
         silent.addHandler(logging.NullHandler())
         self.project = project
         self.token = secrets.token_urlsafe(32)
@@ -453,7 +454,7 @@ class Studio:
 
 def _ports() -> list[dict[str, str]]:
     """The serial ports of this computer; none without pyserial."""
-    from ..link.ports import list_ports
+    from sewfast.link.ports import list_ports
 
     try:
         return [{"path": p.path, "text": p.problem or p.description} for p in list_ports()]

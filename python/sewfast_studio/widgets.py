@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import SettingError, not_installed
+from sewfast.errors import SettingError, not_installed
+
 from .bench import error_text
 from .jobs import Jobs, Steps
 from .project import Project
@@ -22,9 +23,9 @@ from .requests import MODEL
 from .session import checked, finite
 
 if TYPE_CHECKING:
-    from ..control.controller import Controller
-    from ..dataset import Dataset
-    from ..models import Model
+    from sewfast.control.controller import Controller
+    from sewfast.dataset import Dataset
+    from sewfast.models import Model
 
 START = "start.json"
 ALLOWED = (

@@ -16,7 +16,7 @@ import pytest
 import sewfast
 from moments import until
 from sewfast.errors import FitError
-from sewfast.studio import Studio
+from sewfast_studio import Studio
 from studio_page import EVIL
 
 

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import SettingError
+from sewfast.errors import SettingError
 
 if TYPE_CHECKING:
     from websockets.sync.server import ServerConnection
 
-    from ..dataset import FloatArray
+    from sewfast.dataset import FloatArray
 
 
 PROMPT, ROW = 0.15, 10

@@ -24,9 +24,9 @@ from cli import PROGRAM, environment
 from effort import FULL
 from moments import until
 from sewfast.errors import SettingError
-from sewfast.studio import Project, Step, Studio
-from sewfast.studio.requests import envelope
 from sewfast.tuning import costs, first_controller
+from sewfast_studio import Project, Step, Studio
+from sewfast_studio.requests import envelope
 from studio_page import EVIL, Page, websockets
 
 STEP = {"file": "run.csv", "inputs": ["u"], "output": "y", "resample": 0.02, "model": "oe"}

@@ -27,8 +27,8 @@ from moments import until
 from sewfast.commissioning import STAGES
 from sewfast.link import VirtualDevice
 from sewfast.recordfile import read_recording
-from sewfast.studio import Project, Studio
-from sewfast.studio.session import SCHEMAS, checked
+from sewfast_studio import Project, Studio
+from sewfast_studio.session import SCHEMAS, checked
 from studio_page import Page, Watching
 
 TRIPPED = 4

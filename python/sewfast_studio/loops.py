@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DataError, FitError
+from sewfast.errors import DataError, FitError
+
 from .tuning import band, bode_curves
 
 if TYPE_CHECKING:
-    from ..analysis.points import LoopBode, PlantPoint
-    from ..control.margins import Margins
-    from ..dataset import FloatArray
-    from ..frequency import FrequencyResponse, ShaftFit
+    from sewfast.analysis.points import LoopBode, PlantPoint
+    from sewfast.control.margins import Margins
+    from sewfast.dataset import FloatArray
+    from sewfast.frequency import FrequencyResponse, ShaftFit
+
     from .tuning import Tuning
 
 LEAST_COHERENCE = 0.5
@@ -30,7 +32,7 @@ Curves = dict[str, "FloatArray"]
 
 def shown_response(response: FrequencyResponse) -> tuple[dict[str, Any], Curves]:
     """A measured response for the page: curves, the fitted shaft, and a notch for it."""
-    from ..frequency import fit_shaft
+    from sewfast.frequency import fit_shaft
 
     fit: ShaftFit | None = None
     try:
@@ -81,7 +83,7 @@ def shown_loop(
     """Plant, L, S and T of the loop with these values, with marked margins and a measured response.
     Raises `SettingError` for a response with another sample time or other units.
     """
-    from ..analysis.points import loop_bodes
+    from sewfast.analysis.points import loop_bodes
 
     controller = tuning.controller(values)
     (bode,) = loop_bodes(controller, [tuning.points], tuning.slowest)

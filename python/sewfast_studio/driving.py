@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SettingError
+from sewfast.errors import SettingError
+
 from .requests import Commission, carry_out, drawn
 
 if TYPE_CHECKING:
-    from ..commissioning import Commissioning
+    from sewfast.commissioning import Commissioning
+
     from .bench import Bench, SeenDrive
 
 LIMITS = {
@@ -87,8 +89,8 @@ def record(
     drive: SeenDrive, folder: Path, bench: Bench, signal: str, seed: int, scale: float, file: str
 ) -> dict[str, Any]:
     """Record a named excitation into a file."""
-    from .. import signals
-    from ..control.machine import record
+    from sewfast import signals
+    from sewfast.control.machine import record
 
     u = scale * signals.excitation(signal, seed)
     made = record(drive, u, name=signal, file=folder / file, cancel=bench.cancel)
@@ -100,9 +102,9 @@ def run(
     scale: float, file: str,
 ) -> dict[str, Any]:  # fmt: skip
     """Run a controller of the folder along a named reference."""
-    from .. import signals
-    from ..control.files import load_pid
-    from ..control.loop import run
+    from sewfast import signals
+    from sewfast.control.files import load_pid
+    from sewfast.control.loop import run
 
     found = run(
         load_pid(folder / controller), drive, scale * signals.reference(reference, seed),

@@ -19,13 +19,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import LinkError, SettingError
-from ..live import Feed
+from sewfast.errors import LinkError, SettingError
+from sewfast.live import Feed
+
 from .driving import LIMITS, Place, copies
 
 if TYPE_CHECKING:
-    from ..dataset import FloatArray
-    from ..link import VirtualDevice
+    from sewfast.dataset import FloatArray
+    from sewfast.link import VirtualDevice
 
 PATIENCE = 15.0
 """Longest wait for an answer of the process, which waits up to 10 s for a motor to rest [s]."""
@@ -33,7 +34,7 @@ PATIENCE = 15.0
 CLOSING = 3.0
 """Time for the process to end by itself [s]."""
 
-_PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.studio.bench import main; main()"
+_PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast_studio.bench import main; main()"
 
 
 class Line:
@@ -210,7 +211,7 @@ class Line:
 
     def connect(self, port: str, baud: int = 115_200, watchdog: float | None = None) -> None:
         """Open a port; ``virtual[:SEED]`` is a virtual drive served by this process."""
-        from ..link import VirtualDevice
+        from sewfast.link import VirtualDevice
 
         with self._lock:
             if self.is_connected:

@@ -12,17 +12,17 @@ import pytest
 
 import sewfast
 from moments import until
-from sewfast.studio.project import looked_at
+from sewfast_studio.project import looked_at
 
 pytest.importorskip("anywidget")
 
-from sewfast.studio import widgets
+from sewfast_studio import widgets
 
 MOVE = {"Kp": 0.03, "Ti": 0.07}
 
 CELL = """
 import sewfast
-from sewfast.studio.widgets import tune_view, look_view
+from sewfast_studio.widgets import tune_view, look_view
 view = tune_view({model!r})
 view
 """

@@ -24,13 +24,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from ..errors import Interrupted, LinkError, SettingError, SewfastError
-from ..link.drive import Drive
-from ..live import Feed
+from sewfast.errors import Interrupted, LinkError, SettingError, SewfastError
+from sewfast.link.drive import Drive
+from sewfast.live import Feed
 
 if TYPE_CHECKING:
-    from ..dataset import FloatArray
-    from ..link.plan import Outcome, Plan, Sink
+    from sewfast.dataset import FloatArray
+    from sewfast.link.plan import Outcome, Plan, Sink
 
 LEASE = 0.5
 """Time without an answer of the page after which an armed drive is stopped [s]."""

@@ -11,7 +11,7 @@ import pytest
 
 import sewfast
 from fitted import made
-from sewfast.studio import Project, Studio, make_demo
+from sewfast_studio import Project, Studio, make_demo
 from studio_page import EVIL, Page
 
 

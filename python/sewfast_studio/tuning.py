@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import FitError, Interrupted, SettingError
+from sewfast.errors import FitError, Interrupted, SettingError
 
 if TYPE_CHECKING:
-    from ..analysis.points import LoopBode
-    from ..analysis.responses import Responses
-    from ..control.controller import Controller
-    from ..dataset import FloatArray
-    from ..models import Model
-    from ..tuning import Constraints, Cost
+    from sewfast.analysis.points import LoopBode
+    from sewfast.analysis.responses import Responses
+    from sewfast.control.controller import Controller
+    from sewfast.dataset import FloatArray
+    from sewfast.models import Model
+    from sewfast.tuning import Constraints, Cost
 
 MOST_MEMBERS = 16
 READABLE_DB = -60.0
@@ -78,12 +78,12 @@ class Tuning:
         notches: Sequence[Sequence[float]] = (),
         stamp: str = "",
     ) -> None:
-        from ..analysis.analysis import slowest_time
-        from ..analysis.points import plant_points, recorded_way
-        from ..analysis.responses import default_steps
-        from ..control.biquad import Biquad
-        from ..control.loop import check_fits, each_plant, titles
-        from ..tuning import first_controller
+        from sewfast.analysis.analysis import slowest_time
+        from sewfast.analysis.points import plant_points, recorded_way
+        from sewfast.analysis.responses import default_steps
+        from sewfast.control.biquad import Biquad
+        from sewfast.control.loop import check_fits, each_plant, titles
+        from sewfast.tuning import first_controller
 
         self.model, self.name, self.stamp = model, name, stamp
         start = first_controller(model) if start is None else start
@@ -215,8 +215,8 @@ class Tuning:
         curves : dict of array
             By name: median, lowest and highest of the members.
         """
-        from ..analysis.points import loop_bodes
-        from ..analysis.responses import responses
+        from sewfast.analysis.points import loop_bodes
+        from sewfast.analysis.responses import responses
 
         controller = self.controller(values)
         (bode,) = loop_bodes(controller, [self.points], self.slowest)
@@ -248,7 +248,7 @@ class Tuning:
         weights : mapping, optional
             Fields of `sewfast.Cost` by name.
         """
-        from ..tuning import Cost, costs
+        from sewfast.tuning import Cost, costs
 
         # all get the same weights: the defaults depend on the first
         controllers = [self.controller(values) for values in several]
@@ -288,7 +288,7 @@ class Tuning:
         FitError
             If every controller diverges or breaks a constraint.
         """
-        from ..tuning import tune
+        from sewfast.tuning import tune
 
         start = self.controller(values)
         try:
@@ -438,7 +438,7 @@ def _number(value: Any) -> str:
 
 def _document(controller: Controller) -> str:
     """The text of its file."""
-    from ..control.controller import FORMAT, VERSION
+    from sewfast.control.controller import FORMAT, VERSION
 
     return json.dumps({"format": FORMAT, "version": VERSION, **controller.to_dict()}, indent=1)
 
@@ -466,13 +466,13 @@ class Search:
 
     def cost(self) -> Cost:
         """The weights; those that are not given are the defaults."""
-        from ..tuning import Cost
+        from sewfast.tuning import Cost
 
         return Cost(**self.weights)
 
     def limits(self) -> Constraints:
         """The constraints."""
-        from ..tuning import Constraints
+        from sewfast.tuning import Constraints
 
         return Constraints(**self.constraints)
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from sewfast.cli.parser import build_parser
-from sewfast.studio import driving, requests
+from sewfast_studio import driving, requests
 
 PLACES = {
     "virtual": driving.Place("virtual:3", limits={"volt": 20.0, "speed_rpm": 3000.0}),

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import DataError, SettingError
-from ..kinds import KINDS, Kind
+from sewfast.errors import DataError, SettingError
+from sewfast.kinds import KINDS, Kind
 
 if TYPE_CHECKING:
-    from ..commissioning import Commissioning
-    from ..commissioning.verification import Comparison
-    from ..dataset import FloatArray
-    from ..readers import Table
+    from sewfast.commissioning import Commissioning
+    from sewfast.commissioning.verification import Comparison
+    from sewfast.dataset import FloatArray
+    from sewfast.readers import Table
 
 MODEL = "model.json"
 RESPONSE = "response.json"
@@ -99,7 +99,7 @@ class Step:
         SettingError, DataError
             If input or output are missing.
         """
-        from ..dataset import is_reference
+        from sewfast.dataset import is_reference
 
         if not self.inputs:
             raise SettingError(f"{self.file}: expected an input, received none; choose a column")
@@ -260,8 +260,8 @@ def carry_out(
     Raises `Refusal` if the evidence is not good enough, and `SettingError` for a folder of that
     name with other files.
     """
-    from ..commissioning import commission
-    from ..commissioning.result import require_own
+    from sewfast.commissioning import commission
+    from sewfast.commissioning.result import require_own
 
     place = folder / COMMISSIONED
     if place.is_symlink():

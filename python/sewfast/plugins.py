@@ -1,0 +1,116 @@
+"""Plug-ins: what installed packages add by entry points, and what is said where one cannot be used.
+
+A group of entry points is a list in the metadata of the installed packages: `sewfast.readers`
+(formats of files), `sewfast.commands` (commands), `sewfast.names` (names of `sewfast`). Nothing is
+registered, and nothing is imported before it is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from .errors import SettingError, printable
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+
+def points(group: str, name: str | None = None) -> tuple[EntryPoint, ...]:
+    """The entry points of a group, or those of one name in it, by name."""
+    # imported here: it loads parsers for mail and archives, and reads the metadata of all packages
+    from importlib.metadata import entry_points
+
+    found = entry_points(group=group) if name is None else entry_points(group=group, name=name)
+    return tuple(sorted(found, key=lambda point: point.name))
+
+
+def only(
+    found: tuple[EntryPoint, ...], place: str, task: str, remedy: str = "uninstall one"
+) -> EntryPoint:
+    """The entry point for a task such as `that reads .dlog`, at a place named in the error.
+    Raises `SettingError` if there are several.
+    """
+    if len(found) > 1:
+        raise SettingError(
+            name=place, expected=f"one installed package {task}",
+            received=" and ".join(sorted(map(package, found))), remedy=remedy,
+        )  # fmt: skip
+    return found[0]
+
+
+def load(point: EntryPoint, place: str, task: str) -> Any:
+    """What an entry point names.
+    Raises `SettingError` if it cannot be imported.
+    """
+    try:
+        return point.load()
+    except Exception as e:
+        # importing runs code of another package
+        raise unusable(point, place, task, told(e)) from e
+
+
+def function(point: EntryPoint, place: str, task: str) -> Callable[..., Any]:
+    """The function that an entry point names.
+    Raises `SettingError` if it cannot be imported or is no function.
+    """
+    found = load(point, place, task)
+    if not callable(found):
+        raise unusable(point, place, task, f"{point.value}, a {type(found).__name__}")
+    named: Callable[..., Any] = found
+    return named
+
+
+def unusable(point: EntryPoint, place: str, task: str, received: str) -> SettingError:
+    return SettingError(
+        name=place, expected=f"a part of {package(point)} {task}", received=received,
+        remedy=f"update {package(point)} and what it needs, or uninstall it",
+    )  # fmt: skip
+
+
+def told(error: Exception) -> str:
+    """The error of another package in one short line."""
+    return f"{type(error).__name__}: {printable(str(error))[:200]}"
+
+
+def package(point: EntryPoint) -> str:
+    return point.dist.name if point.dist is not None else point.value
+
+
+NAMES = "sewfast.names"
+
+
+def public_names() -> list[str]:
+    """Names of `sewfast` that plug-ins add."""
+    return [point.name for point in points(NAMES)]
+
+
+def public_name(name: str) -> Any:
+    """What a plug-in has for a name of `sewfast`.
+    Raises `AttributeError`, as `hasattr` and `help` expect, if there is none or it cannot be used.
+    """
+    found = points(NAMES, name)
+    if not found:
+        raise AttributeError(f"module 'sewfast' has no attribute {name!r}")
+    try:
+        place, task = f"sewfast.{name}", "for this name"
+        return load(only(found, place, task), place, task)
+    except SettingError as e:
+        raise AttributeError(str(e)) from e
+
+
+def on_first_use(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
+    """The `__getattr__` of a package whose names are loaded on first use.
+    `homes` has the names for each module. A plug-in takes it so that its command can be listed
+    without loading what carries it out.
+    """
+    home_of = {name: home for home, names in homes.items() for name in names.split()}
+
+    def found(name: str) -> Any:
+        from importlib import import_module
+
+        if name not in home_of:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(import_module(f"{package}.{home_of[name]}"), name)
+
+    return found

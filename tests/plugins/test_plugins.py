@@ -1,0 +1,144 @@
+"""Plug-ins: commands and names that installed packages add, and what is said where one fails."""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sewfast
+from cli import called
+from installed import installed
+from sewfast import plugins
+
+CODE = """
+from sewfast.cli.arguments import add_command
+
+answer = 42
+
+def add(commands):
+    add_command(
+        commands, "greet", lambda args: print("hello"), summary="a word", text="", examples=""
+    )
+
+def fails(commands):
+    raise RuntimeError("no \\x1b[2J luck")
+"""
+COMMANDS, NAMES = "sewfast.commands", "sewfast.names"
+
+
+def test_an_installed_package_adds_a_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site, here = tmp_path / "site", tmp_path / "here"
+    here.mkdir()
+    installed(site, monkeypatch, CODE, "greet = drive_logger:add", COMMANDS)
+    assert called(here, "greet").out == "hello\n"
+    found = called(here, "--help")
+    assert "greet     a word" in found.out
+    assert found.err == ""
+    assert "did you mean greet?" in called(here, "great", done=2).err
+
+
+@pytest.mark.parametrize(
+    ("point", "received"),
+    [
+        ("drive_logger:fails", "RuntimeError: no \\x1b[2J luck"),
+        ("drive_logger:absent", "AttributeError: "),
+        ("drive_logger:answer", "drive_logger:answer, a int"),
+        ("nowhere:add", "ModuleNotFoundError: No module named 'nowhere'"),
+    ],
+)
+def test_a_command_that_fails_is_named_and_the_others_work(
+    point: str, received: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = f"greet = drive_logger:add\nworse = {point}"
+    installed(tmp_path / "site", monkeypatch, CODE, points, COMMANDS)
+    found = called(tmp_path, "--help")
+    assert found.err.startswith(
+        f"sewfast: command worse: expected a part of drive-logger that adds it, received {received}"
+    )
+    assert found.err.endswith("; update drive-logger and what it needs, or uninstall it\n")
+    assert found.err.count("\n") == 1
+    assert "greet     a word" in found.out
+    # neither another plug-in nor a command of the core speaks of it
+    assert called(tmp_path, "greet").err == ""
+    assert called(tmp_path, "signals").err == ""
+
+
+def test_the_core_s_commands_are_not_taken_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = called(tmp_path, "signals", "--help").out
+    installed(tmp_path / "site", monkeypatch, CODE, "signals = drive_logger:fails", COMMANDS)
+    assert called(tmp_path, "signals", "--help").out == before
+    assert called(tmp_path, "--help").err == ""
+
+
+def test_two_packages_for_one_command_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for package in ("a-logger", "b-logger"):
+        point = f"greet = {package.replace('-', '_')}:add"
+        installed(tmp_path / package, monkeypatch, CODE, point, COMMANDS, package)
+    assert "received a-logger and b-logger; uninstall one" in called(tmp_path, "--help").err
+
+
+def test_an_installed_package_adds_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = "answer = drive_logger:answer\nlogger = drive_logger\nidentify = drive_logger:answer"
+    installed(tmp_path / "site", monkeypatch, CODE, f"{points}\nlost = nowhere", NAMES)
+    for name in ("answer", "logger"):  # what is found is kept, and not by this test
+        monkeypatch.setitem(vars(sewfast), name, None)
+        monkeypatch.delitem(vars(sewfast), name)
+    assert sewfast.answer == 42
+    assert sewfast.logger is sys.modules["drive_logger"]
+    assert callable(sewfast.identify)
+    assert {"answer", "logger", "lost", "identify"} <= set(dir(sewfast))
+    assert not hasattr(sewfast, "lost")
+    with pytest.raises(AttributeError, match=r"sewfast\.lost: .*No module named 'nowhere'; update"):
+        sewfast.lost  # noqa: B018
+
+
+def test_the_core_s_modules_are_not_looked_for_in_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plugins, "points", lambda *_: pytest.fail("read all metadata"))
+    for name in ("units", "storage", "_core", "__wrapped__"):
+        monkeypatch.setitem(vars(sewfast), name, None)
+        monkeypatch.delitem(vars(sewfast), name)
+        assert not hasattr(sewfast, name)
+
+
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The core as it would be without any plug-in: none is named, none can be imported."""
+
+    def none(group: str, name: str | None = None) -> tuple[EntryPoint, ...]:
+        return ()
+
+    monkeypatch.setattr(plugins, "points", none)
+    for folder in Path(sewfast.__file__).parents[1].glob("sewfast_*"):
+        for module in [m for m in sys.modules if m.split(".")[0] == folder.name]:
+            monkeypatch.delitem(sys.modules, module)
+        monkeypatch.setitem(sys.modules, folder.name, None)
+
+
+@pytest.mark.usefixtures("alone")
+def test_the_core_works_without_plugins(tmp_path: Path) -> None:
+    found = called(tmp_path, "--help")
+    assert "identify" in found.out
+    assert "\n    studio" not in found.out
+    assert found.err == ""
+    assert "invalid choice: 'studio'" in called(tmp_path, "studio", done=2).err
+    random = np.random.default_rng(1)
+    u = np.repeat(random.uniform(-5.0, 5.0, 30), 10)
+    y = [0.0]
+    for command in u[:-1]:
+        y.append(0.9 * y[-1] + 20.0 * command + random.normal())
+    sewfast.write_table(tmp_path / "run.csv", {"t": 0.01 * np.arange(300), "u": u, "y": y})
+    columns = ("--input", "u", "--output", "y")
+    called(tmp_path, "identify", "run.csv", *columns, "--model", "arx", "-o", "drive.json")
+    called(tmp_path, "validate", "drive.json", "run.csv")
+    assert not hasattr(sewfast, "nothing")
+    assert "identify" in dir(sewfast)
