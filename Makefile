@@ -250,7 +250,7 @@ parting: $(VENV)/bench.stamp ## writes tests/night.txt: which tests of over half
 CORE_TESTS := $(addprefix tests/,analysis control dataset evidence files greybox identification models tuning) \
   $(wildcard tests/test_*.py)
 python-core: $(DEV)
-	$(PYTEST) -m '$(COMPUTES)' $(filter-out tests/test_fleet.py,$(CORE_TESTS))
+	$(PYTEST) -m '$(COMPUTES)' $(CORE_TESTS)
 
 docs: $(DEV) ## the site, in site/index.html; works offline
 	$(BIN)/python docs/build.py

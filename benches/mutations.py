@@ -42,11 +42,11 @@ import sewfast
 from sewfast import cli
 from sewfast.cli import project
 from sewfast.errors import SewfastError
-from sewfast.fleets.table import load_fleet
 from sewfast.greybox.equations import load_equations
 from sewfast.recordfile import Header, RecordWriter, read_recording
 from sewfast.recordfile import export as exported
 from sewfast.report import report
+from sewfast_fleet.table import load_fleet
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
 from commissioned import SMALL, short

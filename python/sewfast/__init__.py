@@ -33,7 +33,6 @@ if TYPE_CHECKING:
         SewfastError,
     )
     from .evidence import ReportCard, check
-    from .fleets import Fleet, fleet
     from .frequency import (
         FrequencyResponse,
         ResponsesOverSpeed,
@@ -80,7 +79,6 @@ __all__ = [
     "Ensemble",
     "Experiment",
     "FitError",
-    "Fleet",
     "FrequencyResponse",
     "Gains",
     "Interrupted",
@@ -119,7 +117,6 @@ __all__ = [
     "diagnose",
     "fit_fopdt",
     "fit_shaft",
-    "fleet",
     "identify",
     "least_squares",
     "load_controller",
@@ -162,7 +159,6 @@ _HOMES = {
     "deployment": "Deployment deploy",
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
     "evidence": "ReportCard check",
-    "fleets": "Fleet fleet",
     "frequency": "FrequencyResponse ResponsesOverSpeed ShaftFit fit_shaft load_response "
     "load_responses",
     "greybox": "Motor load_motor physics",

@@ -142,3 +142,9 @@ def test_the_core_works_without_plugins(tmp_path: Path) -> None:
     called(tmp_path, "validate", "drive.json", "run.csv")
     assert not hasattr(sewfast, "nothing")
     assert "identify" in dir(sewfast)
+
+
+@pytest.mark.parametrize("name", ["Fleet", "fleet", "studio"])
+def test_the_wheel_s_plugins_have_their_public_names(name: str) -> None:
+    assert getattr(sewfast, name) is not None
+    assert name in dir(sewfast)

@@ -16,9 +16,10 @@ for name in sewfast.__all__:
     getattr(sewfast, name)
 
 plugins = entry_points(group="sewfast.commands")
-assert {point.name for point in plugins} >= {"studio"}
+assert {point.name for point in plugins} >= {"fleet", "studio"}
 for point in plugins:
     point.load()
+assert callable(sewfast.fleet)
 assert files("sewfast_studio").joinpath("page/index.html").is_file()
 
 machine = sewfast.VirtualMachine(1)

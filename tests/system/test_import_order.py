@@ -21,7 +21,7 @@ ORDER = """
     recordfile dataset readers benchmarks gains machine live recording
     causes equilibrium dynamic_model validation comparison evidence models
     motorfit identification sklearn
-    rules control tuning trust analysis frequency deployment fleets
+    rules control tuning trust analysis frequency deployment
     link greybox report commissioning experiment cli __main__
 """
 

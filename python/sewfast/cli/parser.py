@@ -140,7 +140,6 @@ def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
         machine.add_physics,
         deploy.add,
         deploy.add_pil,
-        identify.add_fleet,
         drive.add_ports,
         drive.add_doctor,
         drive.add,

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import storage
-from ..errors import SettingError, printable
-from ..plotting import Drawing, Plotted, lettered, stacked
-from ..tables import Table, percent, significant
+from sewfast import storage
+from sewfast.errors import SettingError, printable
+from sewfast.plotting import Drawing, Plotted, lettered, stacked
+from sewfast.tables import Table, percent, significant
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,16 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from ..control.controller import Controller
-from ..dataset import Dataset
-from ..dataset.faults import faults
-from ..errors import SettingError, SewfastError, printable
-from ..evidence import Residuals, estimate
-from ..identification import identify
-from ..models import Model
-from ..readers import read, read_table
-from ..storage import file_bytes
-from ..validation import validate
+from sewfast.control.controller import Controller
+from sewfast.dataset import Dataset
+from sewfast.dataset.faults import faults
+from sewfast.errors import SettingError, SewfastError, printable
+from sewfast.evidence import Residuals, estimate
+from sewfast.identification import identify
+from sewfast.models import Model
+from sewfast.readers import read, read_table
+from sewfast.storage import file_bytes
+from sewfast.validation import validate
+
 from .table import Row
 
 READABLE = (
@@ -197,7 +198,7 @@ def _identified(job: Job, settings: Mapping[str, Any], controller: Controller | 
         quantities = _physical(model, data.slice(f"0:{cut}"))
     gains: dict[str, Any] = {}
     if controller is not None:
-        from ..tuning import tune
+        from sewfast.tuning import tune
 
         tuned = tune(model, start=controller, seed=settings["seed"], threads=1).pid
         standard = tuned.gains.to("standard")

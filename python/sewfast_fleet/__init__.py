@@ -3,10 +3,17 @@
 `fleet` identifies and checks every recording of a folder. A recording that cannot be used affects
 only its own row; finished rows are kept in a journal, from which the same call continues. Read
 `recordings` (one recording, its row), then `table` (all rows, files, drift) and `running` (workers,
-journal).
+journal); `command` adds `sewfast fleet`.
 """
 
-from .running import fleet
-from .table import Drift, Fleet, Row, load_fleet
+from typing import TYPE_CHECKING
+
+from sewfast.plugins import on_first_use
+
+if TYPE_CHECKING:
+    from .running import fleet
+    from .table import Drift, Fleet, Row, load_fleet
 
 __all__ = ["Drift", "Fleet", "Row", "fleet", "load_fleet"]
+
+__getattr__ = on_first_use(__name__, {"running": "fleet", "table": "Drift Fleet Row load_fleet"})

@@ -20,12 +20,13 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
-from .. import storage
-from ..arrays import is_whole
-from ..control.controller import Controller
-from ..errors import ModelFileError, SettingError, unreadable, unwritable
-from ..kinds import KINDS, Kind
-from ..progress import shown_in_notebooks
+from sewfast import storage
+from sewfast.arrays import is_whole
+from sewfast.control.controller import Controller
+from sewfast.errors import ModelFileError, SettingError, unreadable, unwritable
+from sewfast.kinds import KINDS, Kind
+from sewfast.progress import shown_in_notebooks
+
 from .recordings import Job, jobs_of, row_of
 from .table import COLUMNS, FORMAT, Fleet, Row, drifts, earlier_rows, require_ending
 

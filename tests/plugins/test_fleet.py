@@ -24,9 +24,9 @@ import pytest
 from sewfast import Controller, Fleet, Gains, fleet
 from sewfast.cli import main
 from sewfast.errors import SettingError, SewfastError
-from sewfast.fleets import Drift, Row, load_fleet
-from sewfast.fleets.recordings import jobs_of
-from sewfast.fleets.running import Journal
+from sewfast_fleet import Drift, Row, load_fleet
+from sewfast_fleet.recordings import jobs_of
+from sewfast_fleet.running import Journal
 
 SAMPLES = 1500
 MACHINES = 8
@@ -144,7 +144,7 @@ def test_workers_that_are_gone_for_good_are_missed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     distributed = pytest.importorskip("distributed", reason="needs dask")
-    from sewfast.fleets import running
+    from sewfast_fleet import running
 
     monkeypatch.setattr(running, "_PATIENCE", 1.0)
     monkeypatch.setattr(running, "_LOOK", 0.2)
@@ -170,7 +170,7 @@ def test_a_worker_that_starts_slowly_is_not_given_up(
     distributed = pytest.importorskip("distributed", reason="needs dask")
     import dask
 
-    from sewfast.fleets import running
+    from sewfast_fleet import running
 
     many = made(tmp_path / "many", 30)
     expected = bits(fleet(many, workers=0))
@@ -207,7 +207,7 @@ def test_a_worker_that_starts_slowly_is_not_given_up(
 def test_workers_that_are_starting_are_waited_for_longer(
     monkeypatch: pytest.MonkeyPatch, starting: bool
 ) -> None:
-    from sewfast.fleets import running
+    from sewfast_fleet import running
 
     now = 0.0
     asked: list[int] = []
@@ -241,7 +241,7 @@ def test_a_look_that_takes_long_is_no_absence(
     monkeypatch: pytest.MonkeyPatch, present: bool
 ) -> None:
     """A computer so busy that each look takes 200 s, the first while a worker starts anew."""
-    from sewfast.fleets import running
+    from sewfast_fleet import running
 
     now, looks = 0.0, [{}, {"worker": 1} if present else {}]
 
@@ -272,7 +272,7 @@ def test_recordings_that_share_a_task_do_not_share_its_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     distributed = pytest.importorskip("distributed", reason="needs dask")
-    from sewfast.fleets import running
+    from sewfast_fleet import running
 
     many = made(tmp_path / "many", 40)
     expected = fleet(many, workers=0).rows
@@ -357,7 +357,7 @@ def test_no_machine_drifts_by_itself(tmp_path: Path, alone: Fleet) -> None:
 def test_what_is_done_is_not_done_again(
     folder: Path, alone: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sewfast.fleets import running
+    from sewfast_fleet import running
 
     worked: list[str] = []
     real = running.row_of
@@ -386,7 +386,7 @@ def test_what_is_done_is_not_done_again(
 
 
 def test_other_settings_begin_anew(folder: Path, tmp_path: Path) -> None:
-    from sewfast.fleets import running
+    from sewfast_fleet import running
 
     out = tmp_path / "table.json"
     jobs = running.jobs_of(folder, "u", "y", None)
@@ -521,7 +521,7 @@ def test_ctrl_c_says_what_is_kept(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from sewfast.fleets import running
+    from sewfast_fleet import running
 
     done: list[str] = []
     real = running.row_of
@@ -678,7 +678,7 @@ def test_a_fault_in_a_reader_costs_its_own_row(
     def broken(path: str) -> Any:
         raise RuntimeError("out of luck")
 
-    monkeypatch.setattr("sewfast.fleets.recordings.read_table", broken)
+    monkeypatch.setattr("sewfast_fleet.recordings.read_table", broken)
     (row,) = fleet([folder / "m0.npz"], workers=0).rows
     assert (row.status, row.message) == ("failed", "RuntimeError: out of luck")
 
