@@ -20,7 +20,7 @@ ORDER = """
     errors plugins kinds units arrays written storage tables plotting progress threads speed signals
     recordfile dataset readers benchmarks gains machine live recording
     causes equilibrium dynamic_model validation comparison evidence models
-    motorfit identification sklearn
+    motorfit identification
     rules control tuning trust analysis frequency deployment
     link greybox report commissioning experiment cli __main__
 """

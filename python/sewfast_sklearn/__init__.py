@@ -15,12 +15,12 @@ from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.metrics import r2_score
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from .dataset import Dataset, FloatArray
-from .dynamic_model import INIT
-from .errors import DataError, SettingError
-from .identification import identify
-from .kinds import Kind
-from .models import Model
+from sewfast.dataset import Dataset, FloatArray
+from sewfast.dynamic_model import INIT
+from sewfast.errors import DataError, SettingError
+from sewfast.identification import identify
+from sewfast.kinds import Kind
+from sewfast.models import Model
 
 
 class FreeRunRegressor(RegressorMixin, BaseEstimator):
@@ -53,7 +53,7 @@ class FreeRunRegressor(RegressorMixin, BaseEstimator):
     Examples
     --------
     >>> import numpy as np
-    >>> from sewfast.sklearn import FreeRunRegressor
+    >>> from sewfast_sklearn import FreeRunRegressor
     >>> u = np.repeat(np.random.default_rng(0).normal(size=40), 10)
     >>> y = np.zeros(400)
     >>> for k in range(1, 400):

@@ -17,7 +17,7 @@ from sklearn.utils.estimator_checks import check_estimator
 
 import sewfast
 from sewfast.errors import DataError, SettingError
-from sewfast.sklearn import FreeRunRegressor, blocks
+from sewfast_sklearn import FreeRunRegressor, blocks
 
 SHORT = "has fewer samples than an initial state and the orders need"
 ORDERED = "samples of a dynamic system are not exchangeable"
@@ -41,6 +41,11 @@ def lagged(count: int = 1200, seed: int = 0, noise: float = 0.05) -> tuple[np.nd
     for k in range(2, count):
         y[k] = 1.6 * y[k - 1] - 0.64 * y[k - 2] + 0.02 * u[k - 1] + 0.02 * u[k - 2]
     return u[:, None], y + noise * rng.normal(size=count)
+
+
+def test_it_is_a_public_name() -> None:
+    assert sewfast.sklearn.FreeRunRegressor is FreeRunRegressor
+    assert "sklearn" in dir(sewfast)
 
 
 def test_scikit_learns_own_checks() -> None:
