@@ -21,10 +21,10 @@ from sewfast.control import Controller, Gains
 from sewfast.control.loop import run
 from sewfast.control.machine import record
 from sewfast.errors import DataError, LinkError, SettingError
-from sewfast.experiment import run_demo
 from sewfast.link import Drive, VirtualDevice, connect
 from sewfast.recordfile import Header, RecordWriter, export, read_recording
 from sewfast.recordfile.filing import Sink
+from sewfast_demo import run_demo
 
 U = np.round(3.0 * np.sin(np.arange(300) / 20.0), 3)
 CONTROLLER = Controller(Gains.standard(0.005, 0.1), u_min=-10.0, u_max=10.0)

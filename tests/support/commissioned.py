@@ -29,7 +29,7 @@ def short() -> Iterator[None]:
 @contextmanager
 def short_experiment() -> Iterator[None]:
     """The paper's experiment with networks and searches cut short."""
-    from sewfast.experiment import loops
+    from sewfast_demo import loops
 
     with short(), pytest.MonkeyPatch.context() as patch:
         quick = functools.partial(identification.identify, iterations=3, starts=1)

@@ -1,18 +1,17 @@
-"""`sewfast demo`, `commission`, `report`: all the way to a controller."""
+"""`sewfast commission`, `report`: all the way to a controller."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..errors import Interrupted
 from ..progress import Progress
 from .arguments import Commands, add_command, add_overwrite
 from .drive import add_drive, is_port, machine_of, opened, require_no_drive_options
-from .output import INTERRUPTED, print_json, print_rows, suggested
+from .output import INTERRUPTED, print_json, suggested
 
 if TYPE_CHECKING:
     from ..commissioning import Commissioning
@@ -161,72 +160,21 @@ def _commissioned(args: argparse.Namespace) -> Commissioning:
         return commission(machine_of(args.on), **options)
 
 
-# --- `sewfast demo`, `sewfast report`: the paper's experiment and its page ------------------------
+# --- `sewfast report`: the page of an experiment --------------------------------------------------
 
-
-DEMO = """\
-Carry out the paper's experiment on the virtual sewing machine: excite, record, identify, validate,
-tune, run, report. Takes about a minute.
-
-DIR/report.html is the page to look at; DIR/results.json has its numbers. Recordings, models and the
-controller are written as well, ready for the other commands.
-"""
 
 REPORT = """\
 Write DIR/report.html again from the files of `sewfast demo` in DIR; nothing is computed again.
 """
 
 
-def add_demo(commands: Commands) -> None:
-    parser = add_command(
-        commands, "demo", demo_command,
-        summary="the whole experiment, with a report", text=DEMO,
-        examples="examples:\n  sewfast demo\n  sewfast demo --out second --seed 1",
-    )  # fmt: skip
-    parser.add_argument(
-        "--out", type=Path, default=Path("demo"), metavar="DIR", help="folder to fill (demo)"
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, metavar="N",
-        help="seed of the random signals and of every search (0)",
-    )  # fmt: skip
-    add_overwrite(parser)
+def add_report(commands: Commands) -> None:
     parser = add_command(
         commands, "report", report_command,
         summary="the page of an experiment", text=REPORT,
         examples="example:\n  sewfast report demo",
     )  # fmt: skip
     parser.add_argument("folder", type=Path, metavar="DIR", help="folder that demo filled")
-
-
-def demo_command(args: argparse.Namespace) -> None:
-    from ..experiment import run_demo
-
-    with Progress("demo", quiet=args.quiet) as progress:
-        results = run_demo(
-            args.out, args.seed, overwrite=args.overwrite,
-            progress=lambda done, total, stage: progress.say(stage),
-        )  # fmt: skip
-    page = args.out / "report.html"
-    if args.json:
-        print_json({"report": str(page), "results": results})
-    else:
-        _summarise(results)
-        print(f"{results['seconds']:.0f} s; look at {page}")
-
-
-def _summarise(results: Mapping[str, Any]) -> None:
-    """Print free-run errors on records not used for training, and the trapezoid."""
-    head = ["free-run error [RPM rms]", "paper", "neural_oe", "oe_all", "oe", "arx"]
-    found = results["identification"]
-    rows = [
-        [r, *(f"{found[m][r]['simulation']['rmse_rpm']:.1f}" for m in head[1:])]
-        for r in ("chirp_hi_lo", "random", "saturating")
-    ]
-    print_rows([head, *rows])
-    trapezoid = results["control"]["trapezoid"]
-    rise, overshoot = (trapezoid["machine"][key] for key in ("rise_time_ms", "overshoot_percent"))
-    print(f"trapezoid on the machine: rise {rise:.0f} ms, overshoot {overshoot:.1f} %")
 
 
 def report_command(args: argparse.Namespace) -> None:

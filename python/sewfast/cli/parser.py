@@ -122,8 +122,8 @@ def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
     # in the order of the help
     makers = (
         project.add,
-        commission.add_demo,
         commission.add,
+        commission.add_report,
         recording.add,
         recording.add_files,
         data.add_look,

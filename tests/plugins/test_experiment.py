@@ -19,14 +19,14 @@ from fitted import made
 from sewfast import Commissioning, signals
 from sewfast.control import Controller, Gains, load_controller
 from sewfast.errors import DataError, SettingError
-from sewfast.experiment import STAGES, loops, run_demo
-from sewfast.experiment import demo as experiment
-from sewfast.experiment.loops import drive_of
 from sewfast.machine import VirtualMachine
 from sewfast.models import load_model
 from sewfast.readers import read, read_table
 from sewfast.report import artefacts, report
 from sewfast.validation import validate
+from sewfast_demo import STAGES, loops, run_demo
+from sewfast_demo import demo as experiment
+from sewfast_demo.loops import drive_of
 
 SCORES = ("rmse_rpm", "fit_percent")
 

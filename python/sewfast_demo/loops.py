@@ -12,29 +12,29 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import _core, signals
-from ..commissioning import Commissioning, commission
-from ..commissioning.bench import DriveBench
-from ..commissioning.result import run_numbers
-from ..control.controller import Controller, SampledController, paper_controller
-from ..control.loop import ClosedLoopRun, run
-from ..control.machine import RecordedRun, Watch, record
-from ..dataset import Dataset
-from ..errors import FitError, LinkError
-from ..evidence.figures import figures
-from ..gains import Gains
-from ..identification import identify
-from ..link import VirtualDevice, connect
-from ..machine import VirtualMachine
-from ..models import LinearOE, Model
-from ..plotting import style, svg
-from ..recording import Recording
-from ..report.artefacts import PLANTS, REFERENCES, SCORED, record_of
-from ..report.pictures import CAPTIONS
-from ..rules import Fopdt, fit_fopdt, table_1
-from ..signals import excitation
-from ..speed import Method, floor_of_J
-from ..validation import Validation, validate
+from sewfast import _core, signals
+from sewfast.commissioning import Commissioning, commission
+from sewfast.commissioning.bench import DriveBench
+from sewfast.commissioning.result import run_numbers
+from sewfast.control.controller import Controller, SampledController, paper_controller
+from sewfast.control.loop import ClosedLoopRun, run
+from sewfast.control.machine import RecordedRun, Watch, record
+from sewfast.dataset import Dataset
+from sewfast.errors import FitError, LinkError
+from sewfast.evidence.figures import figures
+from sewfast.gains import Gains
+from sewfast.identification import identify
+from sewfast.link import VirtualDevice, connect
+from sewfast.machine import VirtualMachine
+from sewfast.models import LinearOE, Model
+from sewfast.plotting import style, svg
+from sewfast.recording import Recording
+from sewfast.report.artefacts import PLANTS, REFERENCES, SCORED, record_of
+from sewfast.report.pictures import CAPTIONS
+from sewfast.rules import Fopdt, fit_fopdt, table_1
+from sewfast.signals import excitation
+from sewfast.speed import Method, floor_of_J
+from sewfast.validation import Validation, validate
 
 # --- ExperimentDrive: the virtual machine as a drive behind a port --------------------------------
 

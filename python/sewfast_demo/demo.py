@@ -9,20 +9,20 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from .. import __version__, storage
-from ..commissioning import Commissioning
-from ..commissioning.checkpoint import prepare
-from ..commissioning.result import first_taken, numbers_in
-from ..control.controller import Controller, paper_controller
-from ..control.loop import ClosedLoopRun
-from ..errors import SettingError
-from ..machine import VirtualMachine
-from ..models import Model
-from ..plotting import require
-from ..progress import shown_in_notebooks
-from ..recording import Recording
-from ..report import report
-from ..report.artefacts import (
+from sewfast import __version__, storage
+from sewfast.commissioning import Commissioning
+from sewfast.commissioning.checkpoint import prepare
+from sewfast.commissioning.result import first_taken, numbers_in
+from sewfast.control.controller import Controller, paper_controller
+from sewfast.control.loop import ClosedLoopRun
+from sewfast.errors import SettingError
+from sewfast.machine import VirtualMachine
+from sewfast.models import Model
+from sewfast.plotting import require
+from sewfast.progress import shown_in_notebooks
+from sewfast.recording import Recording
+from sewfast.report import report
+from sewfast.report.artefacts import (
     FORMAT,
     VERSION,
     drawing_file,
@@ -30,10 +30,11 @@ from ..report.artefacts import (
     recording_file,
     run_file,
 )
-from ..rules import Fopdt
-from ..signals import excitation
-from ..storage import write_table
-from ..tuning.search import TuningResult
+from sewfast.rules import Fopdt
+from sewfast.signals import excitation
+from sewfast.storage import write_table
+from sewfast.tuning.search import TuningResult
+
 from . import loops
 from .loops import ExperimentDrive, drive_of
 
