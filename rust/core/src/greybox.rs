@@ -22,9 +22,11 @@
 //! one more parameter adds a column but no code.
 
 mod model;
+mod motor;
 mod normal;
 
 pub use model::{Frame, GreyBox, MOST_UNITS};
+pub(crate) use motor::{Motor, Moving, tanh_of_one};
 pub use normal::{Current, Measured, Normal, normal};
 
 use crate::simd::{self, F64x8, Kernel};

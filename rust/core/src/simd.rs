@@ -57,6 +57,7 @@ pub(crate) trait Arithmetic: Copy {
     fn sub(self, other: Self) -> Self;
     fn mul(self, other: Self) -> Self;
     fn div(self, other: Self) -> Self;
+    fn sqrt(self) -> Self;
     // Limits are comparisons, not `f64::min`, which turns NaN into the limit: a run that has left the finite numbers
     // would go on as if its output were merely limited.
     /// The smaller of `self` and `limits`, one by one; NaN in `self` stays NaN.

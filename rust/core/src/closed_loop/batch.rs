@@ -68,7 +68,7 @@ impl<C: InLanes> BatchLoop<'_, C> {
     pub fn run(self, notes: &mut [impl Notes]) -> [Outcome; MOST] {
         // For the usual model the loops over the regressor are unrolled. Each further constant would add a copy of the
         // whole batch for each kind of controller, level and notes.
-        if (self.known.lags.na, self.known.lags.regressors()) == (2, 4) {
+        if self.known.is_second_order() {
             simd::run(Grouped::<_, _, 4>(self, notes))
         } else {
             simd::run(Grouped::<_, _, 0>(self, notes))

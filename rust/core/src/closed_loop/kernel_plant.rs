@@ -11,33 +11,59 @@
 use std::marker::PhantomData;
 
 use super::Plant;
+use crate::greybox::{Motor, Moving, tanh_of_one};
 use crate::lagged::{Form, Lags};
-use crate::neural::Meanwhile;
+use crate::neural::{Meanwhile, Nothing};
 use crate::simd::{F64x8, Lanes};
 
-/// A plant whose equations kernels know: a lagged model with a gain on its output and extra delay on its input.
+/// Equations that kernels know.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Known<'a> {
+    Lagged(&'a Form, Lags),
+    Motor(&'a Motor),
+}
+
+/// A plant whose equations kernels know, with a gain on its output and extra delay on its input.
 #[derive(Clone, Copy, Debug)]
 pub struct KernelPlant<'a> {
-    pub(super) form: &'a Form,
-    pub(super) lags: Lags,
+    pub(super) equations: Known<'a>,
     pub(super) ts: f64,
     pub(super) gain: f64,
     /// Samples of input delay in addition to the model's own.
     pub(super) delay: usize,
 }
 
-impl KernelPlant<'_> {
-    /// Samples between a command and its first appearance in the regressor.
+impl<'a> KernelPlant<'a> {
+    pub(crate) fn new(equations: Known<'a>, ts: f64) -> Self {
+        Self {
+            equations,
+            ts,
+            gain: 1.0,
+            delay: 0,
+        }
+    }
+
+    /// Samples between a command and its first effect on the equations.
     fn lead(&self) -> usize {
         // The model's nk = 1 is the sample that every loop has: a command decided at k is in the regressor of y(k+1).
         // Only delay beyond that has to be waited for.
-        self.delay + self.lags.nk - 1
+        self.delay
+            + match self.equations {
+                Known::Lagged(_, lags) => lags.nk - 1,
+                Known::Motor(motor) => motor.whole(),
+            }
+    }
+
+    /// Whether the equations have two outputs and two inputs in their regressor: the usual model.
+    pub(super) fn is_second_order(&self) -> bool {
+        matches!(self.equations, Known::Lagged(_, lags) if (lags.na, lags.regressors()) == (2, 4))
     }
 }
 
 /// One plant inside a kernel that compiles the whole loop for one processor; `R` holds its regressor.
 pub(super) struct ScalarPlant<'a, V, R> {
     known: KernelPlant<'a>,
+    form: &'a Form,
     regressor: R,
     position: f64,
     // The level is in the type: `Plant` has no room for it, and a network's step has to know its registers.
@@ -46,10 +72,11 @@ pub(super) struct ScalarPlant<'a, V, R> {
 
 impl<'a, V: F64x8, R: Regressor> ScalarPlant<'a, V, R> {
     #[inline(always)]
-    pub fn new(known: KernelPlant<'a>) -> Self {
+    pub fn new(known: KernelPlant<'a>, form: &'a Form, lags: Lags) -> Self {
         Self {
             known,
-            regressor: R::at_rest(&known),
+            form,
+            regressor: R::at_rest(lags, known.lead()),
             position: 0.0,
             level: PhantomData,
         }
@@ -59,7 +86,7 @@ impl<'a, V: F64x8, R: Regressor> ScalarPlant<'a, V, R> {
 impl<V: F64x8, R: Regressor> Plant for ScalarPlant<'_, V, R> {
     #[inline(always)]
     fn reset(&mut self) {
-        self.regressor = R::at_rest(&self.known);
+        self.regressor.rest();
         self.position = 0.0;
     }
 
@@ -79,7 +106,7 @@ impl<V: F64x8, R: Regressor> Plant for ScalarPlant<'_, V, R> {
     fn advance(&mut self, u: f64) {
         let before = self.regressor.newest();
         self.regressor.take(u);
-        let y = self.regressor.output::<V>(self.known.form);
+        let y = self.regressor.output::<V>(self.form);
         // Trapezoidal rule: between samples the output is taken to change linearly.
         self.position += self.known.ts * (before + y) / 2.0;
         self.regressor.put(y);
@@ -88,7 +115,8 @@ impl<V: F64x8, R: Regressor> Plant for ScalarPlant<'_, V, R> {
 
 /// What the next output of one plant depends on.
 pub(super) trait Regressor {
-    fn at_rest(known: &KernelPlant<'_>) -> Self;
+    fn at_rest(lags: Lags, lead: usize) -> Self;
+    fn rest(&mut self);
     /// The newest output.
     fn newest(&self) -> f64;
     /// Shifts a command in.
@@ -111,14 +139,19 @@ pub(super) struct AnyOrder {
 
 impl Regressor for AnyOrder {
     #[inline(always)]
-    fn at_rest(known: &KernelPlant<'_>) -> Self {
-        let (lags, lead) = (known.lags, known.lead());
+    fn at_rest(lags: Lags, lead: usize) -> Self {
         Self {
             phi: vec![0.0; lags.regressors()],
             inputs: vec![0.0; lead + lags.nb],
             past: lags.na,
             lead,
         }
+    }
+
+    #[inline(always)]
+    fn rest(&mut self) {
+        self.phi.fill(0.0);
+        self.inputs.fill(0.0);
     }
 
     #[inline(always)]
@@ -163,14 +196,19 @@ pub(super) struct SecondOrder([f64; 4]);
 impl SecondOrder {
     /// Whether a plant has exactly that many, and no extra delay.
     pub fn takes(known: &KernelPlant<'_>) -> bool {
-        (known.lags.na, known.lags.regressors(), known.lead()) == (2, 4, 0)
+        known.is_second_order() && known.lead() == 0
     }
 }
 
 impl Regressor for SecondOrder {
     #[inline(always)]
-    fn at_rest(_known: &KernelPlant<'_>) -> Self {
+    fn at_rest(_lags: Lags, _lead: usize) -> Self {
         Self([0.0; 4])
+    }
+
+    #[inline(always)]
+    fn rest(&mut self) {
+        self.0 = [0.0; 4];
     }
 
     #[inline(always)]
@@ -212,10 +250,75 @@ fn shift(newest_first: &mut [f64], value: f64) {
     newest_first[0] = value;
 }
 
+/// One motor inside a kernel that compiles the whole loop for one processor.
+pub(super) struct ScalarMotor<'a, V> {
+    known: KernelPlant<'a>,
+    motor: &'a Motor,
+    at: Moving<f64>,
+    /// Commands that have not acted yet, newest first.
+    waiting: Vec<f64>,
+    output: f64,
+    position: f64,
+    level: PhantomData<V>,
+}
+
+impl<'a, V: F64x8> ScalarMotor<'a, V> {
+    #[inline(always)]
+    pub fn new(known: KernelPlant<'a>, motor: &'a Motor) -> Self {
+        Self {
+            known,
+            motor,
+            at: Moving::at_rest(),
+            waiting: vec![0.0; known.lead()],
+            output: 0.0,
+            position: 0.0,
+            level: PhantomData,
+        }
+    }
+}
+
+impl<V: F64x8> Plant for ScalarMotor<'_, V> {
+    #[inline(always)]
+    fn reset(&mut self) {
+        self.at = Moving::at_rest();
+        self.waiting.fill(0.0);
+        (self.output, self.position) = (0.0, 0.0);
+    }
+
+    #[inline(always)]
+    fn output(&self) -> f64 {
+        self.known.gain * self.output
+    }
+
+    #[inline(always)]
+    fn position(&self) -> f64 {
+        self.known.gain * self.position
+    }
+
+    #[inline(always)]
+    fn advance(&mut self, u: f64) {
+        let due = match self.waiting.last() {
+            Some(due) => *due,
+            None => u,
+        };
+        if !self.waiting.is_empty() {
+            shift(&mut self.waiting, u);
+        }
+        let (output, moved) = self
+            .motor
+            .step(&mut self.at, due, tanh_of_one::<V>, &mut Nothing);
+        self.output = output;
+        self.position += moved;
+    }
+}
+
+/// Numbers in [`BatchPlant::phi`] for a motor: output, speed, drive, command of the last sample.
+const OF_MOTOR: usize = 4;
+
 /// Eight runs of one plant, side by side.
 pub(super) struct BatchPlant<'a> {
     pub known: KernelPlant<'a>,
-    /// Past outputs, newest first, then the inputs of the regressor.
+    /// Past outputs, newest first, then the inputs of the regressor; or what a motor remembers, its output first.
     // Entry by entry, eight loops each: `phi[c].0[i]` is entry c of loop i. A broadcast weight then multiplies all
     // loops at once.
     phi: Vec<Lanes>,
@@ -232,7 +335,10 @@ impl<'a> BatchPlant<'a> {
     pub fn new(known: KernelPlant<'a>) -> Self {
         Self {
             known,
-            phi: vec![Lanes::ZERO; known.lags.regressors()],
+            phi: match known.equations {
+                Known::Lagged(_, lags) => vec![Lanes::ZERO; lags.regressors()],
+                Known::Motor(_) => vec![Lanes::ZERO; OF_MOTOR],
+            },
             waiting: vec![Lanes::ZERO; known.lead()],
             next: 0,
             position: Lanes::ZERO,
@@ -254,18 +360,24 @@ impl<'a> BatchPlant<'a> {
     #[inline(always)]
     pub fn advance<V: F64x8, const N: usize>(&mut self, u: V, meanwhile: &mut impl Meanwhile) {
         let due = self.delayed(u);
+        let (form, lags) = match self.known.equations {
+            Known::Lagged(form, lags) => (form, lags),
+            // the caller takes N = 0 for a motor: it need not be compiled for any other
+            Known::Motor(motor) if N == 0 => return self.turn::<V>(motor, due, meanwhile),
+            Known::Motor(_) => return,
+        };
         // For the usual model these are compile-time constants: the network's loops over phi are unrolled, and its
         // weights are addressed without a multiplication.
         let (na, n) = if N == 4 {
             (2, 4)
         } else {
-            (self.known.lags.na, self.phi.len())
+            (lags.na, self.phi.len())
         };
         let phi = &mut self.phi[..n];
         push_eight(&mut phi[na..], due);
         // Read before the step and kept in a register: the position needs the output at both ends of the sample.
         let newest = V::load(&phi[0].0);
-        let y = match self.known.form {
+        let y = match form {
             Form::Linear(model) => model.next_in_lanes::<V>(phi),
             Form::Network(network) => network.next_in_lanes::<V, N>(phi, meanwhile),
         };
@@ -276,6 +388,25 @@ impl<'a> BatchPlant<'a> {
             .add(moved)
             .store(&mut self.position.0);
         push_eight(&mut phi[..na], y);
+    }
+
+    #[inline(always)]
+    fn turn<V: F64x8>(&mut self, motor: &Motor, due: V, meanwhile: &mut impl Meanwhile) {
+        let [output, w, x, before] = &mut self.phi[..] else {
+            return;
+        };
+        let mut at = Moving {
+            w: V::load(&w.0),
+            x: V::load(&x.0),
+            before: V::load(&before.0),
+        };
+        let (y, moved) = motor.step(&mut at, due, V::tanh, meanwhile);
+        at.w.store(&mut w.0);
+        at.x.store(&mut x.0);
+        at.before.store(&mut before.0);
+        y.store(&mut output.0);
+        let position = V::load(&self.position.0).add(moved);
+        position.store(&mut self.position.0);
     }
 
     #[inline(always)]

@@ -1,6 +1,6 @@
 //! Plants to close a loop around: identified models, variations for robust tuning.
 
-use super::{KernelPlant, Plant};
+use super::{KernelPlant, Known, Plant};
 use crate::lagged::{Form, Lagged, Lags};
 use crate::neural_ss::{NeuralSS, Shape, Stepper};
 use crate::speed::Encoder;
@@ -89,13 +89,8 @@ impl<M: Lagged> Plant for LaggedPlant<'_, M> {
     }
 
     fn known(&self) -> Option<KernelPlant<'_>> {
-        Some(KernelPlant {
-            form: self.form.as_ref()?,
-            lags: self.lags,
-            ts: self.ts,
-            gain: 1.0,
-            delay: 0,
-        })
+        let equations = Known::Lagged(self.form.as_ref()?, self.lags);
+        Some(KernelPlant::new(equations, self.ts))
     }
 }
 

@@ -10,8 +10,9 @@
 //! sample, so it depends on the command `v(k) = u(k - nk)`, where `nk` is one sample plus the whole samples of the delay. Terms that
 //! depend on the shaft angle are excluded: a record of the speed does not say at which angle it begins.
 
+use super::motor::Motor;
 use super::{DELAY, Dual, Equations, ORDERS, PARAMETERS, Run, Turn, check, varies};
-use crate::closed_loop::Plant;
+use crate::closed_loop::{KernelPlant, Known, Plant};
 use crate::embedded::Embedded;
 use crate::lagged::finite;
 use crate::linearised::Linearised;
@@ -232,13 +233,13 @@ impl<const N: usize> Moving<N> {
 
 /// Steps by one sample with [`Equations`].
 #[derive(Clone, Debug)]
-struct Stepper<const N: usize> {
-    equations: Equations<N>,
-    turn: Turn<N>,
-    network: Vec<[Dual<N>; WEIGHTS]>,
-    frame: Frame,
+pub(super) struct Stepper<const N: usize> {
+    pub equations: Equations<N>,
+    pub turn: Turn<N>,
+    pub network: Vec<[Dual<N>; WEIGHTS]>,
+    pub frame: Frame,
     /// Fraction of a sample in the command's delay.
-    part: f64,
+    pub part: f64,
 }
 
 impl<const N: usize> Stepper<N> {
@@ -573,8 +574,10 @@ impl Model for GreyBox {
                 self.frame.sample_time
             )));
         }
+        let stepper = Stepper::new(self, false);
         Ok(Box::new(GreyBoxPlant {
-            stepper: Stepper::new(self, false),
+            motor: Motor::of(&stepper, self.nk() - 1),
+            stepper,
             at: Moving::at(self, &[0.0; STATES]),
             pending: vec![0.0; self.nk() - 1],
             output: 0.0,
@@ -610,6 +613,8 @@ impl GreyBox {
 #[derive(Clone, Debug)]
 struct GreyBoxPlant {
     stepper: Stepper<0>,
+    /// The same motor for kernels.
+    motor: Motor,
     at: Moving<0>,
     /// Commands that have not acted yet, newest first.
     pending: Vec<f64>,
@@ -645,6 +650,11 @@ impl Plant for GreyBoxPlant {
         let (mean, output) = self.stepper.step(&mut self.at, &Dual::constant(due));
         self.output = output.value;
         self.position += self.stepper.frame.sample_time * mean / self.stepper.frame.unit;
+    }
+
+    fn known(&self) -> Option<KernelPlant<'_>> {
+        let ts = self.stepper.frame.sample_time;
+        Some(KernelPlant::new(Known::Motor(&self.motor), ts))
     }
 }
 

@@ -57,6 +57,11 @@ impl Arithmetic for Plain {
     }
 
     #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.each(|_, v| v.sqrt())
+    }
+
+    #[inline(always)]
     fn load(values: &[f64; LANES]) -> Self {
         Self(*values)
     }
@@ -201,6 +206,11 @@ impl Arithmetic for f64 {
     #[inline(always)]
     fn div(self, other: Self) -> Self {
         self / other
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.sqrt()
     }
 
     #[inline(always)]

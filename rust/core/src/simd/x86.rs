@@ -119,6 +119,12 @@ impl Arithmetic for Wide {
     }
 
     #[inline(always)]
+    fn sqrt(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_sqrt_pd(self.0)) }
+    }
+
+    #[inline(always)]
     fn load(values: &[f64; LANES]) -> Self {
         // `loadu` also for aligned addresses, where it is as fast as the aligned load; slices may begin anywhere.
         // SAFETY: eight readable numbers; only run if the processor has AVX-512.
@@ -310,6 +316,12 @@ impl Arithmetic for Halves {
                 _mm256_div_pd(self.1, other.1),
             )
         }
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm256_sqrt_pd(self.0), _mm256_sqrt_pd(self.1)) }
     }
 
     #[inline(always)]

@@ -7,11 +7,13 @@ use sewfast_control::{
 };
 
 use super::*;
-use crate::closed_loop::kernel_plant::{AnyOrder, ScalarPlant, SecondOrder};
+use crate::closed_loop::kernel_plant::{AnyOrder, Known, ScalarMotor, ScalarPlant, SecondOrder};
 use crate::closed_loop::{Constant, LoopController};
 use crate::closed_loop::{LaggedPlant, Plant, Run, Varied, encoder, white_noise};
+use crate::greybox::{self, GreyBox};
 use crate::lagged::Lags;
 use crate::linear::LinearModel;
+use crate::model::{ClonePlant, Model};
 use crate::neural::{NeuralOE, Scaling, Shape};
 use crate::random::Random;
 use crate::simd::{Lanes, Level, run_everywhere};
@@ -136,16 +138,25 @@ impl Kernel for Both<'_> {
         });
         let alone = self.controllers.iter().map(|controller| {
             let mut constant = Constant::new(controller);
-            let any = || ScalarPlant::<V, AnyOrder>::new(self.known);
-            let run = self.alone(
-                any(),
-                &mut AnyController::from(PidController::clone(controller)),
-            );
-            assert_eq!(run, self.alone(any(), &mut constant));
-            if SecondOrder::takes(&self.known) {
-                let plant = ScalarPlant::<V, SecondOrder>::new(self.known);
-                assert_eq!(run, self.alone(plant, &mut constant));
-            }
+            let mut general = AnyController::from(PidController::clone(controller));
+            let run = match self.known.equations {
+                Known::Lagged(form, lags) => {
+                    let any = || ScalarPlant::<V, AnyOrder>::new(self.known, form, lags);
+                    let run = self.alone(any(), &mut general);
+                    assert_eq!(run, self.alone(any(), &mut constant));
+                    if SecondOrder::takes(&self.known) {
+                        let plant = ScalarPlant::<V, SecondOrder>::new(self.known, form, lags);
+                        assert_eq!(run, self.alone(plant, &mut constant));
+                    }
+                    run
+                }
+                Known::Motor(motor) => {
+                    let plant = || ScalarMotor::<V>::new(self.known, motor);
+                    let run = self.alone(plant(), &mut general);
+                    assert_eq!(run, self.alone(plant(), &mut constant));
+                    run
+                }
+            };
             (run.outcome, [run.u, run.y, run.feedback])
         });
         let sums = (0..self.controllers.len()).map(|i| tallies[i / LANES].sums(i % LANES));
@@ -258,6 +269,128 @@ proptest! {
         let plant = LaggedPlant::new(&model, TS).unwrap();
         let reference = references(seed, SAMPLES);
         check(&plant, &designs, Signals::new(&reference), encoder(counts, 0.25).unwrap().as_ref());
+    }
+}
+
+struct Boxed<'a>(Box<dyn ClonePlant + 'a>);
+
+impl Plant for Boxed<'_> {
+    fn reset(&mut self) {
+        self.0.reset();
+    }
+    fn output(&self) -> f64 {
+        self.0.output()
+    }
+    fn position(&self) -> f64 {
+        self.0.position()
+    }
+    fn advance(&mut self, u: f64) {
+        self.0.advance(u);
+    }
+    fn known(&self) -> Option<KernelPlant<'_>> {
+        self.0.known()
+    }
+}
+
+/// A motor with or without voltage drop, limits, Stribeck friction, sag and network.
+fn motor(values: &[(usize, f64)], units: usize, steps: usize, mean: bool) -> GreyBox {
+    let mut all = [0.0; greybox::PARAMETERS.len()];
+    all[..10].copy_from_slice(&[0.02, 1e-3, 0.004, 0.006, 0.0, 0.2, 0.25, 0.05, 0.0, 9.0]);
+    all[17] = f64::INFINITY;
+    for (place, value) in values {
+        all[*place] = *value;
+    }
+    let mut random = Random::new(units as u64);
+    let weights: Vec<f64> = (0..4 * units).map(|_| 0.3 * random.normal()).collect();
+    let frame = greybox::Frame {
+        values: all,
+        free: Vec::new(),
+        sample_time: TS,
+        steps,
+        mean,
+        unit: std::f64::consts::TAU / 60.0,
+        speed_scale: 150.0,
+        command_scale: 3.0,
+        residual_variance: 4.0,
+        process_noise: 1e-5,
+    };
+    GreyBox::new(frame, &weights).unwrap()
+}
+
+proptest! {
+    #![proptest_config(crate::laws::cases(100))]
+    #[test]
+    fn a_lane_around_a_motor_is_its_loop(
+        designs in of_a_search(),
+        seed in any::<u64>(),
+        (drop, bump, uneven, sag) in (0.0..2.0_f64, 0.0..0.5_f64, -0.1..0.1_f64, 0.0..0.01_f64),
+        given in prop::array::uniform5(any::<bool>()),
+        (units, steps, mean, delay) in (0_usize..4, 1_usize..4, any::<bool>(), 0.0..3.5_f64),
+        (gain, more) in (0.5..1.5, 0_usize..3),
+        counts in prop_oneof![Just(0.0), Just(26.2)],
+    ) {
+        // drop, torque limit, bump of friction and its unevenness, sag
+        let values = [(4, drop), (17, 2.0), (8, bump), (18, uneven), (19, sag)];
+        let mut values: Vec<_> = values.into_iter().zip(given).filter(|(_, given)| *given).map(|(v, _)| v).collect();
+        values.push((16, delay * TS));
+        let model = motor(&values, units, steps, mean);
+        let plant = Varied::new(Boxed(model.plant(TS).unwrap()), gain, more).unwrap();
+        let reference = references(seed, SAMPLES);
+        check(&plant, &designs, Signals::new(&reference), encoder(counts, 0.25).unwrap().as_ref());
+    }
+}
+
+/// Output and position of a motor under commands, on one level.
+struct Turned<'a>(KernelPlant<'a>, &'a [f64]);
+
+impl Kernel for Turned<'_> {
+    type Output = Vec<[u64; 2]>;
+
+    #[inline(always)]
+    fn run<V: F64x8>(self) -> Self::Output {
+        let Known::Motor(motor) = self.0.equations else {
+            panic!("expected a motor");
+        };
+        let mut plant = ScalarMotor::<V>::new(self.0, motor);
+        turned(&mut plant, self.1)
+    }
+}
+
+fn turned(plant: &mut impl Plant, u: &[f64]) -> Vec<[u64; 2]> {
+    let after = |u: &f64| {
+        plant.advance(*u);
+        [plant.output().to_bits(), plant.position().to_bits()]
+    };
+    u.iter().map(after).collect()
+}
+
+/// Without a network, whose `tanh` is the kernel's own.
+#[test]
+fn a_motor_in_a_kernel_has_the_bits_of_its_equations() {
+    let values = [
+        (4, 0.8),
+        (17, 2.5),
+        (8, 0.2),
+        (18, 0.05),
+        (19, 0.004),
+        (16, 1.4 * TS),
+    ];
+    let (some, mut random) = (values.len(), Random::new(3));
+    let mut level = 0.0;
+    let command = (0..2000).map(|k| {
+        if k % 40 == 0 {
+            level = random.between(-12.0, 12.0);
+        }
+        level
+    });
+    let u: Vec<f64> = command.collect();
+    for count in [0, 1, some] {
+        let model = motor(&values[..count], 0, 2, count > 0);
+        let mut plant = Boxed(model.plant(TS).unwrap());
+        let own = turned(&mut plant, &u);
+        for (level, kernel) in run_everywhere(|| Turned(plant.known().unwrap(), &u)) {
+            assert!(own == kernel, "{level:?}, {count} values");
+        }
     }
 }
 
@@ -375,7 +508,10 @@ impl Kernel for States<'_> {
         });
         let together = together.collect();
         let alone = self.controllers.iter().map(|&controller| {
-            let mut plant = ScalarPlant::<V, AnyOrder>::new(self.known);
+            let Known::Lagged(form, lags) = self.known.equations else {
+                panic!("expected a lagged plant");
+            };
+            let mut plant = ScalarPlant::<V, AnyOrder>::new(self.known, form, lags);
             let mut controller = AnyController::StateFeedback(controller.clone());
             let mut run = Run::default();
             let (signals, encoder) = (self.signals, self.encoder);

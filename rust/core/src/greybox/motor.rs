@@ -1,0 +1,285 @@
+//! The motor's equations without derivatives, for one motor or eight side by side: [`Equations`] operation by operation, with selections
+//! in place of branches. Read `step` first.
+
+use super::model::Stepper;
+use super::{NEWTON, NEWTON_TOLERANCE};
+use crate::neural::Meanwhile;
+use crate::simd::{Arithmetic, F64x8, LANES};
+
+/// The numbers of a motor and its network; names as in [`Equations`](super::Equations).
+#[derive(Clone, Debug)]
+pub(crate) struct Motor {
+    k_e: f64,
+    k_b: f64,
+    per_inertia: f64,
+    load: f64,
+    k_s: f64,
+    k_t: f64,
+    per_w_s: f64,
+    drop: f64,
+    ripple: f64,
+    share: f64,
+    memory: f64,
+    bend: f64,
+    limit: Option<f64>,
+    uneven: Option<f64>,
+    sag: Option<f64>,
+    network: Vec<[f64; 4]>,
+    /// Integration steps per sample, and their length \[s\].
+    steps: usize,
+    time: f64,
+    /// Fraction of a sample in the command's delay, and its whole samples.
+    part: f64,
+    whole: usize,
+    /// Whether the output is the mean speed over a sample.
+    mean: bool,
+    sample_time: f64,
+    unit: f64,
+    command_scale: f64,
+    // inverses: in the loop each would be a division at every sample
+    per_share: f64,
+    per_steps: f64,
+    per_unit: f64,
+    per_speed: f64,
+    per_command: f64,
+}
+
+/// What one motor, or each of eight, remembers; all 0 at rest.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Moving<A> {
+    /// Speed \[rad/s\], drive, and the command of the last sample.
+    pub w: A,
+    pub x: A,
+    pub before: A,
+}
+
+impl<A: Arithmetic> Moving<A> {
+    pub fn at_rest() -> Self {
+        let zero = A::splat(0.0);
+        Self {
+            w: zero,
+            x: zero,
+            before: zero,
+        }
+    }
+}
+
+impl Motor {
+    /// The motor of a stepper, whose command is late by `whole` samples and a fraction.
+    pub(super) fn of(stepper: &Stepper<0>, whole: usize) -> Self {
+        let (is, frame) = (&stepper.equations, &stepper.frame);
+        Self {
+            k_e: is.k_e.value,
+            k_b: is.k_b.value,
+            per_inertia: stepper.turn.per_inertia.value,
+            load: stepper.turn.load.value,
+            k_s: is.k_s.value,
+            k_t: is.k_t.value,
+            per_w_s: is.per_w_s.value,
+            drop: is.drop.value,
+            ripple: is.ripple.value,
+            share: is.share.value,
+            memory: is.memory.value,
+            bend: is.bend.value,
+            limit: is.limit.map(|limit| limit.value),
+            uneven: is.uneven.map(|uneven| uneven.value),
+            sag: is.sag.map(|sag| sag.value),
+            network: stepper
+                .network
+                .iter()
+                .map(|unit| unit.map(|weight| weight.value))
+                .collect(),
+            steps: frame.steps,
+            time: is.step,
+            part: stepper.part,
+            whole,
+            mean: frame.mean,
+            sample_time: frame.sample_time,
+            unit: frame.unit,
+            command_scale: frame.command_scale,
+            per_share: 1.0 / is.share.value,
+            per_steps: 1.0 / frame.steps as f64,
+            per_unit: 1.0 / frame.unit,
+            per_speed: 1.0 / frame.speed_scale,
+            per_command: 1.0 / frame.command_scale,
+        }
+    }
+
+    /// Whole samples of the command's delay beyond the one of every loop.
+    pub fn whole(&self) -> usize {
+        self.whole
+    }
+
+    /// Advances by a sample in which `now` comes to act; returns the output that follows, and by how much the position moves. `meanwhile`
+    /// is other work, done while the results of this step are waited for.
+    #[inline(always)]
+    pub fn step<A: Arithmetic>(
+        &self,
+        at: &mut Moving<A>,
+        now: A,
+        tanh: impl Fn(A) -> A,
+        meanwhile: &mut impl Meanwhile,
+    ) -> (A, A) {
+        let all = A::splat;
+        let mut load = all(self.load);
+        if !self.network.is_empty() {
+            load = load.add(self.residual(at.w, at.x, tanh));
+        }
+        let mut mean = all(0.0);
+        for j in 0..self.steps {
+            let old = (self.part * self.steps as f64 - j as f64).clamp(0.0, 1.0);
+            let command = now.mul(all(1.0 - old)).add(all(old).mul(at.before));
+            let (drive, speed) = self.advanced(load, at, command, meanwhile);
+            mean = mean.add(all(0.5).mul(at.w)).add(all(0.5).mul(speed));
+            (at.x, at.w) = (drive, speed);
+        }
+        at.before = now;
+        let mean = mean.mul(all(self.per_steps));
+        let output = if self.mean { mean } else { at.w };
+        let moved = all(self.sample_time).mul(mean).div(all(self.unit));
+        (output.mul(all(self.per_unit)), moved)
+    }
+
+    /// The network's load, in units of the command.
+    #[inline(always)]
+    fn residual<A: Arithmetic>(&self, w: A, x: A, tanh: impl Fn(A) -> A) -> A {
+        let all = A::splat;
+        let speed = w.mul(all(self.per_speed));
+        let drive = x.mul(all(self.per_command));
+        let mut sum = all(0.0);
+        for &[b, p, q, c] in &self.network {
+            let argument = all(b).add(all(p).mul(speed)).add(all(q).mul(drive));
+            sum = sum.add(all(c).mul(tanh(argument)));
+        }
+        sum.mul(all(self.command_scale))
+    }
+
+    /// Drive and speed after a step at this command.
+    #[inline(always)]
+    fn advanced<A: Arithmetic>(
+        &self,
+        load: A,
+        at: &Moving<A>,
+        u: A,
+        meanwhile: &mut impl Meanwhile,
+    ) -> (A, A) {
+        let all = A::splat;
+        let (w, x) = (at.w, at.x);
+        let middle = self.moved(load, w, x, w, 0.5 * self.time);
+        let voltage = match self.sag {
+            Some(sag) => u.sub(all(sag).mul(x).mul(u.mul(u))),
+            None => u,
+        };
+        let goal = voltage.sub(all(self.k_e).mul(middle));
+        let change = all(self.k_e).mul(w.sub(middle)).mul(all(2.0));
+        let (after, mean) = self.driven(x, goal, change, meanwhile);
+        (after, self.moved(load, w, mean, middle, self.time))
+    }
+
+    /// The speed after `time` under a drive; terms that depend on the speed are taken at `middle`.
+    #[inline(always)]
+    fn moved<A: Arithmetic>(&self, load: A, from: A, drive: A, middle: A, time: f64) -> A {
+        let all = A::splat;
+        let smooth = drive.sub(load).sub(all(self.k_b).mul(middle));
+        let free = from.add(all(time).mul(smooth.mul(all(self.per_inertia))));
+        let direction = free.if_less(all(0.0), all(-1.0), all(1.0));
+        let most = self
+            .dry(middle, direction)
+            .mul(all(self.per_inertia))
+            .mul(all(time));
+        let moved = free.sub(direction.mul(most));
+        // friction that could take more than all of the speed stops the shaft; NaN is neither less nor equal, and stays
+        let stopped = free.abs().if_less(most, all(0.0), moved);
+        free.abs().if_equal(most, all(0.0), stopped)
+    }
+
+    /// The magnitude of dry friction against a motion in this direction.
+    #[inline(always)]
+    fn dry<A: Arithmetic>(&self, speed: A, direction: A) -> A {
+        let all = A::splat;
+        if self.k_t == 0.0 && self.uneven.is_none() {
+            return all(self.k_s);
+        }
+        let bump = match self.uneven {
+            Some(k_d) => all(self.k_t).add(direction.mul(all(k_d))),
+            None => all(self.k_t),
+        };
+        let ratio = speed.mul(all(self.per_w_s));
+        let shape = all(1.0).div(ratio.mul(ratio).add(all(1.0)));
+        all(self.k_s).add(bump.mul(shape))
+    }
+
+    /// The drive after a step towards `goal`, which changes by `change` during the step, and the drive's mean.
+    #[inline(always)]
+    fn driven<A: Arithmetic>(
+        &self,
+        from: A,
+        goal: A,
+        change: A,
+        meanwhile: &mut impl Meanwhile,
+    ) -> (A, A) {
+        let all = A::splat;
+        let aim = from
+            .add(all(self.share).mul(goal.sub(from)))
+            .add(all(self.bend).mul(change));
+        meanwhile.go();
+        let (mut after, mut steady) = (aim, goal);
+        if self.drop != 0.0 {
+            let x = self.newton(from, aim, meanwhile);
+            let root = x.mul(x).add(all(self.ripple * self.ripple)).sqrt();
+            let taken_at = all(self.drop).mul(x.div(root));
+            let cube = root.mul(root).mul(root);
+            let least = self.share * self.drop * self.ripple * self.ripple;
+            let slope = all(1.0).add(all(least).div(cube));
+            let per_slope = all(1.0).div(slope.at_least_each(all(0.1)));
+            let left = aim.sub(x).sub(all(self.share).mul(taken_at));
+            after = x.add(per_slope.mul(left));
+            let taken = aim.sub(after).mul(all(self.per_share));
+            steady = goal.sub(taken);
+        }
+        let mean = steady.add(all(self.memory).mul(from.sub(steady)));
+        (self.limited(after), self.limited(mean))
+    }
+
+    /// The drive before the last step of Newton's method, from the drive before.
+    #[inline(always)]
+    fn newton<A: Arithmetic>(&self, from: A, aim: A, meanwhile: &mut impl Meanwhile) -> A {
+        let all = A::splat;
+        let (most, square) = (self.share * self.drop, self.ripple * self.ripple);
+        let close = all(NEWTON_TOLERANCE * self.ripple);
+        let (mut x, mut last) = (from, close);
+        for _ in 0..NEWTON {
+            let per_root = all(1.0).div(x.mul(x).add(all(square)).sqrt());
+            let cube = per_root.mul(per_root).mul(per_root);
+            let slope = all(1.0).add(all(most * square).mul(cube));
+            let off = x.add(all(most).mul(x).mul(per_root)).sub(aim);
+            let by = off.div(slope.at_least_each(all(0.1)));
+            // a lane that has converged waits for the others
+            x = last.if_less(close, x, x.sub(by));
+            last = last.if_less(close, last, by.abs());
+            meanwhile.go();
+            if last.are_less(close) == A::ALL {
+                break;
+            }
+        }
+        x
+    }
+
+    #[inline(always)]
+    fn limited<A: Arithmetic>(&self, drive: A) -> A {
+        let Some(limit) = self.limit else {
+            return drive;
+        };
+        let all = A::splat;
+        let side = drive.if_less(all(0.0), all(-limit), all(limit));
+        all(limit).if_less(drive.abs(), side, drive)
+    }
+}
+
+/// `tanh` of one number as a lane computes it.
+#[inline(always)]
+pub(crate) fn tanh_of_one<V: F64x8>(x: f64) -> f64 {
+    let mut lanes = [0.0; LANES];
+    V::splat(x).tanh().store(&mut lanes);
+    lanes[0]
+}
