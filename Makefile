@@ -248,7 +248,7 @@ parting: $(VENV)/bench.stamp ## writes tests/night.txt: which tests of over half
 	$(BIN)/python tests/support/parting.py target/seconds $(PARTED)/lines
 
 CORE_TESTS := $(addprefix tests/,analysis control dataset evidence files greybox identification models tuning) \
-  $(wildcard tests/test_*.py)
+  $(wildcard tests/test_*.py) tests/plugins/test_plugins.py
 python-core: $(DEV)
 	$(PYTEST) -m '$(COMPUTES)' $(CORE_TESTS)
 

@@ -200,7 +200,9 @@ def _is_module(name: str) -> bool:
     """`from . import units` asks for an attribute first; the metadata of all packages take long."""
     from importlib.machinery import PathFinder
 
-    return PathFinder.find_spec(f"{__name__}.{name}", __path__) is not None
+    spec = PathFinder.find_spec(f"{__name__}.{name}", __path__)
+    # a folder that an older version left behind has no origin
+    return spec is not None and spec.origin is not None
 
 
 def __dir__() -> list[str]:

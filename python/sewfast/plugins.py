@@ -7,13 +7,18 @@ registered, and nothing is imported before it is asked for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from .errors import SettingError, printable
+from .errors import SettingError, SewfastError, printable
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
+
+OWN = "sewfast"
+"""The package whose plug-ins are in its own wheel."""
 
 
 def points(group: str, name: str | None = None) -> tuple[EntryPoint, ...]:
@@ -21,16 +26,46 @@ def points(group: str, name: str | None = None) -> tuple[EntryPoint, ...]:
     # imported here: it loads parsers for mail and archives, and reads the metadata of all packages
     from importlib.metadata import entry_points
 
-    found = entry_points(group=group) if name is None else entry_points(group=group, name=name)
+    try:
+        found = list(entry_points(group=group))
+    except Exception:
+        # the metadata of one package are damaged
+        found = list(_readable(group))
+    found = [point for point in found if name in (None, point.name)]
     return tuple(sorted(found, key=lambda point: point.name))
+
+
+def _readable(group: str) -> Iterator[EntryPoint]:
+    """The entry points of a group that can be read; a package with damaged ones is named."""
+    from importlib.metadata import distributions
+
+    for one in distributions():
+        try:
+            yield from one.entry_points.select(group=group)
+        except Exception as e:
+            place = getattr(one, "_path", "a package")
+            text = f"{place}: expected entry points that can be read, received {told(e)}"
+            warnings.warn(f"{text}; install the package again", stacklevel=2)
+
+
+def are_registered(group: str) -> bool:
+    """Whether the plug-ins of the wheel are known; not where only its files were copied."""
+    return any(package(point) == OWN for point in points(group))
+
+
+UNREGISTERED = (
+    "the plug-ins of this installation are not registered: install sewfast again (in a checkout: "
+    "make dev)"
+)
 
 
 def only(
     found: tuple[EntryPoint, ...], place: str, task: str, remedy: str = "uninstall one"
 ) -> EntryPoint:
     """The entry point for a task such as `that reads .dlog`, at a place named in the error.
-    Raises `SettingError` if there are several.
+    Raises `SettingError` if there are several. Those of the wheel cannot be taken over.
     """
+    found = tuple(point for point in found if package(point) == OWN) or found
     if len(found) > 1:
         raise SettingError(
             name=place, expected=f"one installed package {task}",
@@ -45,7 +80,9 @@ def load(point: EntryPoint, place: str, task: str) -> Any:
     """
     try:
         return point.load()
-    except Exception as e:
+    except SewfastError:
+        raise
+    except (Exception, SystemExit) as e:
         # importing runs code of another package
         raise unusable(point, place, task, told(e)) from e
 
@@ -62,19 +99,25 @@ def function(point: EntryPoint, place: str, task: str) -> Callable[..., Any]:
 
 
 def unusable(point: EntryPoint, place: str, task: str, received: str) -> SettingError:
+    name = package(point)
+    remedy = f"update {name} and what it needs, or uninstall it"
     return SettingError(
-        name=place, expected=f"a part of {package(point)} {task}", received=received,
-        remedy=f"update {package(point)} and what it needs, or uninstall it",
+        name=place, expected=f"a part of {name} {task}", received=received,
+        remedy=f"install {name} again" if name == OWN else remedy,
     )  # fmt: skip
 
 
-def told(error: Exception) -> str:
+def told(error: BaseException) -> str:
     """The error of another package in one short line."""
     return f"{type(error).__name__}: {printable(str(error))[:200]}"
 
 
 def package(point: EntryPoint) -> str:
-    return point.dist.name if point.dist is not None else point.value
+    """The package of an entry point; without metadata of it, what the point names."""
+    try:
+        return (point.dist and point.dist.name) or point.value
+    except Exception:
+        return point.value
 
 
 NAMES = "sewfast.names"
@@ -91,26 +134,31 @@ def public_name(name: str) -> Any:
     """
     found = points(NAMES, name)
     if not found:
-        raise AttributeError(f"module 'sewfast' has no attribute {name!r}")
+        hint = "" if are_registered(NAMES) else f"; {UNREGISTERED}"
+        raise AttributeError(f"module 'sewfast' has no attribute {name!r}{hint}")
     try:
         place, task = f"sewfast.{name}", "for this name"
         return load(only(found, place, task), place, task)
-    except SettingError as e:
+    except SewfastError as e:
         raise AttributeError(str(e)) from e
 
 
-def on_first_use(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """The `__getattr__` of a package whose names are loaded on first use.
+def on_first_use(
+    package: str, homes: Mapping[str, str]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """`__getattr__` and `__dir__` of a package whose names are loaded on first use.
     `homes` has the names for each module. A plug-in takes it so that its command can be listed
     without loading what carries it out.
     """
     home_of = {name: home for home, names in homes.items() for name in names.split()}
+    own = vars(sys.modules[package])
 
     def found(name: str) -> Any:
         from importlib import import_module
 
         if name not in home_of:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(f"{package}.{home_of[name]}"), name)
+        own[name] = getattr(import_module(f"{package}.{home_of[name]}"), name)
+        return own[name]
 
-    return found
+    return found, lambda: sorted({*own, *home_of})

@@ -8,7 +8,7 @@ journal); `command` adds `sewfast fleet`.
 
 from typing import TYPE_CHECKING
 
-from sewfast.plugins import on_first_use
+from sewfast.plugins import on_first_use as _on_first_use
 
 if TYPE_CHECKING:
     from .running import fleet
@@ -16,4 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Drift", "Fleet", "Row", "fleet", "load_fleet"]
 
-__getattr__ = on_first_use(__name__, {"running": "fleet", "table": "Drift Fleet Row load_fleet"})
+if not TYPE_CHECKING:  # a misspelt name is an error for type checkers
+    __getattr__, __dir__ = _on_first_use(
+        __name__, {"running": "fleet", "table": "Drift Fleet Row load_fleet"}
+    )

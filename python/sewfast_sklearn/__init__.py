@@ -11,16 +11,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.metrics import r2_score
-from sklearn.utils.validation import check_is_fitted, validate_data
 
 from sewfast.dataset import Dataset, FloatArray
 from sewfast.dynamic_model import INIT
-from sewfast.errors import DataError, SettingError
+from sewfast.errors import DataError, SettingError, not_installed
 from sewfast.identification import identify
 from sewfast.kinds import Kind
 from sewfast.models import Model
+
+try:
+    from sklearn.base import BaseEstimator, RegressorMixin
+    from sklearn.metrics import r2_score
+    from sklearn.utils.validation import check_is_fitted, validate_data
+except ImportError as e:
+    raise not_installed("scikit-learn", "the regressor", "sewfast[sklearn]") from e
 
 
 class FreeRunRegressor(RegressorMixin, BaseEstimator):

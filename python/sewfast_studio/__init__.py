@@ -11,7 +11,7 @@ client of `bench`, the process that owns a drive's port. `page` holds the files 
 
 from typing import TYPE_CHECKING
 
-from sewfast.plugins import on_first_use
+from sewfast.plugins import on_first_use as _on_first_use
 
 if TYPE_CHECKING:
     from .project import Project, make_demo
@@ -21,12 +21,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Commission", "Project", "Step", "Studio", "Tuning", "make_demo"]
 
-__getattr__ = on_first_use(
-    __name__,
-    {
-        "project": "Project make_demo",
-        "requests": "Commission Step",
-        "server": "Studio",
-        "tuning": "Tuning",
-    },
-)
+if not TYPE_CHECKING:  # a misspelt name is an error for type checkers
+    __getattr__, __dir__ = _on_first_use(
+        __name__,
+        {
+            "project": "Project make_demo",
+            "requests": "Commission Step",
+            "server": "Studio",
+            "tuning": "Tuning",
+        },
+    )

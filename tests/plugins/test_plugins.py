@@ -110,6 +110,74 @@ def test_the_core_s_modules_are_not_looked_for_in_metadata(monkeypatch: pytest.M
         assert not hasattr(sewfast, name)
 
 
+def test_a_package_that_exits_is_named_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = CODE + "\nprint('chatter')\ndef exits(commands):\n    raise SystemExit('bye')\n"
+    points = "greet = drive_logger:add\nworse = drive_logger:exits"
+    installed(tmp_path / "site", monkeypatch, code, points, COMMANDS)
+    found = called(tmp_path, "--help")
+    assert "received SystemExit: bye" in found.err
+    assert "chatter" in found.err
+    assert "chatter" not in found.out
+    assert "greet     a word" in found.out
+    assert "chatter" not in called(tmp_path, "--version").out
+
+
+def test_a_command_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = CODE + "\ndef half(commands):\n    add(commands)\n    raise RuntimeError('half')\n"
+    points = "greet = drive_logger:half\nother = drive_logger:add"
+    installed(tmp_path / "site", monkeypatch, code, points, COMMANDS)
+    assert "a word" not in called(tmp_path, "--help").out
+    assert "received RuntimeError: half" in called(tmp_path, "greet", done=2).err
+    assert "received no such command" in called(tmp_path, "other", done=2).err
+
+
+@pytest.mark.parametrize("damage", [b"[sewfast.commands\n\xff", b"no line of this has a sign\n"])
+def test_damaged_metadata_of_one_package_leave_the_others(
+    damage: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed(tmp_path / "good", monkeypatch, CODE, "greet = drive_logger:add", COMMANDS)
+    installed(tmp_path / "bad", monkeypatch, "", "", COMMANDS, "bad-one")
+    (tmp_path / "bad" / "bad_one-1.0.dist-info" / "entry_points.txt").write_bytes(
+        b"[sewfast.names]\n" + damage
+    )
+    with pytest.warns(UserWarning, match=r"bad_one.*install the package again"):
+        assert "greet" in [point.name for point in plugins.points(COMMANDS)]
+
+
+def test_a_package_without_a_name_is_named_by_what_it_points_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed(tmp_path, monkeypatch, CODE, "worse = drive_logger:fails", COMMANDS)
+    (tmp_path / "drive_logger-1.0.dist-info" / "METADATA").unlink()
+    assert "a part of drive_logger:fails that adds it" in called(tmp_path, "--help").err
+
+
+def test_the_wheel_s_own_are_not_taken_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed(tmp_path, monkeypatch, CODE, "fleet = drive_logger:answer", NAMES)
+    monkeypatch.delitem(vars(sewfast), "fleet", raising=False)
+    assert callable(sewfast.fleet)
+    monkeypatch.delitem(vars(sewfast), "fleet", raising=False)
+
+
+def test_a_folder_of_an_older_version_hides_no_plugin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "studio" / "__pycache__").mkdir(parents=True)
+    monkeypatch.setattr(sewfast, "__path__", [*sewfast.__path__, str(tmp_path)])
+    monkeypatch.delitem(vars(sewfast), "studio", raising=False)
+    assert sewfast.studio.__name__ == "sewfast_studio"
+
+
+def test_names_that_come_on_first_use_are_listed() -> None:
+    import sewfast_fleet
+
+    assert {"Fleet", "fleet", "load_fleet"} <= {*dir(sewfast_fleet)}
+    with pytest.raises(AttributeError, match="no attribute 'Flet'"):
+        sewfast_fleet.Flet  # noqa: B018
+
+
 @pytest.fixture
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """The core as it would be without any plug-in: none is named, none can be imported."""
@@ -130,7 +198,11 @@ def test_the_core_works_without_plugins(tmp_path: Path) -> None:
     assert "identify" in found.out
     assert "\n    studio" not in found.out
     assert found.err == ""
-    assert "invalid choice: 'studio'" in called(tmp_path, "studio", done=2).err
+    refused = called(tmp_path, "studio", done=2).err
+    assert "invalid choice: 'studio'" in refused
+    assert "plug-ins of this installation are not registered" in refused
+    with pytest.raises(AttributeError, match="not registered"):
+        sewfast.nothing  # noqa: B018
     random = np.random.default_rng(1)
     u = np.repeat(random.uniform(-5.0, 5.0, 30), 10)
     y = [0.0]

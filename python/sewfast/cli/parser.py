@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import re
 import sys
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .. import plugins
 from ..errors import SewfastError, not_installed
@@ -27,6 +28,9 @@ from . import (
 )
 from .arguments import Commands, Help, add_command
 from .output import print_json
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 DESCRIPTION = """\
 From one recording of a motor drive to a verified controller.
@@ -148,29 +152,48 @@ def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
     )
     for add in makers:
         add(commands)
-    if not commands.choices.keys() & given[:1]:
-        _add_plugins(commands, given)
+    asked = given[1:2] if given[:1] == ["help"] else given[:1]
+    if not {*commands.choices, "--version"} & {*asked}:
+        _add_plugins(commands, asked)
     return parser
 
 
-def _add_plugins(commands: Commands, given: Sequence[str]) -> None:
-    """Add the commands of plug-ins behind the package's own: the given one, otherwise all, by name.
+def _add_plugins(commands: Commands, asked: Sequence[str]) -> None:
+    """Add the commands of plug-ins behind the package's own: the one asked for, else all, by name.
     One that cannot be added gets a line on standard error; the others work.
     """
     points = [p for p in plugins.points(GROUP) if p.name not in commands.choices]
-    points = [p for p in points if p.name in given[:1]] or points
+    points = [p for p in points if p.name in asked] or points
     for name in dict.fromkeys(p.name for p in points):
         place, task = f"command {name}", "that adds it"
         try:
             point = plugins.only(tuple(p for p in points if p.name == name), place, task)
-            add = plugins.function(point, place, task)
-            try:
-                add(commands)
-            except Exception as e:
-                # a function of another package can raise anything
-                raise plugins.unusable(point, place, task, plugins.told(e)) from e
+            # what a package prints must not get into output that other programs read
+            with contextlib.redirect_stdout(sys.stderr):
+                _add_plugin(commands, point, place, task)
         except SewfastError as e:
             print(f"sewfast: {e}", file=sys.stderr)
+    wanted = [name for name in asked if not name.startswith("-") and name not in commands.choices]
+    if wanted and not plugins.are_registered(GROUP):
+        print(f"sewfast: {plugins.UNREGISTERED}", file=sys.stderr)
+
+
+def _add_plugin(commands: Commands, point: EntryPoint, place: str, task: str) -> None:
+    add = plugins.function(point, place, task)
+    before = set(commands.choices)
+    try:
+        add(commands)
+        received = "" if point.name in commands.choices else "no such command"
+    except (Exception, SystemExit) as e:
+        # a function of another package can raise anything
+        received = plugins.told(e)
+    if received:
+        added = set(commands.choices) - before
+        for name in added:
+            del commands.choices[name]
+        shown = commands._choices_actions
+        shown[:] = [action for action in shown if action.dest not in added]
+        raise plugins.unusable(point, place, task, received)
 
 
 class _Version(argparse.Action):
