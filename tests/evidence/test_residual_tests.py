@@ -15,7 +15,7 @@ import sewfast
 from effort import FULL
 from sewfast import Dataset, NeuralOE, _core
 from sewfast.dataset import FloatArray
-from sewfast.errors import FitError
+from sewfast.errors import DataError, FitError
 from sewfast.evidence import Residuals, residual_tests
 
 TRIALS = 1000 if FULL else 40
@@ -94,6 +94,29 @@ def trials(noise: str, inputs: str) -> dict[str, FloatArray]:
         clean = network(TRUE).simulate(u[:, None], np.zeros(2))
         found.append(p_values(u, clean + 0.2 * coloured(rng, SAMPLES, NOISES[noise])))
     return {name: np.array([f[name] for f in found]) for name in found[0]}
+
+
+def test_columns_in_another_order_are_refused() -> None:
+    """Row by row is the only order that the core reads."""
+    rng = np.random.default_rng(0)
+    y = rng.standard_normal(100)
+    u = np.asfortranarray(rng.standard_normal((100, 2)))
+    run = (u, y, y, np.ones(100, dtype=bool), np.ones((100, 1)))
+    for wrong in (run, (u[:, :1].copy(), *run[1:4], u)):
+        with pytest.raises(DataError, match="C-contiguous"):
+            _core.coloured_information([wrong], spent=0.0)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_a_sensitivity_that_overflows_is_left_out() -> None:
+    rng = np.random.default_rng(0)
+    u, e = rng.standard_normal((2, 500))
+    psi = np.column_stack([u, np.where(np.arange(500) == 7, np.inf, 1.0)])
+    counts = np.ones(500, dtype=bool)
+    tests = _core.residual_tests(
+        [(u[:, None], u, e - e.mean(), counts, psi)], memory=0, one_step=False
+    )
+    assert all(np.isfinite(test[5]) for test in tests)
 
 
 def binomial_tail(n: int, p: float, least: int) -> float:

@@ -31,6 +31,8 @@ const DETERMINED: f64 = 1e-10;
 const FOLLOWED: f64 = 1e-4;
 /// Binary exponent up to which values are used as they are: sixth powers of the tests neither overflow nor underflow.
 const MODERATE: i32 = 60;
+/// Rounding of a mean, as a share of it.
+const ROUNDING: f64 = 1e-12;
 /// Standard deviations at which a residual is cut off before it is squared: a single outlier would dominate.
 const CUT: f64 = 3.0;
 
@@ -462,6 +464,10 @@ fn centred(mut columns: Vec<Columns>) -> Vec<Columns> {
         let sum: f64 = columns.iter().flat_map(|c| c.column(j)).sum();
         let mean = sum / n as f64;
         columns.iter_mut().for_each(|c| c.shift(j, -mean));
+        // what is left of a constant is rounding
+        if largest(columns.iter().flat_map(|c| c.column(j))) <= ROUNDING * mean.abs() {
+            columns.iter_mut().for_each(|c| c.clear(j));
+        }
     }
     columns
 }

@@ -42,11 +42,12 @@ pub fn slice<'a>(array: &'a PyReadonlyArray1<'_, f64>, name: &str) -> PyResult<&
 
 /// The values of a two-dimensional array row by row and its number of columns, borrowed.
 pub fn rows<'a>(array: &'a PyReadonlyArray2<'_, f64>, name: &str) -> PyResult<(&'a [f64], usize)> {
-    let columns = array.as_array().ncols();
+    // `as_slice` of the array itself takes columns for rows where they are contiguous
+    let view = array.as_array();
+    let columns = view.ncols();
+    let values = view.to_slice();
     Ok((
-        array
-            .as_slice()
-            .map_err(|_| not_contiguous(array.py(), name))?,
+        values.ok_or_else(|| not_contiguous(array.py(), name))?,
         columns,
     ))
 }

@@ -80,6 +80,11 @@ impl Columns {
         self.change(j, |v| v + by);
     }
 
+    /// Column `j` becomes 0.
+    pub fn clear(&mut self, j: usize) {
+        self.change(j, |_| 0.0);
+    }
+
     pub fn divide(&mut self, by: f64) {
         self.values.iter_mut().for_each(|v| *v /= by);
     }
@@ -140,6 +145,14 @@ impl Columns {
                 }
             }
         }
+    }
+
+    /// Some of the columns.
+    fn some(&self, columns: &[usize]) -> Self {
+        Self::from_rows(self.rows, columns.len(), |(k, row)| {
+            let from = self.row(k);
+            row.iter_mut().zip(columns).for_each(|(v, j)| *v = from[*j]);
+        })
     }
 
     /// The columns times a matrix.
@@ -211,13 +224,12 @@ pub(super) fn independent(columns: &[Columns], least: f64) -> Vec<Columns> {
         gram[(used[i], used[j])] / length(used[i]) / length(used[j])
     });
     let (sizes, vectors) = determined(unit, least, 0.0);
-    let mut turn = DMatrix::zeros(gram.nrows(), sizes.len());
-    for (i, from) in used.iter().enumerate() {
-        for (j, size) in sizes.iter().enumerate() {
-            turn[(*from, j)] = vectors[(i, j)] / size.sqrt() / length(*from);
-        }
-    }
-    columns.iter().map(|c| c.turned(&turn)).collect()
+    let turn = DMatrix::from_fn(used.len(), sizes.len(), |i, j| {
+        vectors[(i, j)] / sizes[j].sqrt() / length(used[i])
+    });
+    // one that is not finite must not be multiplied, not even by 0
+    let turned = |c: &Columns| c.some(&used).turned(&turn);
+    columns.iter().map(turned).collect()
 }
 
 /// The direction of a mean.

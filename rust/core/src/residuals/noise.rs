@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector};
 use super::columns::{Columns, squared};
 use super::number;
 use crate::gram::Gram;
-use crate::linear::{poles, stabilised};
+use crate::linear::{is_stable, poles, polynomial};
 
 /// The largest order, orders per decade of samples, and samples for each.
 const LARGEST_ORDER: usize = 40;
@@ -13,6 +13,8 @@ const ORDERS_PER_DECADE: f64 = 10.0;
 const SAMPLES_PER_ORDER: usize = 20;
 /// Least share of an innovation in the power of a series: below it a series is a sum of exponentials, and rounding.
 const LEAST: f64 = 1e-14;
+/// Distance from the unit circle of a pole that is on it: its noise has no variance otherwise.
+const ON_THE_CIRCLE: f64 = 1e-7;
 
 /// `e(k) = sum_i a[i] e(k-1-i) + w(k)`, `w` white.
 #[derive(Clone, Debug)]
@@ -117,11 +119,20 @@ impl Noise {
     /// Coefficients with the same spectrum and every pole inside the unit circle, and their innovation's variance.
     fn stable(&self) -> (Vec<f64>, f64) {
         let negative: Vec<f64> = self.a.iter().map(|a| -a).collect();
-        let inside = stabilised(&negative);
-        if inside == negative {
+        if is_stable(&negative, 0.0) {
             return (self.a.clone(), self.innovation);
         }
-        let gain: f64 = poles(&negative).iter().map(|p| p.norm().max(1.0)).product();
+        // |1 - p/z| = |p| |1 - 1/(p' z)| on the circle
+        let mut gain = 1.0;
+        let inside = poles(&negative).into_iter().map(|p| {
+            let radius = p.norm();
+            if radius < 1.0 {
+                return p;
+            }
+            gain *= radius;
+            p * ((1.0 / radius).min(1.0 - ON_THE_CIRCLE) / radius)
+        });
+        let inside = polynomial(&inside.collect::<Vec<_>>());
         let a = inside.iter().map(|a| -a).collect();
         (a, self.innovation / (gain * gain))
     }

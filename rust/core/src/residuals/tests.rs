@@ -148,6 +148,29 @@ fn noise_finds_the_colour_and_its_covariance() {
     }
 }
 
+/// Slow poles are left as they are, and a pole outside is its mirror, however close to the circle.
+#[test]
+fn slow_noise_keeps_its_power() {
+    let n = 400;
+    let z = Columns::new((0..n).map(|k| 1.0 + (0.001 * k as f64).sin()).collect(), n);
+    let power = |a: &[f64], innovation: f64| {
+        let noise = Noise {
+            a: a.to_vec(),
+            innovation,
+            variance: 1.0,
+        };
+        noise.power_of(vec![z.clone()])[(0, 0)]
+    };
+    // the variance of a series with a double pole p is (1 + p^2) / (1 - p^2)^3, and its covariance falls slowly
+    let p: f64 = 0.9995;
+    let variance = (1.0 + p * p) / (1.0 - p * p).powi(3);
+    let sum: f64 = z.column(0).sum();
+    let found = power(&[2.0 * p, -p * p], 1.0) / (variance * sum * sum);
+    assert!((0.95..1.0).contains(&found), "{found}");
+    let mirrored = power(&[1.0 / p], 1.0) / power(&[p], p * p);
+    assert!((mirrored - 1.0).abs() < 1e-9, "{mirrored}");
+}
+
 #[test]
 fn poles_outside_the_circle_have_the_spectrum_of_mirrored_ones() {
     let z = Columns::new(normal(200, 1), 100);
