@@ -404,6 +404,7 @@ def test_a_search_has_the_limits_weights_and_seconds_of_the_page(
 def test_what_is_shown_follows_its_files(tuned: Studio, browser: Any) -> None:
     """A start that is saved over keeps its notch once; another model of the name is noticed."""
     from selenium.common.exceptions import WebDriverException
+    from selenium.webdriver.support.expected_conditions import staleness_of
 
     def at(name: str) -> Any:
         return browser.find_element("id", name)
@@ -424,8 +425,11 @@ def test_what_is_shown_follows_its_files(tuned: Studio, browser: Any) -> None:
     until(lambda: len(notches()) == 1)
     for _ in range(2):  # the second would add the notch of the file to that of the page
         browser.execute_script("document.getElementById('saved').textContent = ''")
+        opened_anew = staleness_of(at("knob-Kp"))
         at("save").click()
         until(lambda: "written" in at("saved").text)
+        # else it may open the model that is written below, and need not notice another one
+        until(lambda anew=opened_anew: anew(browser))
         until(lambda: not browser.find_elements("css selector", "#notches li"))
         assert len(sewfast.load_controller(folder / "controller.json").biquads) == 1
         assert len(notches()) == 1
