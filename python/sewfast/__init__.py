@@ -152,6 +152,7 @@ _HOMES = {
     "analysis": "Analysis analyse",
     "causes": "Cause cause_of",
     "control": "Biquad Controller Gains fit_fopdt load_controller paper_controller table_1",
+    "control.feedforward": "Feedforward",
     "control.state_feedback": "StateFeedback",
     "tuning": "Constraints Cost LoadStep ParetoFront TuningResult pareto tune",
     "dataset": "Dataset Diagnosis Experiment diagnose",

@@ -556,6 +556,13 @@ def biquad(kind: str, numbers: Sequence[float], *, Ts: float) -> tuple[float, fl
     (frequency, damping), ``lead_lag`` (zero, pole) or ``resonance`` (zero frequency, damping, pole frequency, damping).
     """
 
+def inverse_taps(
+    points: Sequence[tuple[_F, _F, _F, float, int, float]],
+    choices: Sequence[tuple[int, float]], *, count: int,
+) -> list[list[float]]:
+    """The taps of a feedforward for each preview and smoothing, on plants about levels: A, B, C, D of one input, its delay and
+    the slope of the command over the level."""
+
 @final
 class Controller:
     """The controller's arithmetic, one sample at a time (paper Fig. 16). Gains in standard form."""
@@ -566,6 +573,7 @@ class Controller:
         observer_time: float = 0.0, r_rate: float = ...,
         schedule: Sequence[tuple[float, float, float, float]] = ...,
         biquads: Sequence[tuple[float, float, float, float]] = ...,
+        feedforward: tuple[int, float, list[tuple[float, float]], list[float]] | None = ...,
     ) -> Controller:
         """``schedule`` has rows of speed, Kp, Ti, Td; empty for constant gains. ``biquads`` are rows of `biquad`."""
 
@@ -895,6 +903,11 @@ class LinkBodies:
         design: tuple[float, float, Sequence[Sequence[float]]] | None = None,
     ) -> bytes:
         """Twelve numbers and the filter's samples; the design is observer time, r rate, schedule."""
+    @staticmethod
+    def feedforward(
+        preview: int, late: float, levels: Sequence[tuple[float, float]], taps: Sequence[float]
+    ) -> bytes:
+        """Levels of output and command."""
     @staticmethod
     def biquads(sections: Sequence[Sequence[float]]) -> bytes:
         """Sections of c0, c1, a1, a2."""

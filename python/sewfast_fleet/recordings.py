@@ -200,7 +200,8 @@ def _identified(job: Job, settings: Mapping[str, Any], controller: Controller | 
     if controller is not None:
         from sewfast.tuning import tune
 
-        tuned = tune(model, start=controller, seed=settings["seed"], threads=1).pid
+        settled = {"seed": settings["seed"], "threads": 1, "feedforward": "none"}
+        tuned = tune(model, start=controller, **settled).pid
         standard = tuned.gains.to("standard")
         gains = {"Kp": standard.Kp, "Ti": standard.Ti, "Td": standard.Td}
     return Row(

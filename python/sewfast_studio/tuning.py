@@ -294,7 +294,7 @@ class Tuning:
         try:
             result = tune(
                 self.model, start=start, cost=search.cost(),
-                constraints=search.limits(),
+                constraints=search.limits(), feedforward="none",
                 evaluations=search.evaluations, time_budget=search.seconds, seed=search.seed,
                 progress=progress,
             )  # fmt: skip
@@ -478,7 +478,7 @@ class Search:
 
     def python(self) -> str:
         """Arguments of `sewfast.tune`."""
-        words = [f"evaluations={self.evaluations}, seed={self.seed}"]
+        words = [f"feedforward='none', evaluations={self.evaluations}, seed={self.seed}"]
         if self.weights:
             words.append(f"cost=sewfast.Cost({_named(self.weights)})")
         if self.constraints:
@@ -487,7 +487,7 @@ class Search:
 
     def command(self) -> str:
         """Options of `sewfast tune`."""
-        words = [f"--evaluations={self.evaluations}", f"--seed={self.seed}"]
+        words = ["--no-feedforward", f"--evaluations={self.evaluations}", f"--seed={self.seed}"]
         words += [f"--cost {name}={value!r}" for name, value in self.weights.items()]
         words += [f"--constraint {name}={value!r}" for name, value in self.constraints.items()]
         return " ".join(words)

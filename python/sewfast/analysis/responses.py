@@ -142,7 +142,7 @@ def _columns(
     u, y, feedback = (np.empty(len(r)) for _ in range(3))
     counts, speed = machine.counts, machine.speed_rpm
     before, held = counts, 0.0
-    for k, wanted in enumerate(r.tolist()):
+    for k, wanted in enumerate(controller.early(r).tolist()):
         u[k] = core.step(wanted, (counts - before) / per_speed, float(ahead[k]))
         y[k], feedback[k], before = speed, core.filtered, counts
         if torque[k] != held:

@@ -120,6 +120,15 @@ def add(commands: Commands) -> None:
         "first model's step response",
     )  # fmt: skip
     parser.add_argument(
+        "--feedforward", choices=("preview", "causal"), default="preview",
+        help="add the command that the models need for the reference, known ahead (preview) or "
+        "only in time (causal), if following it then costs less",
+    )  # fmt: skip
+    parser.add_argument(
+        "--no-feedforward", dest="feedforward", action="store_const", const="none",
+        help="the PID alone",
+    )  # fmt: skip
+    parser.add_argument(
         "--notch", action="append", metavar="HZ[:DEPTH[:WIDTH]]",
         help="a notch to start with, tuned together with the gains; may repeat (depth .1, width "
         ".5; sewfast bode suggests one)",
@@ -370,7 +379,7 @@ def _tuned(
     with Progress("tune", quiet=args.quiet) as progress:
         return tune(
             models, references, **_started(args, models), **settings, rival=rival,
-            method=args.method, time_budget=args.time_budget, progress=progress,
+            feedforward=args.feedforward, method=args.method, time_budget=args.time_budget, progress=progress,
         )  # fmt: skip
 
 
@@ -404,6 +413,7 @@ def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
                 "grade": found.grade,
                 "verdict": found.verdict.to_json(),
                 "warning": found.warning,
+                "feedforward": None if found.lead is None else found.lead.to_json(),
                 "plot": None if args.plot is None else str(args.plot),
                 "weights": found.weights.named(),
                 "variables": {
@@ -475,6 +485,13 @@ def _show_gains(args: argparse.Namespace, controller: SampledController) -> None
         print(
             "feedback: with the noise that the model's record shows, without an encoder's steps; "
             "--counts-per-rev puts an encoder in the loop"
+        )
+    lead = getattr(controller, "feedforward", None)
+    if lead is not None and lead.preview:
+        early = f"{lead.preview} samples ({1e3 * lead.preview * controller.Ts:.3g} ms)"
+        print(
+            f"feedforward: it needs the reference {early} early, or follows it that much later; "
+            "--feedforward causal does without, --no-feedforward leaves it out"
         )
     if args.plot is not None:
         print(f"written to {args.plot}")

@@ -221,6 +221,7 @@ def search(
             disturbances=disturbances,
             rival=rival,
             variations=variations,
+            feedforward="none",
             evaluations=demands.evaluations,
             seed=demands.seed,
             threads=demands.threads,

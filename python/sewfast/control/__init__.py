@@ -1,6 +1,7 @@
 """The controller and its loop.
 
-Read in this order: `biquad` (notches and other filters), `controller` (the base class of all kinds;
+Read in this order: `biquad` (notches and other filters), `feedforward` (the command that a model
+needs), `controller` (the base class of all kinds;
 the PID), `state_feedback` (the second kind), `files` (`load_controller`), `loop` (`run`: on a model
 or a machine), `machine` (`Machine`, the protocol of machines; `record`), `defaults` (limits, filter
 and references of a drive by default), `margins` (of the linear loop), `systems` (the linear loop as
@@ -11,12 +12,14 @@ from ..gains import Form, Gains, vector
 from ..rules import Fopdt, Rule, fit_fopdt, table_1
 from .biquad import Biquad
 from .controller import Controller, SampledController, paper_controller
+from .feedforward import Feedforward
 from .files import load_controller
 from .state_feedback import StateFeedback
 
 __all__ = [
     "Biquad",
     "Controller",
+    "Feedforward",
     "Fopdt",
     "Form",
     "Gains",

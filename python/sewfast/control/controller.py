@@ -8,13 +8,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
+from numpy.typing import ArrayLike
+
 from .. import _core, storage
+from ..arrays import FloatArray
 from ..errors import SettingError
-from ..gains import Gains, real, whole
+from ..gains import Gains, real, vector, whole
 from ..storage import Fields
 from ..tables import html_of
 from ..units import counts_per_unit
 from .biquad import MOST, NUMBERS, Biquad
+from .feedforward import Feedforward
 
 if TYPE_CHECKING:
     from ..models.rest import Rest
@@ -27,8 +31,9 @@ SETTINGS = (
 """Variables of a search besides the gains, those of a schedule's points and the notches."""
 
 FORMAT = "sewfast.controller"
-VERSION = 3
-"""Version of the files; version 1 had no observer, ramp or schedule, version 2 no biquads."""
+VERSION = 5
+"""Version of the files; version 1 had no observer, ramp or schedule, version 2 no biquads, and
+version 3 no feedforward. Version 4 is that of other kinds."""
 
 _UNBOUNDED = {
     "N": math.inf,
@@ -107,7 +112,16 @@ class SampledController:
                 remedy="leave the schedule out, or identify the model from data that begin at 0",
             )  # fmt: skip
         low, high = self.u_min - rest.u[0], self.u_max - rest.u[0]
-        return replace(self, u_min=low, u_max=high)  # type: ignore[type-var]
+        lead = getattr(self, "feedforward", None)
+        changes = {} if lead is None else {"feedforward": lead.about(rest)}
+        return replace(self, u_min=low, u_max=high, **changes)  # type: ignore[type-var]
+
+    def early(self, reference: ArrayLike) -> FloatArray:
+        """The reference as a step of the compiled controller takes it: with a feedforward `preview`
+        samples early, otherwise in time.
+        """
+        lead = getattr(self, "feedforward", None)
+        return vector("reference", reference) if lead is None else lead.early(reference)
 
     def sent(self) -> tuple[int, list[float]]:
         """Number of the kind and its parameters, as sent to a device (docs/PROTOCOL.md)."""
@@ -197,6 +211,8 @@ class Controller(SampledController):
     biquads : sequence of Biquad
         Up to 4 filters, one after the other, on the reference and on the filtered output:
         `Biquad.notch(60.0)` and the like.
+    feedforward : Feedforward or None
+        The command that a model needs for the reference, which then arrives early; None for none.
     counts_per_rev : float or None
         The encoder that measures a model's output; None for ideal feedback. A machine has its own.
     notes : str
@@ -226,6 +242,7 @@ class Controller(SampledController):
     r_rate: float = math.inf
     schedule: tuple[tuple[float, Gains], ...] = ()
     biquads: tuple[Biquad, ...] = ()
+    feedforward: Feedforward | None = None
     counts_per_rev: float | None = None
     notes: str = ""
 
@@ -243,6 +260,11 @@ class Controller(SampledController):
         for _, gains in self.schedule:
             self._check_gains(gains)
         object.__setattr__(self, "filter_samples", whole("filter_samples", self.filter_samples))
+        if not (self.feedforward is None or isinstance(self.feedforward, Feedforward)):
+            raise SettingError(
+                name="feedforward", expected="a Feedforward, or None",
+                received=repr(self.feedforward),
+            )  # fmt: skip
         if self.counts_per_rev is not None:
             object.__setattr__(self, "counts_per_rev", real("counts_per_rev", self.counts_per_rev))
         if not isinstance(self.notes, str):
@@ -294,6 +316,7 @@ class Controller(SampledController):
             filter_samples=self.filter_samples,
             schedule=self.schedule_rows(),
             biquads=self.sections(),
+            feedforward=None if self.feedforward is None else self.feedforward.core(),
             **{name: getattr(self, name) for name in _REALS},
         )
 
@@ -325,6 +348,7 @@ class Controller(SampledController):
         """Everything as JSON values; null means no such limit or filter."""
         values = {name: bounded(getattr(self, name)) for name in _REALS}
         return {
+            "kind": self.KIND,
             "gains": _gains_to_dict(self.gains),
             "u_unit": self.gains.u_unit,
             "y_unit": self.gains.y_unit,
@@ -332,16 +356,18 @@ class Controller(SampledController):
             "filter_samples": self.filter_samples,
             "schedule": [{"speed": v, "gains": _gains_to_dict(g)} for v, g in self.schedule],
             "biquads": [biquad.to_dict() for biquad in self.biquads],
+            "feedforward": None if self.feedforward is None else self.feedforward.to_dict(),
             "counts_per_rev": self.counts_per_rev,
             "notes": self.notes,
         }
 
     @classmethod
     def read(cls, fields: Fields) -> Controller:
-        """The controller in a file of versions 1 to 3."""
+        """The controller in a file of versions 1 to 3 or 5."""
         version = fields.integer("version")
         reals = _FIRST_REALS if version == 1 else _REALS
         later = (("schedule",) if version > 1 else ()) + (("biquads",) if version > 2 else ())
+        later += ("kind", "feedforward") if version > 3 else ()
         fields.require_only((*_OTHERS, *reals, *later))
         units = {"u_unit": fields.text("u_unit"), "y_unit": fields.text("y_unit")}
         return cls(
@@ -349,6 +375,7 @@ class Controller(SampledController):
             filter_samples=fields.integer("filter_samples"),
             schedule=_schedule(fields, units) if version > 1 else (),
             biquads=_biquads(fields) if version > 2 else (),
+            feedforward=_feedforward(fields) if version > 3 else None,
             counts_per_rev=fields.optional_number("counts_per_rev"),
             notes=fields.text("notes"),
             **{name: unbounded(fields, name, _UNBOUNDED) for name in reals},
@@ -375,6 +402,7 @@ class Controller(SampledController):
             f"  limits    {self.u_min:g} to {self.u_max:g} {u}, slew {self.slew:g} {u}/s; {windup}",
             f"  feedback  {encoder}, mean of {self.filter_samples} samples{lag}",
             *(f"  biquad    {biquad}" for biquad in self.biquads),
+            *([f"  forward   {self.feedforward}"] if self.feedforward else []),
         ]
         return "\n".join([*lines, f"  notes     {self.notes}"] if self.notes else lines)
 
@@ -412,6 +440,12 @@ def _schedule(fields: Fields, units: Mapping[str, str]) -> tuple[tuple[float, Ga
     for point in points:
         point.require_only(("speed", "gains"))
     return tuple((p.number("speed"), _gains(p.object("gains"), units)) for p in points)
+
+
+def _feedforward(fields: Fields) -> Feedforward | None:
+    if fields.any("feedforward") is None:
+        return None
+    return Feedforward.read(fields.object("feedforward"))
 
 
 def _biquads(fields: Fields) -> tuple[Biquad, ...]:

@@ -14,7 +14,7 @@ KINDS: dict[str, type[SampledController]] = {
     kind.KIND: kind for kind in (Controller, StateFeedback)
 }
 """The kinds by name. A file of versions 1 to 3 has no kind and is a PID."""
-_VERSIONS = (1, 2, 3, 4)
+_VERSIONS = (1, 2, 3, 4, 5)
 
 
 def load_controller(path: str | os.PathLike[str]) -> SampledController:

@@ -89,7 +89,8 @@ class RecordedRun(ClosedLoopRun):
         core, feedback = controller.core(), np.zeros(len(r))
         per_count = 60.0 / (recording.counts_per_rev * recording.Ts)
         speeds = np.diff(recording.counts, prepend=0.0) * per_count
-        for k, (wanted, speed) in enumerate(zip(r.tolist(), speeds.tolist(), strict=True)):
+        early = controller.early(r).tolist()
+        for k, (wanted, speed) in enumerate(zip(early, speeds.tolist(), strict=True)):
             core.step(wanted, speed)
             feedback[k] = core.filtered
         t = np.arange(len(r), dtype=np.float64) * recording.Ts
@@ -462,7 +463,7 @@ class SteppedBench:
         self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
         _require_fit(controller, r, self.Ts)
-        core = controller.core()
+        core, early = controller.core(), controller.early(r)
         per_count = 60.0 / (self.counts_per_rev * self.Ts)
         u, feedback, before = np.zeros(len(r)), np.zeros(len(r)), [0.0]
         seen = np.zeros(len(r))
@@ -474,7 +475,7 @@ class SteppedBench:
         def decide(k: int, counts: float) -> float:
             if watch is not None and k and k % WATCHED == 0:
                 watch(k - WATCHED, u[k - WATCHED : k], seen[k - WATCHED : k])
-            u[k] = core.step(float(r[k]), (counts - before[0]) * per_count)
+            u[k] = core.step(float(early[k]), (counts - before[0]) * per_count)
             feedback[k], before[0], seen[k] = core.filtered, counts, counts
             if guard is not None and guard.watch(u[k : k + 1], seen[k : k + 1]) is not None:
                 raise self._lost(name, u[k])

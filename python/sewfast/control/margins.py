@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -93,9 +94,18 @@ def operating_point(model: Any, speed: float) -> OperatingPoint:
             name="plant", expected="one model", received="an ensemble",
             remedy="take the operating point of each of its members",
         )  # fmt: skip
-    speed = real("speed", speed)
+    return point_within(model, command_grid(model), real("speed", speed))
+
+
+def command_grid(model: Any) -> Sequence[OperatingPoint]:
+    """Steady states over the range of the commands that a model was identified on."""
     low, high = model.training.get("input_range", [[-1.0, 1.0]])[0]
-    grid = operating_range(model, [np.array([u]) for u in np.linspace(low, high, _GRID)]).points
+    return operating_range(model, [np.array([u]) for u in np.linspace(low, high, _GRID)]).points
+
+
+def point_within(model: Any, grid: Sequence[OperatingPoint], speed: float) -> OperatingPoint:
+    """As `operating_point`, on a grid that serves for several outputs."""
+    low, high = float(grid[0].u[0]), float(grid[-1].u[0])
     if not any(p.settled for p in grid) and any(p.drift for p in grid):
         return _integrating_point(model, grid, speed)
     pairs = [p for p in itertools.pairwise(grid) if (p[0].y - speed) * (p[1].y - speed) <= 0.0]

@@ -196,9 +196,10 @@ class PolledBoard(Unique, ABC):
                 received=f"{controller.Ts} s", remedy="tune a controller for this machine",
             )  # fmt: skip
         core, feedback = controller.core(), np.zeros(len(r))
+        early = controller.early(r)
 
         def decide(k: int, speed: float) -> float:
-            u = core.step(float(r[k]), speed)
+            u = core.step(float(early[k]), speed)
             feedback[k] = core.filtered
             return u
 

@@ -242,9 +242,11 @@ class Drive(Unique):
             return
         body = gains(controller, self.channels, self.identity)
         self._link.ask(Kind.GAINS, body)
-        # GAINS removes them
+        # GAINS removes both
         if controller.biquads:
             self._link.ask(Kind.BIQUADS, wire.biquads(controller.sections()))
+        if controller.feedforward is not None:
+            self._link.ask(Kind.FEEDFORWARD, wire.feedforward(*controller.feedforward.core()))
 
     def arm(self) -> None:
         """Make it ready to start; if the host falls silent, its watchdog returns it to idle."""

@@ -117,7 +117,7 @@ def run_on_host(
     while True:
         with drive.lent() as session, _scheduling(real_time) as scheduling:
             found = _core.host_loop(
-                session.descriptor, controller.core(), r, tag=drive.identity.tag,
+                session.descriptor, controller.core(), controller.early(r), tag=drive.identity.tag,
                 session=session.session, key=drive.identity.key, command=session.command,
                 heartbeat=session.heartbeat, device_period=drive.identity.period_us,
                 ratio=ratio, watchdog=round(1e6 * wait),

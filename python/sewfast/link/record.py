@@ -218,7 +218,8 @@ def follow(
     def convert(run: RunResult) -> RecordedRun:
         return _run(run.columns, drive, controller, r, name)
 
-    return _converted(drive, Plan("controller", r, controller), convert, name=name, **options)
+    plan = Plan("controller", controller.early(r), controller)
+    return _converted(drive, plan, convert, name=name, **options)
 
 
 def _converted(drive: Drive, plan: Plan, convert: Callable[[RunResult], T], **options: Any) -> T:

@@ -37,6 +37,7 @@ class Kind(IntEnum):
     ECHO = 0x0B
     BIQUADS = 0x0C
     CONTROLLER = 0x0D
+    FEEDFORWARD = 0x0E
     KEEP = 0x20
     DRIVE = 0x21
     CREDIT = 0x22
@@ -50,7 +51,9 @@ REASONS = (
 EVENTS = ("", "boot", "armed", "started", "finished", "stopped", "tripped", "cleared")
 MODES = {"commands": 0, "controller": 1, "direct": 2}
 
-PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN, BIQUADS, KINDS = (1 << b for b in range(9))
+PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN, BIQUADS, KINDS, FEEDFORWARD = (
+    1 << b for b in range(10)
+)
 """Capabilities of a device."""
 
 
@@ -315,7 +318,8 @@ def _shown(name: str) -> str:
 
 
 arm, set_limits, gains = LinkBodies.arm, LinkBodies.limits, LinkBodies.gains
-biquads, controller, start = LinkBodies.biquads, LinkBodies.controller, LinkBodies.start
+biquads, feedforward = LinkBodies.biquads, LinkBodies.feedforward
+controller, start = LinkBodies.controller, LinkBodies.start
 
 
 def body_size(encodings: Sequence[int], batch: int) -> int:
@@ -343,6 +347,7 @@ _FIELDS: dict[int, tuple[str, ...]] = {
         "counts per unit", "filter_samples", "observer_time", "r_rate", "schedule",
     ),
     Kind.BIQUADS: ("the number of biquads",),
+    Kind.FEEDFORWARD: ("its preview, levels or taps",),
     Kind.CONTROLLER: ("kind", "counts per unit"),
     Kind.START: ("mode", "watchdog", "at", "length", "mask", "batch"),
 }  # fmt: skip

@@ -259,6 +259,7 @@ def pareto(
         references,
         start=start,
         variables=variables,
+        feedforward="none",
         evaluations=first,
         seed=seed,
         threads=threads,

@@ -19,6 +19,7 @@ from ..errors import FitError, Interrupted, SettingError
 from ..gains import whole
 from ..progress import TimeUp, shown_in_notebooks
 from ..tables import Table, significant
+from .lead import LEADS, Lead, Led, with_lead
 from .objective import Constraints, Cost, LoadStep
 from .opinion import SHARE, SecondOpinion, second_opinion
 from .robustness import HAIR, within_default
@@ -65,7 +66,8 @@ class TuningResult:
     start : Controller or StateFeedback
         The start of the search, moved to the given bounds if it lay outside.
     cost, start_cost : float
-        Cost of both in the output's unit, over plants and references; inf if one diverges.
+        Cost of the gains found, without feedforward, and of the start in the output's unit, over
+        plants and references; inf if one diverges.
     variables : tuple of Variable
         The searched variables, their bounds and the values found.
     trace : array, shape (evaluations,)
@@ -89,6 +91,8 @@ class TuningResult:
         model contradict each other, ``poor``; no gains are better than their models.
     opinion : SecondOpinion or None
         The comparison with a rival; None without one, or if no gains suit it.
+    lead : Led or None
+        What the feedforward is worth, with the PID alone; None if none was asked for.
     """
 
     controller: SampledController
@@ -105,6 +109,7 @@ class TuningResult:
     lost: tuple[str, ...] = ()
     verdict: Verdict = field(default_factory=Verdict)
     opinion: SecondOpinion | None = None
+    lead: Led | None = None
 
     @property
     def grade(self) -> str:
@@ -187,7 +192,8 @@ class TuningResult:
         ).to_html([f"{name}: {text}" for name, text in self._remarks()])
 
     def _remarks(self) -> list[tuple[str, str]]:
-        pairs = (("in time", self.cut), ("verdict", str(self.verdict)))
+        forward = ("forward", None if self.lead is None else str(self.lead))
+        pairs = (("in time", self.cut), forward, ("verdict", str(self.verdict)))
         return [(name, text) for name, text in pairs if text is not None]
 
     def __str__(self) -> str:
@@ -223,6 +229,7 @@ def tune(
     loads: Sequence[LoadStep] = (),
     disturbances: Sequence[ArrayLike] | None = None,
     rival: Plants | None = None,
+    feedforward: Lead = "preview",
     method: Method = "genetic",
     evaluations: int = EVALUATIONS,
     time_budget: float | None = None,
@@ -295,6 +302,11 @@ def tune(
         more than three times as much on the other's model as that model's own gains,
         `TuningResult.warning` reports it. Then the result is the one of these two and of gains
         tuned on both whose larger cost, relative to the least on the same model, is smallest.
+    feedforward : "preview", "causal" or "none"
+        The command that the models need for the reference, added to that of a PID
+        (`sewfast.Feedforward`): with the reference known ahead, in time only, or not at all. It
+        takes the place of alpha and beta; the gains stay. The result has it only if following the
+        references costs less over all plants, and no more on any of them in any variation.
     method : "genetic" or "cma-es"
         A genetic algorithm with local refinement, or CMA-ES with restarts.
     evaluations : int
@@ -332,6 +344,10 @@ def tune(
     }
     if not isinstance(method, str):
         raise SettingError(f"expected method 'genetic' or 'cma-es', got {method!r}")
+    if feedforward not in LEADS:
+        raise SettingError(
+            name="feedforward", expected=f"one of {', '.join(LEADS)}", received=repr(feedforward)
+        )
     task = TuningTask.of(
         models,
         references,
@@ -357,6 +373,7 @@ def tune(
         result = _asked(result, task, other.with_loops(time), search, variables)
         if result.opinion is not None and result.opinion.objection is not None:
             known.append(result.opinion.objection)
+    result = _led(result, task, feedforward, time, other)
     try:
         verdict = verdict_of(task, result.controller, time, limit=task.constraints.Ms, others=known)
     except KeyboardInterrupt:
@@ -466,6 +483,25 @@ def _asked(
         result, controller=taken.controller, variables=taken.variables,
         cost=result.cost if pick == 0 else float(opinion.costs[0, pick]), opinion=opinion,
     )  # fmt: skip
+
+
+def _led(
+    result: TuningResult, task: TuningTask, lead: Lead, time: Budget, rival: TuningTask | None
+) -> TuningResult:
+    """The result with a feedforward, if that is better."""
+    alone = result.controller
+    if lead == "none" or not isinstance(alone, Controller) or alone.feedforward is not None:
+        return result
+    if time.over("the feedforward"):
+        return result
+    try:
+        controller, led = with_lead(task, alone, lead, [] if rival is None else [rival])
+    except KeyboardInterrupt:
+        raise Interrupted(alone) from None
+    variables = result.variables
+    if controller.feedforward is not None:
+        variables = tuple(v for v in variables if v.name not in ("alpha", "beta"))
+    return replace(result, controller=controller, variables=variables, lead=led)
 
 
 def _in_time(result: TuningResult, violation: float) -> TuningResult:

@@ -40,6 +40,7 @@ extern "C" {
 #define SEWFAST_CAN_DESIGN 64u  /* its PID has observer, reference ramp and gain schedule */
 #define SEWFAST_CAN_BIQUADS 128u /* its PID has biquads */
 #define SEWFAST_CAN_KINDS 256u /* runs controllers of other kinds (CONTROLLER) */
+#define SEWFAST_CAN_FEEDFORWARD 512u /* its PID has feedforward */
 
 /* How a channel's samples are written. */
 enum sewfast_encoding {
@@ -212,6 +213,16 @@ typedef struct sewfast_pid_biquad {
     float c0, c1, a1, a2;
 } sewfast_pid_biquad;
 
+/* The most levels and taps of a feedforward, and its longest preview in samples. */
+#define SEWFAST_PID_LEVELS 8
+#define SEWFAST_PID_TAPS 16
+#define SEWFAST_PID_AHEAD 30
+
+/* A command u that holds the output y. */
+typedef struct sewfast_pid_level {
+    float y, u;
+} sewfast_pid_level;
+
 /* Two-degree-of-freedom PID in standard form with its feedback filter; INFINITY switches off what it limits. */
 typedef struct sewfast_pid_settings {
     float kp;          /*  1: u/y */
@@ -233,10 +244,16 @@ typedef struct sewfast_pid_settings {
     sewfast_pid_point schedule[SEWFAST_PID_POINTS];
     uint8_t biquad_count;   /* 17: biquads that are used; 0: none */
     sewfast_pid_biquad biquads[SEWFAST_PID_BIQUADS];
+    uint8_t level_count;    /* 18: levels of the feedforward; with no tap either there is none */
+    uint8_t tap_count;      /* 18: taps that are used */
+    uint8_t preview;        /* 18: samples by which the reference given to a step is early */
+    float late;             /* 18: 0 to 1 sample by which the measurement is late before its filter; .5 for a speed from counts */
+    sewfast_pid_level levels[SEWFAST_PID_LEVELS]; /* 18: y growing; between them the command is linear */
+    float taps[SEWFAST_PID_TAPS]; /* 18: u/y, command per change of the reference, the newest change's first */
 } sewfast_pid_settings;
 
 /* Enough bytes on any target. */
-#define SEWFAST_PID_SIZE 1280
+#define SEWFAST_PID_SIZE 2048
 
 size_t sewfast_pid_size(void);
 

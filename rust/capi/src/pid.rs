@@ -4,8 +4,8 @@ use crate::{place, tell};
 use core::ffi::c_void;
 use core::ptr::null_mut;
 use sewfast_control::{
-    BIQUADS, Biquad, Cascade, Design, POINTS, PidController, Point, Refused, Schedule, Settings,
-    Standard,
+    BIQUADS, Biquad, Cascade, Design, Feedforward, LEVELS, Level, POINTS, PidController, Point,
+    Refused, Schedule, Settings, Standard, TAPS,
 };
 
 /// `sewfast_pid_point`.
@@ -34,6 +34,16 @@ pub struct CBiquad {
     pub a1: f32,
     /// Coefficients of the denominator.
     pub a2: f32,
+}
+
+/// `sewfast_pid_level`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct CLevel {
+    /// Output \[y\].
+    pub y: f32,
+    /// The command that holds it \[u\].
+    pub u: f32,
 }
 
 /// `sewfast_pid_settings`.
@@ -78,6 +88,18 @@ pub struct CSettings {
     pub biquad_count: u8,
     /// Biquads on reference and feedback.
     pub biquads: [CBiquad; BIQUADS],
+    /// Number of levels of the feedforward.
+    pub level_count: u8,
+    /// Number of its taps; with no level either there is none.
+    pub tap_count: u8,
+    /// Samples by which the reference arrives early.
+    pub preview: u8,
+    /// Share of a sample by which the measurement is late.
+    pub late: f32,
+    /// Commands that hold outputs.
+    pub levels: [CLevel; LEVELS],
+    /// Command per change of the reference, the newest change's first.
+    pub taps: [f32; TAPS],
 }
 
 /// The number of the setting, in the header's order from 1; 0 for none.
@@ -100,6 +122,7 @@ fn number(name: &str) -> i32 {
         "r_rate",
         "schedule",
         "biquads",
+        "feedforward",
     ];
     let found = (1..).zip(names).find(|(_, known)| *known == name);
     found.map_or(-1, |(number, _)| number)
@@ -178,6 +201,28 @@ impl CSettings {
         Cascade::new(named.unwrap_or(&sections))
     }
 
+    fn feedforward(&self) -> Result<Feedforward<f32>, Refused> {
+        if self.level_count == 0 && self.tap_count == 0 {
+            return Ok(Feedforward::NONE);
+        }
+        let mut levels = [Level { y: 0.0, u: 0.0 }; LEVELS + 1];
+        for (place, level) in levels.iter_mut().zip(&self.levels) {
+            let CLevel { y, u } = *level;
+            *place = Level { y, u };
+        }
+        let mut taps = [0.0; TAPS + 1];
+        for (place, tap) in taps.iter_mut().zip(&self.taps) {
+            *place = *tap;
+        }
+        // a count beyond the array means one too many, and is refused
+        Feedforward::new(
+            self.preview.into(),
+            self.late,
+            levels.get(..self.level_count.into()).unwrap_or(&levels),
+            taps.get(..self.tap_count.into()).unwrap_or(&taps),
+        )
+    }
+
     fn design(&self) -> Result<Design<f32>, Refused> {
         let pid = Settings {
             gains: Standard {
@@ -202,6 +247,7 @@ impl CSettings {
             r_rate: self.r_rate,
             schedule: self.schedule()?,
             biquads: self.biquads()?,
+            feedforward: self.feedforward()?,
         })
     }
 }

@@ -84,6 +84,7 @@ fn assertions() -> String {
     layout!(t, "sewfast_output", COutput { u, enabled });
     layout!(t, "sewfast_pid_point", CPoint { speed, kp, ti, td });
     layout!(t, "sewfast_pid_biquad", CBiquad { c0, c1, a1, a2 });
+    layout!(t, "sewfast_pid_level", CLevel { y, u });
     layout!(
         t,
         "sewfast_pid_settings",
@@ -106,7 +107,13 @@ fn assertions() -> String {
             schedule_count,
             schedule,
             biquad_count,
-            biquads
+            biquads,
+            level_count,
+            tap_count,
+            preview,
+            late,
+            levels,
+            taps
         }
     );
     writeln!(

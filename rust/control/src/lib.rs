@@ -6,6 +6,7 @@ extern crate std;
 
 pub mod biquad;
 pub mod controller;
+pub mod feedforward;
 pub mod filter;
 pub mod gains;
 pub mod link;
@@ -18,6 +19,7 @@ pub mod tracker;
 
 pub use biquad::{BIQUADS, Biquad, Cascade};
 pub use controller::*;
+pub use feedforward::{AHEAD, Feedforward, LEVELS, Level, TAPS};
 pub use filter::{CAPACITY, Feedback, Observer, Ramp};
 pub use gains::{Parallel, PerSample, Standard};
 pub use pid::{Pid, Settings, Terms};

@@ -261,6 +261,19 @@ impl<T: Real> Pid<T> {
         (self.settings, self.terms) = (settings, terms);
     }
 
+    /// Adds to the integral term what another part of the command loses, once there was a sample.
+    pub(crate) fn absorb(&mut self, change: T) {
+        let kept = self.integral + change;
+        if self.started && kept.is_finite() {
+            self.integral = kept;
+        }
+    }
+
+    /// Whether there was a sample.
+    pub(crate) fn is_started(&self) -> bool {
+        self.started
+    }
+
     /// The operator's command from the next sample on, within the limits; the integral term tracks it.
     ///
     /// # Errors

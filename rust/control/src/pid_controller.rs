@@ -1,13 +1,17 @@
-//! The whole controller of the paper's Fig. 16: feedback filter, reference ramp, biquads, then the two-degree-of-freedom PID.
+//! The whole controller of the paper's Fig. 16: feedback filter, reference ramp, feedforward, biquads, then the
+//! two-degree-of-freedom PID.
 //!
 //! Biquads act on the reference and on the feedback alike. As the PID is linear in both, this equals biquads after it,
 //! on the command, where drives have them: the machine's resonance is neither fed back nor excited by the reference.
 //! But limits, slew, anti-windup and the operator's command act on the command that the machine receives.
 
 use crate::biquad::Memory;
+use crate::feedforward::Ahead;
 use crate::pid::Terms;
 use crate::schedule::{Row, Table};
-use crate::{Cascade, Controller, Feedback, Pid, Ramp, Real, Refused, Schedule, Settings};
+use crate::{
+    Cascade, Controller, Feedback, Feedforward, Pid, Ramp, Real, Refused, Schedule, Settings,
+};
 
 /// The numbers used by the step of a controller with constant gains, for code that steps many controllers at once with
 /// the same operations in the same order.
@@ -27,12 +31,13 @@ pub struct Numbers<T> {
     pub ramp: T,
 }
 
-/// Feedback filter, reference ramp, biquads, gain schedule and PID in one step.
+/// Feedback filter, reference ramp, feedforward, biquads, gain schedule and PID in one step.
 #[derive(Clone, Debug)]
 pub struct PidController<T> {
     design: Design<T>,
     filter: Feedback<T>,
     ramp: Ramp<T>,
+    ahead: Ahead<T>,
     /// The biquads' memory of the feedback.
     of_y: Memory<T>,
     /// The biquads' memory of the reference.
@@ -56,11 +61,14 @@ impl<T: Real> PidController<T> {
             r_rate,
             schedule,
             biquads: _,
+            feedforward: _,
         } = design;
         let ts = pid.ts;
+        let filter = Feedback::new(filter_samples, filter_time, observer_time, ts)?;
         Ok(Self {
             pid: Pid::new(pid)?,
-            filter: Feedback::new(filter_samples, filter_time, observer_time, ts)?,
+            ahead: Ahead::new(filter.clone()),
+            filter,
             ramp: Ramp::new(r_rate, ts)?,
             of_y: Memory::new(),
             of_r: Memory::new(),
@@ -91,6 +99,7 @@ impl<T: Real> PidController<T> {
     pub fn reset(&mut self) {
         self.filter.reset();
         self.ramp.reset();
+        self.ahead.reset();
         self.of_y.started = false;
         self.of_r.started = false;
         self.pid.reset();
@@ -110,12 +119,12 @@ impl<T: Real> PidController<T> {
     /// [`step`](Self::step) with a command added before the limits.
     pub fn step_with(&mut self, r: T, y: T, feedforward: T) -> T {
         if !y.is_finite() {
-            return self.pid.hold();
+            return self.pass(r);
         }
         let filtered = self.filter.step(y);
         if !filtered.is_finite() {
             self.filter.reset();
-            return self.pid.hold();
+            return self.pass(r);
         }
         let sections = self.design.biquads.sections();
         if !self.of_y.started {
@@ -124,16 +133,60 @@ impl<T: Real> PidController<T> {
         let filtered = self.of_y.step(sections, filtered);
         if !filtered.is_finite() {
             self.of_y.started = false;
-            return self.pid.hold();
+            return self.pass(r);
         }
         self.filtered = filtered;
-        let ramped = self.ramp.step(r, filtered);
-        let r = self.referred(ramped);
+        let (r, own) = self.lead(r, filtered);
+        let r = self.referred(r);
+        let feedforward = own.map_or(feedforward, |own| feedforward + own);
         let terms = match &self.table {
             Some(table) => table.at(self.filtered),
             None => self.pid.terms(),
         };
         self.pid.step_by(terms, r, self.filtered, feedforward)
+    }
+
+    /// From the reference to that of the PID before the biquads, and the command of the feedforward if there is one.
+    /// The ramp begins at `filtered`, the first feedback.
+    ///
+    /// Neither depends on later measurements, so a simulation can take this way before its loop
+    /// ([`without_lead`](Self::without_lead)).
+    pub fn lead(&mut self, r: T, filtered: T) -> (T, Option<T>) {
+        let ramped = self.ramp.step(r, filtered);
+        let feedforward = &self.design.feedforward;
+        if feedforward.is_none() {
+            return (ramped, None);
+        }
+        self.ahead.take(ramped);
+        if !self.ahead.started {
+            return (ramped, None);
+        }
+        let expected = self.ahead.expected(feedforward);
+        (expected, Some(self.ahead.command(feedforward)))
+    }
+
+    /// The design of what follows [`lead`](Self::lead): without ramp and feedforward.
+    pub fn without_lead(&self) -> Design<T> {
+        Design {
+            r_rate: T::INFINITY,
+            feedforward: Feedforward::NONE,
+            ..self.design
+        }
+    }
+
+    /// The filtered feedback if `y` were the first measurement.
+    pub fn first_filtered(&self, y: T) -> T {
+        self.filter.given(y)
+    }
+
+    /// A sample without a measurement: the reference goes on, as it does on the device that plays it.
+    fn pass(&mut self, r: T) -> T {
+        if self.ahead.started {
+            let ramped = self.ramp.step(r, r);
+            self.ahead.take(ramped);
+            self.ahead.expected(&self.design.feedforward);
+        }
+        self.pid.hold()
     }
 
     /// The reference after the biquads. Before the first sample they stood, like the ramp, at the first output, so a
@@ -153,6 +206,9 @@ impl<T: Real> PidController<T> {
     /// Another design from the next sample on, without a bump in the command: filter, ramp and derivative keep their
     /// memory, new biquads begin at rest, and the integral term absorbs the change of the other terms.
     ///
+    /// A feedforward with another preview begins at rest at the reference that the PID used last; the integral term absorbs the
+    /// change of its command.
+    ///
     /// New biquads begin at the output of the former ones or, if they magnify a step, at the values of the reference's
     /// ramp and of the new filter. So they never magnify what filters hold back, not even the last place by which a
     /// filter at rest differs from its input. Biquads that stay take a changed filter into account for the same reason.
@@ -170,7 +226,8 @@ impl<T: Real> PidController<T> {
         let given = |y: Option<T>, filter: &Feedback<T>| y.map(|y| filter.given(y));
         let measured = self.filter.newest();
         let before = given(measured, &self.filter);
-        self.filter = new.filter.after(&self.filter);
+        self.filter = new.filter.clone().after(&self.filter);
+        let jumped = self.lead_by(&design, new.filter);
         let standing = given(measured, &self.filter);
         self.ramp = new.ramp.after(&self.ramp);
         let terms = match &new.table {
@@ -192,8 +249,31 @@ impl<T: Real> PidController<T> {
             }
         }
         self.pid.change(design.pid, terms);
+        self.pid.absorb(jumped);
         (self.table, self.design) = (new.table, design);
         Ok(())
+    }
+
+    /// Takes the feedforward of a new design; returns by how much its command is less than before.
+    fn lead_by(&mut self, design: &Design<T>, filter: Feedback<T>) -> T {
+        let (new, old) = (&design.feedforward, &self.design.feedforward);
+        self.ahead.filtered_by(filter);
+        if new == old {
+            return T::ZERO;
+        }
+        let before = if old.is_none() || !self.ahead.started {
+            T::ZERO
+        } else {
+            self.ahead.command(old)
+        };
+        if new.is_none() || !self.pid.is_started() {
+            self.ahead.reset();
+            return before;
+        }
+        if (old.is_none(), new.preview(), new.late()) != (false, old.preview(), old.late()) {
+            self.ahead.stand_at(self.pid.reference());
+        }
+        before - self.ahead.command(new)
     }
 
     /// Hands the command to the operator: from the next sample on it is `u`, within the limits.
@@ -299,10 +379,12 @@ pub struct Design<T> {
     pub schedule: Schedule<T>,
     /// Biquads, such as notches, on reference and feedback; none by default.
     pub biquads: Cascade<T>,
+    /// The command that a model needs for the reference; none by default.
+    pub feedforward: Feedforward<T>,
 }
 
 impl<T: Real> Design<T> {
-    /// The PID alone: no filter, no observer, no ramp, no schedule, no biquads.
+    /// The PID alone: no filter, no observer, no ramp, no schedule, no biquads, no feedforward.
     pub fn new(pid: Settings<T>) -> Self {
         Self {
             pid,
@@ -312,6 +394,7 @@ impl<T: Real> Design<T> {
             r_rate: T::INFINITY,
             schedule: Schedule::NONE,
             biquads: Cascade::NONE,
+            feedforward: Feedforward::NONE,
         }
     }
 }

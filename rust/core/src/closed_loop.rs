@@ -2,10 +2,12 @@
 
 pub(crate) mod batch;
 mod kernel_plant;
+mod lead;
 mod plants;
 
 pub use kernel_plant::KernelPlant;
 pub(crate) use kernel_plant::Known;
+pub(crate) use lead::Lead;
 pub use plants::{LaggedPlant, StatePlant, Varied};
 
 use sewfast_control::{AnyController, Controller, PidController, Refused};
@@ -65,11 +67,25 @@ fn counts(plant: &(impl Plant + ?Sized), encoder: Option<&Encoder>, since: f64) 
     Some(encoder.count(position))
 }
 
+/// The first measurement of a plant that has been reset.
+fn first_measured(
+    plant: &(impl Plant + ?Sized),
+    encoder: Option<&Encoder>,
+    signals: Signals<'_>,
+) -> f64 {
+    // at rest the counter has stood, and the speed from it is 0 as well
+    let counted = plant.encoder().or(encoder).is_some();
+    let y = if counted { 0.0 } else { plant.output() };
+    signals.noise_at(0).map_or(y, |added| y + added)
+}
+
 /// Reference, feedforward, disturbance and measurement noise of a run, sample by sample.
 #[derive(Clone, Copy, Debug)]
 pub struct Signals<'a> {
     /// The output that is asked for \[y\].
     pub reference: &'a [f64],
+    /// What the controller gets in its place \[y\]: the expected measurement, where a feedforward knows it.
+    pub setpoint: Option<&'a [f64]>,
     /// A command added before the limits \[u\].
     pub feedforward: Option<&'a [f64]>,
     /// A command added after the limits, unseen by the controller \[u\].
@@ -83,6 +99,7 @@ impl<'a> Signals<'a> {
     pub fn new(reference: &'a [f64]) -> Self {
         Self {
             reference,
+            setpoint: None,
             feedforward: None,
             disturbance: None,
             noise: None,
@@ -94,6 +111,7 @@ impl<'a> Signals<'a> {
     pub(crate) fn check(&self) -> Result<()> {
         check_reference(self.reference)?;
         let beside = [
+            ("setpoint", self.setpoint),
             ("feedforward", self.feedforward),
             ("disturbance", self.disturbance),
             ("noise", self.noise),
@@ -110,6 +128,12 @@ impl<'a> Signals<'a> {
             check_finite(name, signal)?;
         }
         Ok(())
+    }
+
+    /// What the controller gets at sample `k`, of which the reference is `r`.
+    #[inline(always)]
+    fn setpoint_at(&self, k: usize, r: f64) -> f64 {
+        self.setpoint.map_or(r, |given| at(given, k))
     }
 
     /// The command added at sample `k` before the limits.
@@ -217,6 +241,8 @@ impl Run {
     }
 
     /// [`record`](Self::record) with further signals beside the reference; a shorter signal continues with 0.
+    ///
+    /// A controller with feedforward gets the reference early by its preview; at the end the last value stays.
     pub fn record_with(
         &mut self,
         plant: &mut (impl Plant + ?Sized),
@@ -225,6 +251,15 @@ impl Run {
         encoder: Option<&Encoder>,
         monitor: &Monitor,
     ) {
+        // The way of the reference through a feedforward depends on no later measurement: it is taken before the loop,
+        // which then is that of a PID alone.
+        if let Some(lead) = Lead::of(controller, signals, || {
+            plant.reset();
+            first_measured(plant, encoder, signals)
+        }) {
+            let (mut rest, signals) = (lead.rest.clone().into(), lead.signals(signals));
+            return self.record_with(plant, &mut rest, signals, encoder, monitor);
+        }
         match plant.known() {
             // The whole loop in one kernel: controller, encoder and plant are compiled for one processor, with no call
             // per sample.
@@ -309,6 +344,7 @@ impl Run {
             }
             // The command is held until the next sample, so it acts on y(k+1) at the earliest: a plant has a delay of 1
             // or more.
+            let r = signals.setpoint_at(k, r);
             let u = controller.decide(k == 0, r, measured, signals.feedforward_at(k));
             commands[k] = u;
             outputs[k] = y;

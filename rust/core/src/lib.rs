@@ -19,6 +19,7 @@ mod gram;
 pub mod greybox;
 pub mod guard;
 pub mod hammerstein;
+pub mod inverse;
 pub mod iv;
 pub mod lagged;
 #[cfg(test)]

@@ -84,6 +84,21 @@ pub fn biquads(sections: &[[f64; 4]]) -> Body {
     })
 }
 
+/// FEEDFORWARD: preview, lateness, levels of y and u, taps; without levels and taps it takes the feedforward away.
+#[must_use]
+pub fn feedforward(preview: u8, late: f64, levels: &[[f64; 2]], taps: &[f64]) -> Body {
+    written(|b| {
+        b.u8(preview);
+        numbers(b, &[late]);
+        b.u8(u8::try_from(levels.len()).unwrap_or(u8::MAX));
+        for level in levels {
+            numbers(b, level);
+        }
+        b.u8(u8::try_from(taps.len()).unwrap_or(u8::MAX));
+        numbers(b, taps);
+    })
+}
+
 /// CONTROLLER: the number of a kind, counts per unit, then the numbers of the kind.
 #[must_use]
 pub fn controller(kind: u8, counts_per_unit: f64, values: &[f64]) -> Body {

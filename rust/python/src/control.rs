@@ -127,6 +127,7 @@ fn closed_loop<'py>(
     let noise = (noise != 0.0).then(|| looped::white_noise(noise, reference.len(), seed));
     let signals = Signals {
         reference,
+        setpoint: None,
         feedforward: feedforward.as_deref(),
         disturbance: disturbance.as_deref(),
         noise: noise.as_deref(),

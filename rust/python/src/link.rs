@@ -132,6 +132,17 @@ impl LinkBodies {
     }
 
     #[staticmethod]
+    fn feedforward(
+        py: Python<'_>,
+        preview: u8,
+        late: f64,
+        levels: Vec<[f64; 2]>,
+        taps: Vec<f64>,
+    ) -> Wire<'_> {
+        wire(py, &bodies::feedforward(preview, late, &levels, &taps))
+    }
+
+    #[staticmethod]
     fn biquads(py: Python<'_>, sections: Vec<[f64; 4]>) -> Wire<'_> {
         wire(py, &bodies::biquads(&sections))
     }

@@ -4,8 +4,8 @@ use super::Fields;
 use super::device::State;
 use super::identity::Limits;
 use crate::{
-    AnyController, AnyDesign, BIQUADS, Biquad, Cascade, Design, POINTS, Point, Refused, Schedule,
-    Settings, Standard,
+    AnyController, AnyDesign, BIQUADS, Biquad, Cascade, Design, Feedforward, LEVELS, Level, POINTS,
+    Point, Refused, Schedule, Settings, Standard, TAPS,
 };
 
 /// Shortest and longest time of a watchdog \[us\].
@@ -108,6 +108,13 @@ impl Gains {
         }
     }
 
+    /// Feedforward from the next start on; GAINS has none.
+    pub(super) fn set_feedforward(&mut self, feedforward: Feedforward<f32>) {
+        if let Some(design) = self.design.pid_mut() {
+            design.feedforward = feedforward;
+        }
+    }
+
     /// Whether the settings are a PID's, which every device with mode 1 can run.
     pub(super) fn are_pid(&self) -> bool {
         self.design.pid().is_some()
@@ -204,6 +211,8 @@ pub(super) enum Command<'a> {
     Echo(&'a [u8]),
     /// The number of sections and, if valid, the sections.
     Biquads(Result<Cascade<f32>, Refusal>),
+    /// The feedforward if it is valid.
+    Feedforward(Result<Feedforward<f32>, Refusal>),
 }
 
 impl<'a> Command<'a> {
@@ -225,6 +234,7 @@ impl<'a> Command<'a> {
             0x0B => Some(Self::Echo(fields.rest())).filter(|_| body.len() <= MAX_ECHO),
             0x0C => biquads(&mut fields).map(Self::Biquads),
             0x0D => controller(&mut fields)?,
+            0x0E => feedforward(&mut fields).map(Self::Feedforward),
             _ => return Err(Refusal::unknown(kind)),
         };
         let whole = command.filter(|_| fields.is_empty());
@@ -377,6 +387,37 @@ fn biquads(fields: &mut Fields<'_>) -> Option<Result<Cascade<f32>, Refusal>> {
     }
     let whole = Cascade::new(named).map_err(|_| Refusal::value(0));
     Some(good.and(whole))
+}
+
+/// `None` if the body is too short for its levels and taps.
+fn feedforward(fields: &mut Fields<'_>) -> Option<Result<Feedforward<f32>, Refusal>> {
+    let (preview, late) = (fields.u8()?, fields.f32()?);
+    // room for one too many of each, which is refused like any larger number
+    let mut levels = [Level { y: 0.0, u: 0.0 }; LEVELS + 1];
+    let level_count = usize::from(fields.u8()?);
+    for place in levels.iter_mut().take(level_count) {
+        *place = Level {
+            y: fields.f32()?,
+            u: fields.f32()?,
+        };
+    }
+    fields.take(8 * level_count.saturating_sub(levels.len()))?;
+    let mut taps = [0.0; TAPS + 1];
+    let tap_count = usize::from(fields.u8()?);
+    for place in taps.iter_mut().take(tap_count) {
+        *place = fields.f32()?;
+    }
+    fields.take(4 * tap_count.saturating_sub(taps.len()))?;
+    if level_count == 0 && tap_count == 0 {
+        return Some(Ok(Feedforward::NONE));
+    }
+    let made = Feedforward::new(
+        preview.into(),
+        late,
+        levels.get(..level_count).unwrap_or(&levels),
+        taps.get(..tap_count).unwrap_or(&taps),
+    );
+    Some(made.map_err(|_| Refusal::value(0)))
 }
 
 fn start<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {

@@ -32,6 +32,8 @@ pub mod capability {
     pub const BIQUADS: u32 = 1 << 7;
     /// Besides its PID, runs controllers of the kinds named by CONTROLLER along uploaded references.
     pub const KINDS: u32 = 1 << 8;
+    /// Its PID has feedforward.
+    pub const FEEDFORWARD: u32 = 1 << 9;
 }
 
 /// How a channel's samples are encoded.

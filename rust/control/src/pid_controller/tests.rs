@@ -3,7 +3,7 @@
 use super::*;
 use crate::biquad::tests::{any_section, section, settling};
 use crate::real::counted::{Counted, operations};
-use crate::{Biquad, Cascade, Point, Schedule, Standard};
+use crate::{AHEAD, Biquad, Cascade, Feedforward, Level, Point, Schedule, Standard, TAPS};
 use proptest::prelude::*;
 use std::vec::Vec;
 
@@ -39,8 +39,15 @@ fn free() -> impl Strategy<Value = Design<f64>> {
         let sections: Vec<_> = given.into_iter().map(section).collect();
         Cascade::new(&sections).unwrap()
     });
-    (gains, n, filter, rate, points, biquads).prop_map(
-        |(g, n, filter, r_rate, schedule, biquads)| Design {
+    let feedforward = prop_oneof![
+        Just(Feedforward::NONE),
+        (0..=30_usize, 0.0..=1.0, -0.5..0.5, -0.5..0.5).prop_map(|(preview, late, u, tap)| {
+            let levels = [Level { y: -5.0, u: -2.0 }, Level { y: 5.0, u }];
+            Feedforward::new(preview, late, &levels, &[tap, u]).unwrap()
+        }),
+    ];
+    (gains, n, filter, rate, points, biquads, feedforward).prop_map(
+        |(g, n, filter, r_rate, schedule, biquads, feedforward)| Design {
             pid: Settings {
                 alpha: g.3,
                 beta: g.4,
@@ -53,6 +60,7 @@ fn free() -> impl Strategy<Value = Design<f64>> {
             r_rate,
             schedule,
             biquads,
+            feedforward,
         },
     )
 }
@@ -71,6 +79,7 @@ fn fading<T: Real>(design: &Design<T>, fade: f64) -> u32 {
     let slow = times.iter().filter(|time| **time > 0.0);
     let memory: f64 = slow.map(|time| time / ts + 1.0).sum();
     let ramp = 100.0 / (design.r_rate.to_f64() * ts);
+    let ramp = ramp + (AHEAD.max(TAPS) + 1) as f64;
     let own = ramp + design.filter_samples as f64 + fade * memory;
     own.ceil() as u32 + settling(&design.biquads, fade)
 }
@@ -454,6 +463,7 @@ fn whole() -> Design<Counted> {
         r_rate: c(5000.0),
         schedule: Schedule::new(&points).unwrap(),
         biquads: Cascade::new(&[section((40.0, 0.2, 70.0, 0.5, 3)); 4]).unwrap(),
+        feedforward: Feedforward::NONE,
     }
 }
 

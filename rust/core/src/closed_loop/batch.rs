@@ -245,9 +245,9 @@ impl<'a, V: F64x8, C: LaneController<V>> Loops<'a, V, C> {
     #[inline(always)]
     fn decide(&mut self, signals: &Signals<'_>, k: usize, r: f64, notes: &mut impl Notes) {
         let y = self.plants.output();
-        let u = self
-            .controllers
-            .decide(k == 0, r, signals.feedforward_at(k));
+        let u =
+            self.controllers
+                .decide(k == 0, signals.setpoint_at(k, r), signals.feedforward_at(k));
         // As in `Run::through`, the command as decided; the disturbance is added afterwards.
         notes.put(k, r, u, y, self.controllers.filtered());
         self.applied = match signals.disturbance_at(k) {

@@ -4,7 +4,9 @@ use nalgebra::{Matrix3, Vector3};
 
 mod state_space;
 
-use sewfast_control::{Biquad, Cascade, Design, PidController, Settings, Standard};
+use sewfast_control::{
+    Biquad, Cascade, Design, Feedforward, Level, PidController, Settings, Standard,
+};
 
 use super::*;
 use crate::lagged::Lagged;
@@ -287,6 +289,54 @@ fn a_disturbance_acts_behind_the_limits() {
     let run = closed_loop_with(&mut plant, &mut c, signals, None, &monitor).unwrap();
     assert!(run.u.iter().all(|u| u.abs() <= 0.5));
     assert!((run.y[1999] - 490.0 * 1.5).abs() < 1e-6);
+}
+
+#[test]
+fn a_feedforward_has_the_bits_of_its_controller_stepped_by_hand() {
+    let model = lag();
+    let levels = [(-1e3, -2.0), (1e3, 2.1)].map(|(y, u)| Level { y, u });
+    let feedforward = Feedforward::new(5, 0.5, &levels, &[0.05, 0.02, -0.01]).unwrap();
+    let reference: Vec<f64> = (0..600)
+        .map(|k| 200.0 * (f64::from(k) / 30.0).sin() + 300.0)
+        .collect();
+    let (added, noise) = (vec![0.1; 600], white_noise(2.0, 600, 3));
+    let signals = Signals {
+        feedforward: Some(&added),
+        noise: Some(&noise),
+        ..Signals::new(&reference)
+    };
+    for (r_rate, sensor) in [
+        (f64::INFINITY, None),
+        (4e3, None),
+        (f64::INFINITY, encoder(26.2, 0.5).unwrap()),
+        (4e3, encoder(26.2, 0.5).unwrap()),
+    ] {
+        let design = Design {
+            filter_samples: 4,
+            r_rate,
+            feedforward,
+            ..Design::new(pi(2e-3, 0.05))
+        };
+        let mut controller: AnyController<f64> = PidController::new(design).unwrap().into();
+        let mut plant = LaggedPlant::new(&model, TS).unwrap();
+        let (sensor, monitor) = (sensor.as_ref(), Monitor::default());
+        let run = closed_loop_with(&mut plant, &mut controller, signals, sensor, &monitor);
+        let run = run.unwrap();
+        plant.reset();
+        let mut before = counts(&plant, sensor, -TS);
+        for k in 0..600 {
+            let now = counts(&plant, sensor, 0.0);
+            let measured = match (before, now) {
+                (Some(before), Some(now)) => (now - before) / (TS * 26.2),
+                _ => plant.output(),
+            };
+            before = now;
+            let ahead = reference[(k + 5).min(599)];
+            let u = controller.step_with(ahead, measured + noise[k], 0.1);
+            assert_eq!(run.u[k].to_bits(), u.to_bits(), "{k}");
+            plant.advance(u);
+        }
+    }
 }
 
 #[test]

@@ -1,6 +1,8 @@
 //! One thread's plants and memory: terms and costs of controllers over all plants and references. Runs go one after the
 //! other, or side by side with sums accumulated as they run.
 
+use std::cell::OnceCell;
+
 use sewfast_control::{AnyController, AnyDesign, Controller};
 
 use super::cost::{Course, Measure, SMOOTHING, Terms, Weights};
@@ -8,7 +10,7 @@ use super::{Aggregate, Extent, LoadLimit, LoadStep, Task};
 use crate::closed_loop::batch::{
     BatchLoop, InLanes, MOST, Sums, Tally, WithKind, are_of_a_kind, of_a_kind,
 };
-use crate::closed_loop::{KernelPlant, Outcome, Plant, Run, Signals};
+use crate::closed_loop::{KernelPlant, Lead, Outcome, Plant, Run, Signals};
 use crate::metrics::Edge;
 use crate::search::Judgement;
 use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
@@ -159,13 +161,15 @@ impl<P: Plant + Clone> Bench<P> {
     ) {
         let made = designs.iter().map(AnyDesign::controller).enumerate();
         let mut open: Vec<_> = made.filter_map(|(i, made)| Some((i, made.ok()?))).collect();
+        let leads = Leads::taken_from(&mut open, task);
         for plant in 0..self.plants.len() {
             for run in 0..task.runs() {
                 let Some(share) = task.share(extent, plant, run) else {
                     continue;
                 };
+                let signals = leads.signals(task, plant, run);
                 let mut all = self
-                    .several(task, plant, run, &mut open, monitor)
+                    .several(task, (plant, run), signals, &mut open, monitor)
                     .into_iter();
                 let mut next = || Some((all.next()??, share));
                 open.retain(|(i, _)| take(*i, plant, run, next()));
@@ -177,8 +181,8 @@ impl<P: Plant + Clone> Bench<P> {
     fn several(
         &mut self,
         task: &Task<'_, P>,
-        plant: usize,
-        run: usize,
+        (plant, run): (usize, usize),
+        signals: Signals<'_>,
         open: &mut [(usize, AnyController<f64>)],
         monitor: &Monitor,
     ) -> Vec<Option<Terms>> {
@@ -187,7 +191,7 @@ impl<P: Plant + Clone> Bench<P> {
             Some(known) if Batch::take(&controllers) => {
                 let course = Runs {
                     known,
-                    signals: task.signals(plant, run),
+                    signals,
                     encoder: task.encoder.as_ref(),
                     load: task.loads.get(run),
                     measure: run.checked_sub(task.loads.len()).map(|r| self.measures[r]),
@@ -196,7 +200,7 @@ impl<P: Plant + Clone> Bench<P> {
             }
             _ => open
                 .iter_mut()
-                .map(|(_, controller)| self.run(task, plant, run, controller, monitor))
+                .map(|(_, controller)| self.run(task, (plant, run), signals, controller, monitor))
                 .collect(),
         }
     }
@@ -213,7 +217,9 @@ impl<P: Plant + Clone> Bench<P> {
         for plant in 0..self.plants.len() {
             let mut worst = Terms::default();
             for run in 0..task.loads.len() {
-                worst = worst.max(&self.run(task, plant, run, &mut controller, monitor)?);
+                let signals = task.signals(plant, run);
+                let terms = self.run(task, (plant, run), signals, &mut controller, monitor);
+                worst = worst.max(&terms?);
             }
             all.push(LoadLimit {
                 recovery: worst.recovery,
@@ -227,12 +233,11 @@ impl<P: Plant + Clone> Bench<P> {
     fn run(
         &mut self,
         task: &Task<'_, P>,
-        plant: usize,
-        run: usize,
+        (plant, run): (usize, usize),
+        signals: Signals<'_>,
         controller: &mut AnyController<f64>,
         monitor: &Monitor,
     ) -> Option<Terms> {
-        let signals = task.signals(plant, run);
         let (plant, encoder) = (&mut self.plants[plant], task.encoder.as_ref());
         self.run
             .record_with(plant, controller, signals, encoder, monitor);
@@ -245,6 +250,44 @@ impl<P: Plant + Clone> Bench<P> {
         }
         let measure = &self.measures[run - task.loads.len()];
         Some(measure.of(signals.reference, &self.run, controller.limits(), ts))
+    }
+}
+
+/// The ways of the references through a feedforward that all candidates share; it is taken once for all of them.
+struct Leads(Vec<OnceCell<Option<Lead>>>, Option<AnyController<f64>>);
+
+impl Leads {
+    /// Takes feedforward and ramp from controllers that share them; none from others, which then run one by one.
+    fn taken_from<P>(open: &mut [(usize, AnyController<f64>)], task: &Task<'_, P>) -> Self {
+        let pids: Option<Vec<_>> = open.iter().map(|(_, c)| c.pid()).collect();
+        let first = pids.as_ref().and_then(|pids| pids.first().copied());
+        let shared = first.filter(|first| {
+            let all = pids.iter().flatten();
+            Lead::has_feedforward(first) && all.into_iter().all(|c| Lead::is_shared(c, first))
+        });
+        let Some(way) = shared.cloned() else {
+            return Self(Vec::new(), None);
+        };
+        for (_, controller) in open {
+            let rest = controller
+                .pid()
+                .map(|pid| AnyDesign::from(pid.without_lead()));
+            if let Some(rest) = rest.and_then(|rest| rest.controller().ok()) {
+                *controller = rest;
+            }
+        }
+        Self(vec![OnceCell::new(); task.runs()], Some(way.into()))
+    }
+
+    /// The signals of a plant's run.
+    fn signals<'a, P>(&'a self, task: &Task<'a, P>, plant: usize, run: usize) -> Signals<'a> {
+        let signals = task.signals(plant, run);
+        let (Some(cell), Some(way)) = (self.0.get(run), &self.1) else {
+            return signals;
+        };
+        // without a ramp nothing depends on the first measurement
+        let lead = cell.get_or_init(|| Lead::of(way, signals, || 0.0));
+        lead.as_ref().map_or(signals, |lead| lead.signals(signals))
     }
 }
 

@@ -21,7 +21,8 @@ const CAPABILITIES: u32 = capability::PROFILE
     | capability::COMPUTED
     | capability::DESIGN
     | capability::BIQUADS
-    | capability::KINDS;
+    | capability::KINDS
+    | capability::FEEDFORWARD;
 
 const CHANNELS: [Channel; 6] = [
     channel("counts", "1", Encoding::Counts, 1, Source::Counts),

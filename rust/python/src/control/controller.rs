@@ -1,21 +1,24 @@
 //! Bindings of the controller, one sample at a time, in double precision and in the single precision of most microcontrollers.
 
+use numpy::{PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::{
-    AnyDesign, Biquad, Cascade, Design, PidController as Core, Point, Refused, Row, STATES,
-    Schedule, Settings, Standard, StateDesign, StateFeedback as States, Weights, lqg,
+    AnyDesign, Biquad, Cascade, Design, Feedforward, Level, PidController as Core, Point, Refused,
+    Row, STATES, Schedule, Settings, Standard, StateDesign, StateFeedback as States, Weights, lqg,
 };
-use sewfast_core::Error;
+use sewfast_core::inverse::{self, Local};
+use sewfast_core::{Error, Result as CoreResult};
 
-use crate::seam::raise;
+use crate::seam::{raise, slice};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Controller>()?;
     module.add_class::<SingleController>()?;
     module.add_class::<StateFeedback>()?;
     module.add_class::<SingleStateFeedback>()?;
-    module.add_function(wrap_pyfunction!(biquad, module)?)
+    module.add_function(wrap_pyfunction!(biquad, module)?)?;
+    module.add_function(wrap_pyfunction!(inverse_taps, module)?)
 }
 
 /// The controller's arithmetic (paper Fig. 16). Gains in standard form.
@@ -80,6 +83,55 @@ pub fn biquad(py: Python<'_>, kind: &str, numbers: Vec<f64>, Ts: f64) -> PyResul
     Ok((c0, c1, a1, a2))
 }
 
+/// Preview [samples], lateness of the measurement [samples], levels of output and command, taps.
+type Ahead = (usize, f64, Vec<(f64, f64)>, Vec<f64>);
+
+fn feedforward(given: &Option<Ahead>) -> Result<Feedforward<f64>, Refused> {
+    let Some((preview, late, levels, taps)) = given else {
+        return Ok(Feedforward::NONE);
+    };
+    let level = |&(y, u): &(f64, f64)| Level { y, u };
+    let levels: Vec<_> = levels.iter().map(level).collect();
+    Feedforward::new(*preview, *late, &levels, taps)
+}
+
+/// A, B, C, D of one input, its delay [samples], and the slope of the levels.
+type Point1<'py> = (
+    PyReadonlyArray2<'py, f64>,
+    PyReadonlyArray1<'py, f64>,
+    PyReadonlyArray1<'py, f64>,
+    f64,
+    usize,
+    f64,
+);
+
+/// The taps of a feedforward on plants linearised about levels, for each pair of preview and smoothing.
+#[pyfunction]
+#[pyo3(signature = (points, choices, *, count))]
+fn inverse_taps(
+    py: Python<'_>,
+    points: Vec<Point1<'_>>,
+    choices: Vec<(usize, f64)>,
+    count: usize,
+) -> PyResult<Vec<Vec<f64>>> {
+    let local = |(a, b, c, d, delay, slope): &Point1<'_>| -> PyResult<Local> {
+        let a = a.as_array().iter().copied().collect::<Vec<_>>();
+        Ok(Local::new(
+            &a,
+            slice(b, "B")?,
+            slice(c, "C")?,
+            *d,
+            *delay,
+            *slope,
+        ))
+    };
+    let plants = points.iter().map(local).collect::<PyResult<Vec<_>>>()?;
+    let each = choices.iter();
+    each.map(|&(preview, smoothing)| inverse::taps(&plants, preview, count, smoothing))
+        .collect::<CoreResult<_>>()
+        .map_err(|e| raise(py, e))
+}
+
 fn schedule(rows: &[Given]) -> Result<Schedule<f64>, Refused> {
     let point = |&(speed, kp, ti, td): &Given| Point {
         speed,
@@ -126,7 +178,21 @@ fn single(design: &Design<f64>) -> Result<Design<f32>, Refused> {
         r_rate: design.r_rate as f32,
         schedule: Schedule::new(&points)?,
         biquads: Cascade::new(&sections)?,
+        feedforward: single_feedforward(&design.feedforward)?,
     })
+}
+
+fn single_feedforward(given: &Feedforward<f64>) -> Result<Feedforward<f32>, Refused> {
+    if given.is_none() {
+        return Ok(Feedforward::NONE);
+    }
+    let level = |level: &Level<f64>| Level {
+        y: level.y as f32,
+        u: level.u as f32,
+    };
+    let levels: Vec<_> = given.levels().iter().map(level).collect();
+    let taps: Vec<_> = given.taps().iter().map(|tap| *tap as f32).collect();
+    Feedforward::new(given.preview(), given.late() as f32, &levels, &taps)
 }
 
 /// The methods common to both precisions; each class adds its own.
@@ -215,6 +281,12 @@ macro_rules! controller_methods {
                 let section = |s: &Biquad<$float>| [s.c0, s.c1, s.a1, s.a2].map(f64::from);
                 let sections: Vec<_> = design.biquads.sections().iter().map(section).collect();
                 found.set_item("biquads", sections)?;
+                let ahead = &design.feedforward;
+                let levels: Vec<_> =
+                    ahead.levels().iter().map(|l| [l.y, l.u].map(f64::from)).collect();
+                let taps: Vec<_> = ahead.taps().iter().map(|tap| f64::from(*tap)).collect();
+                let late = f64::from(ahead.late());
+                found.set_item("feedforward", (ahead.preview(), late, levels, taps))?;
                 Ok(found)
             }
         }
@@ -223,7 +295,7 @@ macro_rules! controller_methods {
 
 controller_methods!(Controller, f64 {
     #[new]
-    #[pyo3(signature = (*, Kp, Ti, Td, alpha, beta, N, Tt, u_min, u_max, slew, Ts, filter_samples, filter_time, observer_time=0.0, r_rate=f64::INFINITY, schedule=Vec::new(), biquads=Vec::new()))]
+    #[pyo3(signature = (*, Kp, Ti, Td, alpha, beta, N, Tt, u_min, u_max, slew, Ts, filter_samples, filter_time, observer_time=0.0, r_rate=f64::INFINITY, schedule=Vec::new(), biquads=Vec::new(), feedforward=None))]
     #[expect(non_snake_case, reason = "the field's names")]
     #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
@@ -245,6 +317,7 @@ controller_methods!(Controller, f64 {
         r_rate: f64,
         schedule: Vec<Given>,
         biquads: Vec<Section>,
+        feedforward: Option<Ahead>,
     ) -> PyResult<Self> {
         let gains = Standard {
             kp: Kp,
@@ -271,6 +344,7 @@ controller_methods!(Controller, f64 {
                 r_rate,
                 schedule: self::schedule(&schedule)?,
                 biquads,
+                feedforward: self::feedforward(&feedforward)?,
             })
         });
         let core = made.map_err(|refused| raise(py, Error::from(refused)))?;

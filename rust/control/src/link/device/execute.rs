@@ -1,7 +1,6 @@
 //! Executes or refuses the host's commands.
 
 use super::{Core, Event, Reason, Run, State, Weight};
-use crate::Cascade;
 use crate::link::command::{
     Beat, Command, Gains, HELLO, Heartbeat, Refusal, STOP, Start, Upload, check_watchdog,
 };
@@ -9,6 +8,7 @@ use crate::link::identity::{Limits, VERSION, capability};
 use crate::link::profile::Table;
 use crate::link::session::{Order, Reply, Session, key};
 use crate::link::{Body, Fields, Frame};
+use crate::{Cascade, Feedforward};
 
 /// How far ahead a run can be planned \[us\].
 const AHEAD: u64 = 10_000_000;
@@ -128,6 +128,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             Command::Upload(upload) => self.upload(upload, body),
             Command::Gains(gains) => self.set_gains(gains),
             Command::Biquads(biquads) => self.set_biquads(biquads),
+            Command::Feedforward(feedforward) => self.set_feedforward(feedforward),
             Command::Start(start) => self.start(start, body),
             Command::Echo(bytes) => {
                 body.add(bytes);
@@ -308,16 +309,34 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         Ok(())
     }
 
-    #[inline(never)]
-    fn set_biquads(&mut self, biquads: Result<Cascade<f32>, Refusal>) -> Done {
+    /// Takes a part that belongs to the gains in force: biquads or feedforward of a PID.
+    fn set_part<T>(
+        &mut self,
+        needed: u32,
+        part: Result<T, Refusal>,
+        is_none: impl Fn(&T) -> bool,
+        set: impl Fn(&mut Gains, T),
+    ) -> Done {
         self.allow(&[State::Idle, State::Armed])?;
         Refusal::state(self.state).unless(self.run.planned.is_none())?;
-        Refusal::unsupported(0).unless(self.can(capability::BIQUADS))?;
-        let biquads = biquads?;
+        Refusal::unsupported(0).unless(self.can(needed))?;
+        let part = part?;
         let gains = self.gains.as_mut().ok_or(Refusal::value(0))?;
-        Refusal::value(0).unless(gains.are_pid() || biquads.is_empty())?;
-        gains.set_biquads(biquads);
+        Refusal::value(0).unless(gains.are_pid() || is_none(&part))?;
+        set(gains, part);
         Ok(())
+    }
+
+    #[inline(never)]
+    fn set_biquads(&mut self, biquads: Result<Cascade<f32>, Refusal>) -> Done {
+        let needed = capability::BIQUADS;
+        self.set_part(needed, biquads, Cascade::is_empty, Gains::set_biquads)
+    }
+
+    #[inline(never)]
+    fn set_feedforward(&mut self, given: Result<Feedforward<f32>, Refusal>) -> Done {
+        let (needed, is_none) = (capability::FEEDFORWARD, Feedforward::is_none);
+        self.set_part(needed, given, is_none, Gains::set_feedforward)
     }
 
     #[inline(never)]

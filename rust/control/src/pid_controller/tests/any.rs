@@ -2,7 +2,9 @@
 
 use super::fading;
 use crate::biquad::tests::{any_section, section};
-use crate::{Cascade, Design, PidController, Point, Real, Schedule, Settings, Standard};
+use crate::{
+    Cascade, Design, Feedforward, Level, PidController, Point, Real, Schedule, Settings, Standard,
+};
 use proptest::prelude::*;
 use std::vec::Vec;
 
@@ -59,6 +61,19 @@ macro_rules! laws {
                 })
             }
 
+            /// Any feedforward, often none.
+            fn feedforward() -> impl Strategy<Value = Feedforward<$float>> {
+                let levels = prop::collection::vec((number(), number()), 0..=8);
+                let taps = prop::collection::vec(number(), 0..=16);
+                (0..=30_usize, 0.0..=1.0 as $float, levels, taps).prop_map(|(preview, late, mut levels, taps)| {
+                    levels.retain(|(y, u)| y.is_finite() && u.is_finite());
+                    levels.sort_by(|a, b| a.0.total_cmp(&b.0));
+                    let levels: Vec<_> = levels.into_iter().map(|(y, u)| Level { y, u }).collect();
+                    let taps: Vec<_> = taps.into_iter().filter(|tap| tap.is_finite()).collect();
+                    Feedforward::new(preview, late, &levels, &taps).unwrap_or(Feedforward::NONE)
+                })
+            }
+
             /// Any design that is accepted at this sample time.
             fn design(ts: $float) -> impl Strategy<Value = Design<$float>> {
                 let tt = prop_oneof![Just(0.0), Just($float::INFINITY), (1.0..1e3 as $float).prop_map(move |n| n * ts)];
@@ -67,7 +82,8 @@ macro_rules! laws {
                 let pid = (gains(), number(), number(), positive(), tt, limits(), positive());
                 let biquads = prop::collection::vec(any_section(), 0..=4);
                 let rest = (1..=64_usize, time(), time(), positive(), points, biquads);
-                (pid, rest).prop_map(move |(p, (filter_samples, filter_time, observer_time, r_rate, points, biquads))| {
+                (pid, rest, feedforward()).prop_map(move |(p, rest, feedforward)| {
+                    let (filter_samples, filter_time, observer_time, r_rate, points, biquads) = rest;
                     let points: Vec<_> = points.into_iter().map(|(speed, gains)| Point { speed, gains }).collect();
                     let finite = |x: $float| if x.is_finite() { x } else { 0.0 };
                     let pid = Settings {
@@ -77,7 +93,9 @@ macro_rules! laws {
                     let schedule = Schedule::new(&points).unwrap_or(Schedule::NONE);
                     let sections: Vec<_> = biquads.into_iter().map(section).collect();
                     let biquads = Cascade::new(&sections).unwrap();
-                    let whole = Design { pid, filter_samples, filter_time, observer_time, r_rate, schedule, biquads };
+                    let whole = Design {
+                        pid, filter_samples, filter_time, observer_time, r_rate, schedule, biquads, feedforward,
+                    };
                     // a ramp so slow that a sample of it is 0 is refused
                     if PidController::new(whole).is_ok() { whole } else { Design { r_rate: $float::INFINITY, ..whole } }
                 })

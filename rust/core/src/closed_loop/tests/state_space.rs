@@ -85,6 +85,7 @@ proptest! {
         };
         let (feedforward, disturbance) = (added(0.5, 30.0), added(0.3, 17.0));
         let signals = Signals {
+            setpoint: None,
             reference: &reference,
             feedforward: Some(&feedforward),
             disturbance: Some(&disturbance),

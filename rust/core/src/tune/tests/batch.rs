@@ -1,5 +1,7 @@
 //! Controllers judged side by side.
 
+use sewfast_control::{Feedforward, Level};
+
 use super::*;
 use crate::random::Random;
 
@@ -71,6 +73,40 @@ fn compare<P: Plant + Clone + Send + Sync>(task: &Task<'_, P>, designs: &[AnyDes
     };
     let alone: Vec<_> = designs.iter().flat_map(|d| terms(&[*d])).collect();
     assert_eq!(terms(designs), alone);
+}
+
+#[test]
+fn a_feedforward_that_all_share_and_others_are_worth_the_same_side_by_side() {
+    let levels = [(-2e3, -4.0), (2e3, 4.0)].map(|(y, u)| Level { y, u });
+    let feedforward = Feedforward::new(6, 0.5, &levels, &[0.02, 0.01]).unwrap();
+    with_task(start(), |task| {
+        let lead = |design: &AnyDesign<f64>| Design {
+            feedforward,
+            ..pid_of(design)
+        };
+        let all: Vec<AnyDesign<f64>> = designs(&task.start)
+            .iter()
+            .map(|design| lead(design).into())
+            .collect();
+        let alike: Vec<AnyDesign<f64>> = all
+            .iter()
+            .map(|design| {
+                Design {
+                    filter_samples: 8,
+                    ..pid_of(design)
+                }
+                .into()
+            })
+            .collect();
+        let without = {
+            let mut some = alike.clone();
+            some[3] = task.start;
+            some
+        };
+        for designs in [all, alike, without] {
+            compare(task, &designs);
+        }
+    });
 }
 
 #[test]

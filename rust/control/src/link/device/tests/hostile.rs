@@ -70,6 +70,15 @@ fn body(dice: &mut Dice, kind: u8, now: u64) -> Vec<u8> {
                 .unwrap()
                 .to_vec()
         }
+        0x0E => {
+            let (levels, taps) = (dice.below(11), dice.below(19));
+            let rising: Vec<_> = (0..levels).map(|i| [i as f32, 0.1 * i as f32]).collect();
+            let preview = dice.below(34) as u8;
+            feedforward(preview, 0.5, &rising, &std::vec![0.01; taps])
+                .bytes()
+                .unwrap()
+                .to_vec()
+        }
         0x0A => {
             let at = if dice.below(2) == 0 {
                 0
@@ -116,9 +125,9 @@ fn body(dice: &mut Dice, kind: u8, now: u64) -> Vec<u8> {
 }
 
 /// Mostly commands that start a run and keep it going.
-const KINDS: [u8; 27] = [
-    0x0C, 0x01, 0x02, 0x03, 0x04, 0x04, 0x05, 0x05, 0x06, 0x07, 0x07, 0x08, 0x09, 0x0A, 0x0A, 0x0B,
-    0x20, 0x20, 0x21, 0x22, 0xC0, 0x05, 0x0A, 0x0A, 0x20, 0x21, 0x22,
+const KINDS: [u8; 28] = [
+    0x0E, 0x0C, 0x01, 0x02, 0x03, 0x04, 0x04, 0x05, 0x05, 0x06, 0x07, 0x07, 0x08, 0x09, 0x0A, 0x0A,
+    0x0B, 0x20, 0x20, 0x21, 0x22, 0xC0, 0x05, 0x0A, 0x0A, 0x20, 0x21, 0x22,
 ];
 
 /// A frame, whole or not, with the next number or another.

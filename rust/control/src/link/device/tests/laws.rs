@@ -284,7 +284,7 @@ impl Bystander {
                 self.say(0x21, body, fate);
             }
             Act::BringUp(mode) => {
-                for kind in [0x07, 0x04, 0x09, 0x0C, 0x08, 0x05, 0x0A] {
+                for kind in [0x07, 0x04, 0x09, 0x0C, 0x0E, 0x08, 0x05, 0x0A] {
                     self.say(
                         kind,
                         command(kind, mode.into(), self.rig.now),
@@ -358,6 +358,7 @@ fn command(kind: u8, value: u32, now: u64) -> Vec<u8> {
             8,
         ),
         0x0C => biquads(&[Biquad::notch(60.0, 0.1, 0.5, 1e-3).unwrap(); 2]),
+        0x0E => feedforward(8, 0.5, &[[-3000.0, -6.0], [3000.0, 6.0]], &[0.01, 0.02]),
         0x0A => {
             let mode = if value % 3 == 1 { 2 } else { value % 3 } as u8;
             let at = if value.is_multiple_of(2) {
@@ -374,7 +375,7 @@ fn command(kind: u8, value: u32, now: u64) -> Vec<u8> {
 
 fn acts() -> impl Strategy<Value = (Act, Fate)> {
     let kinds = prop::sample::select(vec![
-        0x02u8, 0x03, 0x05, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0C, 0x0A, 0x0A, 0x1E,
+        0x02u8, 0x03, 0x05, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0C, 0x0E, 0x0A, 0x0A, 0x1E,
     ]);
     let act = prop_oneof![
         6 => (kinds, any::<u32>()).prop_map(|(kind, value)| Act::Say(kind, value)),

@@ -310,6 +310,59 @@ fn biquads_that_make_no_sense_are_refused_by_field() {
 }
 
 #[test]
+fn a_feedforward_that_makes_no_sense_is_refused_and_gains_take_it_away() {
+    let levels = [[-3000.0, -6.0], [3000.0, 6.0]];
+    let mut rig = Rig::ready();
+    let mut set = |preview, late, levels: &[[f32; 2]], taps: &[f32]| {
+        let body = feedforward(preview, late, levels, taps);
+        rig.command(0x0E, body.bytes().unwrap()).0
+    };
+    assert_eq!(set(8, 0.5, &levels, &[0.01]), 3, "no gains");
+    let values = [
+        0.02, 0.25, 0.004, 0.4, 0.2, INF, 0.0, -20.0, 20.0, INF, 0.0, 25.0,
+    ];
+    let body = gains(values, 8);
+    assert_eq!(rig.command(0x09, body.bytes().unwrap()).0, 0);
+    let mut set = |preview, late, levels: &[[f32; 2]], taps: &[f32]| {
+        let body = feedforward(preview, late, levels, taps);
+        rig.command(0x0E, body.bytes().unwrap()).0
+    };
+    for (preview, late, levels, taps, result) in [
+        (8, 0.5, &levels[..], &[0.01; 16][..], 0),
+        (30, 1.0, &levels, &[], 0),
+        (0, 0.0, &[], &[0.01], 0),
+        (0, 0.0, &[], &[], 0),
+        (31, 0.5, &levels, &[], 3),
+        (8, 1.1, &levels, &[], 3),
+        (8, f32::NAN, &levels, &[], 3),
+        (8, 0.5, &[levels[1], levels[0]], &[], 3),
+        (8, 0.5, &levels, &[f32::INFINITY], 3),
+        (8, 0.5, &levels, &[0.01; 17], 3),
+        (8, 0.5, &[[0.0, 0.0]; 12], &[], 3),
+    ] {
+        assert_eq!(set(preview, late, levels, taps), result, "{preview} {late}");
+    }
+    let whole = feedforward(8, 0.5, &levels, &[0.01; 3]);
+    for length in 0..whole.len() {
+        let cut = rig.command(0x0E, &whole.bytes().unwrap()[..length]);
+        assert_eq!(cut, (2, std::vec![length as u8, 0, 0, 0]));
+    }
+}
+
+#[test]
+fn a_device_without_it_refuses_feedforward() {
+    let capabilities = identity().capabilities & !crate::link::capability::FEEDFORWARD;
+    let mut rig = Rig::with(Identity {
+        capabilities,
+        ..identity()
+    });
+    rig.hello(77);
+    rig.samples(150);
+    let refused = rig.command(0x0E, feedforward(0, 0.0, &[], &[]).bytes().unwrap());
+    assert_eq!(refused, (8, std::vec![0; 4]));
+}
+
+#[test]
 fn a_device_without_them_refuses_biquads() {
     let capabilities = identity().capabilities & !crate::link::capability::BIQUADS;
     let mut rig = Rig::with(Identity {

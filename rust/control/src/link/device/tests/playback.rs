@@ -4,8 +4,8 @@ use super::rig::*;
 use crate::biquad::tests::{any_section, section};
 use crate::link::{Body, Fields, Reason, State};
 use crate::{
-    Biquad, Cascade, Design, PidController, Point, STATES, Schedule, Settings, Standard,
-    StateDesign, StateFeedback, Weights, lqg,
+    Biquad, Cascade, Design, Feedforward, Level, PidController, Point, STATES, Schedule, Settings,
+    Standard, StateDesign, StateFeedback, Weights, lqg,
 };
 use proptest::prelude::*;
 use std::vec;
@@ -68,6 +68,7 @@ proptest! {
         observer in prop_oneof![Just(0f32), 0.001f32..0.02], rate in prop_oneof![Just(INF), 100f32..1e5],
         kps in prop::collection::vec(0.001f32..0.05, 0..=8), long: bool,
         given in prop::collection::vec(any_section(), 0..=4),
+        ahead in 0..=30_u8, taps in prop::collection::vec(-0.01_f32..0.01, 0..=16),
     ) {
         let per_unit = 25.0;
         let values = [kp, ti, td, 0.4, 0.2, 10.0, tt, -20.0, 8.0, 2000.0, 0.002, per_unit];
@@ -81,6 +82,11 @@ proptest! {
         if !sections.is_empty() {
             prop_assert_eq!(rig.command(0x0C, biquads(&sections).bytes().unwrap()).0, 0);
         }
+        let levels = [[-100.0, -0.4], [2000.0, 4.2]];
+        let body = feedforward(ahead, 0.5, &levels, &taps);
+        prop_assert_eq!(rig.command(0x0E, body.bytes().unwrap()).0, 0);
+        let levels = levels.map(|[y, u]| Level { y, u });
+        let feedforward = Feedforward::new(ahead.into(), 0.5, &levels, &taps).unwrap();
         let points: Vec<_> = points
             .iter()
             .map(|&[speed, kp, ti, td]| Point { speed, gains: Standard { kp, ti, td } })
@@ -97,7 +103,7 @@ proptest! {
         };
         let design = Design {
             pid: settings, filter_samples: filter.into(), filter_time: 0.002, observer_time, r_rate,
-            schedule: Schedule::new(&points).unwrap(), biquads: Cascade::new(&sections).unwrap(),
+            schedule: Schedule::new(&points).unwrap(), biquads: Cascade::new(&sections).unwrap(), feedforward,
         };
         let mut controller = PidController::<f32>::new(design).unwrap();
         let mut expected = Vec::new();
@@ -219,6 +225,8 @@ fn another_controller_is_refused_by_its_field() {
     assert_eq!(rig.command(0x0D, short.bytes().unwrap()).0, 2);
     let sections = [Biquad::notch(60.0, 0.1, 0.5, 1e-3).unwrap()];
     assert_eq!(rig.command(0x0C, biquads(&sections).bytes().unwrap()).0, 3);
+    let body = feedforward(0, 0.0, &[], &[0.01]);
+    assert_eq!(rig.command(0x0E, body.bytes().unwrap()).0, 3);
 }
 
 #[test]

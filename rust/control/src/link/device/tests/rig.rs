@@ -50,7 +50,8 @@ pub fn identity() -> Identity {
             | can::CURRENT
             | can::DESIGN
             | can::BIQUADS
-            | can::KINDS,
+            | can::KINDS
+            | can::FEEDFORWARD,
         ceilings: Limits {
             volt: 20.0,
             speed: 5000.0,
@@ -376,6 +377,20 @@ pub fn biquads(sections: &[Biquad<f32>]) -> Body {
         body.f32(section.c0).f32(section.c1);
         body.f32(section.a1).f32(section.a2);
     }
+    body
+}
+
+/// The body of FEEDFORWARD.
+pub fn feedforward(preview: u8, late: f32, levels: &[[f32; 2]], taps: &[f32]) -> Body {
+    let mut body = Body::new();
+    body.u8(preview).f32(late).u8(levels.len() as u8);
+    levels.iter().flatten().for_each(|&value| {
+        body.f32(value);
+    });
+    body.u8(taps.len() as u8);
+    taps.iter().for_each(|&value| {
+        body.f32(value);
+    });
     body
 }
 

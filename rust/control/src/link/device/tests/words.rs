@@ -31,7 +31,7 @@ fn hello_tells_the_identity() {
     assert_eq!((fields.u8(), fields.u8()), (Some(0), Some(6)));
     assert_eq!(
         (fields.u32(), fields.u32()),
-        (Some(1000), Some(0b1_1101_0111))
+        (Some(1000), Some(0b11_1101_0111))
     );
     assert_eq!((fields.u32(), fields.f32()), (Some(64), Some(1500.0)));
     assert_eq!(

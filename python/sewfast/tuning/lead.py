@@ -1,0 +1,205 @@
+"""The feedforward of a tuned PID: made of its models, chosen by cost, kept if no model loses."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
+
+from .. import _core
+from ..control.controller import Controller
+from ..control.defaults import recorded_outputs
+from ..control.feedforward import AHEAD, TAPS, Feedforward, reduced
+from ..control.margins import command_grid, point_within
+from ..errors import FitError, SettingError
+from ..models import Model
+from ..models.rest import Rest
+from ..threads import available
+from .robustness import ROUNDING
+
+if TYPE_CHECKING:
+    from ..evidence import OperatingPoint
+    from .task import TuningTask
+
+Lead: TypeAlias = Literal["preview", "causal", "none"]
+"""With the reference known ahead, in time only, or without feedforward."""
+LEADS = ("preview", "causal", "none")
+
+SMOOTHINGS = (1e-3, 1e-2, 1e-1)
+"""Multiples of the squared taps among which costs choose, from a sharp inverse to a calm one."""
+FURTHER = (0, 2, 4, 6, 8, 12)
+"""Samples of preview beyond the plant's delay among which the costs choose."""
+BESIDE = 2e-3
+"""Distance from rest of the first levels to either side, as a share of the range: dry friction has
+its full size there, as a jump cannot be drawn."""
+PARTS = (0.25, 0.5, 1.0)
+"""The other levels, as shares of the way from rest to the ends of the range."""
+
+
+Point: TypeAlias = "tuple[float, OperatingPoint, bool]"
+"""A level, the steady state there, and whether its dynamics count: close to rest they are those of
+dry friction."""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Feedforwards among which the costs choose; `reason` says why there are none."""
+
+    feedforwards: tuple[Feedforward, ...] = ()
+    reason: str = ""
+
+
+def choices(task: TuningTask, lead: Lead) -> Choices:
+    """The feedforwards that the models of a task allow."""
+    models = [p for p in task.plants if isinstance(p, Model)]
+    if not (isinstance(task.start, Controller) and models):
+        return Choices(reason="only a PID that is tuned on models has feedforward")
+    points = [list(_points(model, task)) for model in models]
+    local = [point for found in points for _, point, is_moving in found if is_moving]
+    if not all(points) or not local:
+        return Choices(reason="a model does not stand still within the references")
+    if any(max(abs(p.poles), default=0.0) > 1.0 + ROUNDING for p in local):
+        return Choices(reason="a model is unstable, and has no inverse that one may trust")
+    levels = reduced(_with_rest(_mean(points), task.rest))
+    delay = min(p.delay for p in local)
+    previews = {min(delay + more, AHEAD) for more in FURTHER} if lead == "preview" else {0}
+    pairs = [(preview, smoothing) for preview in sorted(previews) for smoothing in SMOOTHINGS]
+    try:
+        taps = _core.inverse_taps([_local(p) for p in local], pairs, count=TAPS)
+    except SettingError as error:
+        return Choices(reason=str(error))
+    late = 0.5 if task.start.counts_per_unit > 0.0 else 0.0
+    made = zip(pairs, taps, strict=True)
+    return Choices(
+        tuple(Feedforward(preview, late, tuple(levels), tuple(t)) for (preview, _), t in made)
+    )
+
+
+def _points(model: Model, task: TuningTask) -> Iterator[Point]:
+    """Steady states within the range of references and record."""
+    rest = model.rest.y
+    ends = [float(f(r)) for r in task.references for f in (np.min, np.max)]
+    ends += [rest, *(recorded_outputs(model) or ())]
+    low, high = min(ends), max(ends)
+    moving = PARTS[0] * max(high - rest, rest - low)
+    beside, grid = BESIDE * (high - low), command_grid(model)
+    for end in (low, high):
+        way = end - rest
+        if abs(way) <= beside:
+            continue
+        for off in (math.copysign(beside, way), *(part * way for part in PARTS)):
+            # a level that the model does not reach, or at which it jumps, is left out
+            with contextlib.suppress(SettingError, FitError):
+                point = point_within(model, grid, rest + off)
+                yield rest + off, point, abs(off) >= 0.999 * moving
+
+
+def _mean(points: Sequence[Sequence[Point]]) -> list[tuple[float, float]]:
+    """Levels with the mean of the commands that hold them on all models; none if they integrate."""
+    known: dict[float, list[float]] = {}
+    for found in points:
+        for level, point, _ in found:
+            if point.drift == 0.0 and np.isfinite(point.dc_gain[0]):
+                known.setdefault(level, []).append(float(point.u[0]))
+    everywhere = {y: u for y, u in known.items() if len(u) == len(points)}
+    return [(y, float(np.mean(u))) for y, u in sorted(everywhere.items())]
+
+
+def _with_rest(levels: list[tuple[float, float]], rest: Rest) -> list[tuple[float, float]]:
+    """The levels with that at rest, where a motor must not be pushed against its friction."""
+    kept = [level for level in levels if level[0] != rest.y]
+    return sorted([*kept, (rest.y, rest.u[0])]) if kept else []
+
+
+def _local(point: OperatingPoint) -> tuple[Any, ...]:
+    gain = float(point.dc_gain[0])
+    slope = 1.0 / gain if math.isfinite(gain) and gain != 0.0 else 0.0
+    A, B, C = (np.ascontiguousarray(m) for m in (point.A, point.B[:, 0], point.C[0]))
+    return A, B, C, float(point.D[0, 0]), point.delay, slope
+
+
+@dataclass(frozen=True)
+class Led:
+    """What a feedforward is worth.
+
+    Attributes
+    ----------
+    alone : Controller
+        The PID without it.
+    cost, alone_cost : float
+        Cost with and without it over all plants in all variations, in which overshoot has no weight
+        unless one was given: it counts percents of small edges [y].
+    reason : str
+        Why it was not taken; empty if it was.
+    """
+
+    alone: Controller
+    cost: float = math.nan
+    alone_cost: float = math.nan
+    reason: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values."""
+        costs = {"cost": self.cost, "cost_without": self.alone_cost}
+        known = {name: c if math.isfinite(c) else None for name, c in costs.items()}
+        return {"taken": not self.reason, **known, "reason": self.reason}
+
+    def __str__(self) -> str:
+        if self.reason:
+            return f"none: {self.reason}"
+        unit = self.alone.y_unit or "y"
+        return f"following costs {self.cost:.3g} {unit} with it and {self.alone_cost:.3g} without"
+
+
+def with_lead(
+    task: TuningTask, alone: Controller, lead: Lead, others: Sequence[TuningTask] = ()
+) -> tuple[Controller, Led]:
+    """A PID with feedforward, if that costs less over all plants of this task and of the others,
+    and no more on any of them in any variation; otherwise the PID alone.
+    The feedforward does the work of set-point weights, which become 1. The gains stay: what they
+    owe to loads, noise and other plants, margins included, they keep.
+    """
+    among = choices(task, lead)
+    tried = [replace(alone, alpha=0.0, beta=0.0, feedforward=one) for one in among.feedforwards]
+    if not tried:
+        return alone, Led(alone, reason=among.reason)
+    task, others = _following(task), [_following(other) for other in others]
+    judged = _judged(task, tried)
+    best = min(range(len(tried)), key=lambda k: judged[k][::-1])
+    led = Led(alone, judged[best][0], _judged(task, [alone])[0][0])
+    if all(_is_better(one, tried[best], alone) for one in (task, *others)):
+        return tried[best], led
+    return alone, replace(led, reason="on a model, or in its spread, a loop follows worse with one")
+
+
+def _following(task: TuningTask) -> TuningTask:
+    """The task without load steps, and without a weight of overshoot unless one was given."""
+    weight = 0.0 if task.cost.overshoot is None else task.cost.overshoot
+    limits = replace(task.constraints, recovery=None, load=None)
+    cost = replace(task.cost, overshoot=weight, recovery=0.0, load=0.0)
+    return replace(task, cost=cost, constraints=limits, loads=[])
+
+
+def _is_better(task: TuningTask, controller: Controller, alone: Controller) -> bool:
+    """Whether a controller costs less than another, and no more on any plant in any variation."""
+    (cost, violation), (other, own) = _judged(task, [controller, alone])
+    if not cost < other or violation > own:
+        return False
+    for plant, variation in itertools.product(task.plants, task.variations):
+        one = replace(task, plants=[plant], variations=[variation])
+        (cost, _), (other, _) = _judged(one, [controller, alone])
+        if not cost <= other:
+            return False
+    return True
+
+
+def _judged(task: TuningTask, controllers: Sequence[Controller]) -> list[tuple[float, float]]:
+    """Cost and violation of the constraints of each controller."""
+    rest = task.rest
+    cores = [controller.about(rest).core() for controller in controllers]
+    return _core.tuning_costs(task.core(), cores, threads=available())
