@@ -379,7 +379,8 @@ def _tuned(
     with Progress("tune", quiet=args.quiet) as progress:
         return tune(
             models, references, **_started(args, models), **settings, rival=rival,
-            feedforward=args.feedforward, method=args.method, time_budget=args.time_budget, progress=progress,
+            feedforward=args.feedforward, method=args.method, time_budget=args.time_budget,
+            progress=progress,
         )  # fmt: skip
 
 
