@@ -72,6 +72,7 @@ def test_without_weight_or_limit_a_load_step_changes_nothing() -> None:
 
 def test_a_weight_on_the_load_is_paid_for_in_tracking() -> None:
     settings: dict[str, Any] = {"start": QUIET, "loads": [STEP], "evaluations": 250, "threads": 2}
+    settings["feedforward"] = "none"
     free = tune(drive(), [SHORT], **settings)
     stiff = tune(drive(), [SHORT], cost=Cost(load=50.0), **settings)
     of = [recoveries(found.controller, drive(), [STEP])[:, 1].max() for found in (free, stiff)]

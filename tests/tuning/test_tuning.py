@@ -148,7 +148,7 @@ def test_the_largest_sensitivity_is_that_of_the_margins() -> None:
 
 
 def test_costs_compare_controllers_as_the_search_does() -> None:
-    found = tune(drive(), SHORT, evaluations=60, threads=2)
+    found = tune(drive(), SHORT, feedforward="none", evaluations=60, threads=2)
     both = costs([found.start, found.controller], drive(), SHORT, threads=1)
     assert list(both) == [found.start_cost, found.cost]
     assert costs(found.start, drive(), SHORT) == found.start_cost

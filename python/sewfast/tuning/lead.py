@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 Lead: TypeAlias = Literal["preview", "causal", "none"]
 """With the reference known ahead, in time only, or without feedforward."""
 LEADS = ("preview", "causal", "none")
+WEIGHTS = ("alpha", "beta")
+"""Settings whose work a feedforward does."""
 
 SMOOTHINGS = (1e-3, 1e-2, 1e-1)
 """Multiples of the squared taps among which costs choose, from a sharp inverse to a calm one."""
@@ -157,15 +159,20 @@ class Led:
 
 
 def with_lead(
-    task: TuningTask, alone: Controller, lead: Lead, others: Sequence[TuningTask] = ()
+    task: TuningTask,
+    alone: Controller,
+    lead: Lead,
+    searched: Collection[str] = WEIGHTS,
+    others: Sequence[TuningTask] = (),
 ) -> tuple[Controller, Led]:
     """A PID with feedforward, if that costs less over all plants of this task and of the others,
     and no more on any of them in any variation; otherwise the PID alone.
-    The feedforward does the work of set-point weights, which become 1. The gains stay: what they
-    owe to loads, noise and other plants, margins included, they keep.
+    The feedforward does the work of set-point weights, which become 1 if they are `searched`. The
+    gains stay: what they owe to loads, noise and other plants, margins included, they keep.
     """
     among = choices(task, lead)
-    tried = [replace(alone, alpha=0.0, beta=0.0, feedforward=one) for one in among.feedforwards]
+    weights: dict[str, Any] = {name: 0.0 for name in WEIGHTS if name in searched}
+    tried = [replace(alone, feedforward=one, **weights) for one in among.feedforwards]
     if not tried:
         return alone, Led(alone, reason=among.reason)
     task, others = _following(task), [_following(other) for other in others]

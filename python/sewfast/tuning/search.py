@@ -19,7 +19,7 @@ from ..errors import FitError, Interrupted, SettingError
 from ..gains import whole
 from ..progress import TimeUp, shown_in_notebooks
 from ..tables import Table, significant
-from .lead import LEADS, Lead, Led, with_lead
+from .lead import LEADS, WEIGHTS, Lead, Led, with_lead
 from .objective import Constraints, Cost, LoadStep
 from .opinion import SHARE, SecondOpinion, second_opinion
 from .robustness import HAIR, within_default
@@ -305,7 +305,7 @@ def tune(
     feedforward : "preview", "causal" or "none"
         The command that the models need for the reference, added to that of a PID
         (`sewfast.Feedforward`): with the reference known ahead, in time only, or not at all. It
-        takes the place of alpha and beta; the gains stay. The result has it only if following the
+        takes the place of alpha and beta if they are searched; the gains stay. The result has it only if following the
         references costs less over all plants, and no more on any of them in any variation.
     method : "genetic" or "cma-es"
         A genetic algorithm with local refinement, or CMA-ES with restarts.
@@ -495,12 +495,14 @@ def _led(
     if time.over("the feedforward"):
         return result
     try:
-        controller, led = with_lead(task, alone, lead, [] if rival is None else [rival])
+        others = [] if rival is None else [rival]
+        controller, led = with_lead(task, alone, lead, [v.name for v in result.variables], others)
     except KeyboardInterrupt:
         raise Interrupted(alone) from None
-    variables = result.variables
-    if controller.feedforward is not None:
-        variables = tuple(v for v in variables if v.name not in ("alpha", "beta"))
+    variables = tuple(
+        replace(v, value=getattr(controller, v.name)) if v.name in WEIGHTS else v
+        for v in result.variables
+    )
     return replace(result, controller=controller, variables=variables, lead=led)
 
 
