@@ -29,7 +29,7 @@ MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest n
   night-bits night-logs night-computing night-waiting night-budgets
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives faults nonsense motors fleet interrupts fuzz-logs mutations studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed parting laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning tracking drives faults nonsense motors fleet interrupts fuzz-logs mutations studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed parting laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -322,6 +322,9 @@ notches: $(VENV)/bench.stamp ## gain of a notch on machines with a shaft (docs/b
 
 physics: $(VENV)/bench.stamp ## parameters of motors whose truth is known (docs/physics.md)
 	$(BIN)/python benches/physics.py --count 40 --mujoco 20 --logs 200 --tracked 24
+
+tracking: $(VENV)/bench.stamp ## what a feedforward is worth, beside simple-pid and a linear-quadratic regulator (SEEDS=5 MACHINES=8)
+	$(BIN)/python benches/tracking.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES))
 
 drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONLY="shaft60 lash", SEEDS=)
 	$(BIN)/python benches/drives.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))

@@ -244,10 +244,35 @@ def state_feedback(file: Path) -> None:
     ):
         found = sewfast.tune(
             model, "trapezoid", controller=kind, u_min=-20.0, u_max=20.0,
-            counts_per_rev=machine.counts_per_rev, evaluations=600,
+            counts_per_rev=machine.counts_per_rev, feedforward="none", evaluations=600,
         )  # fmt: skip
         run = sewfast.run(found.controller, machine, "trapezoid")
         loops.append(Trace.of(run.columns(), look, label))
+    loop_drawing(loops, "RPM", "V", (-20.0, 20.0)).plot(file=file)
+
+
+def feedforward(file: Path) -> None:
+    """The README's drive along a trapezoid, with feedforward and without, for feedforward.md."""
+    machine = sewfast.VirtualMachine()
+
+    def record(signal: str) -> sewfast.Dataset:
+        machine.reset()
+        u = sewfast.signals.excitation(signal)
+        counts = machine.run(u).counts
+        y = sewfast.speed_from_counts(counts, machine.Ts, machine.counts_per_rev)
+        units = {"input_units": "V", "output_unit": "RPM"}
+        return sewfast.Dataset.from_arrays(u, y, machine.Ts, **units)
+
+    training = sewfast.Dataset.concat(map(record, ("chirp_lo_hi", "saturating")))
+    model = sewfast.identify(training, model="grey_box", seed=0)
+    found = sewfast.tune(model, counts_per_rev=machine.counts_per_rev)
+    loops = [
+        Trace.of(sewfast.run(controller, machine, "trapezoid").columns(), look, label)
+        for controller, look, label in (
+            (found.lead.alone, "model", "PID alone"),
+            (found.controller, "measured", "with feedforward"),
+        )
+    ]
     loop_drawing(loops, "RPM", "V", (-20.0, 20.0)).plot(file=file)
 
 
@@ -276,6 +301,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "accuracy": accuracy,
     "speed": speed,
     "state-feedback": state_feedback,
+    "feedforward": feedforward,
     "live": live,
 }
 

@@ -58,6 +58,9 @@ deviation); --cost NAME=WEIGHT sets a weight, overshoot_limit the overshoot with
 --constraint sets limits that come first: Ms (1.8 without one; inf: none), overshoot, u, recovery,
 load. --pareto OBJECTIVES searches for a Pareto front instead, and picks its knee.
 
+The command that the models need for the reference is added to that of a PID (--feedforward), which
+then needs the reference some samples early: see the page "Follow a reference".
+
 Gains that destabilise a model, that keep the command at a limit although the reference needs none,
 or that leave the recorded inputs and outputs for most of a run, are refused: exit code 2, and no
 file. --force writes them all the same.

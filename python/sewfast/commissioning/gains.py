@@ -23,8 +23,10 @@ from ..gains import Gains
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
 from ..rules import Fopdt, Rule, eq_12, simc
+from ..tuning.lead import with_lead
 from ..tuning.objective import LARGEST_MS, Constraints, Cost, LoadStep
 from ..tuning.search import TuningResult, costs, recoveries, tune
+from ..tuning.task import TuningTask
 from .bench import Aborted
 from .demands import Demands, Refusal
 from .excitations import pace_of
@@ -233,6 +235,22 @@ def search(
             f"expected gains under which every member of the ensemble does what is required "
             f"({error}); record longer, raise evaluations, or ask for less: a larger Ms, load=0"
         ) from error
+
+
+def led(
+    tuning: TuningResult,
+    ensemble: Ensemble,
+    references: Mapping[str, FloatArray],
+    cost: Cost,
+    disturbances: Sequence[FloatArray] | None,
+) -> TuningResult:
+    """The tuned gains with a feedforward, if no member follows the references worse with it."""
+    task = TuningTask.of(
+        ensemble, list(references.values()), start=tuning.pid, first={}, cost=cost,
+        aggregate="mean", constraints=None, variations=None, disturbances=disturbances,
+    )  # fmt: skip
+    controller, found = with_lead(task, tuning.pid, "preview")
+    return replace(tuning, controller=controller, lead=found)
 
 
 # --- Requirements of tuned gains besides their cost -----------------------------------------------
