@@ -239,7 +239,9 @@ class Responses:
 def _reference_metrics(of: Responses, y: FloatArray) -> dict[str, float | None]:
     after = of.t >= 0.0
     t, share = of.t[after], (y[after] - of.level) / of.size
-    low, high = (_first(t, share >= s) for s in RISE)
+    # a controller with feedforward begins before the step
+    early = ~_quiet(of)
+    low, high = (_first(of.t[early], (y[early] - of.level) / of.size >= s) for s in RISE)
     rise = None if low is None or high is None else 1e3 * (high - low)
     return {
         "rise_ms": rise,
@@ -261,8 +263,13 @@ def _disturbance_metrics(of: Responses, y: FloatArray) -> dict[str, float | None
 
 def _own(of: Responses, y: FloatArray) -> float:
     """Largest deviation of the output from its mean before the step, plus a quarter."""
-    before = y[of.t < 0.0]
+    before = y[_quiet(of)]
     return 1.25 * float(np.abs(before - before.mean()).max(initial=0.0))
+
+
+def _quiet(of: Responses) -> Any:
+    """The first half of the time before the step, in which nothing looks ahead to it."""
+    return of.t < 0.5 * min(float(of.t[0]), 0.0)
 
 
 def _first(t: FloatArray, holds: Any) -> float | None:

@@ -237,7 +237,7 @@ def to_matlab(controller: Controller, form: Object = "pid2") -> dict[str, Any]:
     Parameters
     ----------
     controller : Controller
-        Limits, feedback filters and ramp are left out.
+        Limits, feedback filters, ramp and feedforward are left out.
     form : "pid", "pid2", "pidstd" or "pidstd2"
         `pid` and `pidstd` have one degree of freedom: alpha and beta must be 0.
 

@@ -141,7 +141,8 @@ def run_on_host(
 def at_period(controller: Controller, Ts: float) -> Controller:
     """The same controller at a longer sample time, its feedback averaged over the same time.
 
-    The gains stay the same in standard form. A loop that is stable at its own sample time may be
+    The gains stay the same in standard form; a feedforward, whose taps are for one sample time, is
+    left out. A loop that is stable at its own sample time may be
     unstable at a longer one: try it on a model first.
 
     Parameters
@@ -151,12 +152,14 @@ def at_period(controller: Controller, Ts: float) -> Controller:
     """
     samples = max(1, round(controller.filter_samples * controller.Ts / Ts))
     note = f"made for {controller.Ts:g} s, run at {Ts:g} s"
+    note += ", without its feedforward" if controller.feedforward else ""
     notes = f"{controller.notes}; {note}" if controller.notes else note
     gains = controller.gains.to("standard")
     schedule = tuple((speed, g.to("standard")) for speed, g in controller.schedule)
     return replace(
-        controller, gains=gains, schedule=schedule, Ts=Ts, filter_samples=samples, notes=notes
-    )
+        controller, gains=gains, schedule=schedule, Ts=Ts, filter_samples=samples, notes=notes,
+        feedforward=None,
+    )  # fmt: skip
 
 
 def _batch(ratio: int) -> int:

@@ -21,10 +21,11 @@ from ..models import Model
 from ..models.rest import Rest
 from ..threads import available
 from .robustness import ROUNDING
+from .task import Deadline
 
 if TYPE_CHECKING:
     from ..evidence import OperatingPoint
-    from .task import TuningTask
+    from .task import Budget, TuningTask
 
 Lead: TypeAlias = Literal["preview", "causal", "none"]
 """With the reference known ahead, in time only, or without feedforward."""
@@ -39,6 +40,9 @@ FURTHER = (0, 2, 4, 6, 8, 12)
 BESIDE = 2e-3
 """Distance from rest of the first levels to either side, as a share of the range: dry friction has
 its full size there, as a jump cannot be drawn."""
+LEADING, PART = 0.15, 0.6
+"""Part of a time budget that the search leaves to the feedforward, and part of what is left
+then that this may take."""
 PARTS = (0.25, 0.5, 1.0)
 """The other levels, as shares of the way from rest to the ends of the range."""
 
@@ -56,12 +60,12 @@ class Choices:
     reason: str = ""
 
 
-def choices(task: TuningTask, lead: Lead) -> Choices:
-    """The feedforwards that the models of a task allow."""
+def choices(task: TuningTask, lead: Lead, deadline: Deadline | None = None) -> Choices:
+    """The feedforwards that the models of a task allow; raises `TimeUp` at a deadline."""
     models = [p for p in task.plants if isinstance(p, Model)]
     if not (isinstance(task.start, Controller) and models):
         return Choices(reason="only a PID that is tuned on models has feedforward")
-    points = [list(_points(model, task)) for model in models]
+    points = [list(_points(model, task, deadline)) for model in models]
     local = [point for found in points for _, point, is_moving in found if is_moving]
     if not all(points) or not local:
         return Choices(reason="a model does not stand still within the references")
@@ -82,7 +86,7 @@ def choices(task: TuningTask, lead: Lead) -> Choices:
     )
 
 
-def _points(model: Model, task: TuningTask) -> Iterator[Point]:
+def _points(model: Model, task: TuningTask, deadline: Deadline | None = None) -> Iterator[Point]:
     """Steady states within the range of references and record."""
     rest = model.rest.y
     ends = [float(f(r)) for r in task.references for f in (np.min, np.max)]
@@ -95,6 +99,8 @@ def _points(model: Model, task: TuningTask) -> Iterator[Point]:
         if abs(way) <= beside:
             continue
         for off in (math.copysign(beside, way), *(part * way for part in PARTS)):
+            if deadline is not None:
+                deadline(1, 1, 0.0)
             # a level that the model does not reach, or at which it jumps, is left out
             with contextlib.suppress(SettingError, FitError):
                 point = point_within(model, grid, rest + off)
@@ -164,22 +170,24 @@ def with_lead(
     lead: Lead,
     searched: Collection[str] = WEIGHTS,
     others: Sequence[TuningTask] = (),
+    time: Budget | None = None,
 ) -> tuple[Controller, Led]:
     """A PID with feedforward, if that costs less over all plants of this task and of the others,
     and no more on any of them in any variation; otherwise the PID alone.
     The feedforward does the work of set-point weights, which become 1 if they are `searched`. The
     gains stay: what they owe to loads, noise and other plants, margins included, they keep.
     """
-    among = choices(task, lead)
+    deadline = None if time is None else Deadline(time, time.share(PART), None)
+    among = choices(task, lead, deadline)
     weights: dict[str, Any] = {name: 0.0 for name in WEIGHTS if name in searched}
     tried = [replace(alone, feedforward=one, **weights) for one in among.feedforwards]
     if not tried:
         return alone, Led(alone, reason=among.reason)
     task, others = _following(task), [_following(other) for other in others]
-    judged = _judged(task, tried)
+    judged = _judged(task, tried, deadline)
     best = min(range(len(tried)), key=lambda k: judged[k][::-1])
-    led = Led(alone, judged[best][0], _judged(task, [alone])[0][0])
-    if all(_is_better(one, tried[best], alone) for one in (task, *others)):
+    led = Led(alone, judged[best][0], _judged(task, [alone], deadline)[0][0])
+    if all(_is_better(one, tried[best], alone, deadline) for one in (task, *others)):
         return tried[best], led
     return alone, replace(led, reason="on a model, or in its spread, a loop follows worse with one")
 
@@ -192,21 +200,28 @@ def _following(task: TuningTask) -> TuningTask:
     return replace(task, cost=cost, constraints=limits, loads=[])
 
 
-def _is_better(task: TuningTask, controller: Controller, alone: Controller) -> bool:
+def _is_better(
+    task: TuningTask, controller: Controller, alone: Controller, deadline: Deadline | None
+) -> bool:
     """Whether a controller costs less than another, and no more on any plant in any variation."""
-    (cost, violation), (other, own) = _judged(task, [controller, alone])
+    (cost, violation), (other, own) = _judged(task, [controller, alone], deadline)
     if not cost < other or violation > own:
         return False
     for plant, variation in itertools.product(task.plants, task.variations):
         one = replace(task, plants=[plant], variations=[variation])
-        (cost, _), (other, _) = _judged(one, [controller, alone])
+        (cost, _), (other, _) = _judged(one, [controller, alone], deadline)
         if not cost <= other:
             return False
     return True
 
 
-def _judged(task: TuningTask, controllers: Sequence[Controller]) -> list[tuple[float, float]]:
-    """Cost and violation of the constraints of each controller."""
+def _judged(
+    task: TuningTask, controllers: Sequence[Controller], deadline: Deadline | None
+) -> list[tuple[float, float]]:
+    """Cost and violation of the constraints of each controller; raises `TimeUp` at a deadline."""
     rest = task.rest
     cores = [controller.about(rest).core() for controller in controllers]
-    return _core.tuning_costs(task.core(), cores, threads=available())
+    judged = _core.tuning_costs(task.core(), cores, threads=available(), progress=deadline)
+    if deadline is not None:
+        deadline(1, 1, 0.0)
+    return judged

@@ -19,7 +19,7 @@ from ..errors import FitError, Interrupted, SettingError
 from ..gains import whole
 from ..progress import TimeUp, shown_in_notebooks
 from ..tables import Table, significant
-from .lead import LEADS, WEIGHTS, Lead, Led, with_lead
+from .lead import LEADING, LEADS, WEIGHTS, Lead, Led, with_lead
 from .objective import Constraints, Cost, LoadStep
 from .opinion import SHARE, SecondOpinion, second_opinion
 from .robustness import HAIR, within_default
@@ -305,8 +305,9 @@ def tune(
     feedforward : "preview", "causal" or "none"
         The command that the models need for the reference, added to that of a PID
         (`sewfast.Feedforward`): with the reference known ahead, in time only, or not at all. It
-        takes the place of alpha and beta if they are searched; the gains stay. The result has it only if following the
-        references costs less over all plants, and no more on any of them in any variation.
+        takes the place of alpha and beta if they are searched; the gains stay. The result has it
+        only if following the references costs less over all plants, and no more on any of them in
+        any variation.
     method : "genetic" or "cma-es"
         A genetic algorithm with local refinement, or CMA-ES with restarts.
     evaluations : int
@@ -362,7 +363,8 @@ def tune(
     )
     search = _Search(
         method, whole("evaluations", evaluations), time, whole("seed", seed),
-        threads_or_all(threads), progress, 1.0 - LOOK - (0.0 if rival is None else SHARE),
+        threads_or_all(threads), progress,
+        1.0 - LOOK - SHARE * (rival is not None) - LEADING * (feedforward != "none"),
     )  # fmt: skip
     # check the rival before the search, which may take long
     other = None if rival is None else replace(task, plants=_rivals(rival, task))
@@ -492,11 +494,13 @@ def _led(
     alone = result.controller
     if lead == "none" or not isinstance(alone, Controller) or alone.feedforward is not None:
         return result
-    if time.over("the feedforward"):
-        return result
+    others = [] if rival is None else [rival]
+    names = [v.name for v in result.variables]
     try:
-        others = [] if rival is None else [rival]
-        controller, led = with_lead(task, alone, lead, [v.name for v in result.variables], others)
+        controller, led = with_lead(task, alone, lead, names, others, time)
+    except TimeUp:
+        time.lose("the feedforward")
+        return result
     except KeyboardInterrupt:
         raise Interrupted(alone) from None
     variables = tuple(
