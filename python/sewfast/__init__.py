@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from .comparison import Comparison, compare
     from .control.biquad import Biquad
     from .control.controller import Controller, paper_controller
+    from .control.feedforward import Feedforward
     from .control.files import load_controller
-    from .control.loop import ClosedLoopRun, run
+    from .control.loop import ClosedLoopRun, planned, run
     from .control.machine import Machine, record
     from .control.margins import Margins, margins, operating_point
     from .control.state_feedback import StateFeedback
@@ -78,6 +79,7 @@ __all__ = [
     "Diagnosis",
     "Ensemble",
     "Experiment",
+    "Feedforward",
     "FitError",
     "FrequencyResponse",
     "Gains",
@@ -130,6 +132,7 @@ __all__ = [
     "paper_controller",
     "pareto",
     "physics",
+    "planned",
     "read",
     "read_table",
     "record",
@@ -165,7 +168,7 @@ _HOMES = {
     "greybox": "Motor load_motor physics",
     "identification": "identify",
     "identification.least_squares": "LeastSquaresResult least_squares",
-    "control.loop": "ClosedLoopRun run",
+    "control.loop": "ClosedLoopRun planned run",
     "control.machine": "Machine record",
     "machine": "VirtualMachine",
     "models": "ARX IV Ensemble LinearOE Model NeuralOE NeuralSS load_model",

@@ -417,6 +417,73 @@ def reference_samples(
     )  # fmt: skip
 
 
+ROOM = 0.1
+"""Share of the command's range that a planned reference leaves to the feedback."""
+CORNERS = 8
+"""Samples over which a planned reference's corners are rounded."""
+
+
+def planned(
+    reference: str | ArrayLike,
+    controller: SampledController,
+    *,
+    room: float = ROOM,
+    smooth: float | None = None,
+    plant: Any = None,
+    seed: int = 0,
+) -> FloatArray:
+    """The nearest reference that the drive can follow: a step becomes a ramp with round corners.
+
+    How fast the drive can change its speed follows from the model behind the controller's
+    feedforward: in the direction of the motion less the faster it turns, against it more.
+
+    Parameters
+    ----------
+    reference : str or array, shape (N,)
+        As for `sewfast.run` [y].
+    controller : Controller
+        With feedforward (`sewfast.tune`) and limits of the command.
+    room : float
+        Share of the command's range, 0 to below 1, that is left to the feedback.
+    smooth : float, optional
+        Time over which corners are rounded, so that acceleration does not jump [s]; 8 samples by
+        default.
+    plant : model, optional
+        For a reference by name on a drive that is not in RPM at 1 ms, as in `sewfast.run`.
+    seed : int
+        Of a named random reference.
+
+    Returns
+    -------
+    array, shape (N,)
+        Where the drive can follow, the reference itself but for its corners.
+
+    Raises
+    ------
+    SettingError
+        For a controller without feedforward or limits, and for a level that no command within the
+        limits holds: the message says which one and what it needs.
+    DataError
+        For a reference that is empty or not finite.
+    """
+    lead = getattr(controller, "feedforward", None)
+    limits = (controller.u_min, controller.u_max)
+    if lead is None or not all(map(math.isfinite, limits)):
+        raise SettingError(
+            name="controller", expected="one with feedforward and limits of its command",
+            received="one without", remedy="tune one on a model (sewfast tune)",
+        )  # fmt: skip
+    share = real("room", room)
+    if not 0.0 <= share < 1.0:
+        raise SettingError(name="room", expected="a share from 0 to below 1", received=f"{room!r}")
+    wide = CORNERS if smooth is None else round(real("smooth", smooth) / controller.Ts)
+    kept = 0.5 * share * (limits[1] - limits[0])
+    return _core.planned(
+        reference_samples(reference, controller, seed, plant=plant), lead.core(),
+        low=limits[0] + kept, high=limits[1] - kept, smooth=max(wide, 0),
+    )  # fmt: skip
+
+
 def check_fits(controller: SampledController, plant: Any) -> None:
     """Raise `SettingError` for a plant with another sample time or units than the controller's."""
     if not isinstance(plant, (Model, VirtualMachine)):

@@ -335,9 +335,7 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
         raise SettingError(
             name="controller", expected=f"one without {' and '.join(unknown)} for this device",
             received="one that its firmware does not support",
-            remedy="leave it out (feedforward: tune --no-feedforward), or build the firmware with "
-            "this sewfast" if "feedforward" in unknown
-            else "leave it out, or build the firmware with this sewfast",
+            remedy="leave it out, or build the firmware with this sewfast",
         )  # fmt: skip
     values = (
         g.Kp, g.Ti, g.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew, c.filter_time,

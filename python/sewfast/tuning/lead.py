@@ -193,9 +193,11 @@ def with_lead(
 
 
 def _following(task: TuningTask) -> TuningTask:
-    """The task without load steps, and without a weight of overshoot unless one was given."""
+    """The task without load steps and Ms, which a feedforward does not change, and without a weight
+    of overshoot unless one was given.
+    """
     weight = 0.0 if task.cost.overshoot is None else task.cost.overshoot
-    limits = replace(task.constraints, recovery=None, load=None)
+    limits = replace(task.constraints, Ms=math.inf, recovery=None, load=None)
     cost = replace(task.cost, overshoot=weight, recovery=0.0, load=0.0)
     return replace(task, cost=cost, constraints=limits, loads=[])
 

@@ -37,6 +37,7 @@ pub mod neural;
 pub mod neural_ss;
 pub mod oe;
 pub mod output_error;
+pub mod planned;
 pub mod proposal;
 pub mod random;
 pub mod residuals;
