@@ -39,9 +39,14 @@ def _readable(group: str) -> Iterator[EntryPoint]:
     """The entry points of a group that can be read; a package with damaged ones is named."""
     from importlib.metadata import distributions
 
+    seen = set()
     for one in distributions():
         try:
-            yield from one.entry_points.select(group=group)
+            name = str(one.name).replace("_", "-").lower()
+            # of two packages of a name Python imports the one that comes first on its path
+            if name not in seen:
+                yield from one.entry_points.select(group=group)
+            seen.add(name)
         except Exception as e:
             place = getattr(one, "_path", "a package")
             text = f"{place}: expected entry points that can be read, received {told(e)}"

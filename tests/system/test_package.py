@@ -30,7 +30,7 @@ def test_type_checkers_see_every_public_name() -> None:
 
 def test_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="no attribute 'idenfity'"):
-        sewfast.idenfity  # noqa: B018
+        _ = sewfast.idenfity
 
 
 def _loaded_by(statement: str) -> set[str]:

@@ -31,6 +31,8 @@
 //! 1 % with 155. Panels and blocks of 128 rows save loads: `J'J` of 155 parameters 330 -> 290 ns a sample on an Intel Xeon
 //! (docs/PERFORMANCE.md). A Zen 4 processes its wide registers in halves, has loads to spare and shows no gain (-0.4 to 0 %).
 
+use nalgebra::DMatrix;
+
 use crate::simd::{self, F64x8, Kernel, LANES};
 
 /// Rows per block: with 64 parameters a block is 32 kB and stays in the first-level cache.
@@ -164,6 +166,13 @@ impl Gram {
         }
     }
 
+    /// Adds a row that `write` fills (it has old values) and that counts in full.
+    #[inline(always)]
+    pub fn add(&mut self, write: impl FnOnce(&mut [f64])) {
+        write(self.place().1);
+        self.keep_weighed(0.0, 1.0);
+    }
+
     /// The previous rows, the oldest first, followed by room for `count` rows, at most 64, with old values;
     /// [`Gram::keep_all`] appends them.
     pub fn ahead(&mut self, count: usize) -> &mut [f64] {
@@ -210,6 +219,13 @@ impl Gram {
         // Includes the block in progress, however few rows it has.
         self.fold();
         (&self.sums, self.width)
+    }
+
+    /// `X'X`, both triangles.
+    pub fn matrix(&mut self) -> DMatrix<f64> {
+        let n = self.columns;
+        let (sums, width) = self.finish();
+        DMatrix::from_fn(n, n, |i, j| sums[i.max(j) * width + i.min(j)])
     }
 
     #[inline(never)]

@@ -194,15 +194,19 @@ pub(crate) fn poles(a: &[f64]) -> Vec<Complex<f64>> {
     if n == 0 {
         return Vec::new();
     }
-    let companion = DMatrix::from_fn(n, n, |row, column| match (row, column) {
-        (0, j) => -a[j],
-        (i, j) => f64::from(u8::from(i == j + 1)),
-    });
     // without a limit the QR iteration never ends if squares of the coefficients overflow
-    companion.try_schur(f64::EPSILON, 200 * n).map_or_else(
+    companion(a).try_schur(f64::EPSILON, 200 * n).map_or_else(
         || vec![Complex::new(f64::NAN, f64::NAN); n],
         |schur| schur.complex_eigenvalues().iter().copied().collect(),
     )
+}
+
+/// The companion matrix of `z^n + a_1 z^(n-1) + .. + a_n`, `-a` in its first row.
+pub(crate) fn companion(a: &[f64]) -> DMatrix<f64> {
+    DMatrix::from_fn(a.len(), a.len(), |i, j| match i {
+        0 => -a[j],
+        _ => f64::from(u8::from(i == j + 1)),
+    })
 }
 
 /// Coefficients `a` of the polynomial with these roots, which come in conjugate pairs.

@@ -3,6 +3,7 @@
 mod causes;
 mod control;
 mod device;
+mod evidence;
 mod frequency;
 mod greybox;
 mod guard;
@@ -10,8 +11,6 @@ mod host_loop;
 mod link;
 mod loop_transfer;
 mod models;
-mod records;
-mod residuals;
 mod seam;
 mod search;
 mod signals;
@@ -33,8 +32,7 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     loop_transfer::register(module)?;
     frequency::register(module)?;
     link::register(module)?;
-    records::register(module)?;
-    residuals::register(module)?;
+    evidence::register(module)?;
     causes::register(module)?;
     guard::register(module)?;
     device::register(module)

@@ -108,17 +108,16 @@ impl Part {
     fn new(x: &[f64], width: usize, y: &[f64], rows: &[bool]) -> Self {
         let mut gram = Gram::new(width + 2, 0);
         for (k, _) in rows.iter().enumerate().filter(|(_, is_own)| **is_own) {
-            let (_, row) = gram.place();
-            row[..width].copy_from_slice(&x[k * width..][..width]);
-            row[width] = 1.0;
-            row[width + 1] = y[k];
-            gram.keep_weighed(0.0, 1.0);
+            gram.add(|row| {
+                row[..width].copy_from_slice(&x[k * width..][..width]);
+                row[width] = 1.0;
+                row[width + 1] = y[k];
+            });
         }
-        let (sums, stride) = gram.finish();
-        let sum = |i: usize, j: usize| sums[i.max(j) * stride + i.min(j)];
-        let n = sum(width, width).max(1.0);
-        let mean = |i: usize| sum(i, width) / n;
-        let about = |i: usize, j: usize| sum(i, j) - sum(i, width) * mean(j);
+        let sums = gram.matrix();
+        let n = sums[(width, width)].max(1.0);
+        let mean = |i: usize| sums[(i, width)] / n;
+        let about = |i: usize, j: usize| sums[(i, j)] - sums[(i, width)] * mean(j);
         Self {
             gram: DMatrix::from_fn(width, width, about),
             right: DVector::from_fn(width, |i, _| about(i, width + 1)),

@@ -10,13 +10,14 @@
 //! sample, so it depends on the command `v(k) = u(k - nk)`, where `nk` is one sample plus the whole samples of the delay. Terms that
 //! depend on the shaft angle are excluded: a record of the speed does not say at which angle it begins.
 
-use super::motor::Motor;
+use super::motor::{self, Motor};
 use super::{DELAY, Dual, Equations, ORDERS, PARAMETERS, Run, Turn, check, varies};
 use crate::closed_loop::{KernelPlant, Known, Plant};
 use crate::embedded::Embedded;
 use crate::lagged::finite;
 use crate::linearised::Linearised;
 use crate::model::{ClonePlant, Model, RunAndRows};
+use crate::neural::Nothing;
 use crate::simd::{self, F64x8, Kernel};
 use crate::{Error, Result};
 
@@ -290,9 +291,9 @@ impl<const N: usize> Stepper<N> {
         sum.scaled(self.frame.command_scale)
     }
 
-    /// Advances by a sample in which `now` comes to act; returns the mean speed over it and the output that follows.
+    /// Advances by a sample in which `now` comes to act; returns the output that follows.
     #[inline(always)]
-    fn step(&self, at: &mut Moving<N>, now: &Dual<N>) -> (f64, Dual<N>) {
+    fn step(&self, at: &mut Moving<N>, now: &Dual<N>) -> Dual<N> {
         let mut turn = self.turn;
         if !self.network.is_empty() {
             turn.load = turn.load.plus(1.0, &self.residual(&at.w, &at.x));
@@ -309,7 +310,7 @@ impl<const N: usize> Stepper<N> {
         at.before = *now;
         let mean = mean.scaled(1.0 / steps as f64);
         let output = if self.frame.mean { mean } else { at.w };
-        (mean.value, output.scaled(1.0 / self.frame.unit))
+        output.scaled(1.0 / self.frame.unit)
     }
 }
 
@@ -331,7 +332,7 @@ impl<const N: usize> Kernel for Carried<'_, N> {
         }
         let mut run = Vec::with_capacity(v.len());
         for &v in v {
-            let (_, y) = stepper.step(&mut at, &Dual::constant(v));
+            let y = stepper.step(&mut at, &Dual::constant(v));
             run.push(y.value);
             if N > 0 {
                 rows.extend_from_slice(&y.by[..columns + STATES]);
@@ -353,7 +354,7 @@ impl Filter<'_> {
     /// The predicted output, the scaled speed and drive that follow, and the state that follows, each with derivatives.
     fn step(&self, v: f64) -> (Dual<STATES>, [Dual<STATES>; FILTERED], Moving<STATES>) {
         let mut at = Moving::at(self.model, &self.state).seeded(self.model, 0);
-        let (_, y) = self.stepper.step(&mut at, &Dual::constant(v));
+        let y = self.stepper.step(&mut at, &Dual::constant(v));
         let frame = &self.model.frame;
         let scaled = [
             at.w.scaled(1.0 / frame.speed_scale),
@@ -450,7 +451,7 @@ impl Model for GreyBox {
         let ahead = |state: &[f64], v: &[f64]| {
             let mut at = Moving::at(self, state);
             v.iter()
-                .map(|v| plain.step(&mut at, &Dual::constant(*v)).1.value)
+                .map(|v| plain.step(&mut at, &Dual::constant(*v)).value)
                 .last()
         };
         // the first samples have no measured output a horizon before them
@@ -549,7 +550,7 @@ impl Model for GreyBox {
         let mut at = Moving::<{ STATES + 1 }>::at(self, state).seeded(self, 0);
         let mut v = Dual::constant(u[0]);
         v.by[INPUT] = 1.0;
-        let (_, y) = Stepper::new(self, false).step(&mut at, &v);
+        let y = Stepper::new(self, false).step(&mut at, &v);
         let frame = &self.frame;
         let next = [
             at.w.scaled(1.0 / frame.speed_scale),
@@ -574,11 +575,10 @@ impl Model for GreyBox {
                 self.frame.sample_time
             )));
         }
-        let stepper = Stepper::new(self, false);
         Ok(Box::new(GreyBoxPlant {
-            motor: Motor::of(&stepper, self.nk() - 1),
-            stepper,
-            at: Moving::at(self, &[0.0; STATES]),
+            motor: Motor::of(&Stepper::new(self, false), self.nk() - 1),
+            sample_time: self.frame.sample_time,
+            at: motor::Moving::at_rest(),
             pending: vec![0.0; self.nk() - 1],
             output: 0.0,
             position: 0.0,
@@ -612,10 +612,9 @@ impl GreyBox {
 /// A grey box as a plant in a loop.
 #[derive(Clone, Debug)]
 struct GreyBoxPlant {
-    stepper: Stepper<0>,
-    /// The same motor for kernels.
     motor: Motor,
-    at: Moving<0>,
+    sample_time: f64,
+    at: motor::Moving<f64>,
     /// Commands that have not acted yet, newest first.
     pending: Vec<f64>,
     output: f64,
@@ -624,11 +623,7 @@ struct GreyBoxPlant {
 
 impl Plant for GreyBoxPlant {
     fn reset(&mut self) {
-        self.at = Moving {
-            w: Dual::ZERO,
-            x: Dual::ZERO,
-            before: Dual::ZERO,
-        };
+        self.at = motor::Moving::at_rest();
         self.pending.fill(0.0);
         (self.output, self.position) = (0.0, 0.0);
     }
@@ -647,14 +642,16 @@ impl Plant for GreyBoxPlant {
             self.pending.rotate_right(1);
             due = std::mem::replace(&mut self.pending[0], u);
         }
-        let (mean, output) = self.stepper.step(&mut self.at, &Dual::constant(due));
-        self.output = output.value;
-        self.position += self.stepper.frame.sample_time * mean / self.stepper.frame.unit;
+        let (output, moved) = self.motor.step(&mut self.at, due, f64::tanh, &mut Nothing);
+        self.output = output;
+        self.position += moved;
     }
 
     fn known(&self) -> Option<KernelPlant<'_>> {
-        let ts = self.stepper.frame.sample_time;
-        Some(KernelPlant::new(Known::Motor(&self.motor), ts))
+        Some(KernelPlant::new(
+            Known::Motor(&self.motor),
+            self.sample_time,
+        ))
     }
 }
 

@@ -80,17 +80,13 @@ pub fn normal(
     let parameters = m + usize::from(measured.current.is_some());
     let mut gram = Gram::new(parameters + 1, 0);
     simd::run(Sum(&found, m, measured, &mut gram));
-    let (sums, width) = gram.finish();
-    let last = &sums[parameters * width..];
+    let sums = gram.matrix();
+    let gradient = sums.view((0, parameters), (parameters, 1));
+    let matrix = sums.view((0, 0), (parameters, parameters));
     Ok(Normal {
-        cost: last[parameters],
-        gradient: last[..parameters].to_vec(),
-        matrix: (0..parameters * parameters)
-            .map(|at| {
-                let (i, j) = (at / parameters, at % parameters);
-                sums[i.max(j) * width + i.min(j)]
-            })
-            .collect(),
+        cost: sums[(parameters, parameters)],
+        gradient: gradient.iter().copied().collect(),
+        matrix: matrix.iter().copied().collect(),
     })
 }
 
@@ -134,15 +130,15 @@ fn summed(gram: &mut Gram, used: &[bool], filter: &[f64], write: impl Fn(usize, 
         if used {
             write(k, row);
         }
-        let (_, sum) = gram.place();
-        sum.fill(0.0);
-        for (lag, gain) in filter.iter().enumerate() {
-            let at = (newest + lags - lag) % lags;
-            for (value, old) in sum.iter_mut().zip(&past[at * width..][..width]) {
-                *value += gain * old;
+        gram.add(|sum| {
+            sum.fill(0.0);
+            for (lag, gain) in filter.iter().enumerate() {
+                let at = (newest + lags - lag) % lags;
+                for (value, old) in sum.iter_mut().zip(&past[at * width..][..width]) {
+                    *value += gain * old;
+                }
             }
-        }
-        gram.keep_weighed(0.0, 1.0);
+        });
     }
 }
 

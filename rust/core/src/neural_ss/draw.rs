@@ -9,7 +9,7 @@ use super::problem::Experiment;
 use super::shape::{Scaling, Shape};
 use super::state::Statistics;
 use crate::lagged::Lagged;
-use crate::linear::LinearModel;
+use crate::linear::{LinearModel, companion};
 use crate::random::Random;
 use crate::{Error, Result};
 
@@ -98,10 +98,7 @@ impl Realisation {
             0.0
         };
         Ok(Self {
-            a: DMatrix::from_fn(nx, nx, |i, j| match j {
-                0 => -a[i + 1],
-                j => f64::from(u8::from(j == i + 1)),
-            }),
+            a: companion(&a[1..=nx]).transpose(),
             b: DMatrix::from_fn(nx, shape.inputs, |i, j| b(i + 1, j) - a[i + 1] * b(0, j)),
             c: DMatrix::from_fn(1, nx, |_, j| f64::from(u8::from(j == 0))),
             d: DMatrix::from_fn(1, shape.inputs, |_, j| b(0, j)),

@@ -169,14 +169,13 @@ pub(super) fn joint(a: &[Columns], b: &[Columns]) -> DMatrix<f64> {
     let mut gram = Gram::new(p + q, 0);
     for (a, b) in a.iter().zip(b) {
         for k in 0..a.len() {
-            let (_, row) = gram.place();
-            row[..p].copy_from_slice(a.row(k));
-            row[p..p + q].copy_from_slice(b.row(k));
-            gram.keep_weighed(0.0, 1.0);
+            gram.add(|row| {
+                row[..p].copy_from_slice(a.row(k));
+                row[p..p + q].copy_from_slice(b.row(k));
+            });
         }
     }
-    let (sums, width) = gram.finish();
-    DMatrix::from_fn(p + q, p + q, |i, j| sums[i.max(j) * width + i.min(j)])
+    gram.matrix()
 }
 
 /// `A'A` over all experiments.

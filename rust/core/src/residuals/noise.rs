@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector};
 use super::columns::{Columns, squared};
 use super::number;
 use crate::gram::Gram;
-use crate::linear::{is_stable, poles, polynomial};
+use crate::linear::{companion, is_stable, poles, polynomial};
 
 /// The largest order, orders per decade of samples, and samples for each.
 const LARGEST_ORDER: usize = 40;
@@ -149,10 +149,7 @@ fn add(row: &mut [f64], factor: f64, other: &[f64]) {
 /// With the companion matrix `C`, `P = sum_j C'^j e e' C^j` from j = 1 on, `e` the first unit vector. The sum is doubled until it stays.
 fn decayed(a: &[f64]) -> DMatrix<f64> {
     let p = a.len();
-    let mut c = DMatrix::from_fn(p, p, |i, j| match i {
-        0 => a[j],
-        _ => f64::from(u8::from(i == j + 1)),
-    });
+    let mut c = companion(&a.iter().map(|a| -a).collect::<Vec<_>>());
     let first = c.clone();
     let mut sum = DMatrix::zeros(p, p);
     if p == 0 {
@@ -214,20 +211,13 @@ fn products_of_lags(
         for (k, is_known) in known.iter().enumerate() {
             length = if *is_known { length + 1 } else { 0 };
             if length > order {
-                let (_, row) = gram.place();
-                row.iter_mut()
-                    .zip(e[k - order..=k].iter().rev())
-                    .for_each(|(v, e)| *v = *e);
-                gram.keep_weighed(0.0, 1.0);
+                let window = e[k - order..=k].iter().rev();
+                gram.add(|row| row.iter_mut().zip(window).for_each(|(v, e)| *v = *e));
                 n += 1;
             }
         }
     }
-    let (sums, width) = gram.finish();
-    let sums = DMatrix::from_fn(order + 1, order + 1, |i, j| {
-        sums[i.max(j) * width + i.min(j)]
-    });
-    (sums, n)
+    (gram.matrix(), n)
 }
 
 fn solved(mut matrix: DMatrix<f64>, right: &DVector<f64>) -> Option<DVector<f64>> {

@@ -1,15 +1,38 @@
-//! Bindings of the tests of a model's residuals.
+//! Bindings of what is seen in a record without a model, and of the tests of a model's residuals.
 
 use numpy::{PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
+use sewfast_core::changes;
 use sewfast_core::residuals::{self, Run, Test};
 
-use crate::seam::{array2, raise, rows, slice, watched};
+use crate::seam::{Experiments, array2, raise, rows, slice, watched};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_function(wrap_pyfunction!(changed, module)?)?;
     module.add_function(wrap_pyfunction!(residual_tests, module)?)?;
     module.add_function(wrap_pyfunction!(parameter_test, module)?)?;
     module.add_function(wrap_pyfunction!(coloured_information, module)?)
+}
+
+/// Experiment, sample, gain, shift, and the share of the error that is left.
+type Change = (usize, usize, f64, isize, f64);
+
+#[pyfunction]
+fn changed(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Change>> {
+    let mut channels = 1;
+    let borrowed = experiments.iter().map(|e| {
+        let (u, width) = rows(&e.u, "u")?;
+        channels = width;
+        Ok(changes::Experiment {
+            u,
+            y: slice(&e.y, "y")?,
+        })
+    });
+    let borrowed = borrowed.collect::<PyResult<Vec<_>>>()?;
+    let found = watched(py, None, |monitor| {
+        changes::changed(&borrowed, channels, monitor)
+    })?;
+    Ok(found.map(|c| (c.experiment, c.start, c.gain, c.shift, c.left)))
 }
 
 /// Inputs, computed output, residual, which samples count, and sensitivities of one experiment.
