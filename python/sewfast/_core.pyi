@@ -824,6 +824,23 @@ def shaft_fraction(theta: _F, *, Ts: float) -> tuple[_F, _F]:
 def changed(experiments: Sequence[tuple[_F, _F]]) -> tuple[int, int, float, int, float] | None:
     """Experiment and sample from which on a record has another sign, scale or time; gain, shift, error left."""
 
+_Delay = tuple[int, tuple[int, int], int | None, _F, _F, _F, float]
+"""Lag of the least cost, plausible lags, first correlated lag, costs in free run and one step ahead, correlations, bound."""
+
+def delay(
+    experiments: _Experiments, *, least: int, longest: int, confidence: float
+) -> list[_Delay]:
+    """The delay of every input; lags count from `least`."""
+
+_Structure = tuple[tuple[int, int, int], int, float, _F, list[float], float]
+"""na, nb, nk; parameters; one-step error; squared free-run errors in parts; AIC, AICc, BIC, FPE; Lipschitz index."""
+
+def order_table(
+    train: _Experiments, later: _Experiments, *, na: Sequence[int], nb: Sequence[int],
+    nk: Sequence[int], init: int, progress: _Progress = None,
+) -> list[_Structure]:
+    """Errors of linear models on later data, after `init` outputs for the initial state."""
+
 _Experiment = tuple[_F, _F, _F, NDArray[np.bool_], _F]
 """Inputs, computed output, residual, which samples count, sensitivities."""
 _Tested = tuple[list[int], list[list[int]], _F, _F, float, float, int, float, float]

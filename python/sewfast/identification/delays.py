@@ -1,113 +1,27 @@
-"""Dead time: `delay`, by regressions on lags that share one triangular factor."""
+"""Dead time of each input: `delay`; `rust/core/src/dead_time.rs` computes it."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 
 from .. import _core
-from ..arrays import gram, require_whole
-from ..dataset import Dataset, Experiment, FloatArray, require_dataset
+from ..arrays import require_whole
+from ..dataset import Dataset, FloatArray, require_dataset
 from ..dataset.experiment import in_effect
 from ..dataset.pieces import require_fittable
-from ..errors import DataError, FitError, SettingError
+from ..errors import SettingError
 from ..plotting import SHADE, lettered, stacked
 from ..tables import html_of
 from ..units import duration
 
-CHUNK = 4096
-DEPENDENT = 1e-10
-"""Singular values below this part of the largest (for columns of length 1) count as zero."""
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Least squares on some of the columns.
-    `squares` is the sum of squared residuals, and `rank` the number of parameters that the data
-    determine.
-    """
-
-    columns: tuple[int, ...]
-    theta: FloatArray
-    squares: float
-    rank: int
-
-
-class LaggedRegression:
-    """The triangle R of [y(k), y(k-1) .., u_1(k) u_1(k-1) .., u_2(k) .., 1] over all whole rows.
-    A regression on some of these columns has the same sums of squares as the one on those columns
-    of R, which has only as many rows as columns. R'R is never formed: its condition number is the
-    square of R's. There are `na` past outputs and `lags` values of each input from u(k) on back;
-    rows with a sample that is not finite are left out.
-    """
-
-    def __init__(self, data: Dataset, na: int, lags: int) -> None:
-        self.na, self.lags, self.n_inputs = na, lags, data.n_inputs
-        width = 2 + na + lags * data.n_inputs
-        self.triangle: FloatArray = np.zeros((0, width))
-        self.samples = 0
-        for experiment in data.experiments:
-            for rows in _chunks(experiment, na, lags):
-                self.samples += len(rows)
-                stacked = np.vstack([self.triangle, rows])
-                self.triangle = np.asarray(np.linalg.qr(stacked, mode="r"), dtype=np.float64)
-
-    def columns(self, na: int, windows: Sequence[tuple[int, int]]) -> tuple[int, ...]:
-        """Columns of y(k-1) .. y(k-na), of each input's lags `start:stop`, and of the constant."""
-        first = 1 + self.na
-        inputs = [
-            first + j * self.lags + lag
-            for j, (start, stop) in enumerate(windows)
-            for lag in range(start, stop)
-        ]
-        return (*range(1, na + 1), *inputs, first + self.lags * self.n_inputs)
-
-    def solve(self, columns: tuple[int, ...]) -> Solution:
-        """Least squares of y(k) on these columns, the least-norm one where they are dependent."""
-        chosen, y = self.triangle[:, columns], self.triangle[:, 0]
-        lengths = np.linalg.norm(chosen, axis=0)
-        scale = 1.0 / np.where(lengths > 0.0, lengths, 1.0)
-        theta, _, rank, _ = np.linalg.lstsq(chosen * scale, y, rcond=DEPENDENT)
-        theta = theta * scale
-        return Solution(columns, theta, float(np.sum((y - chosen @ theta) ** 2)), int(rank))
-
-    def squares(self, solution: Solution) -> float:
-        """Sum of squared one-step errors of a solution found on other data."""
-        error = self.triangle[:, 0] - self.triangle[:, solution.columns] @ solution.theta
-        return float(np.sum(error**2))
-
-
-def _chunks(e: Experiment, na: int, lags: int) -> Iterator[FloatArray]:
-    first = max(na, lags - 1)
-    for start in range(first, len(e), CHUNK):
-        k = np.arange(start, min(start + CHUNK, len(e)))
-        past = e.y[k[:, None] - np.arange(na + 1)]
-        inputs = [e.u[k[:, None] - np.arange(lags), j] for j in range(e.u.shape[1])]
-        rows = np.hstack([past, *inputs, np.ones((len(k), 1))])
-        yield rows[np.isfinite(rows).all(axis=1)]
-
-
-# --- delay: the dead time of each input -----------------------------------------------------------
-
-
 LONGEST = 30
 """Largest delay tried by default [samples]."""
-ORDER = 4
-"""Past outputs and inputs of the ARX models."""
-REFINED = 2
-"""Past outputs and inputs of the models whose free runs are compared; more could mimic a delay."""
-ITERATIONS = 6
-SMOOTH = 2000
-"""Lags over which the residual's autocorrelations are summed."""
-WHITENING = 20
-"""Order of the autoregression that makes an input white."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,28 +194,24 @@ def delay(
     data = in_effect(data)
     data.require_measured(0)
     require_fittable(data)
-    regression = LaggedRegression(data, ORDER, longest + ORDER)
-    needed = 2 * regression.triangle.shape[1]
-    if regression.samples < needed:
-        raise DataError(
-            f"{data.source}: expected at least {needed} samples with {longest + ORDER} samples "
-            f"before them, received {regression.samples}; lower `longest`, or record longer"
-        )
-    lags = range(least, longest + 1)
-    one_step = [_one_step_costs(regression, j, lags) for j in range(data.n_inputs)]
-    best = [lags[int(np.argmin(c))] for c in one_step]
-    costs = one_step
-    for _ in range(1 if data.n_inputs == 1 else 2):
-        costs = []
-        for j in range(data.n_inputs):
-            costs.append(_free_run_costs(data, j, lags, best))
-            best[j] = lags[int(np.argmin(costs[j]))]
-    samples = _independent_samples(data, best)
-    found = tuple(
-        _of_input(data, j, lags, confidence, samples, costs[j], one_step[j])
-        for j in range(data.n_inputs)
+    found = _core.delay(
+        [(e.u, e.y) for e in data.experiments],
+        least=least,
+        longest=longest,
+        confidence=confidence,
     )
-    return DelayEstimate(min(i.nk for i in found), found, data.Ts, confidence)
+    lags = np.arange(least, longest + 1, dtype=np.float64)
+    inputs = []
+    for name, of in zip(data.input_names, found, strict=True):
+        best, (low, high), seen, cost, one_step, correlation, bound = of
+        first = None if seen is None else least + seen
+        inputs.append(
+            InputDelay(
+                name, least + best, least + low, least + high, first, lags, cost, one_step,
+                correlation, bound,
+            )
+        )  # fmt: skip
+    return DelayEstimate(min(i.nk for i in inputs), tuple(inputs), data.Ts, confidence)
 
 
 def reach(data: Dataset) -> int:
@@ -318,132 +228,3 @@ def _require(data: Dataset, longest: int, least: int, confidence: float) -> None
         require_whole(name, value, low, high)
     if not 0.0 < confidence < 1.0:
         raise SettingError(f"confidence: expected a number between 0 and 1, received {confidence}")
-
-
-def _one_step_costs(regression: LaggedRegression, j: int, lags: range) -> FloatArray:
-    """Mean square errors of ARX models in which the other inputs have all lags."""
-    everything = [(0, regression.lags)] * regression.n_inputs
-    costs = []
-    for nk in lags:
-        windows = [*everything[:j], (nk, nk + ORDER), *everything[j + 1 :]]
-        costs.append(regression.solve(regression.columns(ORDER, windows)).squares)
-    return np.array(costs) / regression.samples
-
-
-def _free_run_costs(data: Dataset, j: int, lags: range, best: list[int]) -> FloatArray:
-    """Mean square free-run errors with input `j` delayed by each lag, others by their best."""
-    costs = []
-    for nk in lags:
-        try:
-            costs.append(2.0 * _refined(data, [*best[:j], nk, *best[j + 1 :]]).cost)
-        except (DataError, FitError):
-            costs.append(math.inf)
-    if not np.isfinite(costs).any():
-        raise FitError(
-            f"{data.source}: expected a linear model with a finite free run, found none at any "
-            "delay; check units and signs, or record with more excitation"
-        )
-    return np.array(costs)
-
-
-def _refined(data: Dataset, delays: list[int]) -> _core.LinearFit:
-    """The second-order model with these delays."""
-    arrays = [(_delayed(e.u, delays), e.y) for e in data.experiments]
-    fit = _core.fit_iv(arrays, na=REFINED, nb=REFINED, nk=1, max_iterations=ITERATIONS)
-    if fit.termination == "interrupted":
-        raise KeyboardInterrupt
-    return fit
-
-
-def _independent_samples(data: Dataset, delays: list[int]) -> float:
-    """Samples over the sum of the residual's squared autocorrelations (Bartlett)."""
-    fit = _refined(data, delays)
-    products, samples = np.zeros(1), 0
-    for e, state in zip(data.experiments, fit.initial_states, strict=True):
-        first = int(np.argmax(np.isfinite(e.y)))
-        error = e.y[first:] - fit.model.simulate(_delayed(e.u, delays)[first:], state)
-        error = np.where(np.isfinite(error), error - np.nanmean(error), 0.0)
-        power = np.abs(np.fft.rfft(error, 2 * len(error))) ** 2
-        found = np.fft.irfft(power)[: min(len(error) // 4 + 1, SMOOTH)]
-        products = _sum(products, found)
-        samples += int(np.isfinite(e.y).sum())
-    if products[0] <= 0.0:
-        return float(samples)
-    squares = (products[1:] / products[0]) ** 2
-    # squared autocorrelations of a white residual have the mean 1/N
-    excess = float(squares.sum()) - len(squares) / samples
-    return samples / (1.0 + 2.0 * max(excess, 0.0))
-
-
-def _sum(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Sum of two series with a common start, over the longer of both."""
-    total = np.zeros(max(len(one), len(other)))
-    total[: len(one)] += one
-    total[: len(other)] += other
-    return total
-
-
-def _delayed(u: FloatArray, delays: list[int]) -> FloatArray:
-    """Inputs delayed by one sample less than `delays`, held at their first values."""
-    k = np.arange(len(u))
-    shifted = [u[np.clip(k - (d - 1), 0, len(u) - 1), j] for j, d in enumerate(delays)]
-    return np.ascontiguousarray(np.stack(shifted, axis=1))
-
-
-def _of_input(
-    data: Dataset,
-    j: int,
-    lags: range,
-    confidence: float,
-    independent: float,
-    cost: FloatArray,
-    one_step_cost: FloatArray,
-) -> InputDelay:
-    measured = np.concatenate([e.y[np.isfinite(e.y)] for e in data.experiments])
-    # floor of rounding: a clean record has costs of nearly zero, whose ratios mean nothing
-    floor = 1e-16 * float(np.var(measured))
-    deviance = independent * np.log((cost + floor) / (cost.min() + floor))
-    plausible = np.flatnonzero(deviance <= -2.0 * math.log(1.0 - confidence))
-    correlation, samples = _prewhitened_correlation(data, j, lags)
-    # significance of each of L lags such that all together keep the level (Sidak)
-    each = 1.0 - (1.0 - confidence ** (1.0 / len(lags))) / 2.0
-    bound = NormalDist().inv_cdf(each) / math.sqrt(samples)
-    beyond = np.flatnonzero(np.abs(correlation) > bound)
-    return InputDelay(
-        name=data.input_names[j],
-        nk=lags[int(np.argmin(cost))],
-        low=lags[int(plausible[0])],
-        high=lags[int(plausible[-1])],
-        first_correlated=lags[int(beyond[0])] if len(beyond) else None,
-        lags=np.arange(lags.start, lags.stop, dtype=np.float64),
-        cost=cost,
-        one_step_cost=one_step_cost,
-        correlation=correlation,
-        bound=bound,
-    )
-
-
-def _prewhitened_correlation(data: Dataset, j: int, lags: range) -> tuple[FloatArray, int]:
-    """Correlation of input `j` and the output after the filter that makes the input white."""
-    whitener = _autoregression([e.u[:, j] for e in data.experiments])
-    sums, power, samples = np.zeros(len(lags)), np.zeros(2), 0
-    for e in data.experiments:
-        u, y = (np.convolve(v - np.nanmean(v), whitener, "valid") for v in (e.u[:, j], e.y))
-        known = np.isfinite(y)
-        y = np.where(known, y, 0.0)
-        sums += [u[: len(u) - lag] @ y[lag:] if lag < len(u) else 0.0 for lag in lags]
-        power += [u @ u, y @ y]
-        samples += int(known.sum())
-    size = math.sqrt(power.prod())
-    return (sums / size if size > 0.0 else sums), max(samples, 1)
-
-
-def _autoregression(series: list[FloatArray]) -> FloatArray:
-    """Filter [1, c_1, .., c_n] that makes the series white, by least squares."""
-    order = min(WHITENING, *(max((len(s) - 1) // 4, 0) for s in series))
-    mean = np.mean(np.concatenate(series))
-    rows = [np.lib.stride_tricks.sliding_window_view(s - mean, order + 1)[:, ::-1] for s in series]
-    sums = np.sum([gram(r) for r in rows], axis=0)
-    # the ridge bounds the filter for inputs that few parameters describe (steps, sines)
-    ridge = 1e-8 * sums[0, 0] * np.eye(order)
-    return np.concatenate([[1.0], -np.linalg.solve(sums[1:, 1:] + ridge, sums[1:, 0])])

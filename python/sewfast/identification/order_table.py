@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from .. import _core
-from ..dataset import Dataset, Experiment, FloatArray, labelled, require_dataset
+from ..dataset import Dataset, FloatArray, labelled, require_dataset
 from ..dataset.experiment import in_effect
 from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
 from ..dynamic_model import INIT
@@ -20,17 +19,14 @@ from ..errors import DataError, FitError, SettingError
 from ..plotting import legend, lettered, stacked
 from ..progress import shown_in_notebooks
 from ..tables import Table, significant
-from .delays import DelayEstimate, LaggedRegression, Solution, delay, reach
+from .delays import DelayEstimate, delay, reach
 
 Progress: TypeAlias = Callable[[int, int, float], object]
 
-BLOCKS = 10
-"""Number of parts of the later data, for the standard error of a difference between structures."""
 ABOUT_AS_WELL = 1.005
 """Ratio of free-run errors below which they count as equal: a tenth of the noise, if only that."""
 EXACT = 1e-3
 """Error due to the unknown inputs before the later part, in standard deviations of the output."""
-IV_ITERATIONS = 10
 SHOWN = 12
 
 
@@ -260,29 +256,25 @@ def orders(
     require_fittable(judged)
     train, later = (in_effect(part) for part in _parts(data, validation, held_out))
     found = delay(train, longest=reach(train)) if nk is None else None
-    grid = _Grid(_upto("na", na, 1), _upto("nb", nb, 1), _delays(nk, found))
-    rows, errors = _tried(train, later, grid, progress)
+    tried = _core.order_table(
+        *([(e.u, e.y) for e in part.experiments] for part in (train, later)),
+        na=_upto("na", na, 1),
+        nb=_upto("nb", nb, 1),
+        nk=_delays(nk, found),
+        init=INIT,
+        progress=progress,
+    )
+    errors = [blocks for *_, blocks, _, _ in tried]
+    rows = [
+        Structure(
+            *orders, parameters, one_step, math.sqrt(blocks.mean()), aic, aicc, bic, fpe, index
+        )
+        for orders, parameters, one_step, blocks, (aic, aicc, bic, fpe), index in tried
+    ]
     exact = EXACT * float(np.nanstd(np.concatenate([e.y for e in later.experiments])))
     choice, reason = _chosen(rows, errors, exact)
     output = labelled(data.output_name, data.output_unit)
     return OrderTable(tuple(rows), choice, reason, found, output)
-
-
-@dataclass(frozen=True)
-class _Grid:
-    na: tuple[int, ...]
-    nb: tuple[int, ...]
-    nk: tuple[int, ...]
-
-    def __iter__(self) -> Any:
-        return ((a, b, k) for k in self.nk for a in self.na for b in self.nb)
-
-    def __len__(self) -> int:
-        return len(self.na) * len(self.nb) * len(self.nk)
-
-    @property
-    def lags(self) -> int:
-        return max(self.nk) + max(self.nb)
 
 
 def _upto(name: str, value: int | Iterable[int], least: int) -> tuple[int, ...]:
@@ -337,85 +329,6 @@ def _split(data: Dataset, fraction: float) -> tuple[Dataset, Dataset]:
     return replace(data, experiments=first), replace(data, experiments=rest)
 
 
-def _tried(
-    train: Dataset, later: Dataset, grid: _Grid, progress: Progress | None
-) -> tuple[list[Structure], list[FloatArray]]:
-    """Every row, and its squared free-run errors in blocks."""
-    largest = (max(grid.na), grid.lags)
-    known, fresh = LaggedRegression(train, *largest), LaggedRegression(later, *largest)
-    width = known.triangle.shape[1]
-    if known.samples < 2 * width or fresh.samples == 0:
-        raise DataError(
-            f"{train.source}: expected at least {2 * width} samples for {width - 1} parameters, "
-            f"received {known.samples} to fit and {fresh.samples} to judge on; record longer, or "
-            "lower na, nb and nk"
-        )
-    rows, errors, lowest = [], [], math.inf
-    for done, (na, nb, nk) in enumerate(grid, 1):
-        arx = known.solve(known.columns(na, [(nk, nk + nb)] * train.n_inputs))
-        models = _models(arx, train, na, nb, nk)
-        blocks = min((_blocks(m, later) for m in models), key=np.mean, default=_NO_MODEL)
-        free = math.sqrt(float(np.mean(blocks)))
-        lowest = min(lowest, free)
-        one_step = math.sqrt(fresh.squares(arx) / fresh.samples)
-        criteria = _criteria(arx, known.samples)
-        index = lipschitz_index(train, na, nb, nk)
-        rows.append(Structure(na, nb, nk, arx.rank, one_step, free, *criteria, index))
-        errors.append(blocks)
-        if progress is not None:
-            progress(done, len(grid), lowest)
-    return rows, errors
-
-
-def _criteria(arx: Solution, n: int) -> tuple[float, float, float, float]:
-    """AIC, AICc, BIC and FPE of a least-squares fit with `rank` parameters on n samples."""
-    p, variance = arx.rank, max(arx.squares, 1e-300) / n
-    aic = n * math.log(variance) + 2 * p
-    aicc = aic + 2 * p * (p + 1) / (n - p - 1)
-    bic = n * math.log(variance) + p * math.log(n)
-    return aic, aicc, bic, variance * (1 + p / n) / (1 - p / n)
-
-
-_NO_MODEL = np.full(BLOCKS, math.inf)
-
-
-def _models(
-    arx: Solution, train: Dataset, na: int, nb: int, nk: int
-) -> Iterator[_core.LinearModel]:
-    """The structure by least squares and by instrumental variables.
-    For a nonlinear drive, instrumental variables can follow the record's trend with a slow pole
-    that no other record shows; least squares cannot.
-    """
-    theta, inputs = arx.theta, train.n_inputs
-    b = theta[na:-1].reshape(inputs, nb)
-    arrays = [(e.u, e.y) for e in train.experiments]
-    with suppress(FitError, DataError, SettingError):
-        yield _core.LinearModel(-theta[:na], b, nk, float(theta[-1]))
-    with suppress(FitError, DataError):
-        fit = _core.fit_iv(arrays, na=na, nb=nb, nk=nk, max_iterations=IV_ITERATIONS)
-        if fit.termination == "interrupted":
-            raise KeyboardInterrupt
-        yield fit.model
-
-
-def _blocks(model: _core.LinearModel, later: Dataset) -> FloatArray:
-    """Mean squared free-run error in each block of the later data; inf if the run diverges."""
-    try:
-        errors = [_errors(model, e.u, e.y) for e in later.experiments]
-    except FitError:
-        return _NO_MODEL
-    squares = np.concatenate(errors) ** 2
-    return np.array([part.mean() for part in np.array_split(squares, min(BLOCKS, len(squares)))])
-
-
-def _errors(model: _core.LinearModel, u: FloatArray, y: FloatArray) -> FloatArray:
-    known = np.flatnonzero(np.isfinite(y))[:INIT]
-    first = int(known[-1]) + 1 if len(known) else INIT
-    state = model.estimate_initial_state(u[:first], y[:first])
-    error = (y - model.simulate(u, state))[first:]
-    return error[np.isfinite(error)]
-
-
 def _chosen(rows: list[Structure], errors: list[FloatArray], exact: float) -> tuple[Structure, str]:
     best = min(range(len(rows)), key=lambda i: rows[i].free_run)
     if not math.isfinite(rows[best].free_run):
@@ -448,57 +361,3 @@ def _is_not_worse(errors: FloatArray, least: FloatArray) -> bool:
         return False
     difference = errors - least
     return float(difference.mean()) <= 2.0 * float(difference.std(ddof=1)) / math.sqrt(n)
-
-
-# --- Lipschitz quotients: the number of lags that explain an output -------------------------------
-
-
-POINTS = 600
-"""Number of samples compared pairwise, spread evenly over the data."""
-SHARE = 0.02
-"""Part of the points: number of largest quotients that are averaged."""
-
-
-def lipschitz_index(data: Dataset, na: int, nb: int, nk: int) -> float:
-    """Geometric mean of the largest quotients |dy| / |dphi|, times sqrt(n) (He and Asada 1993).
-    With too few lags two nearly equal regressors can have very different outputs: the index is
-    large. It falls to a level, which noise raises, as lags are added; the order is where it stops
-    falling. Inputs and output are in units of their standard deviations. Samples that were not
-    measured are left out; NaN if too few are left.
-    """
-    mean, scale = _moments(data)
-    rows = np.vstack([_regressors(e, na, nb, nk, mean, scale) for e in data.experiments])
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    if len(rows) < 20:
-        return math.nan
-    rows = rows[np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).round().astype(int)]
-    y, phi = rows[:, 0], rows[:, 1:]
-    power = np.sum(phi**2, axis=1)
-    apart = power[:, None] + power - 2.0 * phi @ phi.T
-    # distances within rounding do not count, such as those of points from themselves
-    near = apart <= 1e-14 * power.max()
-    quotients = np.where(near, 0.0, (y[:, None] - y) ** 2 / np.where(near, 1.0, apart)).ravel()
-    # every pair occurs twice
-    count = 2 * max(1, int(SHARE * len(y)))
-    largest = np.partition(quotients, len(quotients) - count)[-count:]
-    if largest.min() <= 0.0:
-        return math.nan
-    return math.sqrt(phi.shape[1]) * math.exp(float(np.mean(np.log(largest))) / 2.0)
-
-
-def _moments(data: Dataset) -> tuple[FloatArray, FloatArray]:
-    """Means and standard deviations of [y, u_1, ..]."""
-    columns = np.vstack([np.column_stack([e.y, e.u]) for e in data.experiments])
-    scale = np.nanstd(columns, axis=0)
-    return np.nanmean(columns, axis=0), np.where(scale > 0.0, scale, 1.0)
-
-
-def _regressors(
-    e: Experiment, na: int, nb: int, nk: int, mean: FloatArray, scale: FloatArray
-) -> FloatArray:
-    y, u = (e.y - mean[0]) / scale[0], (e.u - mean[1:]) / scale[1:]
-    first = max(na, nk + nb - 1)
-    k = np.arange(first, len(y))
-    past = y[k[:, None] - np.arange(na + 1)]
-    inputs = [u[k[:, None] - nk - np.arange(nb), j] for j in range(u.shape[1])]
-    return np.hstack([past, *inputs])

@@ -9,7 +9,7 @@
 
 mod confirm;
 mod point;
-mod triangle;
+pub(crate) mod triangle;
 mod trust;
 
 pub use crate::descent::Termination;

@@ -16,6 +16,7 @@ use nalgebra::DMatrix;
 pub use chi_square::{quantile, tail};
 use columns::{Columns, constant, independent, lagged, leading};
 pub use noise::Noise;
+pub(crate) use noise::products_of_lags;
 use sums::Sums;
 
 use crate::{Error, Monitor, Result};

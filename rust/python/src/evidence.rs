@@ -1,14 +1,16 @@
 //! Bindings of what is seen in a record without a model, and of the tests of a model's residuals.
 
-use numpy::{PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
-use sewfast_core::changes;
 use sewfast_core::residuals::{self, Run, Test};
+use sewfast_core::{changes, dead_time, orders};
 
-use crate::seam::{Experiments, array2, raise, rows, slice, watched};
+use crate::seam::{Experiments, array1, array2, raise, rows, samples, slice, watched};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(changed, module)?)?;
+    module.add_function(wrap_pyfunction!(delay, module)?)?;
+    module.add_function(wrap_pyfunction!(order_table, module)?)?;
     module.add_function(wrap_pyfunction!(residual_tests, module)?)?;
     module.add_function(wrap_pyfunction!(parameter_test, module)?)?;
     module.add_function(wrap_pyfunction!(coloured_information, module)?)
@@ -33,6 +35,80 @@ fn changed(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Chan
         changes::changed(&borrowed, channels, monitor)
     })?;
     Ok(found.map(|c| (c.experiment, c.start, c.gain, c.shift, c.left)))
+}
+
+/// Lag of the least cost, first and last plausible lag, first correlated lag, costs in free run and one step ahead, correlations, and
+/// their bound. Lags count from the least delay.
+type Delay<'py> = (
+    usize,
+    (usize, usize),
+    Option<usize>,
+    Bound<'py, PyArray1<f64>>,
+    Bound<'py, PyArray1<f64>>,
+    Bound<'py, PyArray1<f64>>,
+    f64,
+);
+
+#[pyfunction]
+#[pyo3(signature = (experiments, *, least, longest, confidence))]
+fn delay<'py>(
+    py: Python<'py>,
+    experiments: Experiments<'py>,
+    least: usize,
+    longest: usize,
+    confidence: f64,
+) -> PyResult<Vec<Delay<'py>>> {
+    let borrowed = samples(py, &experiments)?;
+    let found = watched(py, None, |monitor| {
+        dead_time::delay(&borrowed, least..longest + 1, confidence, monitor)
+    })?;
+    let handed_over = |d: dead_time::InputDelay| {
+        let [cost, one_step, correlation] =
+            [d.cost, d.one_step_cost, d.correlation].map(|v| array1(py, v));
+        let (best, plausible, seen) = (d.best, d.plausible, d.correlated);
+        (best, plausible, seen, cost, one_step, correlation, d.bound)
+    };
+    Ok(found.into_iter().map(handed_over).collect())
+}
+
+/// Orders, parameters, one-step error, squared free-run errors in parts, criteria, Lipschitz index.
+type Structure<'py> = (
+    (usize, usize, usize),
+    usize,
+    f64,
+    Bound<'py, PyArray1<f64>>,
+    [f64; 4],
+    f64,
+);
+
+#[pyfunction]
+#[pyo3(signature = (train, later, *, na, nb, nk, init, progress = None))]
+#[expect(clippy::too_many_arguments, reason = "settings of Python's function")]
+fn order_table<'py>(
+    py: Python<'py>,
+    train: Experiments<'py>,
+    later: Experiments<'py>,
+    na: Vec<usize>,
+    nb: Vec<usize>,
+    nk: Vec<usize>,
+    init: usize,
+    progress: Option<Bound<'py, PyAny>>,
+) -> PyResult<Vec<Structure<'py>>> {
+    let (train, later) = (samples(py, &train)?, samples(py, &later)?);
+    let grid = orders::Grid {
+        na: &na,
+        nb: &nb,
+        nk: &nk,
+    };
+    let found = watched(py, progress.as_ref(), |monitor| {
+        orders::table(&train, &later, grid, init, monitor)
+    })?;
+    let handed_over = |s: orders::Structure| {
+        let blocks = array1(py, s.blocks);
+        let (orders, count) = (s.orders, s.parameters);
+        (orders, count, s.one_step, blocks, s.criteria, s.lipschitz)
+    };
+    Ok(found.into_iter().map(handed_over).collect())
 }
 
 /// Inputs, computed output, residual, which samples count, and sensitivities of one experiment.

@@ -6,9 +6,12 @@
 /// Rows folded at a time; a block stays in the caches.
 const BLOCK: usize = 64;
 
+/// Squares below this have lost digits, and their inverse is infinite. Columns that are equal in one block after the other come to it.
+const NEGLIGIBLE: f64 = f64::MIN_POSITIVE / f64::EPSILON;
+
 /// `R` of `[J, r]`, row by row, `n + 1` values a row.
 #[derive(Clone, Debug)]
-pub(super) struct Triangle {
+pub(crate) struct Triangle {
     n: usize,
     rows: Vec<f64>,
     block: Vec<f64>,
@@ -63,7 +66,7 @@ impl Triangle {
         let block = &mut self.block[..self.filled * width];
         for k in 0..self.n {
             let below: f64 = block.chunks_exact(width).map(|row| row[k] * row[k]).sum();
-            if below == 0.0 {
+            if below < NEGLIGIBLE {
                 continue;
             }
             let top = &mut self.rows[k * width + k..(k + 1) * width];

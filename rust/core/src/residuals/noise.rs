@@ -199,7 +199,7 @@ fn autoregression(
 }
 
 /// Sums of `e(k-i) e(k-j)` over windows of known samples, and the number of windows.
-fn products_of_lags(
+pub(crate) fn products_of_lags(
     series: &[Vec<f64>],
     known: &[Vec<bool>],
     order: usize,
