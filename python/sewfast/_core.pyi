@@ -824,6 +824,50 @@ def shaft_fraction(theta: _F, *, Ts: float) -> tuple[_F, _F]:
 def changed(experiments: Sequence[tuple[_F, _F]]) -> tuple[int, int, float, int, float] | None:
     """Experiment and sample from which on a record has another sign, scale or time; gain, shift, error left."""
 
+def copied(experiments: _Experiments) -> tuple[int, float, float, int] | None:
+    """Input, gain, offset and delay if the output repeats an input to rounding."""
+
+def computed(experiments: _Experiments) -> str | None:
+    """Whether the "output" or its "change" is a sum of inputs in the same sample and some before."""
+
+def order_in_time(experiments: _Experiments) -> tuple[str, int, int, float] | None:
+    """Kind, input, shift and twice the log-likelihood of an input that moves after the output."""
+
+def integration(
+    experiments: _Experiments, *, Ts: float
+) -> tuple[bool, int, float, float, float, float, float] | None:
+    """Whether the output integrates, input, lengths, time constant, gain, standard errors of restoring and driving."""
+
+def feedback(experiments: _Experiments) -> tuple[int, int, float, float, float] | None:
+    """Input, lead, correlation, significance and misfit of the clearest answer to the output's noise."""
+
+def quantum(column: _F) -> float | None:
+    """The step of a grid on which all values lie."""
+
+def dead(experiments: _Experiments) -> list[list[tuple[int, int]]]:
+    """First sample and length of each experiment's stretches in which the output's sensor was dead."""
+
+def spikes(experiments: _Experiments) -> list[list[tuple[int, int]]]:
+    """The same of a few samples that have most of the output's power."""
+
+def two_levels(experiments: _Experiments) -> list[tuple[float, float] | None]:
+    """The two levels of every input that has no others."""
+
+def limits(experiments: _Experiments) -> list[tuple[int, float, int, float]]:
+    """Input, limit, stretches and share of the samples at each limit at which an input stays."""
+
+def rests(experiments: _Experiments) -> list[tuple[int, int]]:
+    """Samples at rest at the beginning and the end of every experiment."""
+
+def period(experiments: _Experiments) -> tuple[float, float] | None:
+    """Period in samples of the longest experiment, if its inputs repeat, and their correlation."""
+
+def wraps(experiments: _Experiments) -> tuple[float, int] | None:
+    """A turn and the number of jumps of an output that wraps."""
+
+def unstable_pole(experiments: _Experiments) -> float | None:
+    """Modulus per sample of a pole outside the unit circle."""
+
 _Delay = tuple[int, tuple[int, int], int | None, _F, _F, _F, float]
 """Lag of the least cost, plausible lags, first correlated lag, costs in free run and one step ahead, correlations, bound."""
 

@@ -7,10 +7,9 @@ import pytest
 from scipy.linalg import expm, solve_discrete_are
 
 from effort import FULL
-from sewfast import Controller, Dataset, Gains, identify, run, tune
+from sewfast import Controller, Dataset, Gains, _core, identify, run, tune
 from sewfast.arrays import FloatArray
 from sewfast.dataset import diagnose
-from sewfast.dataset.stability import unstable_pole
 from sewfast.models import LinearOE
 
 Plant = tuple[FloatArray, FloatArray]
@@ -48,6 +47,10 @@ def looped(seed: int) -> tuple[Dataset, float]:
         y[k], x = x[0], F @ x + G * u[k]
     y += y.std() * rng.choice([0.001, 0.01, 0.03]) * rng.standard_normal(n)
     return Dataset.from_arrays(u, y, Ts), float(np.abs(np.linalg.eigvals(F)).max())
+
+
+def unstable_pole(data: Dataset) -> float | None:
+    return _core.unstable_pole([(e.u, e.y) for e in data.experiments])
 
 
 def test_unstable_plants_in_loops_are_found() -> None:

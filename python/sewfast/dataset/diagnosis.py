@@ -9,18 +9,17 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import FloatArray, labelled, runs
+from .. import _core
+from ..arrays import FloatArray, labelled
 from ..tables import Table
 from .faults import faults
 from .feedback import Integration, feedback, integration
-from .outliers import MAD, quantum
+from .outliers import quantum
 from .pieces import LARGEST, require_dataset
 
 if TYPE_CHECKING:
     from .dataset import Dataset
-    from .experiment import Experiment
 
 SHORT = 3.0
 """Shortest length of a record, in time constants of its slowest pole."""
@@ -28,18 +27,8 @@ SURE = 5.0
 """Standard errors by which that pole must be known before a record is called short."""
 RESTING = 0.2
 """Part of a record that can be at rest at its ends without a finding."""
-REPEATED = 0.95
-"""Correlation of the inputs with themselves one period later above which a record repeats."""
-REPEATED_LOOSELY, OUTPUT_REPEATED = 0.3, 0.98
-"""The same in a closed loop, where noise returns in the input: inputs alone, inputs with output."""
-CLUSTERED = 0.95
-"""Part of the samples that must be at one of two levels."""
 COARSE = 10.0
 """Steps of the sensor in a standard deviation of the output, below which it counts as coarse."""
-LIMITED, VISITS = 0.02, 3
-"""Least part of the samples and least number of stretches for an input to count as limited."""
-_MOST = 65_536
-"""Most values searched for a period; longer records are averaged in blocks."""
 _REFERENCE = re.compile(
     r"((y_?)?(r|ref|reference|set_?point|sp|target|soll|sollwert|demand)"
     # a `voltage_ref` can be the plant's input, a `speed_ref` cannot
@@ -194,6 +183,10 @@ def _output(data: Dataset) -> str:
     return labelled(data.output_name, data.output_unit)
 
 
+def _arrays(data: Dataset) -> list[tuple[FloatArray, FloatArray]]:
+    return [(e.u, e.y) for e in data.experiments]
+
+
 def _known(column: FloatArray) -> FloatArray:
     return column[np.abs(column) < LARGEST]
 
@@ -259,8 +252,7 @@ def _coarse(data: Dataset) -> Iterator[Finding]:
 
 
 def _two_levels(data: Dataset) -> Iterator[Finding]:
-    for j in range(data.n_inputs):
-        levels = two_levels(_known(np.concatenate([e.u[:, j] for e in data.experiments])))
+    for j, levels in enumerate(_core.two_levels(_arrays(data))):
         if levels is None:
             continue
         low, high = levels
@@ -274,50 +266,16 @@ def _two_levels(data: Dataset) -> Iterator[Finding]:
         )
 
 
-def two_levels(values: FloatArray) -> tuple[float, float] | None:
-    """The two levels of an input, apart from noise and few values in transit; else None."""
-    if len(values) == 0 or values.min() == values.max():
-        return None
-    low, high = float(values.min()), float(values.max())
-    if bool(((values == low) | (values == high)).all()):
-        return low, high
-    sample = values[:: max(1, len(values) // 20_000)]
-    # quantiles, because one outlier would shift the middle
-    middle = float(np.mean(np.quantile(sample, [0.02, 0.98])))
-    groups = sample[sample < middle], sample[sample >= middle]
-    if min(map(len, groups)) < 0.02 * len(sample):
-        return None
-    levels = [float(np.median(g)) for g in groups]
-    gap = levels[1] - levels[0]
-    spreads = [MAD * float(np.median(np.abs(g - at))) for g, at in zip(groups, levels, strict=True)]
-    if max(spreads) > gap / 20.0:
-        return None
-    there = sum(
-        int((np.abs(g - at) < max(5.0 * spread, 0.02 * gap)).sum())
-        for g, at, spread in zip(groups, levels, spreads, strict=True)
-    )
-    return (levels[0], levels[1]) if there > CLUSTERED * len(sample) else None
-
-
 def _limited(data: Dataset) -> Iterator[Finding]:
-    for j in range(data.n_inputs):
-        columns = [e.u[:, j] for e in data.experiments]
-        known = _known(np.concatenate(columns))
-        # a staircase also stays at its highest level
-        if len(known) == 0 or len(np.unique(known[:200_000])) < 50:
-            continue
-        for value in (float(known.min()), float(known.max())):
-            stretches = [n for c in columns for _, n in runs(c == value) if n >= 3]
-            share = sum(stretches) / len(known)
-            if len(stretches) >= VISITS and share > LIMITED:
-                yield Finding(
-                    "limited_input",
-                    f"{_input(data, j)} stays at its limit of {value:.4g} in {len(stretches)} "
-                    f"stretches, {share:.0%} of the samples",
-                    "make sure that it was recorded behind the limiter: a command that the "
-                    "amplifier did not follow makes a wrong model",
-                    {"input": data.input_names[j], "limit": value, "share": share},
-                )
+    for j, value, stretches, share in _core.limits(_arrays(data)):
+        yield Finding(
+            "limited_input",
+            f"{_input(data, j)} stays at its limit of {value:.4g} in {stretches} "
+            f"stretches, {share:.0%} of the samples",
+            "make sure that it was recorded behind the limiter: a command that the "
+            "amplifier did not follow makes a wrong model",
+            {"input": data.input_names[j], "limit": value, "share": share},
+        )
 
 
 def _closed_loop(data: Dataset) -> Iterator[Finding]:
@@ -382,7 +340,7 @@ def _reference(data: Dataset) -> tuple[str, float] | None:
 
 def _repeats(data: Dataset) -> Iterator[Finding]:
     e = max(data.experiments, key=len)
-    found = _period(e)
+    found = _core.period(_arrays(data))
     if found is None:
         return
     period, correlation = found
@@ -396,59 +354,9 @@ def _repeats(data: Dataset) -> Iterator[Finding]:
     )
 
 
-def _period(e: Experiment) -> tuple[float, float] | None:
-    """Period [samples] of inputs that repeat at least twice, and their correlation at it."""
-    size = max(1, len(e) // _MOST)
-    columns = [_averaged(c, size) for c in (*e.u.T, e.y)]
-    *inputs, output = [None if c is None else _autocorrelation(c) for c in columns]
-    moving = [r for r in inputs if r is not None]
-    if not moving or len(moving[0]) < 20:
-        return None
-    r = np.min(moving, axis=0)
-    # at lags near 0 every signal resembles itself
-    again = (r >= REPEATED) & np.maximum.accumulate(r < 0.5)
-    if output is not None:
-        loosely = (r >= REPEATED_LOOSELY) & (output >= OUTPUT_REPEATED)
-        again |= loosely & np.maximum.accumulate(output < 0.5)
-    stretches = runs(again)
-    if not stretches:
-        return None
-    first, count = stretches[0]
-    lag = first + int(np.argmax(r[first : first + count]))
-    return float(lag * size), float(r[lag])
-
-
-def _averaged(column: FloatArray, size: int) -> FloatArray | None:
-    """Block means minus their mean, 0 where nothing is known; None if the column is constant."""
-    count = len(column) // size
-    cut = column[: count * size].reshape(count, size)
-    known = np.abs(cut) < LARGEST
-    number = known.sum(axis=1)
-    means = np.where(known, cut, 0.0).sum(axis=1) / np.maximum(number, 1)
-    some = number > 0
-    if not some.any():
-        return None
-    means = np.where(some, means - means[some].mean(), 0.0)
-    largest = float(np.abs(means).max())
-    scaled: FloatArray = means / largest if largest > 0.0 else means
-    return scaled if largest > 1e-12 * float(np.abs(_known(column)).max()) else None
-
-
-def _autocorrelation(column: FloatArray) -> FloatArray:
-    """Correlation of the column with itself at lags up to half its length, over each overlap."""
-    n = len(column)
-    power = np.abs(np.fft.rfft(column, 2 * n)) ** 2
-    products = np.fft.irfft(power, 2 * n)[: n // 2 + 1]
-    squares = np.concatenate([[0.0], np.cumsum(column**2)])
-    lags = np.arange(n // 2 + 1)
-    size = np.sqrt(squares[n - lags] * (squares[n] - squares[lags]))
-    correlation: FloatArray = products / np.maximum(size, 1e-9 * squares[n])
-    return correlation
-
-
 def _rests(data: Dataset) -> Iterator[Finding]:
-    ends = [(e, _resting(e), _resting(e, backwards=True)) for e in data.experiments]
-    ends = [(e, 0, 0) if a >= len(e) else (e, a, b) for e, a, b in ends]
+    found = zip(data.experiments, _core.rests(_arrays(data)), strict=True)
+    ends = [(e, 0, 0) if a >= len(e) else (e, a, b) for e, (a, b) in found]
     share = sum(a + b for _, a, b in ends) / len(data)
     if share < RESTING:
         return
@@ -469,22 +377,3 @@ def _rests(data: Dataset) -> Iterator[Finding]:
         + ("" if one else f" for {e.name}"),
         {"share": share, "first": float(first), "last": float(last)},
     )
-
-
-def _resting(e: Experiment, *, backwards: bool = False) -> int:
-    """Number of samples at one end during which every column stays at its level."""
-    still: NDArray[np.bool_] = np.ones(len(e), dtype=np.bool_)
-    end = max(5, min(50, len(e) // 20))
-    for i, column in enumerate((*e.u.T, e.y)):
-        ordered = column[::-1] if backwards else column
-        known = _known(ordered)
-        if len(known) < 2 * end or known.min() == known.max():
-            continue
-        level = float(np.median(known[:end]))
-        spread = MAD * float(np.median(np.abs(known[:end] - level)))
-        span = float(np.ptp(known))
-        # noise on a level is allowed, but an input that is noise does not rest
-        most = 0.05 if i < e.u.shape[1] else 0.1
-        tolerance = min(max(0.01 * span, 5.0 * spread), most * span)
-        still &= ~(np.abs(ordered - level) > tolerance)
-    return len(e) if still.all() else int(np.argmin(still))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import _core
 from ..arrays import FloatArray, is_whole, runs
 from ..errors import DataError, SettingError
 from .pieces import require_sane
@@ -24,7 +25,6 @@ MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 STUCK = 3
 """Samples in a row at an extreme that count as at a limit."""
-_GRID = 1e-3
 _SAME = 1e-9
 
 
@@ -45,18 +45,7 @@ def quantum(column: FloatArray) -> float | None:
     It requires at least three values that occur twice or more on average: a few values always lie
     on some grid.
     """
-    values = np.unique(column[np.isfinite(column)])
-    if len(values) < 3 or len(values) > 0.5 * np.isfinite(column).sum():
-        return None
-    steps = np.diff(values)
-    step = float(steps[steps > _SAME * np.ptp(values)].min(initial=np.inf))
-    if not math.isfinite(step):
-        return None
-    places = (values - values[0]) / step
-    step *= float(places[-1] / round(places[-1]))
-    places = (values - values[0]) / step
-    on_grid = np.abs(places - np.round(places)).max() < max(_GRID, _SAME * places[-1])
-    return step if on_grid else None
+    return _core.quantum(np.ascontiguousarray(column))
 
 
 def share_at_limits(column: FloatArray) -> tuple[float, float]:

@@ -2,13 +2,30 @@
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
+use sewfast_core::Monitor;
 use sewfast_core::residuals::{self, Run, Test};
-use sewfast_core::{changes, dead_time, orders};
+use sewfast_core::{
+    changes, column, dead_time, excitation, faults, feedback as loops, orders, sensor,
+};
 
 use crate::seam::{Experiments, array1, array2, raise, rows, samples, slice, watched};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(changed, module)?)?;
+    module.add_function(wrap_pyfunction!(copied, module)?)?;
+    module.add_function(wrap_pyfunction!(computed, module)?)?;
+    module.add_function(wrap_pyfunction!(order_in_time, module)?)?;
+    module.add_function(wrap_pyfunction!(integration, module)?)?;
+    module.add_function(wrap_pyfunction!(feedback, module)?)?;
+    module.add_function(wrap_pyfunction!(quantum, module)?)?;
+    module.add_function(wrap_pyfunction!(dead, module)?)?;
+    module.add_function(wrap_pyfunction!(spikes, module)?)?;
+    module.add_function(wrap_pyfunction!(two_levels, module)?)?;
+    module.add_function(wrap_pyfunction!(limits, module)?)?;
+    module.add_function(wrap_pyfunction!(rests, module)?)?;
+    module.add_function(wrap_pyfunction!(period, module)?)?;
+    module.add_function(wrap_pyfunction!(wraps, module)?)?;
+    module.add_function(wrap_pyfunction!(unstable_pole, module)?)?;
     module.add_function(wrap_pyfunction!(delay, module)?)?;
     module.add_function(wrap_pyfunction!(order_table, module)?)?;
     module.add_function(wrap_pyfunction!(residual_tests, module)?)?;
@@ -35,6 +52,144 @@ fn changed(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Chan
         changes::changed(&borrowed, channels, monitor)
     })?;
     Ok(found.map(|c| (c.experiment, c.start, c.gain, c.shift, c.left)))
+}
+
+/// Input, gain, offset, delay.
+type Copied = (usize, f64, f64, usize);
+
+#[pyfunction]
+fn copied(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Copied>> {
+    let borrowed = samples(py, &experiments)?;
+    let found = py.detach(|| faults::copied(&borrowed));
+    Ok(found.map(|c| (c.input, c.gain, c.offset, c.delay)))
+}
+
+#[pyfunction]
+fn computed(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<&'static str>> {
+    let borrowed = samples(py, &experiments)?;
+    let found = py.detach(|| faults::computed(&borrowed));
+    Ok(found.map(|sum| match sum {
+        faults::Sum::Output => "output",
+        faults::Sum::Change => "change",
+    }))
+}
+
+/// Kind, input, shift, and twice the log-likelihood.
+type Order = (&'static str, usize, usize, f64);
+
+#[pyfunction]
+fn order_in_time(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Order>> {
+    let borrowed = samples(py, &experiments)?;
+    let work = |monitor: &Monitor| Ok(faults::order_in_time(&borrowed, monitor));
+    Ok(watched(py, None, work)?.map(|o| {
+        let kind = match o.kind {
+            faults::Kind::Exchanged => "exchanged",
+            faults::Kind::Late => "late",
+            faults::Kind::AtOnce => "at_once",
+        };
+        (kind, o.input, o.shift, o.evidence)
+    }))
+}
+
+/// Whether it is an integral, input, lengths, time constant, gain, and standard errors of restoring and driving.
+type Integration = (bool, usize, f64, f64, f64, f64, f64);
+
+#[pyfunction]
+#[pyo3(signature = (experiments, *, Ts))]
+#[allow(non_snake_case)]
+fn integration(
+    py: Python<'_>,
+    experiments: Experiments<'_>,
+    Ts: f64,
+) -> PyResult<Option<Integration>> {
+    let borrowed = samples(py, &experiments)?;
+    let found = py.detach(|| loops::integration(&borrowed, Ts));
+    Ok(found.map(|i| {
+        let (is, of) = (i.is_integral, i.input);
+        (
+            is,
+            of,
+            i.lengths,
+            i.time_constant,
+            i.gain,
+            i.restoring,
+            i.driving,
+        )
+    }))
+}
+
+/// Input, lead, correlation, significance, misfit.
+type Feedback = (usize, usize, f64, f64, f64);
+
+#[pyfunction]
+fn feedback(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Feedback>> {
+    let borrowed = samples(py, &experiments)?;
+    let work = |monitor: &Monitor| Ok(loops::feedback(&borrowed, monitor));
+    Ok(
+        watched(py, None, work)?
+            .map(|f| (f.input, f.lead, f.correlation, f.significance, f.misfit)),
+    )
+}
+
+#[pyfunction]
+fn quantum(py: Python<'_>, column: PyReadonlyArray1<'_, f64>) -> PyResult<Option<f64>> {
+    let column = slice(&column, "column")?;
+    Ok(py.detach(|| column::quantum(column)))
+}
+
+/// First sample and number of samples of stretches of each experiment.
+type Stretches = Vec<Vec<(usize, usize)>>;
+
+#[pyfunction]
+fn dead(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Stretches> {
+    let borrowed = samples(py, &experiments)?;
+    Ok(py.detach(|| sensor::dead(&borrowed)))
+}
+
+#[pyfunction]
+fn spikes(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Stretches> {
+    let borrowed = samples(py, &experiments)?;
+    Ok(py.detach(|| sensor::spikes(&borrowed)))
+}
+
+#[pyfunction]
+fn two_levels(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Vec<Option<(f64, f64)>>> {
+    let borrowed = samples(py, &experiments)?;
+    Ok(py.detach(|| excitation::two_levels(&borrowed)))
+}
+
+/// Input, limit, number of stretches, share of the samples.
+type Limit = (usize, f64, usize, f64);
+
+#[pyfunction]
+fn limits(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Vec<Limit>> {
+    let borrowed = samples(py, &experiments)?;
+    Ok(py.detach(|| excitation::limits(&borrowed)))
+}
+
+#[pyfunction]
+fn rests(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Vec<(usize, usize)>> {
+    let borrowed = samples(py, &experiments)?;
+    Ok(py.detach(|| excitation::rests(&borrowed)))
+}
+
+#[pyfunction]
+fn period(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<(f64, f64)>> {
+    let borrowed = samples(py, &experiments)?;
+    Ok(py.detach(|| excitation::period(&borrowed)))
+}
+
+#[pyfunction]
+fn wraps(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<(f64, usize)>> {
+    let borrowed = samples(py, &experiments)?;
+    let found = py.detach(|| excitation::wraps(&borrowed));
+    Ok(found.map(|w| (w.period, w.jumps)))
+}
+
+#[pyfunction]
+fn unstable_pole(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<f64>> {
+    let borrowed = samples(py, &experiments)?;
+    Ok(py.detach(|| excitation::unstable_pole(&borrowed)))
 }
 
 /// Lag of the least cost, first and last plausible lag, first correlated lag, costs in free run and one step ahead, correlations, and
