@@ -818,6 +818,11 @@ def shaft_response(theta: _F, hertz: _F, *, Ts: float, counted: bool) -> NDArray
     ``theta``: logarithms of K, a1, a2, the delay [samples], then of w_r, z_r, w_a, z_a of each shaft.
     """
 
+def record_response(
+    u: _F, y: _F, r: _F | None
+) -> tuple[_F, NDArray[np.complex128], _F, _F, _F, bool] | None:
+    """Response by local polynomials: lines, values, variances, coherences, averaged values, whether r moves u."""
+
 def shaft_fraction(theta: _F, *, Ts: float) -> tuple[_F, _F]:
     """num, den in powers of z^-1 of the same machine's speed at the samples."""
 

@@ -1,35 +1,18 @@
 """Frequency responses of any record by local polynomials, without window or periods.
 
-The spectra of a finite record are related, at the line k of its transform, by
-
-    Y(k) = G(k) U(k) + T(k) + V(k)
-
-T is leakage: the transient at the beginning of the record minus the one at its end. It is as smooth
-over the frequency as G, so over a few lines both are parabolas, found by least squares; the
-residuals are noise, and give the variance (Pintelon and Schoukens 2012, section 7.2). A window only
-reduces the leakage, and smears resonances. The leakage expected in an interval is learned from all
-the others.
-
-The remaining question is the number of lines. The lines are divided into intervals: starting from
-wide ones, an interval is halved, and its halves again, if Akaike's criterion, corrected for few
-lines, prefers two parabolas to one (Hurvich and Tsai, Biometrika 76, 1989). Around a resonance the
-intervals become narrow; where the response is smooth they stay wide, and average more. Each is read
-at the three Gauss points, where a parabola's error from a smooth curve is least; under even power
-the three errors are independent.
+`rust/core/src/local_polynomial.rs` computes them, and has the derivation.
 """
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .. import _core
 from ..arrays import FloatArray
 from ..dataset import Dataset, Experiment
 from ..errors import DataError, SettingError
@@ -37,25 +20,10 @@ from ..readers import parse_source, read_table
 from ..recording import Recording
 from ..speed import speed_from_counts
 from .estimate import record_of, spectral
-from .response import LEVEL, Complex, FrequencyResponse
+from .response import FrequencyResponse
 
-LINES = 13
-"""Least lines of an interval: seven more than the coefficients of the two parabolas."""
-WIDEST = 0.25
-"""Largest width of an interval, relative to its first frequency."""
-NARROWEST = 0.006
-"""Width, relative to its frequency, below which an interval is not halved: fine enough for a
-damping of .003, while the time for long records stays that of their transform."""
-SAMPLES = 4 * LINES
-RANK = 1e-9
-"""Diagonal element of R, relative to the largest, below which a column adds nothing."""
-ROUNDING = 1e-13
-"""Magnitude, relative to the largest line, below which a line counts as empty."""
-FLOOR = 1e-24
-"""Mean square of the residual that cannot be distinguished from rounding."""
-GAUSS = np.array([-math.sqrt(0.6), 0.0, math.sqrt(0.6)])
-CHANCE = 3.0
-"""Standard deviations above chance by which a reference must be visible in the input."""
+SAMPLES = 52
+"""Least samples: lines for two intervals."""
 
 
 def local_polynomial(
@@ -93,230 +61,22 @@ def local_polynomial(
             name="u", expected=f"at least {SAMPLES} samples", received=str(n),
             remedy="record longer",
         )  # fmt: skip
-    largest = [max(float(np.abs(s).max()), 1e-300) for s in signals]
-    spectra = np.stack(
-        [
-            np.fft.rfft((s - s.mean()) / top)[1 : (n + 1) // 2]
-            for s, top in zip(signals, largest, strict=True)
-        ]
-    )
-    # lines at the level of rounding have no power
-    size = np.abs(spectra)
-    spectra[size < ROUNDING * size.max(axis=1, keepdims=True)] = 0.0
-    by = 0 if r is None else 2
-    outputs = np.ascontiguousarray(spectra[[1] if r is None else [1, 0]].T)
-    pieces = list(_divided(spectra[by], outputs))
-    if not pieces:
+    found = _core.record_response(*signals, *([None] if r is None else []))
+    if found is None:
         raise DataError(
             name="u" if r is None else "r", expected="power at three frequencies or more",
             received="one that hardly moves", remedy="excite more frequencies",
         )  # fmt: skip
-    if r is not None:
-        _require_related(pieces)
-    leakage = _leakage(pieces)
-    pieces = [_shrunk(piece, spectra[by], outputs, leakage) for piece in pieces]
-    seen = [piece.response() for piece in pieces]
-    value: Complex = np.concatenate([part[0] for part in seen])
-    place, variance, coherence = (np.concatenate([part[k] for part in seen]) for k in (1, 2, 3))
-    blocks = np.repeat([piece.freedom + 1.0 for piece in pieces], len(GAUSS))
-    scale = largest[1] / largest[0]
-    known = np.isfinite(value * scale) & np.isfinite(variance * scale**2)
-    return FrequencyResponse(
-        place[known] / (n * Ts), value[known] * scale,
-        np.maximum(variance[known] * scale**2, 1e-300), coherence[known], blocks[known],
-        float(Ts), **labels,
-    )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """Two parabolas over the lines from index `start` to before `stop`.
-
-    Attributes
-    ----------
-    solution : array of complex, shape (6, m)
-        Coefficients for each of m outputs: first of the response to the input over `scale`, then of
-        the leakage.
-    inverse : array of complex, shape (6, 6)
-        Inverse of the triangular factor R of the regressors.
-    products : array of complex, shape (m, m)
-        Sums of conj(e_i) e_j over the residuals of the outputs.
-    power : float
-        Mean squared magnitude of u.
-    output : array, shape (m,)
-        Mean squared magnitude of each output.
-    """
-
-    start: int
-    stop: int
-    scale: float
-    solution: Complex
-    inverse: Complex
-    products: Complex
-    power: float
-    output: FloatArray
-
-    @property
-    def freedom(self) -> int:
-        """Complex degrees of freedom left after fitting two parabolas."""
-        return self.stop - self.start - 6
-
-    @property
-    def ratio(self) -> FloatArray:
-        """Variance of the noise over the power, for each output."""
-        found: FloatArray = np.diag(self.products).real / self.freedom / self.output
-        return found
-
-    @cached_property
-    def criterion(self) -> float:
-        """Akaike's corrected criterion; real and imaginary part of a line are two observations.
-        Outputs count as independent: in a loop they share one noise, with a determinant of 0.
-        """
-        n, k = 2 * (self.stop - self.start), 2 * len(self.solution)
-        size = 2.0 * np.diag(self.products).real / n + FLOOR
-        return float(n * np.log(size).sum() + len(size) * n * (n + k) / (n - k - 2))
-
-    @property
-    def places(self) -> FloatArray:
-        """Line numbers at its Gauss points, in general between two lines."""
-        return 1.0 + self.start + 0.5 * (1.0 + GAUSS) * (self.stop - self.start - 1)
-
-    def gains(self) -> tuple[Complex, FloatArray]:
-        """Gains of the outputs, shape (3, m), and their variance under unit noise, shape (3,)."""
-        powers = GAUSS[:, None] ** np.arange(3)
-        spread = (np.abs(powers @ self.inverse[:3]) ** 2).sum(axis=1)
-        return powers @ self.solution[:3] / self.scale, spread / self.scale**2
-
-    def response(self) -> tuple[Complex, FloatArray, FloatArray, FloatArray]:
-        """Output over input, number of the line, variance, coherence."""
-        gains, spread = self.gains()
-        C = self.products / self.freedom
-        if C.shape == (1, 1):
-            value, per = gains[:, 0], np.ones(len(gains))
-            noise = np.full(len(gains), C[0, 0].real)
-        else:
-            # residual of the output minus the response times that of the input: the loop's noise
-            value, per = gains[:, 0] / gains[:, 1], np.abs(gains[:, 1]) ** 2
-            noise = C[0, 0].real - 2.0 * (value * C[0, 1]).real + np.abs(value) ** 2 * C[1, 1].real
-            noise = np.maximum(noise, 0.0)
-        # an uncertain response must not appear large: subtract the contribution of its error
-        explained = np.maximum(np.abs(value) ** 2 - noise * spread / per, 0.0) * self.power
-        share = explained / np.maximum(explained + noise, 1e-300)
-        return value, self.places, noise * spread / per, share
-
-
-def _divided(source: Complex, outputs: Complex) -> Iterator[_Piece]:
-    """The intervals, from the lowest line upwards."""
-    start, lines = 0, len(source)
-    while lines - start >= LINES:
-        width = max(LINES, int(WIDEST * (start + 1)))
-        piece = None
-        # a sparse multisine has no power in a few lines
-        while piece is None and width < 2 * lines:
-            stop = start + width
-            stop = lines if lines - stop < LINES else stop
-            piece, width = _piece(source, outputs, start, stop), 2 * width
-        if piece is None:
-            return
-        yield from _best(source, outputs, piece)[1]
-        start = piece.stop
-
-
-def _best(source: Complex, outputs: Complex, piece: _Piece) -> tuple[float, list[_Piece]]:
-    """The piece itself, or the best of its halves if these have the lower criterion."""
-    length = piece.stop - piece.start
-    if length < max(2 * LINES, NARROWEST * piece.start):
-        return piece.criterion, [piece]
-    middle = piece.start + length // 2
-    halves = [
-        _piece(source, outputs, piece.start, middle),
-        _piece(source, outputs, middle, piece.stop),
-    ]
-    if any(half is None for half in halves):
-        return piece.criterion, [piece]
-    parts = [_best(source, outputs, half) for half in halves if half is not None]
-    together = sum(criterion for criterion, _ in parts)
-    if together < piece.criterion:
-        return together, [p for _, found in parts for p in found]
-    return piece.criterion, [piece]
-
-
-def _piece(source: Complex, outputs: Complex, start: int, stop: int) -> _Piece | None:
-    """Fit one interval; None if the input has too little power there."""
-    part, seen = source[start:stop], outputs[start:stop]
-    scale = float(np.abs(part).max())
-    if scale == 0.0:
-        return None
-    Q, R = np.linalg.qr(_regressors(part / scale))
-    diagonal = np.abs(np.diag(R))
-    k = int(np.argmin(np.append(diagonal > RANK * diagonal.max(), False)))
-    if k < 3:
-        return None
-    inverse = np.linalg.inv(R[:k, :k])
-    turned = Q[:, :k].conj().T @ seen
-    left = seen - Q[:, :k] @ turned
-    own = part if seen.shape[1] == 1 else seen[:, 1]
-    return _Piece(
-        start, stop, scale, inverse @ turned, inverse, left.conj().T @ left,
-        float(np.mean(np.abs(own) ** 2)), np.mean(np.abs(seen) ** 2, axis=0),
-    )  # fmt: skip
-
-
-def _regressors(source: Complex) -> Complex:
-    """Parabolas times the input, and parabolas, shape (lines, 6)."""
-    x = np.linspace(-1.0, 1.0, len(source))
-    powers = np.stack([np.ones_like(x), x, x * x], axis=1)
-    return np.hstack([powers * source[:, None], powers])
-
-
-def _leakage(pieces: list[_Piece]) -> FloatArray:
-    """Mean squares of the leakage's three coefficients over the outputs' power, shape (3,), from
-    the half of the intervals that determine them best.
-    """
-    full = [piece for piece in pieces if len(piece.solution) == 6]
-    if not full:
-        return np.zeros(3)
-    share = np.array([np.mean(np.abs(p.solution[3:]) ** 2 / p.output, axis=1) for p in full])
-    doubt = np.array([(np.abs(p.inverse[3:]) ** 2).sum(axis=1) * p.ratio.mean() for p in full])
-    clear = doubt <= np.median(doubt, axis=0)
-    found: FloatArray = np.maximum(np.where(clear, share - doubt, 0.0).sum(axis=0), 0.0)
-    found /= clear.sum(axis=0)
-    return found
-
-
-def _shrunk(piece: _Piece, source: Complex, outputs: Complex, leakage: FloatArray) -> _Piece:
-    """The piece refitted with a prior on its leakage, from its size in other intervals.
-    The prior adds three observations of 0 with that variance. If the command's own spectrum is
-    smooth, as that of a chirp near its start, response and leakage cannot be separated otherwise.
-    """
-    kept = leakage > 0.0
-    columns = np.flatnonzero(np.append([True] * 3, kept))
-    observed = np.zeros((kept.sum(), len(columns)))
-    observed[:, 3:] = np.diag(np.sqrt(piece.ratio.min() / leakage[kept]))
-    lines = slice(piece.start, piece.stop)
-    regressors = _regressors(source[lines] / piece.scale)[:, columns]
-    Q, R = np.linalg.qr(np.vstack([regressors, observed]))
-    inverse = np.linalg.inv(R)
-    turned = Q[: len(regressors)].conj().T @ outputs[lines]
-    return replace(piece, solution=inverse @ turned, inverse=inverse)
-
-
-def _require_related(pieces: list[_Piece]) -> None:
-    """Refuse a reference that is visible in the input no more than by chance."""
-    seen = []
-    for piece in pieces:
-        gains, spread = piece.gains()
-        nu = piece.freedom
-        noise = piece.products[1, 1].real / nu
-        quantile = nu * ((1.0 - LEVEL) ** (-1.0 / nu) - 1.0)
-        seen += (np.abs(gains[:, 1]) ** 2 > quantile * noise * spread).tolist()
-    chance = 1.0 - LEVEL
-    if np.mean(seen) < chance + CHANCE * math.sqrt(chance * LEVEL / len(seen)):
+    lines, value, variance, coherence, blocks, is_related = found
+    if not is_related:
         raise DataError(
             name="r", expected="a reference that moves u",
             received="one that has nothing to do with it",
             remedy="name the column that the controller follows",
         )  # fmt: skip
+    return FrequencyResponse(
+        lines / (n * Ts), value, variance, coherence, blocks, float(Ts), **labels
+    )
 
 
 # --- The response of a recording or a data set, with cautions about parts that are not linear -----

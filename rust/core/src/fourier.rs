@@ -46,6 +46,36 @@ pub(crate) fn spectrum(x: &[f64], size: usize) -> Vec<Complex<f64>> {
     found
 }
 
+/// Spectrum of real samples of any number: `j k = (j^2 + k^2 - (j - k)^2) / 2` turns the sum into a convolution with a chirp (Bluestein,
+/// *IEEE Trans. Audio and Electroacoustics* 18, 1970).
+pub(crate) fn lines(x: &[f64]) -> Vec<Complex<f64>> {
+    let n = x.len();
+    if n.is_power_of_two() {
+        return spectrum(x, n);
+    }
+    // the square is reduced before it is a phase: it would lose digits
+    let turn =
+        |k: usize| Complex::from_polar(1.0, -TAU / 2.0 * ((k * k) % (2 * n)) as f64 / n as f64);
+    let chirp: Vec<_> = (0..n).map(turn).collect();
+    let size = (2 * n - 1).next_power_of_two();
+    let zero = Complex::new(0.0, 0.0);
+    let (mut a, mut b) = (vec![zero; size], vec![zero; size]);
+    for (k, chirp) in chirp.iter().enumerate() {
+        a[k] = chirp * x[k];
+        b[k] = chirp.conj();
+        b[(size - k) % size] = chirp.conj();
+    }
+    transform(&mut a);
+    transform(&mut b);
+    // the inverse transform of z is the conjugate of that of z', over the size
+    let mut product: Vec<_> = a.iter().zip(&b).map(|(a, b)| (a * b).conj()).collect();
+    transform(&mut product);
+    let found = product.iter().zip(&chirp);
+    found
+        .map(|(z, chirp)| z.conj() * chirp / size as f64)
+        .collect()
+}
+
 /// `sum_k x[k] y[k + s]` for every `s`, from the spectra; negative `s` count from the end.
 pub(crate) fn correlation(x: &[Complex<f64>], y: &[Complex<f64>]) -> Vec<f64> {
     // the inverse transform of z is the conjugate of that of z', over n
@@ -62,6 +92,16 @@ mod tests {
     use super::*;
 
     proptest! {
+        #[test]
+        fn lines_are_sums_over_samples(x in prop::collection::vec(-1.0..1.0_f64, 1..70)) {
+            let n = x.len();
+            for (j, line) in lines(&x).iter().enumerate() {
+                let turn = |k: usize| Complex::from_polar(1.0, -TAU * ((j * k) % n) as f64 / n as f64);
+                let sum: Complex<f64> = x.iter().enumerate().map(|(k, x)| turn(k) * x).sum();
+                prop_assert!((line - sum).norm() < 1e-12);
+            }
+        }
+
         #[test]
         fn correlations_are_sums_over_shifted_samples(
             x in prop::collection::vec(-1.0..1.0_f64, 1..40),

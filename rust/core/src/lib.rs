@@ -33,6 +33,7 @@ pub mod least_squares;
 pub mod linear;
 pub mod linearised;
 pub mod lm;
+pub mod local_polynomial;
 pub mod loop_transfer;
 pub mod machine;
 pub mod metrics;

@@ -2,6 +2,7 @@
 
 use numpy::{Complex64, PyArray1, PyArray2, PyReadonlyArray1};
 use pyo3::prelude::*;
+use sewfast_core::local_polynomial;
 use sewfast_core::loop_transfer::Plant;
 use sewfast_core::proposal::{self, Task};
 use sewfast_core::shaft;
@@ -13,9 +14,39 @@ type Values<'py> = PyReadonlyArray1<'py, f64>;
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<ProposalTask>()?;
+    module.add_function(wrap_pyfunction!(record_response, module)?)?;
     module.add_function(wrap_pyfunction!(shaft_response, module)?)?;
     module.add_function(wrap_pyfunction!(shaft_fraction, module)?)?;
     module.add_function(wrap_pyfunction!(fit_shaft, module)?)
+}
+
+/// Lines, values, variances, coherences, numbers of averaged values, and whether the reference is visible.
+type Response<'py> = (
+    Bound<'py, PyArray1<f64>>,
+    Bound<'py, PyArray1<Complex64>>,
+    Bound<'py, PyArray1<f64>>,
+    Bound<'py, PyArray1<f64>>,
+    Bound<'py, PyArray1<f64>>,
+    bool,
+);
+
+#[pyfunction]
+#[pyo3(signature = (u, y, r))]
+fn record_response<'py>(
+    py: Python<'py>,
+    u: Values<'py>,
+    y: Values<'py>,
+    r: Option<Values<'py>>,
+) -> PyResult<Option<Response<'py>>> {
+    let (u, y) = (slice(&u, "u")?, slice(&y, "y")?);
+    let r = r.as_ref().map(|r| slice(r, "r")).transpose()?;
+    let found = py.detach(|| local_polynomial::response(u, y, r));
+    Ok(found.map(|f| {
+        let [lines, variance, coherence, blocks] =
+            [f.lines, f.variance, f.coherence, f.blocks].map(|v| array1(py, v));
+        let value = PyArray1::from_vec(py, f.value);
+        (lines, value, variance, coherence, blocks, f.is_related)
+    }))
 }
 
 #[pyfunction]
