@@ -145,8 +145,9 @@ def diagnose(data: Dataset) -> Diagnosis:
 
     Notes
     -----
-    The tests for an integrator and for feedback are statistical: `sewfast.dataset.feedback`
-    describes their assumptions.
+    Two tests are statistical: that for an integrator, a regression of Dickey and Fuller (1979) on
+    means of blocks, and that for feedback, whether innovations of the output help to predict the
+    input (Granger 1969).
 
     Examples
     --------

@@ -12,6 +12,7 @@ use std::ops::Range;
 
 use pair::Pair;
 
+use crate::column::{LARGEST, SMALLEST};
 use crate::fourier::{correlation, spectrum};
 use crate::{Error, Monitor, Result};
 
@@ -35,9 +36,6 @@ const CURVED: i32 = 3;
 const ROWS_PER_COLUMN: usize = 10;
 /// Rounds in which a place is made sharper.
 const ROUNDS: usize = 3;
-/// Magnitude and range between which sums of products neither overflow nor underflow.
-const LARGEST: f64 = 1e60;
-const SMALLEST: f64 = 1e-60;
 
 /// One experiment, its output NaN where it is not known.
 #[derive(Clone, Copy, Debug)]

@@ -6,7 +6,9 @@
 
 use nalgebra::DMatrix;
 
-use crate::column::{LARGEST, Rows, distinct, moments, quantum, range, scale_of, stretches};
+use crate::column::{
+    LARGEST, Rows, SMALLEST, distinct, moments, quantum, range, scale_of, stretches,
+};
 use crate::data::Samples;
 use crate::regression::{solve, triangle};
 use crate::{Monitor, Record};
@@ -68,7 +70,7 @@ fn copy_of(rows: &[Rows], j: usize, delay: usize) -> Option<Copy> {
     of_line(&head(&u), &head(&y))?;
     let moves = |v: &[f64]| {
         let (low, high) = range(v.iter().copied());
-        high - low >= crate::column::SMALLEST
+        high - low >= SMALLEST
     };
     if !moves(&u) || !moves(&y) {
         return None;
