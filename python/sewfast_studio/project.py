@@ -44,6 +44,9 @@ LARGEST = 512 * 2**20
 KEPT = 4
 """Models with their first controllers that are cached, for pages that use different ones."""
 
+GRADES = {"ok": "good", "info": "good", "warn": "warn", "fail": "bad"}
+"""Chips of the page for the verdicts of a report card."""
+
 _ARTEFACTS = ("controllers", "models")
 """Subfolders of a commissioning with documents."""
 
@@ -305,14 +308,17 @@ class Project:
         errors = found.experiments[0]
         pairs = (("measured", errors.y), ("free run", errors.simulated))
         curves = [{"name": n, "unit": found.unit, **envelope(c, data.Ts)} for n, c in pairs]
+        unexplained = envelope(errors.y - errors.simulated, data.Ts)
         return {
             "fit": found.simulation.fit_percent,
             "rmse": found.simulation.rmse,
             "unit": found.unit,
             # the verdict of the whole card: a model with a good fit can fail another check
             "verdict": card.summary,
-            "card": str(card),
+            "grade": GRADES[card.verdict],
+            "lines": [line.to_json() for line in card.lines],
             "free_run": curves,
+            "error": {"name": "error", "unit": found.unit, **unexplained},
         }
 
     def bode(

@@ -60,6 +60,8 @@ PAGE = {
     "/curves.js": ("curves.js", "text/javascript; charset=utf-8"),
     "/commission.js": ("commission.js", "text/javascript; charset=utf-8"),
     "/bode.js": ("bode.js", "text/javascript; charset=utf-8"),
+    "/model.js": ("model.js", "text/javascript; charset=utf-8"),
+    "/deploy.js": ("deploy.js", "text/javascript; charset=utf-8"),
     "/data.js": ("data.js", "text/javascript; charset=utf-8"),
     "/look.js": ("look.js", "text/javascript; charset=utf-8"),
     "/copies.js": ("copies.js", "text/javascript; charset=utf-8"),
@@ -68,8 +70,12 @@ PAGE = {
     "/server.js": ("server.js", "text/javascript; charset=utf-8"),
     "/studio.css": ("studio.css", "text/css; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
+    "/design.css": ("design.css", "text/css; charset=utf-8"),
 }
 """All files that are served: a path is looked up here and never on the disk."""
+
+SHARED = ("design.css",)
+"""Files that reports and documentation use as well, from the core."""
 
 HEADERS = {
     "Cache-Control": "no-store",
@@ -217,7 +223,8 @@ class Studio:
         if request.path not in PAGE:
             return _answer(connection, 404, b"not found\n")
         name, kind = PAGE[request.path]
-        return _answer(connection, 200, (files(__package__) / "page" / name).read_bytes(), kind)
+        place = files("sewfast") if name in SHARED else files(__package__) / "page"
+        return _answer(connection, 200, (place / name).read_bytes(), kind)
 
     def _written_report(self, connection: ServerConnection) -> Response:
         """The report of the project's commissioning; its address is as secret as the token."""

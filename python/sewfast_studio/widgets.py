@@ -152,8 +152,9 @@ def look_view(data: Dataset) -> Any:
     """
     from .project import looked_at
 
-    html = '<div class="view"><section><div id="signals"></div><ul id="advice"></ul>'
-    html += '<pre id="summary" tabindex="0" hidden></pre></section></div>'
+    html = '<div class="results"><div id="signals" class="linked"></div><ul id="advice"></ul>'
+    html += '<details id="summary-fold" open hidden><summary>All figures</summary>'
+    html += '<pre id="summary"></pre></details></div>'
     view = _widget(_source(("curves", "look", "widget"), _LOOK, html))
     found = looked_at(data)
 
@@ -206,7 +207,8 @@ def _source(modules: tuple[str, ...], render: str, html: str) -> str:
     """Several modules as one for a notebook: without imports, with the elements as text."""
     import json
 
-    css = _page("studio.css").replace(":root", ":host")
+    sheet = (files("sewfast") / "design.css").read_text(encoding="utf-8")
+    css = (sheet + _page("studio.css")).replace(":root", ":host")
     parts = [re.sub(r"(?m)^import .*\n", "", _page(f"{name}.js")) for name in modules]
     parts = [re.sub(r"(?m)^export ", "", part) for part in parts]
     constants = f"const HTML = {json.dumps(html)}, CSS = {json.dumps(css)};"

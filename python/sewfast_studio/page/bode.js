@@ -1,4 +1,4 @@
-// The Bode view: the frequency response of a recording with its bands, and the tuned loop over it.
+// The frequency response of a recording with its bands, in Look; and the tuned loop beside it, in Tune.
 import { ask, on } from "/server.js";
 import { Chart } from "/curves.js";
 import { copies } from "/copies.js";
@@ -14,7 +14,7 @@ const charts = {
 };
 let tune = null, view = null, response = null, notch = null, busy = false, writes = false;
 
-/** The Tune view, whose controller is drawn, and the way to it. */
+/** The step Tune, whose controller is drawn, and the way to it. */
 export function connect(tuning, viewing) { tune = tuning; view = viewing; }
 function tell(error) { $("bode-error").textContent = error ? error.message : ""; $("bode-error").hidden = !error; }
 
@@ -40,7 +40,7 @@ on("responded", m => {
   running(false);
   if (m.error) return tell(new Error(m.error));
   const f = m.found, c = Object.fromEntries(Object.entries(f.curves).map(([name, values]) => [name, values.map(v => v ?? NaN)]));
-  response = f.response; notch = f.notch;
+  response = f.response; notch = f.notch; $("bode-charts").hidden = false;
   charts.gain.axes.y = `gain [dB re 1 ${f.unit}]`;
   charts.gain.draw([...curve(c, "hertz", "P_db", "measured, 95 %", 0, true), ...curve(c, "fit_hertz", "fit_db", "fit", 1)], "measured gain over frequency with its band");
   charts.phase.draw([...curve(c, "hertz", "P_deg", "measured, 95 %", 0, true), ...curve(c, "fit_hertz", "fit_deg", "fit", 1)], "measured phase over frequency with its band");
@@ -48,15 +48,20 @@ on("responded", m => {
   $("bode-text").textContent = `${f.text}\n\n${f.shaft}`; $("bode-text").hidden = false;
   $("bode-notch").hidden = !notch;
   if (notch) $("bode-notch").textContent = `Put the notch at ${notch[0].toPrecision(4)} Hz into the controller`;
-  copies($("bode-copy"), f); loop();
+  copies($("bode-copy"), f);
 });
-$("bode-notch").onclick = () => { tune.addNotch(notch); view("tune"); };
-$("bode-loop").onclick = () => loop();
+$("bode-notch").onclick = () => { $("notch-fold").open = true; tune.addNotch(notch); view("tune"); };
+// the loop is drawn while somebody looks at it, and again with every controller that is
+$("loop-fold").addEventListener("toggle", () => loop());
+document.addEventListener("drawn", () => loop());
 
-/** Plant, L, S and T of the controller in the Tune view, with the response over it where there is one. */
+let drawing = false, again = false;
+/** Plant, L, S and T of the tuned controller, with the response over it if there is one; the latest wins. */
 async function loop() {
   const asked = tune.question();
-  if (!asked.model) { $("loop-text").textContent = "There is no model in this folder: identify one in the view Data, then the loop is drawn here."; return; }
+  if (!$("loop-fold").open || !asked.model) return;
+  if (drawing) { again = true; return; }
+  drawing = true; again = false;
   try {
     const f = await ask("loop", { ...asked, response }), c = f.curves, m = "measured_hertz", at = plot => f.marks.filter(k => k.plot === plot);
     const both = (name, label) => [...curve(c, m, `measured_${name}`, "measured, 95 %", 1, true), ...curve(c, "hertz", name, label, 0)];
@@ -65,7 +70,8 @@ async function loop() {
     charts.S.draw([...curve(c, m, "measured_S_db", "S measured", 1, true), ...curve(c, m, "measured_T_db", "T measured", 3, true), ...curve(c, "hertz", "S_db", "S", 0), ...curve(c, "hertz", "T_db", "T", 4)], "sensitivity over frequency, its peak marked", at("S_db"));
     const whose = f.members > 1 ? `worst of ${f.members} members` : "model";
     $("loop-text").textContent = `${whose}, about ${Number(f.level.toPrecision(4))} ${tune.unit()}: ${f.text}` + (f.measured ? `\nmeasured: ${f.measured}` : "");
-  } catch (error) { tell(error); }
+  } catch (error) { $("loop-text").textContent = error.message; }
+  drawing = false; if (again) loop();
 }
 
 function references() {
@@ -77,5 +83,5 @@ function references() {
 }
 document.addEventListener("columns", references);
 
-/** Opens the view. */
-export async function show() { await open(); references(); await tune.show(); loop(); }
+/** Opens the step Look. */
+export async function show() { await open(); references(); }

@@ -1,14 +1,14 @@
-// Buttons that copy a step as Python and as commands, and show both where the clipboard is closed.
+// A step as Python and as commands: buttons that copy, and the text itself, folded.
 export function copies(place, found) {
-  place.replaceChildren();
+  const details = document.createElement("details"), summary = document.createElement("summary");
+  summary.textContent = "Repeat this step without the page"; details.append(summary);
   for (const [label, value] of [["Copy as Python", found.python], ["Copy as commands", found.commands]]) {
-    const button = document.createElement("button"), details = document.createElement("details");
-    const summary = document.createElement("summary"), pre = document.createElement("pre");
-    summary.textContent = label.replace("Copy as ", "Show "); pre.textContent = value; details.append(summary, pre);
-    button.textContent = label;
+    if (!value) continue;
+    const button = document.createElement("button"), pre = document.createElement("pre");
+    pre.textContent = value; button.textContent = label;
     button.onclick = () => navigator.clipboard.writeText(value).then(
-      () => { button.textContent = "Copied"; setTimeout(() => { button.textContent = label; }, 1500); },
-      () => { details.open = true; });
-    place.append(button, details);
+      () => { button.textContent = "Copied"; setTimeout(() => { button.textContent = label; }, 1500); }, () => {});
+    details.append(button, pre);
   }
+  place.replaceChildren(details);
 }

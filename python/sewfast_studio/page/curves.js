@@ -1,131 +1,315 @@
-// Curves on a canvas: axes, bands, gaps; colours that colour-blind people tell apart (Okabe-Ito), and dashes.
-const STYLES = [["#0072b2", []], ["#d55e00", [7, 4]], ["#009e73", [2, 3]], ["#cc79a7", [9, 3, 2, 3]], ["#e69f00", [12, 4]]];
-const CHARTS = new Set();
+// Curves on a canvas: ticks with units, bands and gaps, linked cursors, zoom and pan, files as SVG and PNG.
+// Measured, predicted and reference look the same in every chart: solid, dashed and dotted, in colours of the sheet.
+const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3], [12, 4], [2, 3]], REFERENCE = 5;
+const TOKENS = ["--series-1", "--series-2", "--series-3", "--series-4", "--series-5", "--soft", "--ink", "--paper"], INK = 6, PAPER = 7;
+const ROLES = { measured: 0, "free run": 1, predicted: 1, fit: 1, model: 1, reference: REFERENCE };
+const CHARTS = new Set(), FONT = "12px system-ui, 'DejaVu Sans', sans-serif", LEFT = 62, RIGHT = 12, BELOW = 34;
 let printing = false;
 
+function every(act) { for (const c of CHARTS) c.canvas.isConnected ? act(c) : CHARTS.delete(c); }
 // on paper every curve is black and distinct by its dashes, whatever the theme of the screen
-function ink(canvas) { return printing ? "#000" : getComputedStyle(canvas).color; }
-function colour(style) { return printing ? "#000" : STYLES[style][0]; }
-function print(on) { printing = on; for (const c of CHARTS) c.canvas.isConnected ? c.paint() : CHARTS.delete(c); }
+function print(on) { printing = on; every(c => c.paint()); }
 addEventListener("beforeprint", () => print(true));
 addEventListener("afterprint", () => print(false));
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => every(c => { c.colours = null; c.paint(); }));
 
-/** A chart in a new canvas in `place`, painted again when its size changes. */
+/** A chart in `place`, painted again when its size changes. */
 export class Chart {
   /** `axes`: x and y (titles), log (of x), marks (levels of y that mean something), floor (least y that is shown). */
   constructor(place, axes) {
     this.axes = { x: "time [s]", y: "", log: false, marks: [], floor: -Infinity, ...axes };
-    this.series = []; this.marks = [];
+    this.series = []; this.marks = []; this.view = null; this.colours = null;
     CHARTS.add(this);
+    const plot = document.createElement("div"); plot.className = "plot";
     this.canvas = document.createElement("canvas");
     this.canvas.setAttribute("role", "img"); this.canvas.setAttribute("aria-label", "no curve yet");
-    place.append(this.canvas);
+    this.line = document.createElement("div"); this.line.className = "line"; this.line.hidden = true;
+    this.read = document.createElement("div"); this.read.className = "read"; this.read.hidden = true;
+    plot.append(this.canvas, this.line, this.read); place.append(plot);
+    this.menu(plot); this.pointer();
     new ResizeObserver(() => this.paint()).observe(this.canvas);
   }
 
   /** Draws series {name, x, y, low, high, style, dots}: arrays, NaN is a gap; low and high make a band; marks {x, y, label}. */
   draw(series, says, marks = []) {
     this.series = series; this.marks = marks;
-    this.canvas.setAttribute("aria-label", says);
+    this.canvas.setAttribute("aria-label", says); this.canvas.parentNode.classList.toggle("none", !series.length);
     this.paint();
   }
 
+  /** Charts with the same x axis in the same group: their cursors and windows move together. */
+  linked() {
+    const group = this.canvas.closest(".linked"), found = [this];
+    if (group) every(c => { if (c !== this && c.axes.x === this.axes.x && c.canvas.closest(".linked") === group) found.push(c); });
+    return found;
+  }
+
   paint() {
-    const { canvas, series, axes } = this, scale = devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight;
+    const { canvas } = this, scale = devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight;
     if (!w || !h) return;
     if (canvas.width !== Math.round(w * scale)) canvas.width = w * scale;
     if (canvas.height !== Math.round(h * scale)) canvas.height = h * scale;
     const g = canvas.getContext("2d");
-    g.setTransform(scale, 0, 0, scale, 0, 0); g.clearRect(0, 0, w, h); g.font = "12px system-ui, sans-serif";
+    g.setTransform(scale, 0, 0, scale, 0, 0); g.clearRect(0, 0, w, h);
+    this.picture(g, w, h, printing ? TOKENS.map((_, k) => k === PAPER ? "#fff" : "#000") : this.colours ??= this.resolved());
+  }
+
+  /** The sheet's colours of a scheme, or of the page's own. */
+  resolved(scheme = "") {
+    const probe = document.createElement("i");
+    probe.style.colorScheme = scheme; this.canvas.parentNode.append(probe);
+    const found = TOKENS.map(name => { probe.style.color = `var(${name})`; return getComputedStyle(probe).color; });
+    probe.remove();
+    return found;
+  }
+
+  picture(g, w, h, colours) {
+    const { series, axes } = this;
+    this.at = null; g.font = FONT;
     if (!series.length) return;
-    let [low, high] = range(series.flatMap(s => [s.y, s.low, s.high])), [from, to] = range(series.map(s => s.x));
+    const whole = range(series.map(s => s.x)), [from, to] = this.view || whole;
+    let [low, high] = range(series.flatMap(s => { const [i, j] = inside(s.x, from, to); return [s.y, s.low, s.high].map(v => v && [v, i, j]); }), true);
     low = Math.max(low, axes.floor);
     if (!(high >= low)) return;
     if (high - low < 1e-9 * Math.max(1, Math.abs(high))) { high += 1; low -= 1; }
     const room = .04 * (high - low); low -= room; high += room;
-    const left = 62, right = w - 12, top = this.top(), bottom = h - 34, lg = axes.log ? Math.log10 : v => v;
-    const kx = (right - left) / (lg(to) - lg(from)), ky = (bottom - top) / (high - low), x0 = lg(from);
-    const X = v => left + kx * (lg(v) - x0), Y = v => bottom - ky * (v - low);
-    this.grid(g, { w, h, left, right, top, bottom, X, Y, low, high, from, to });
-    g.save(); g.beginPath(); g.rect(left, top - 2, right - left, bottom - top + 4); g.clip();
+    const top = this.legend(g, w, colours), right = w - RIGHT, bottom = h - BELOW, lg = axes.log ? Math.log10 : v => v;
+    const kx = (right - LEFT) / (lg(to) - lg(from)), ky = (bottom - top) / (high - low), x0 = lg(from);
+    const X = v => LEFT + kx * (lg(v) - x0), Y = v => bottom - ky * (v - low);
+    const back = px => { const v = x0 + (px - LEFT) / kx; return axes.log ? 10 ** v : v; };
+    this.at = { X, Y, back, whole, from, to, left: LEFT, right, top, bottom, low, high, colours };
+    this.grid(g, w, h);
+    g.save(); g.beginPath(); g.rect(LEFT, top - 2, right - LEFT, bottom - top + 4); g.clip();
     series.forEach((s, i) => {
-      const style = s.style ?? i % STYLES.length;
-      g.strokeStyle = g.fillStyle = colour(style);
+      const style = styleOf(s, i), [begin, end] = inside(s.x, from, to);
+      g.strokeStyle = g.fillStyle = colours[style];
       if (s.low) { g.globalAlpha = .22; band(g, s, X, Y); g.globalAlpha = 1; }
-      g.lineWidth = 1.6; g.setLineDash(STYLES[style][1]); s.dots ? dots(g, s, X, Y) : trace(g, s, X, Y);
+      g.lineWidth = style ? 1.6 : 1.8; g.setLineDash(DASHES[style]); s.dots ? dots(g, s, X, Y) : trace(g, s, X, Y, begin, end, right - LEFT);
     });
     g.restore();
-    this.point(g, { X, Y, low, high, from, to, right });
-    this.legend(g, left);
+    this.point(g);
   }
 
-  grid(g, { w, h, left, right, top, bottom, X, Y, low, high, from, to }) {
-    g.fillStyle = g.strokeStyle = ink(this.canvas); g.lineWidth = 1; g.textBaseline = "middle"; g.setLineDash([]);
+  grid(g, w, h) {
+    const { X, Y, left, right, top, bottom, low, high, from, to, colours } = this.at;
+    g.fillStyle = g.strokeStyle = colours[INK]; g.lineWidth = 1; g.textBaseline = "middle"; g.setLineDash([]);
     g.textAlign = "right";
-    for (const v of ticks(low, high, 5)) {
-      g.globalAlpha = .2; line(g, left, Y(v), right, Y(v)); g.globalAlpha = 1;
-      g.fillText(String(v), left - 6, Y(v));
+    for (const v of ticks(low, high)) {
+      g.globalAlpha = .14; line(g, left, Y(v), right, Y(v)); g.globalAlpha = 1;
+      g.fillText(number(v), left - 6, Y(v));
     }
     for (const v of this.axes.marks) if (v > low && v < high) { g.globalAlpha = .7; line(g, left, Y(v), right, Y(v)); g.globalAlpha = 1; }
     g.textAlign = "center";
-    for (const v of this.axes.log ? decades(from, to) : ticks(from, to, Math.max(2, w / 130))) {
-      g.globalAlpha = .2; line(g, X(v), top, X(v), bottom); g.globalAlpha = 1;
-      g.fillText(String(v), Math.min(X(v), w - g.measureText(String(v)).width / 2), bottom + 12);
+    for (const v of this.axes.log ? decades(from, to) : ticks(from, to)) {
+      g.globalAlpha = .14; line(g, X(v), top, X(v), bottom); g.globalAlpha = 1;
+      const text = number(v); g.fillText(text, Math.min(X(v), w - g.measureText(text).width / 2), bottom + 12);
     }
     g.fillText(this.axes.x, (left + right) / 2, h - 8);
   }
 
-  /** Circles with labels, to the left of those at the right edge. */
-  point(g, { X, Y, low, high, from, to, right }) {
-    g.strokeStyle = g.fillStyle = ink(this.canvas); g.lineWidth = 1.6; g.setLineDash([]); g.textBaseline = "middle";
+  /** Circles with labels, each at the corner where the fewest points of curves are. */
+  point(g) {
+    const { X, Y, low, high, from, to, left, right, top, bottom, colours } = this.at;
+    g.lineWidth = 1.6; g.setLineDash([]); g.textBaseline = "middle"; g.textAlign = "left";
     for (const m of this.marks) if (m.x >= from && m.x <= to && m.y >= low && m.y <= high) {
-      const x = X(m.x), y = Y(m.y), room = g.measureText(m.label).width + 12 < right - x;
-      g.beginPath(); g.arc(x, y, 4.5, 0, 2 * Math.PI); g.stroke();
-      g.textAlign = room ? "left" : "right"; g.fillText(m.label, x + (room ? 9 : -9), y - 9);
+      const x = X(m.x), y = Y(m.y), wide = g.measureText(m.label).width;
+      g.strokeStyle = colours[INK]; g.beginPath(); g.arc(x, y, 4.5, 0, 2 * Math.PI); g.stroke();
+      let best = null, least = Infinity;
+      for (const [dx, dy] of [[9, -12], [9, 12], [-9 - wide, -12], [-9 - wide, 12], [9, -28], [9, 28], [-9 - wide, -28], [-9 - wide, 28]]) {
+        const a = x + dx, b = y + dy;
+        let met = a < left || a + wide > right || b - 8 < top || b + 8 > bottom ? 1e6 : 0;
+        for (const s of this.series) for (let k = 0; k < s.x.length; k++) {
+          const px = X(s.x[k]); if (px > a - 2 && px < a + wide + 2 && Math.abs(Y(s.y[k]) - b) < 9) met++;
+        }
+        if (met < least) { least = met; best = [a, b]; }
+      }
+      g.fillStyle = colours[INK]; g.fillText(m.label, ...best);
     }
   }
 
-  /** The title stands over the legend. */
-  top() { return this.axes.y ? 40 : 24; }
-
-  legend(g, left) {
-    let at = left;
-    const y = this.top() - 14;
-    g.textAlign = "left"; g.textBaseline = "middle"; g.lineWidth = 1.6;
+  /** Title and names above the axes, so that they cover nothing, in as many rows as they need; returns where the axes begin. */
+  legend(g, w, colours) {
+    let at = LEFT, y = 12;
+    const place = wide => { if (at > LEFT && at + wide > w - 30) { at = LEFT; y += 18; } const x = at; at += wide + 16; return x; };
+    g.textAlign = "left"; g.textBaseline = "middle"; g.lineWidth = 1.8; g.setLineDash([]);
+    if (this.axes.y) { g.fillStyle = colours[INK]; g.font = `600 ${FONT}`; g.fillText(this.axes.y, place(g.measureText(this.axes.y).width), y); g.font = FONT; }
     this.series.forEach((s, i) => {
-      if (!s.name) return;
-      const style = s.style ?? i % STYLES.length;
-      g.strokeStyle = g.fillStyle = colour(style); g.setLineDash(STYLES[style][1]);
-      if (s.dots) for (const k of [3, 13, 23]) g.fillRect(at + k - 1, y - 1, 3, 3); else line(g, at, y, at + 26, y);
-      g.setLineDash([]); g.fillStyle = ink(this.canvas); g.fillText(s.name, at + 32, y);
-      at += 52 + g.measureText(s.name).width;
+      if (!s.name || s.name === this.axes.y) return;
+      const style = styleOf(s, i), x = place(32 + g.measureText(s.name).width);
+      g.strokeStyle = g.fillStyle = colours[style]; g.setLineDash(DASHES[style]);
+      if (s.dots) for (const k of [3, 13, 23]) g.fillRect(x + k - 1, y - 1, 3, 3); else line(g, x, y, x + 26, y);
+      g.setLineDash([]); g.fillStyle = colours[INK]; g.fillText(s.name, x + 32, y);
     });
-    if (this.axes.y) { g.fillStyle = ink(this.canvas); g.fillText(this.axes.y, left, 10); }
+    return y + 14;
+  }
+
+  // --- cursor, zoom and pan -----------------------------------------------------------------------
+
+  pointer() {
+    const { canvas } = this;
+    let start = null, pans = false, began = null;
+    const px = event => event.clientX - canvas.getBoundingClientRect().left;
+    canvas.addEventListener("pointerdown", event => {
+      if (event.button !== 0 || !this.at) return;
+      start = px(event); began = this.at; pans = event.shiftKey || event.pointerType === "touch"; canvas.setPointerCapture(event.pointerId);
+    });
+    canvas.addEventListener("pointermove", event => {
+      if (!this.at) return;
+      const x = px(event);
+      if (start === null) return this.cursor(x);
+      if (pans) this.window(began.back(began.left + start - x), began.back(began.right + start - x));
+      else { this.line.hidden = false; this.line.style.left = `${Math.min(start, x)}px`; this.line.style.width = `${Math.abs(x - start)}px`; this.line.style.opacity = .25; }
+    });
+    const end = event => {
+      if (start === null) return;
+      const from = start, x = px(event); start = null; this.line.style.width = ""; this.line.style.opacity = "";
+      if (!pans && Math.abs(x - from) > 4) this.window(this.at.back(Math.min(from, x)), this.at.back(Math.max(from, x)));
+      this.cursor(x);
+    };
+    canvas.addEventListener("pointerup", end); canvas.addEventListener("pointercancel", () => { start = null; });
+    canvas.addEventListener("pointerleave", () => { if (start === null) for (const c of this.linked()) c.line.hidden = c.read.hidden = true; });
+    canvas.addEventListener("dblclick", () => this.window(-Infinity, Infinity));
+    canvas.addEventListener("wheel", event => {
+      if (!event.ctrlKey || !this.at) return;  // the page scrolls as ever
+      event.preventDefault(); this.zoom(Math.exp(event.deltaY / 300), px(event));
+    }, { passive: false });
+  }
+
+  /** Values at a place of this chart, in all that are linked with it. */
+  cursor(x) {
+    const at = this.at, value = at.back(Math.min(Math.max(x, at.left), at.right));
+    for (const c of this.linked()) {
+      if (!c.at) continue;
+      const place = c.at.X(value), said = [`${c.axes.x.split(" [")[0]} ${short(value)}`];
+      for (const s of c.series) { const y = s.y[nearest(s.x, value)]; if (y !== undefined && !Number.isNaN(y)) said.push(`${s.name || c.axes.y.split(" [")[0]} ${short(y)}`); }
+      c.line.hidden = c.read.hidden = place < c.at.left || place > c.at.right; c.line.style.left = `${place}px`;
+      c.read.textContent = said.join("\n");
+      const over = place > (c.at.left + c.at.right) / 2;
+      c.read.style.left = over ? "" : `${place + 8}px`; c.read.style.right = over ? `${c.canvas.clientWidth - place + 8}px` : "";
+    }
+  }
+
+  /** Shows x from one value to another, in all linked charts; nothing beyond what is recorded. */
+  window(from, to) {
+    if (!this.at) return;
+    const [least, most] = this.at.whole, all = from <= least && to >= most, lg = this.axes.log ? Math.log10 : v => v, power = this.axes.log ? v => 10 ** v : v => v;
+    if (!all && lg(to) - lg(from) < 1e-4 * (lg(most) - lg(least))) return;
+    if (from < least) { to = power(lg(to) + lg(least) - lg(from)); from = least; }
+    if (to > most) { from = Math.max(least, power(lg(from) - lg(to) + lg(most))); to = most; }
+    for (const c of this.linked()) { c.view = all ? null : [from, Math.min(to, most)]; c.paint(); }
+  }
+
+  /** `factor` below 1 enlarges, about a place or the middle; `shift` moves by a share of the window. */
+  zoom(factor, about = null, shift = 0) {
+    if (!this.at) return;
+    const { left, right, back } = this.at, x = about ?? (left + right) / 2, move = shift * (right - left);
+    this.window(back(x - (x - left) * factor + move), back(x + (right - x) * factor + move));
+  }
+
+  // --- files --------------------------------------------------------------------------------------
+
+  menu(plot) {
+    const menu = document.createElement("details"), summary = document.createElement("summary"), list = document.createElement("div");
+    menu.className = "menu"; summary.textContent = "\u22ef"; summary.title = "Drag to enlarge, Shift and drag to move, Ctrl and wheel to zoom, double click for the whole";
+    summary.setAttribute("aria-label", "Zoom and save this picture");
+    for (const [label, act] of [["Enlarge", () => this.zoom(.5)], ["Reduce", () => this.zoom(2)], ["Earlier", () => this.zoom(1, null, -.25)], ["Later", () => this.zoom(1, null, .25)],
+      ["Whole", () => this.window(-Infinity, Infinity)], ["Save as SVG", () => this.save("svg")], ["Save as PNG", () => this.save("png")]]) {
+      const button = document.createElement("button"); button.type = "button"; button.textContent = label; button.onclick = act; list.append(button);
+    }
+    menu.addEventListener("focusout", event => { if (!menu.contains(event.relatedTarget)) menu.open = false; });
+    menu.append(summary, list); plot.append(menu);
+  }
+
+  /** The picture as on light paper, at the size of the screen; a PNG has twice its pixels. */
+  async file(kind) {
+    const w = this.canvas.clientWidth, h = this.canvas.clientHeight, colours = this.resolved("light");
+    try {
+      if (kind === "svg") { const g = new Svg(w, h); this.picture(g, w, h, colours); return new Blob([g.text()], { type: "image/svg+xml" }); }
+      const canvas = document.createElement("canvas"), g = canvas.getContext("2d");
+      canvas.width = 2 * w; canvas.height = 2 * h; g.scale(2, 2); g.fillStyle = "#fff"; g.fillRect(0, 0, w, h);
+      this.picture(g, w, h, colours);
+      return await new Promise(done => canvas.toBlob(done));
+    } finally { this.paint(); }
+  }
+
+  async save(kind) {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(await this.file(kind));
+    link.download = `${(this.axes.y || this.series[0]?.name || "curves").replace(/\W+/g, "-").replace(/^-|-$/g, "") || "curves"}.${kind}`;
+    link.click(); setTimeout(() => URL.revokeObjectURL(link.href), 1000);
   }
 }
 
-/** Draws recorded curves {name, unit, Ts, n, low, high}, lowest and highest of each piece, into `place`. */
+/** The part of a canvas's context that a chart uses, as SVG. */
+class Svg {
+  constructor(w, h) { this.head = `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 ${w} ${h}" width="${w}" height="${h}"><rect width="${w}" height="${h}" fill="#fff"/>`; this.parts = []; this.path = ""; this.globalAlpha = 1; this.dash = []; this.groups = 0; this.ruler = document.createElement("canvas").getContext("2d"); }
+  text() { return `${this.head}${this.parts.join("")}</svg>`; }
+  beginPath() { this.path = ""; }
+  moveTo(x, y) { this.path += `M${short2(x)} ${short2(y)}`; }
+  lineTo(x, y) { this.path += `${this.path ? "L" : "M"}${short2(x)} ${short2(y)}`; }
+  rect(x, y, w, h) { this.path += `M${x} ${y}h${w}v${h}h${-w}z`; }
+  arc(x, y, r) { this.path += `M${short2(x - r)} ${short2(y)}a${r} ${r} 0 1 0 ${2 * r} 0a${r} ${r} 0 1 0 ${-2 * r} 0`; }
+  stroke() { this.parts.push(`<path d="${this.path}" fill="none" stroke="${this.strokeStyle}" stroke-width="${this.lineWidth}" stroke-opacity="${this.globalAlpha}" stroke-dasharray="${this.dash.join(" ") || "none"}"/>`); }
+  fill() { this.parts.push(`<path d="${this.path}" fill="${this.fillStyle}" fill-opacity="${this.globalAlpha}"/>`); }
+  fillRect(x, y, w, h) { this.beginPath(); this.rect(short2(x), short2(y), w, h); this.fill(); }
+  setLineDash(dash) { this.dash = dash; }
+  clip() { this.parts.push(`<clipPath id="axes"><path d="${this.path}"/></clipPath><g clip-path="url(#axes)">`); this.groups++; }
+  save() {}
+  restore() { for (; this.groups; this.groups--) this.parts.push("</g>"); }
+  measureText(text) { this.ruler.font = this.font; return this.ruler.measureText(text); }
+  fillText(text, x, y) {
+    const plain = text.replace(/[&<>]/g, c => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;" })[c]), anchor = { left: "start", right: "end", center: "middle" }[this.textAlign];
+    this.parts.push(`<text x="${short2(x)}" y="${short2(y + 4)}" text-anchor="${anchor}" fill="${this.fillStyle}" font-family="sans-serif" font-size="12"${this.font.startsWith("600") ? ' font-weight="600"' : ""}>${plain}</text>`);
+  }
+}
+
+/** Draws recorded curves {name, unit, Ts, n, low, high}, lowest and highest of each piece, into `place`; the first's unit is on the axis. */
 export function draw(place, curves, says) {
-  new Chart(place, {}).draw(curves.map(c => {
+  const unit = curves[0]?.unit, one = curves.length === 1, title = one ? curves[0].name : "";
+  new Chart(place, { y: `${title}${unit ? ` [${unit}]` : ""}`.trim() }).draw(curves.map(c => {
     const step = c.n * c.Ts / c.low.length, whole = c.low.every((v, k) => v === c.high[k]);
     const each = whole ? [c.low] : [c.low, c.high], x = [], y = [];
     for (let k = 0; k < c.low.length; k++) for (const values of each) { x.push(k * step); y.push(values[k] ?? NaN); }
-    return { name: c.unit ? `${c.name} [${c.unit}]` : c.name, x, y };
+    return { name: one ? "" : c.name, style: one ? 0 : ROLES[c.name], x, y };
   }), says);
 }
 
-function range(arrays) {
+function styleOf(s, i) { return s.style ?? ROLES[s.name] ?? i % 5; }
+
+/** Least and largest of arrays; with `parts`, of [array, first, end]. */
+function range(arrays, parts = false) {
   let low = Infinity, high = -Infinity;
-  for (const values of arrays) if (values) for (const v of values) { if (v < low) low = v; if (v > high) high = v; }
+  for (const given of arrays) if (given) {
+    const [values, i, j] = parts ? given : [given, 0, given.length];
+    for (let k = i; k < j; k++) { const v = values[k]; if (v < low) low = v; if (v > high) high = v; }
+  }
   return [low, high];
 }
 
-function trace(g, { x, y }, X, Y) {
+/** First index whose x is not below a value; x grows. */
+function place(x, value) {
+  let a = 0, b = x.length;
+  while (a < b) { const m = (a + b) >> 1; if (x[m] < value) a = m + 1; else b = m; }
+  return a;
+}
+/** The samples from one x to another, with a neighbour at either side. */
+function inside(x, from, to) { return [Math.max(0, place(x, from) - 1), Math.min(x.length, place(x, to) + 2)]; }
+function nearest(x, value) { const k = place(x, value); return k > 0 && (k >= x.length || value - x[k - 1] < x[k] - value) ? k - 1 : k; }
+
+/** A line; of many samples only the lowest and the highest of each column of pixels, which is all that one sees. */
+function trace(g, { x, y }, X, Y, begin, end, pixels) {
   g.beginPath();
   let pen = false;
-  for (let k = 0; k < y.length; k++) {
+  if (end - begin <= 4 * pixels) for (let k = begin; k < end; k++) {
     if (Number.isNaN(y[k])) { pen = false; continue; }
     g[pen ? "lineTo" : "moveTo"](X(x[k]), Y(y[k])); pen = true;
+  }
+  else for (let column = 0; column < pixels; column++) {
+    const i = begin + Math.floor((end - begin) * column / pixels), j = begin + Math.floor((end - begin) * (column + 1) / pixels);
+    let least = i, most = i, gaps = 0;
+    for (let k = i; k < j; k++) { const v = y[k]; if (v < y[least] || Number.isNaN(y[least])) least = k; if (v > y[most] || Number.isNaN(y[most])) most = k; if (Number.isNaN(v)) gaps++; }
+    if (2 * gaps >= j - i) { pen = false; continue; }
+    for (const k of least < most ? [least, most] : [most, least]) { g[pen ? "lineTo" : "moveTo"](X(x[k]), Y(y[k])); pen = true; }
   }
   g.stroke();
 }
@@ -146,17 +330,25 @@ function band(g, { x, low, high }, X, Y) {
 }
 
 function line(g, x, y, x2, y2) { g.beginPath(); g.moveTo(x, y); g.lineTo(x2, y2); g.stroke(); }
+const number = v => String(v).replace("-", "\u2212"), short = v => number(Number(v.toPrecision(4))), short2 = v => Math.round(100 * v) / 100;
 
-function ticks(low, high, about) {
-  const raw = (high - low) / about, ten = 10 ** Math.floor(Math.log10(raw));
-  const step = [1, 2, 5, 10].map(k => k * ten).find(s => s >= raw), found = [];
+/** Five to seven round numbers: the first of the usual steps that gives so many. */
+export function ticks(low, high) {
+  const ten = 10 ** Math.floor(Math.log10((high - low) / 6)), found = [];
+  const count = s => Math.floor(high / s) - Math.ceil(low / s) + 1;
+  const step = [1, 2, 5, 10, 2.5, 4, 8, 6, 1.5, 3, 20].map(k => k * ten).find(s => count(s) >= 5 && count(s) <= 7) || 10 * ten;
   // a whole number beyond 2^53 does not grow by one
-  for (let k = Math.ceil(low / step); k * step <= high && found.length < 4 * about; k++) found.push(Number((k * step).toPrecision(6)));
+  for (let k = Math.ceil(low / step); k * step <= high && found.length < 12; k++) found.push(Number((k * step).toPrecision(6)));
   return found;
 }
 
-function decades(from, to) {
-  const found = [];
-  for (let e = Math.ceil(Math.log10(from)); 10 ** e <= to; e++) found.push(Number((10 ** e).toPrecision(6)));
-  return found;
+/** The same on a logarithmic axis: powers of ten, with 3 or 2 and 5 between where they are few. */
+export function decades(from, to) {
+  let found = [];
+  for (const each of [[1], [1, 3], [1, 2, 5]]) {
+    found = [];
+    for (let e = Math.floor(Math.log10(from)); 10 ** e <= to; e++) for (const k of each) { const v = Number((k * 10 ** e).toPrecision(6)); if (v >= from && v <= to) found.push(v); }
+    if (found.length >= 5) return found.length > 7 ? found.filter((_, k) => k % Math.ceil(found.length / 7) === 0) : found;
+  }
+  return found.length > 2 ? found : ticks(from, to);
 }

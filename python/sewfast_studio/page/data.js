@@ -1,10 +1,10 @@
-// The Data view: which recording and columns; look, identify, validate; files that are dropped or chosen.
-import { ask as send, on, sendBytes } from "/server.js";
+// The step Look: which recording and columns; its signals; files that are dropped or chosen.
+import { ask as send, on, mark, sendBytes } from "/server.js";
 import { copies } from "/copies.js";
-import { panels, showLook } from "/look.js";
+import { showLook } from "/look.js";
 
 const $ = id => document.getElementById(id), PIECE = 48 * 1024;
-let writes = false, busy = false, files = null, stale = false, uploading = false;
+let writes = false, files = null, stale = false, uploading = false;
 
 const number = id => $(id).valueAsNumber > 0 ? $(id).valueAsNumber : null;
 
@@ -16,67 +16,43 @@ export function chosen() {
   };
 }
 
-/** Names of the columns, for other views. */
+/** Names of the columns, for other steps. */
 export const columns = () => [...$("inputs").options].map(o => o.value);
 
-function ask(name) {
-  return send(name, { ...chosen(), model: $("model").value, seed: parseInt($("seed").value) || 0 });
-}
-
 function tell(error) { $("error").textContent = error ? error.message : ""; $("error").hidden = !error; }
+function enable() { $("upload").disabled = !writes || uploading; }
 
-async function act(name, show) {
-  tell(null); $(name).disabled = true;
-  try { show(await ask(name)); } catch (error) { tell(error); }
-  $(name).disabled = false; enable();
-}
-
-function enable() {
-  $("identify").disabled = busy || !writes; $("cancel").disabled = !busy || !writes; $("bar").hidden = !busy;
-  $("upload").disabled = !writes || uploading;
+export function fill(select, pairs, kept) {
+  select.replaceChildren(...pairs.map(([value, label]) => {
+    const option = new Option(label, value); option.selected = kept.includes(value); return option;
+  }));
 }
 
 on("state", s => {
   writes = s.writes;
-  if (s.gone) tell(new Error("the project folder is gone: put it back, or start sewfast studio in another one"));
+  if (s.gone) tell(new Error("The project folder is gone. Put it back, or start sewfast studio in another one."));
   if (files !== s.recordings.join("/")) {
     files = s.recordings.join("/");
     const before = $("file").value;
     fill($("file"), s.recordings.map(n => [n, n]), [s.recordings.includes(before) ? before : s.first]);
     // a recording may be large, so it is opened only where its columns are asked for
     if ($("file").value !== before) { stale = true; if (!$("data").hidden) open(); }
-    if (!s.recordings.length && !s.gone) tell(new Error("there is no recording in this folder: drop a CSV, log, JSON, .mat, .npz, Parquet or MCAP file here"));
+    if (!s.recordings.length && !s.gone) tell(new Error("There is no recording in this folder. Drop a CSV, log, JSON, .mat, .npz, Parquet or MCAP file here."));
+    mark("data", s.recordings.length === 1 ? "1 file" : `${s.recordings.length || "no"} files`);
+    document.dispatchEvent(new CustomEvent("recordings", { detail: s.recordings }));
   }
   enable();
 });
-on("progress", p => {
-  if (p.of !== "identified") return;
-  busy = true; $("bar").value = p.done / Math.max(p.total, 1);
-  $("progress").textContent = `${p.done} of ${p.total}` + (p.best === null ? "" : `, best ${p.best.toPrecision(4)}`); enable();
-});
-on("identified", m => {
-  busy = false; $("progress").textContent = ""; enable();
-  if (m.error) return tell(new Error(m.error));
-  const f = m.found;
-  clearValidation();  // it was that of the model before
-  $("headline").textContent = `free run explains ${f.fit.toFixed(1)} % of the training data (rmse ${`${f.rmse.toPrecision(4)} ${f.unit}`.trim()})`;
-  panels($("fit"), [f.free_run]); candidates(f.candidates); text("modeltext", f.text); copies($("identify-copy"), f);
-});
-
-function fill(select, pairs, kept) {
-  select.replaceChildren(...pairs.map(([value, label]) => {
-    const option = new Option(label, value); option.selected = kept.includes(value); return option;
-  }));
-}
 
 /** Reads the columns of the recording that is chosen, if that was not done yet. */
 export async function open() {
   if (!stale || !$("file").value) return;
   stale = false; tell(null);
   // what was found on another recording would pass for this one's
-  clear(["signals", "advice", "summary", "look-copy"]); clearValidation();
+  for (const id of ["signals", "advice", "summary", "look-copy", "looked"]) $(id).replaceChildren();
+  $("summary-fold").hidden = true; $("no-look").hidden = false; next(false);
   try {
-    const c = await ask("columns"), names = c.names.map(n => [n, n]);
+    const c = await send("columns", chosen()), names = c.names.map(n => [n, n]);
     fill($("inputs"), names, c.inputs);
     fill($("output"), [["", c.encoder ? "speed from counts" : "speed from the counts below"], ...names], [c.output ?? ""]);
     fill($("counts"), [["", c.encoder ? "counts" : "none"], ...names], [""]);
@@ -84,36 +60,23 @@ export async function open() {
   } catch (error) { tell(error); }
 }
 
-function clear(ids) {
-  for (const id of ids) { $(id).replaceChildren(); if ($(id).tagName === "PRE") $(id).hidden = true; }
-}
-function clearValidation() { clear(["verdict", "free", "card", "validate-copy"]); }
+/** After a look, the way on is the step's action. */
+function next(on) { $("look").classList.toggle("primary", !on); $("to-model").hidden = !on; }
 
-function text(id, value) { $(id).textContent = value; $(id).hidden = false; }
-
-function candidates(rows) {
-  const table = document.createElement("table"), place = $("candidates");
-  place.replaceChildren(); if (!rows.length) return;
-  const best = Math.min(...rows.map(r => r.free_run_rmse ?? Infinity));
-  const head = table.insertRow();
-  for (const name of ["candidate", "settings", "free-run rmse"]) { const th = document.createElement("th"); th.textContent = name; head.append(th); }
-  for (const { kind, free_run_rmse: rmse, ...rest } of rows) {
-    const row = table.insertRow(), settings = Object.entries(rest).map(([k, v]) => `${k} ${v}`).join(", ");
-    const cells = [kind, settings, (rmse === null ? "none" : rmse.toPrecision(4)) + (rmse === best ? " lowest" : "")];
-    for (const cell of cells) row.insertCell().textContent = cell;
-    row.classList.toggle("chosen", rmse === best);
-  }
-  place.className = "scroll"; place.tabIndex = 0; place.append(table);
+async function look() {
+  tell(null); $("look").disabled = true;
+  try {
+    const f = await send("look", chosen());
+    showLook($("data"), f); copies($("look-copy"), f); $("no-look").hidden = true; next(true);
+    $("looked").textContent = f.advice.length ? `${f.advice.length} thing${f.advice.length > 1 ? "s" : ""} to improve` : "Good to identify a model from";
+    mark("data", f.advice.length ? `${f.advice.length} to improve` : "good", f.advice.length ? "warn" : "good");
+  } catch (error) { tell(error); mark("data", "not read", "bad"); }
+  $("look").disabled = false;
 }
 
 $("file").onchange = () => { stale = true; open(); };
 $("what").onsubmit = event => event.preventDefault();
-$("cancel").onclick = () => send("cancel").catch(tell);
-$("look").onclick = () => act("look", f => { showLook($("data"), f); copies($("look-copy"), f); });
-$("identify").onclick = () => act("identify", () => { busy = true; $("progress").textContent = "starting"; });
-$("validate").onclick = () => act("validate", f => {
-  $("verdict").textContent = f.verdict; panels($("free"), [f.free_run]); text("card", f.card); copies($("validate-copy"), f);
-});
+$("look").onclick = look;
 
 // --- uploads: piece by piece, each after the server has written the one before ---
 
@@ -132,15 +95,19 @@ async function upload(file) {
     }
     await send("upload_end");
     $("uploaded").textContent = `${file.name} is in the project folder`;
-    $("file").value = file.name; $("file").onchange();
+    $("file").value = file.name; stale = true; await open();
   } catch (error) { $("uploaded").textContent = ""; tell(error); }
   uploading = false; received = null; enable();
 }
 
-async function uploadAll(list) { for (const file of [...list]) await upload(file); }
+async function uploadAll(list) {
+  for (const file of [...list]) await upload(file);
+  // a person who adds a file wants to see it
+  if ($("error").hidden && $("inputs").selectedOptions.length) await look();
+}
 $("upload").onchange = async () => { await uploadAll($("upload").files); $("upload").value = ""; };
-// a file that misses the view must not replace the page
+// a file that misses the step must not replace the page
 for (const name of ["dragover", "drop"]) addEventListener(name, event => event.preventDefault());
-$("data").addEventListener("dragover", () => $("what").classList.add("dropping"));
-$("data").addEventListener("dragleave", () => $("what").classList.remove("dropping"));
-$("data").addEventListener("drop", event => { $("what").classList.remove("dropping"); uploadAll(event.dataTransfer.files); });
+addEventListener("dragover", () => $("what").classList.add("dropping"));
+addEventListener("dragleave", () => $("what").classList.remove("dropping"));
+addEventListener("drop", event => { $("what").classList.remove("dropping"); uploadAll(event.dataTransfer.files); });

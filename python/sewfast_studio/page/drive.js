@@ -1,10 +1,10 @@
-// The Drive view: connect, limits, arming, live curves, and a STOP that goes ahead of everything else.
-import { ask, on } from "/server.js";
+// The step Record: connect, limits, arming, live curves, and a STOP that goes ahead of everything else.
+import { ask, on, mark } from "/server.js";
 import { Chart } from "/curves.js";
 import { copies } from "/copies.js";
 
 const $ = id => document.getElementById(id);
-const LIMITS = ["volt", "speed_rpm", "acceleration", "current"], MOST_COLUMNS = 1200;
+const LIMITS = ["volt", "speed_rpm", "acceleration", "current"], SAID = ["command", "V", "speed", "RPM", "acceleration", "RPM/s", "current", "A"], MOST_COLUMNS = 1200;
 let writes = false, drive = { connected: false, armed: false }, prompt = 0, paused = false, looping = false, charts = new Map(), run = -1, asking = false;
 
 function tell(error) { $("drive-error").textContent = error ? error.message : ""; $("drive-error").hidden = !error; }
@@ -19,7 +19,7 @@ function stop() {
 $("stop").onclick = stop;
 addEventListener("keydown", event => { if (event.key === "Escape") { event.preventDefault(); stop(); } }, { capture: true });
 on("beat", m => { prompt = m.prompt; ask("alive", { n: m.n }, false); state(); });
-on("closed", () => { $("drive-state").textContent = "no connection to the studio: it has stopped the drive; else use the emergency stop"; });
+on("closed", () => { $("drive-state").textContent = "no connection: the studio has stopped the drive; if not, use the emergency stop"; });
 on("stopped", m => {
   drive = { ...drive, armed: false }; state(); enable();
   if (!m.moving) return;
@@ -42,6 +42,7 @@ on("drive", m => {
     $(`limit-${name}`).placeholder = ceiling === null ? "none" : `at most ${Number(ceiling.toPrecision(4))}`;
   }
   state(); enable(); table();
+  if (m.connected && !$("drive").hidden) follow();
 });
 
 function state() {
@@ -49,7 +50,9 @@ function state() {
   document.querySelector("header").classList.toggle("armed", !!d.armed);
   const said = !d.connected ? "no drive" : `${d.name}: ${d.job ? "running" : d.state}${d.state === "tripped" ? ` (${d.reason})` : ""}, ${d.armed ? "ARMED" : "not armed"}${d.job ? `, ${d.job}` : ""}`;
   if ($("drive-state").textContent !== said) $("drive-state").textContent = said;
-  $("prompt").textContent = d.connected && writes && !d.armed ? (prompt < 10 ? `this page has answered ${prompt} of 10 times in a row` : "this page answers in time") : "";
+  mark("drive", ...!d.connected ? ["no drive"] : d.state === "tripped" ? ["tripped", "bad"] : d.armed ? [d.job ? "moving" : "armed", "warn"] : ["connected", "good"]);
+  $("no-drive").hidden = d.connected; $("live-panel").hidden = !d.connected;
+  $("prompt").textContent = d.connected && writes && !d.armed ? (prompt < 10 ? `This page has answered ${prompt} of 10 times in a row.` : "This page answers in time.") : "";
   // the last sample of a run is no speed of the drive any more
   if (!d.job) $("speed").textContent = d.connected ? `${d.state}${speed}` : "no drive";
 }
@@ -57,7 +60,7 @@ function state() {
 function table() {
   const d = drive, rows = !d.connected ? [] : [
     ["state", d.state + (d.reason && d.state === "tripped" ? `: ${d.reason}` : "")], ["sample time", `${d.Ts * 1000} ms`], ["watchdog", `${d.watchdog * 1000} ms`],
-    ["limits", LIMITS.map((name, k) => `${name} ${d.limits[k] === null ? "none" : Number(d.limits[k].toPrecision(4))}`).join(", ")],
+    ["limits", isLimited() ? LIMITS.map((_, k) => `${SAID[2 * k]} ${d.limits[k] === null ? "free" : `${Number(d.limits[k].toPrecision(4))} ${SAID[2 * k + 1]}`}`).join(", ") : "none are set yet"],
     ["frames received, dropped", `${d.received}, ${d.dropped}`],
   ];
   $("drive-table").replaceChildren(...rows.map(([title, value]) => {
@@ -66,11 +69,19 @@ function table() {
   }));
 }
 
+/** Limits are numbers of a drive from the first that is set on; before, it moves nothing. */
+function isLimited() { return !!drive.limits && drive.limits.some(v => v !== 0); }
+
 function enable() {
   const d = drive, idle = d.connected && writes && !d.job;
   $("connect").disabled = d.connected || !writes; $("disconnect").disabled = !idle; $("limits").disabled = !idle;
   $("arm").disabled = !idle || d.armed; $("disarm").disabled = !idle || !d.armed; $("clear").disabled = !idle || d.state !== "tripped";
-  $("record").disabled = !idle || !d.armed; $("run").disabled = !idle || !d.armed || !$("run-controller").value;
+  $("record").disabled = !idle || !d.armed;
+  // what comes next is the only action that stands out
+  $("connect").hidden = d.connected; $("limits").hidden = !d.connected || d.armed; $("limits").classList.toggle("primary", !isLimited());
+  $("arm").hidden = !d.connected || d.armed || !isLimited(); $("record").hidden = !d.armed;
+  for (const id of ["disconnect", "disarm", "clear"]) $(id).hidden = $(id).disabled;
+  $("run").disabled = !idle || !d.armed || !$("run-controller").value;
 }
 
 async function act(name, asked = {}) {
@@ -85,7 +96,7 @@ $("connect").onclick = async () => {
 $("disconnect").onclick = () => { $("stopped").textContent = $("limits-set").textContent = ""; act("drive_disconnect"); };
 $("limits").onclick = async () => {
   const asked = Object.fromEntries(LIMITS.map(name => [name, $(`limit-${name}`).valueAsNumber || null]));
-  $("limits-set").textContent = await act("drive_limits", asked) ? "set; an empty field is the drive's own ceiling" : "";
+  $("limits-set").textContent = await act("drive_limits", asked) ? "The limits are set." : "";
 };
 $("arm").onclick = async () => { $("stopped").textContent = ""; await act("drive_arm"); };
 $("disarm").onclick = () => act("drive_disarm");
@@ -95,7 +106,7 @@ $("run").onclick = () => begin("drive_run", { controller: $("run-controller").va
 
 async function begin(name, asked) {
   $("driven").textContent = ""; $("driven-copy").replaceChildren(); $("stopped").textContent = "";
-  if (await act(name, asked)) $("driven").textContent = "under way";
+  if (await act(name, asked)) $("driven").textContent = name === "drive_run" ? "The controller runs." : "Recording.";
 }
 on("driven", m => {
   if (m.kind === "commission") return;
@@ -106,7 +117,7 @@ on("driven", m => {
 // --- what is seen: one question under way, so that a slow page misses frames and nothing queues up ---
 
 async function loop() {
-  if ($("drive").hidden) { looping = false; return; }
+  if ($("drive").hidden || !drive.connected) { looping = false; return; }
   if (drive.connected && !paused && !asking) {
     asking = true;
     try { paint(await ask("live", { seconds: seconds($("live-seconds").valueAsNumber), columns: Math.min(MOST_COLUMNS, Math.max(100, $("live").clientWidth - 74)) })); } catch (error) { tell(error); }
@@ -121,11 +132,11 @@ function paint(f) {
   const panels = new Map(), t = f.curves.t, n = t.length, step = n > 1 ? t[1] - t[0] : 0;
   for (const [name, unit] of Object.entries(f.columns)) panels.set(unit, [...(panels.get(unit) || []), name]);
   for (const [unit, names] of panels) {
-    if (!charts.has(unit)) charts.set(unit, new Chart($("live"), { y: `[${unit || "1"}]` }));
+    if (!charts.has(unit)) charts.set(unit, new Chart($("live"), { y: `${names.length > 1 ? "" : names[0] + " "}[${unit || "1"}]` }));
     const series = names.map(name => {
       const low = f.curves[`${name}_low`], high = f.curves[`${name}_high`], x = new Float32Array(2 * n), y = new Float32Array(2 * n);
       for (let k = 0; k < n; k++) { x[2 * k] = t[k]; x[2 * k + 1] = t[k] + .5 * step; y[2 * k] = low[k]; y[2 * k + 1] = high[k]; }
-      return { name, x, y };
+      return { name: names.length > 1 ? name : "", x, y };
     });
     charts.get(unit).draw(series, `${names.join(" and ")} over the last ${seconds($("live-seconds").valueAsNumber)} seconds`);
   }
@@ -149,9 +160,11 @@ function fill(select, names) {
   if (names.includes(kept)) select.value = kept;
 }
 
-/** Opens the view. */
+function follow() { if (!looping) { looping = true; requestAnimationFrame(loop); } }
+
+/** Opens the step. */
 export async function look() {
-  if (!looping) { looping = true; requestAnimationFrame(loop); }
+  follow();
   try {
     const found = await ask("ports");
     $("ports").replaceChildren(...[{ path: "virtual", text: "a computed drive" }, ...found].map(({ path, text }) => new Option(text, path)));

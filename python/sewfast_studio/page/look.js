@@ -11,6 +11,6 @@ export function panels(place, lists) {
 export function showLook(root, found) {
   const $ = id => root.querySelector(`#${id}`);
   panels($("signals"), found.curves.map(c => [c]));
-  $("advice").replaceChildren(...found.advice.map(a => { const li = document.createElement("li"); li.textContent = a; return li; }));
-  $("summary").textContent = found.text; $("summary").hidden = false;
+  $("advice").replaceChildren(...found.advice.map(a => { const li = document.createElement("li"); li.textContent = a; li.className = "chip warn"; return li; }));
+  $("summary").textContent = found.text; $("summary-fold").hidden = false;
 }

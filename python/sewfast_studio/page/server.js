@@ -20,6 +20,9 @@ export function ask(name, asked = {}, answered = true) {
   return new Promise((done, failed) => waiting.set(id, [done, failed]));
 }
 
+/** Says the state of a step beside its name: a word, and good, warn or bad. */
+export function mark(...said) { document.dispatchEvent(new CustomEvent("mark", { detail: said })); }
+
 /** A piece of a file that is uploaded; its answer is the event `received`. */
 export function sendBytes(piece) { socket.send(piece); }
 

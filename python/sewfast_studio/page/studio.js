@@ -1,36 +1,49 @@
-// The page: its views and who holds the control. Texts of others are only ever set as text.
+// The page: its steps, their marks, and which page is in control. Texts of others are only ever set as text.
 import * as server from "/server.js";
 import { open } from "/data.js";
 import { mount } from "/tune.js";
 import * as bode from "/bode.js";
+import * as model from "/model.js";
 import "/commission.js";
+import "/deploy.js";
 import { look } from "/drive.js";
 
-const { ask, on } = server, $ = id => document.getElementById(id), VIEWS = ["data", "bode", "tune", "drive", "commission"];
+const { ask, on } = server, $ = id => document.getElementById(id), VIEWS = ["drive", "data", "model", "tune", "commission", "deploy"];
 const tune = mount(document, server);
 let first = true, over = false, lost = false;
 
-// what the focus goes to must not be left below the header, whose lines depend on the width
-const header = document.querySelector("header");
-new ResizeObserver(() => { document.documentElement.style.scrollPaddingTop = `${header.offsetHeight + 8}px`; }).observe(header);
+function notice(text, takes) { $("notice-text").textContent = text; $("notice").hidden = !text; $("take").hidden = !takes; }
+on("closed", () => {
+  $("control").textContent = "not connected";
+  notice("This page is not connected: reload it. If it stays so, start sewfast studio again and open its whole address.", false);
+});
 
-on("closed", () => { $("control").textContent = "not connected: reload this page; if it stays so, start sewfast studio again and open its whole address"; });
+/** The state of a step beside its name: kind is good, warn, bad or nothing. */
+document.addEventListener("mark", ({ detail: [step, word, kind = ""] }) => {
+  const chip = $(`view-${step}`).querySelector(".chip");
+  if (chip.textContent !== word) chip.textContent = word;
+  chip.className = `chip ${kind}`;
+});
 
 function view(name) {
   for (const v of VIEWS) { $(v).hidden = v !== name; $(`view-${v}`).setAttribute("aria-pressed", v === name); }
-  if (name === "data") open();
-  if (name === "bode") bode.show();
+  scrollTo(0, 0);
+  if (name === "data") bode.show();
+  if (name === "model") open();
   if (name === "tune") tune.show();
   if (name === "drive") look();
 }
-bode.connect(tune, view);
+bode.connect(tune, view); model.connect(tune, view);
 
 on("state", s => {
-  $("folder").textContent = s.folder; $("take").hidden = s.writes;
+  $("folder").textContent = $("folder").title = s.folder;
   if (s.writes) { over = lost = false; $("take").textContent = "Take control"; }
-  $("control").textContent = (s.writes ? "this page holds the control" : lost ? "another page has taken the control; this page looks on" : "this page looks on") + (s.pages > 1 ? `; ${s.pages} pages are open` : "");
+  const others = s.pages > 1 ? `${s.pages} pages are open.` : "";
+  $("control").textContent = s.writes ? "in control" : "looking on";
+  notice(s.writes ? "" : `${lost ? "Another page has taken control. This page looks on." : "This page looks on."} ${others}`.trim(), true);
   if (first && s.port) { $("port").value = s.port; view("drive"); }
   else if (first && s.models.length && (s.demo || s.models.includes(s.first))) view("tune");
+  else if (first) view("data");
   first = false;
 });
 on("lost", () => { lost = true; });
@@ -38,7 +51,9 @@ $("take").onclick = async () => {
   const held = await ask("take", { over });
   over = Boolean(held);
   if (!held) return;
-  $("control").textContent = `another page has held the control of the drive for ${Math.ceil(held.held_s)} s` + (held.moves ? ", and the motor can turn" : "") + "; taking it over stops the motor";
+  notice(`Another page has been in control of the drive for ${Math.ceil(held.held_s)} s.${held.moves ? " The motor can turn." : ""} Taking it over stops the motor.`, true);
   $("take").textContent = "Take over";
 };
 for (const v of VIEWS) $(`view-${v}`).onclick = () => view(v);
+// a file that is dropped anywhere goes to the step Look
+addEventListener("drop", () => { if ($("data").hidden) view("data"); }, { capture: true });

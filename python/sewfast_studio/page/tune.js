@@ -1,8 +1,9 @@
-// The Tune view: sliders whose every move is a question to the server, and at most one under way; the latest wins.
+// The step Tune: sliders whose every move is a question to the server, and at most one under way; the latest wins.
 import { Chart } from "/curves.js";
 
 const PINS = ["A", "B"], MOST_NOTCHES = 4;
 const WEIGHTS = [["tracking", "per y"], ["chatter", "per u"], ["effort", "per u"], ["overshoot", "per %"], ["rise", "per ms"], ["lag", "per ms"], ["saturation", "per share"]];
+const KNOBS = { alpha: "weight alpha", beta: "weight beta", N: "derivative filter N", filter_samples: "speed filter", filter_time: "feedback filter" };
 const NUMBERS = [ // name, title, unit
   ["Ms", "Ms", ""], ["Mt", "Mt", ""], ["phase_margin_deg", "phase margin", "deg"], ["gain_margin", "gain margin", ""],
   ["delay_margin_ms", "delay margin", "ms"], ["crossover_hz", "crossover", "Hz"], ["noise_gain", "noise gain", "u/y"],
@@ -14,7 +15,7 @@ const NUMBERS = [ // name, title, unit
  * Brings the view to life: `root` holds its elements, `ask` and `on` reach the steps (server.js).
  * Returns how it is opened, its controller as a question has it, and how a notch is put in.
  */
-export function mount(root, { ask, on }) {
+export function mount(root, { ask, on, mark = () => {} }) {
   const $ = id => root.querySelector(`[id="${id}"]`);
   const charts = {
     step: new Chart($("step-plot"), {}), command: new Chart($("command-plot"), {}), load: new Chart($("load-plot"), {}),
@@ -38,7 +39,7 @@ export function mount(root, { ask, on }) {
       values = { ...start, ...Object.fromEntries(Object.entries(kept).filter(([name]) => name in start)) };
       history = []; pins = {}; first = null; now = null;
       if (Object.keys(kept).length) first = { ...await ask("tune_move", question({ values: start })), values: start };
-      $("tune-members").textContent = opened.members > 1 ? `${opened.members} members: median and band` : "one model";
+      $("tune-members").textContent = opened.members > 1 ? `${opened.members} members: median and band` : "one model"; $("limit-unit").textContent = `[${opened.u_unit}]`;
       sliders(); move(); listNotches();
     } catch (error) { opened = null; $("knobs").replaceChildren(); tell(error); }
   }
@@ -46,7 +47,7 @@ export function mount(root, { ask, on }) {
   function sliders() {
     knobs = opened.knobs.map(k => {
       const label = document.createElement("label"), slider = document.createElement("input"), field = document.createElement("input");
-      label.textContent = k.name + (k.unit ? ` [${k.unit}]` : ""); label.htmlFor = `knob-${k.name}`;
+      label.textContent = (KNOBS[k.name] ?? k.name.replaceAll("_", " ")) + (k.unit ? ` [${k.unit}]` : ""); label.htmlFor = `knob-${k.name}`;
       const to = v => k.log ? Math.log(v / k.low) / Math.log(k.high / k.low) : (v - k.low) / (k.high - k.low);
       const from = p => k.log ? k.low * (k.high / k.low) ** p : k.low + p * (k.high - k.low);
       Object.assign(slider, { type: "range", id: label.htmlFor, min: 0, max: 1, step: k.whole ? 1 / (k.high - k.low) : .005 });
@@ -116,7 +117,7 @@ export function mount(root, { ask, on }) {
   async function anew() {
     asking = false; again = null;
     await open(values);
-    if (opened) tell(new Error("the model or the controller in the folder has changed: the start was computed again"));
+    if (opened) tell(new Error("The model or the controller in the folder has changed. The start was computed again."));
   }
 
   /** What `tune` would count; it takes longer, so it waits for a rest. */
@@ -132,6 +133,7 @@ export function mount(root, { ask, on }) {
     } catch (error) { tell(error); }
   }
 
+  const STYLES = { now: 0, A: 1, B: 3, start: 5 };
   const each = () => [["now", now], ...PINS.filter(p => pins[p]).map(p => [p, pins[p]]), ["start", first]].filter(([, f], i) => i === 0 || f !== now);
 
   function series(x, name, f, label, style) {
@@ -140,7 +142,7 @@ export function mount(root, { ask, on }) {
   }
 
   function paint() {
-    const shown = each(), style = name => ({ now: 0, A: 1, B: 3, start: 2 })[name], y = opened.y_unit, u = opened.u_unit;
+    const shown = each(), style = name => STYLES[name], y = opened.y_unit, u = opened.u_unit;
     const all = (x, name) => shown.flatMap(([label, f]) => series(x, name, f, label, style(label)));
     const says = now.diverges ? "the loop diverges" : `overshoot ${text(now.overshoot_percent)} %, rise ${text(now.rise_ms)} ms, Ms ${text(now.Ms)}`;
     charts.step.axes.y = `step response [${y}]`; charts.command.axes.y = `command [${u}]`; charts.load.axes.y = `disturbance of ${text(opened.disturbance)} ${u} [${y}]`;
@@ -175,13 +177,15 @@ export function mount(root, { ask, on }) {
     if (Number.isFinite(most)) rows.push([`command at most ${most} ${opened.u_unit}`, !now.diverges && now.u_peak <= most, text(now.u_peak)]);
     if (limit > 1) $("Ms-means").textContent = `Ms ${limit} leaves a gain margin of at least ${text(limit / (limit - 1))} and a phase margin of at least ${text(2 * Math.asin(.5 / limit) * 180 / Math.PI)} degrees.`;
     $("lights").replaceChildren(...rows.map(([what, ok, found]) => {
-      const li = document.createElement("li"); li.textContent = `${ok ? "\u2713 kept" : "\u2717 broken"}: ${what} (${found})`; li.className = ok ? "kept" : "broken"; return li;
+      const li = document.createElement("li"); li.textContent = `${ok ? "kept" : "broken"}: ${what} (${found})`; li.className = `chip ${ok ? "good" : "bad"}`; return li;
     }));
+    const broken = rows.find(([, ok]) => !ok);
+    mark("tune", broken ? `${broken[0].split(" ")[0]} ${broken[2]}` : `Ms ${text(now.Ms)}`, broken ? "bad" : "good");
   }
 
   function enable() {
     $("undo").disabled = !history.length; $("reset").disabled = !opened;
-    $("search").disabled = !opened || busy || !writes; $("tune-cancel").disabled = !busy || !writes; $("tune-bar").hidden = !busy;
+    $("search").disabled = !opened || busy || !writes; $("tune-cancel").disabled = $("tune-cancel").hidden = !busy || !writes; $("tune-bar").hidden = !busy;
     $("save").disabled = !opened || !writes; $("add-notch").disabled = !opened || notches.length >= MOST_NOTCHES;
     for (const p of PINS) { $(`pin-${p}`).disabled = !opened; $(`take-${p}`).disabled = !pins[p]; }
   }
@@ -203,7 +207,7 @@ export function mount(root, { ask, on }) {
   }));
   $("add-notch").onclick = () => {
     const f = $("notch-hz").valueAsNumber;
-    f > 0 ? addNotch([f, .1, .5]) : tell(new Error("notch: expected a frequency in Hz; type it, or take the one that the view Bode proposes"));
+    f > 0 ? addNotch([f, .1, .5]) : tell(new Error("Expected a frequency in Hz. Type it, or take the one that the frequency response in Look proposes."));
   };
   $("undo").onclick = undo;
   $("reset").onclick = () => set(Object.fromEntries(opened.knobs.map(k => [k.name, k.value])));
@@ -224,7 +228,7 @@ export function mount(root, { ask, on }) {
     const file = $("save-name").value;
     saving = true;
     try {
-      await ask("tune_save", question({ file })); $("saved").textContent = `written: ${file}`;
+      await ask("tune_save", question({ file })); $("saved").textContent = `Written: ${file}`;
       // the start is this controller now, and has the notches that were put into it
       if (file === $("tune-start").value) { notches = []; await open(values); }
     } catch (error) { tell(error); }
@@ -250,7 +254,8 @@ export function mount(root, { ask, on }) {
   on("state", s => {
     writes = s.writes; enable();
     fill($("tune-model"), s.models.map(n => [n, n]), s.first); fill($("tune-start"), [["", "first controller"], ...s.controllers.map(n => [n, n])], s.start ?? "");
-    $("no-model").hidden = s.models.length > 0;
+    $("no-model").hidden = s.models.length > 0; $("figures").hidden = !s.models.length; $("step-plot").parentNode.hidden = !s.models.length;
+    if (!opened) mark("tune", s.models.length ? "ready" : "needs a model");
     if (!$("tune").hidden && !saving) opened ? move() : open();
   });
 
@@ -261,5 +266,7 @@ export function mount(root, { ask, on }) {
   }
 
   enable();
-  return { show: async () => { await (opened ? move() : open()); }, question, addNotch, unit: () => opened ? opened.y_unit : "" };
+  /** Takes a model of the folder, as one that was just identified. */
+  function choose(name) { if ([...$("tune-model").options].some(o => o.value === name) && $("tune-model").value !== name) { $("tune-model").value = name; notches = []; open(); } }
+  return { choose, show: async () => { await (opened ? move() : open()); }, question, addNotch, unit: () => opened ? opened.y_unit : "" };
 }

@@ -3,7 +3,7 @@
 function connect(model, el, html, css) {
   const root = el.attachShadow({ mode: "open" }), waiting = new Map(), listeners = {};
   const style = document.createElement("style"), holder = document.createElement("div");
-  style.textContent = css; holder.innerHTML = html; root.append(style, holder);
+  style.textContent = css; holder.className = "sf cell"; holder.innerHTML = html; root.append(style, holder);
   // keys of the view are no commands of the notebook
   root.addEventListener("keydown", event => event.stopPropagation());
   let number = 0;

@@ -383,7 +383,9 @@ def test_a_model_is_identified_and_validated(folder: Path, page: Page) -> None:
     assert found["fit"] > 50
     assert (folder / "model.json").is_file()
     checked = page.ask("validate", **{**STEP, "file": "run2.csv"})["found"]
-    assert "Report card" in checked["card"]
+    assert {"name", "shown", "limit", "verdict", "meaning"} <= set(checked["lines"][0])
+    assert checked["grade"] in ("good", "warn", "bad")
+    assert len(checked["error"]["low"]) == len(checked["free_run"][0]["low"])
     assert len(checked["free_run"]) == 2
 
 

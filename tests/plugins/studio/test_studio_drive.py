@@ -60,10 +60,13 @@ def _armed(browser: Any, studio: Studio, device: VirtualDevice) -> None:
     until(shown)
     port.clear()
     port.send_keys(device.port)
+    browser.execute_script(
+        "document.querySelectorAll('#drive details').forEach(d => { d.open = true })"
+    )
     browser.find_element("id", "watchdog").send_keys("2000")
     _press(browser, "connect")
     _press(browser, "limits")
-    until(lambda: "set;" in browser.find_element("id", "limits-set").text)
+    until(lambda: "are set" in browser.find_element("id", "limits-set").text)
     until(lambda: "in time" in browser.find_element("id", "prompt").text)
     _press(browser, "arm")
     until(lambda: "ARMED" in browser.find_element("id", "drive-state").text)
@@ -95,7 +98,7 @@ def test_a_drive_by_clicks(studio: Studio, device: VirtualDevice, browser: Any) 
     until(lambda: "RPM" in at("speed").text)
     assert len(browser.find_elements("css selector", "#live canvas")) == 2
     assert len(set(browser.execute_script("return window.taken"))) > 5
-    for view in ("data", "tune", "commission", "drive"):
+    for view in ("data", "model", "tune", "commission", "deploy", "drive"):
         browser.execute_script("arguments[0].click()", at(f"view-{view}"))
         stop = at("stop")
         assert stop.is_displayed()
@@ -271,11 +274,11 @@ def test_taking_over_by_clicks(studio: Studio, device: VirtualDevice, browser: A
         browser.get(studio.address)
         _press(browser, "take")
         until(lambda: browser.find_element("id", "take").text == "Take over")
-        assert "stops the motor" in browser.find_element("id", "control").text
+        assert "stops the motor" in browser.find_element("id", "notice-text").text
         assert _is_on(device)
         _press(browser, "take")
         until(lambda: not _is_on(device))
-        until(lambda: "holds the control" in browser.find_element("id", "control").text)
+        until(lambda: browser.find_element("id", "control").text == "in control")
 
 
 def _both(found: dict[str, Any]) -> list[list[str]]:

@@ -77,7 +77,7 @@ def test_sliders_in_a_real_kernel(demo: Path) -> None:
         )
         comm = opened["content"]["comm_id"]
         esm = opened["content"]["data"]["state"]["_esm"]
-        assert "import " not in esm.split("const STYLES")[1].split("\n")[0]
+        assert "import " not in esm.split("const DASHES")[1].split("\n")[0]
         asked = {"model": "drive.json", "values": MOVE}
         answer = kernel.ask(comm, 1, "tune_move", **asked)
         content = answer["content"]["data"]["content"]

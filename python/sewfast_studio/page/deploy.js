@@ -1,0 +1,33 @@
+// The step Deploy: the report, and the commands that write a controller as code.
+import { ask, on, mark } from "/server.js";
+import { copies } from "/copies.js";
+
+const $ = id => document.getElementById(id);
+function failed(error) { $("report-error").textContent = error ? error.message : ""; $("report-error").hidden = !error; if (error) $("report-state").textContent = ""; }
+
+on("state", s => {
+  $("report").disabled = !s.writes;
+  const field = $("deploy-controller"), kept = field.value;
+  field.replaceChildren(...s.controllers.map(n => new Option(n, n)));
+  if (s.controllers.includes(kept)) field.value = kept;
+  $("no-controller").hidden = s.controllers.length > 0; show();
+  mark("deploy", s.controllers.length ? `${s.controllers.length} saved` : "nothing yet", s.controllers.length ? "good" : "");
+});
+
+function show() {
+  const name = $("deploy-controller").value, quoted = /^[\w./-]+$/.test(name) ? name : `'${name.replaceAll("'", "'\\''")}'`;
+  $("deploy-copy").replaceChildren();
+  if (!name) return;
+  copies($("deploy-copy"), { commands: `# C99, then IEC 61131-3 structured text, then an FMU\nsewfast deploy ${quoted} firmware\nsewfast deploy ${quoted} plc --to st\nsewfast deploy ${quoted} simulation --to fmi\n` });
+  const fold = $("deploy-copy").querySelector("details"); fold.open = true; fold.querySelector("summary").textContent = "Commands that write it as code";
+}
+$("deploy-controller").onchange = show;
+$("report").onclick = async () => {
+  failed(null);
+  try { await ask("report"); $("report-state").textContent = "under way"; } catch (error) { failed(error); }
+};
+on("reported", m => {
+  if (m.error) return failed(new Error(m.error));
+  $("report-state").textContent = `Written: ${m.found.file}`; $("report-link").href = m.found.address; $("report-link").hidden = false;
+  copies($("report-copy"), m.found);
+});
