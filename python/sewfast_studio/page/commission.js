@@ -33,8 +33,8 @@ on("stage", m => {
 function loops(references) {
   $("loops").replaceChildren();
   for (const r of references) {
-    const title = document.createElement("h3"); title.textContent = `${r.name}: tracking error`; $("loops").append(title);
-    draw($("loops"), r.curves.length > 1 ? r.curves : [{ ...r.curves[0], name: "tracking error" }], `tracking error along ${r.name}, ${r.curves.map(c => c.name).join(" and ")}, over time`);
+    const title = `${r.name.replaceAll("_", " ")}: tracking error`;
+    draw($("loops"), r.curves, `tracking error along ${r.name}, ${r.curves.map(c => c.name).join(" and ")}, over time`, title);
   }
 }
 

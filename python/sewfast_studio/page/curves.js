@@ -264,13 +264,13 @@ class Svg {
 }
 
 /** Draws recorded curves {name, unit, Ts, n, low, high}, lowest and highest of each piece, into `place`; the first's unit is on the axis. */
-export function draw(place, curves, says) {
-  const unit = curves[0]?.unit, one = curves.length === 1, title = one ? curves[0].name : "";
+export function draw(place, curves, says, named = "") {
+  const unit = curves[0]?.unit, one = curves.length === 1, title = named || (one ? curves[0].name : "");
   new Chart(place, { y: `${title}${unit ? ` [${unit}]` : ""}`.trim() }).draw(curves.map(c => {
     const step = c.n * c.Ts / c.low.length, whole = c.low.every((v, k) => v === c.high[k]);
     const each = whole ? [c.low] : [c.low, c.high], x = [], y = [];
     for (let k = 0; k < c.low.length; k++) for (const values of each) { x.push(k * step); y.push(values[k] ?? NaN); }
-    return { name: one ? "" : c.name, style: one ? 0 : ROLES[c.name], x, y };
+    return { name: one && !named ? "" : c.name, style: one && !named ? 0 : ROLES[c.name], x, y };
   }), says);
 }
 

@@ -1,6 +1,7 @@
 // The step Deploy: the report, and the commands that write a controller as code.
 import { ask, on, mark } from "/server.js";
 import { copies } from "/copies.js";
+import { titleOf } from "/tune.js";
 
 const $ = id => document.getElementById(id);
 function failed(error) { $("report-error").textContent = error ? error.message : ""; $("report-error").hidden = !error; if (error) $("report-state").textContent = ""; }
@@ -8,7 +9,7 @@ function failed(error) { $("report-error").textContent = error ? error.message :
 on("state", s => {
   $("report").disabled = !s.writes;
   const field = $("deploy-controller"), kept = field.value;
-  field.replaceChildren(...s.controllers.map(n => new Option(n, n)));
+  field.replaceChildren(...s.controllers.map(n => new Option(titleOf(n), n)));
   if (s.controllers.includes(kept)) field.value = kept;
   $("no-controller").hidden = s.controllers.length > 0; show();
   mark("deploy", s.controllers.length ? `${s.controllers.length} saved` : "nothing yet", s.controllers.length ? "good" : "");

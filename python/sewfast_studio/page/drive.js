@@ -2,6 +2,7 @@
 import { ask, on, mark } from "/server.js";
 import { Chart } from "/curves.js";
 import { copies } from "/copies.js";
+import { titleOf } from "/tune.js";
 
 const $ = id => document.getElementById(id);
 const LIMITS = ["volt", "speed_rpm", "acceleration", "current"], SAID = ["command", "V", "speed", "RPM", "acceleration", "RPM/s", "current", "A"], MOST_COLUMNS = 1200;
@@ -19,7 +20,7 @@ function stop() {
 $("stop").onclick = stop;
 addEventListener("keydown", event => { if (event.key === "Escape") { event.preventDefault(); stop(); } }, { capture: true });
 on("beat", m => { prompt = m.prompt; ask("alive", { n: m.n }, false); state(); });
-on("closed", () => { $("drive-state").textContent = "no connection: the studio has stopped the drive; if not, use the emergency stop"; });
+on("closed", () => { $("drive-state").textContent = "no connection: use the emergency stop"; });
 on("stopped", m => {
   drive = { ...drive, armed: false }; state(); enable();
   if (!m.moving) return;
@@ -156,7 +157,7 @@ document.addEventListener("keydown", event => {
 function free(names, word) { let k = 1; while (names.includes(`${word}-${k}.mcap`)) k++; return `${word}-${k}.mcap`; }
 function fill(select, names) {
   const kept = select.value;
-  select.replaceChildren(...names.map(name => new Option(name, name)));
+  select.replaceChildren(...names.map(name => new Option(titleOf(name), name)));
   if (names.includes(kept)) select.value = kept;
 }
 

@@ -4,7 +4,7 @@ import { draw } from "/curves.js";
 /** Curves of recordings, one panel for each list. */
 export function panels(place, lists) {
   place.replaceChildren();
-  for (const panel of lists) draw(place, panel, panel.map(c => `${c.name} ${c.unit}`).join(" and ") + " over time");
+  for (const panel of lists) draw(place, panel, panel.map(c => `${c.name} ${c.unit}`).join(" and ") + " over time", panel.length > 1 ? "output" : "");
 }
 
 /** Fills the elements #signals, #advice and #summary in `root`. */

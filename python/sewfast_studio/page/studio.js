@@ -15,7 +15,7 @@ let first = true, over = false, lost = false;
 function notice(text, takes) { $("notice-text").textContent = text; $("notice").hidden = !text; $("take").hidden = !takes; }
 on("closed", () => {
   $("control").textContent = "not connected";
-  notice("This page is not connected: reload it. If it stays so, start sewfast studio again and open its whole address.", false);
+  notice("This page is not connected. The studio stops the drive when it ends; if the motor turns, use the emergency stop. Reload this page. If it stays so, start sewfast studio again and open its whole address.", false);
 });
 
 /** The state of a step beside its name: kind is good, warn, bad or nothing. */

@@ -11,6 +11,9 @@ const NUMBERS = [ // name, title, unit
   ["peak", "disturbance peak", "y"], ["recovery_ms", "recovery", "ms"], ["u_rms", "effort, rms u", "u"], ["du_rms", "chatter, rms du", "u"],
 ];
 
+/** A file of a commissioning by a name that fits into a field. */
+export const titleOf = name => name.replace(/^commissioned\/\w+\//, "commissioned: ");
+
 /**
  * Brings the view to life: `root` holds its elements, `ask` and `on` reach the steps (server.js).
  * Returns how it is opened, its controller as a question has it, and how a notch is put in.
@@ -180,7 +183,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
       const li = document.createElement("li"); li.textContent = `${ok ? "kept" : "broken"}: ${what} (${found})`; li.className = `chip ${ok ? "good" : "bad"}`; return li;
     }));
     const broken = rows.find(([, ok]) => !ok);
-    mark("tune", broken ? `${broken[0].split(" ")[0]} ${broken[2]}` : `Ms ${text(now.Ms)}`, broken ? "bad" : "good");
+    mark("tune", broken ? "limit broken" : `Ms ${text(now.Ms)}`, broken ? "bad" : "good");
   }
 
   function enable() {
@@ -253,7 +256,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
   });
   on("state", s => {
     writes = s.writes; enable();
-    fill($("tune-model"), s.models.map(n => [n, n]), s.first); fill($("tune-start"), [["", "first controller"], ...s.controllers.map(n => [n, n])], s.start ?? "");
+    fill($("tune-model"), s.models.map(n => [n, titleOf(n)]), s.first); fill($("tune-start"), [["", "first controller"], ...s.controllers.map(n => [n, titleOf(n)])], s.start ?? "");
     $("no-model").hidden = s.models.length > 0; $("figures").hidden = !s.models.length; $("step-plot").parentNode.hidden = !s.models.length;
     if (!opened) mark("tune", s.models.length ? "ready" : "needs a model");
     if (!$("tune").hidden && !saving) opened ? move() : open();

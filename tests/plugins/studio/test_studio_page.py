@@ -46,7 +46,8 @@ def test_the_way_by_clicks(studio: Studio, browser: Any) -> None:
     for width in (1200, 600):  # 600: what 200 % zoom leaves of a window of 1200
         browser.set_window_size(width, 900)
         assert browser.execute_script(WIDE) <= 0
-    painted = "return [...document.querySelectorAll('#fit canvas, #free canvas')].every(c => c.getContext('2d')"
+    painted = "return [...document.querySelectorAll('#fit canvas, #free canvas')]"
+    painted += ".every(c => c.getContext('2d')"
     painted += ".getImageData(0, 0, c.width, c.height).data.some(v => v))"
     assert browser.execute_script(painted)
     assert browser.title == "sewfast studio"
