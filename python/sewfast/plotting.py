@@ -43,7 +43,9 @@ Float = NDArray[np.float64]
 SHADE = "#e6e6e6"
 """Colour of an uncertainty range."""
 WIDTH = 9.2
-"""Width of every figure [inch]."""
+"""Width of a figure by itself [inch]."""
+PAGE_WIDTH = 6.4
+"""Width of a figure that stands beside another one on a page [inch]: its letters stay legible."""
 
 BUCKETS = 700
 """A long series is drawn by the smallest and largest value in each of this many buckets."""
@@ -52,14 +54,14 @@ BUCKETS = 700
 LOOKS: dict[str, dict[str, Any]] = {
     "truth": {"color": "#a9a9a9", "lw": 2.8, "ls": "-"},
     "command": {"color": "#333333", "lw": 1.0, "ls": "-"},
-    "reference": {"color": "black", "lw": 0.9, "ls": "-"},
+    "reference": {"color": "black", "lw": 1.0, "ls": (0, (1, 1.6))},
     "paper": {"color": "#D55E00", "lw": 1.2, "ls": (0, (4, 1.5))},
     "neural_oe": {"color": "#0072B2", "lw": 1.2, "ls": "-"},
     "oe": {"color": "#007a59", "lw": 1.2, "ls": (0, (6, 1.5, 1, 1.5))},
     "arx": {"color": "#B07800", "lw": 1.2, "ls": (0, (8, 2))},
     "arx_raw": {"color": "#9b3f77", "lw": 1.3, "ls": (0, (1.5, 1.2))},
     "model": {"color": "#D55E00", "lw": 1.3, "ls": (0, (4, 1.8))},
-    "machine": {"color": "#56B4E9", "lw": 2.6, "ls": "-"},
+    "machine": {"color": "#0072B2", "lw": 1.6, "ls": "-"},
     "measured": {"color": "#0072B2", "lw": 1.2, "ls": "-"},
 }
 
@@ -116,12 +118,18 @@ def style() -> Iterator[None]:
 
 
 def panels(
-    heights: list[float], *, widths: list[float] | None = None, share_x: bool = True
+    heights: list[float],
+    *,
+    widths: list[float] | None = None,
+    share_x: bool = True,
+    width: float = PAGE_WIDTH,
 ) -> tuple[Figure, NDArray[Any]]:
-    """A figure of panels, each row `heights` inch high; axes as an array (rows, columns)."""
+    """A figure of panels for a page, `width` inch wide, each row `heights` inch high; axes as an
+    array (rows, columns).
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
+    figure = Figure(figsize=(width, sum(heights)), layout="constrained")
     axes = figure.subplots(
         len(heights),
         len(widths or [1]),
@@ -170,7 +178,7 @@ def legend(ax: Axes, columns: int = 6) -> None:
     """A legend above the axes, so that it covers nothing."""
     ax.legend(
         loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.1,
-        handlelength=2.8, columnspacing=1.4,
+        handlelength=2.6, columnspacing=1.2,
     )  # fmt: skip
 
 
@@ -213,15 +221,21 @@ class Drawing:
         """All panels in reading order."""
         return [panel for row in self.rows for panel in row if panel is not None]
 
-    def figure(self) -> Figure:
-        """A new figure that no window or notebook shows, for pages and files."""
+    def figure(self, width: float = WIDTH) -> Figure:
+        """A new figure that no window or notebook shows, for pages and files; `width` in inch."""
         from matplotlib.figure import Figure
 
         require_matplotlib()
         with style():
-            figure = Figure(figsize=(WIDTH, sum(self.heights)), layout="constrained")
+            figure = Figure(figsize=(width, sum(self.heights)), layout="constrained")
             self._fill(figure)
         return figure
+
+    def beside(self) -> Figure:
+        """A figure to stand beside another one on a page: narrow, so that its letters stay legible;
+        one of several columns needs the whole width for its titles.
+        """
+        return self.figure(PAGE_WIDTH if len(self.widths) == 1 else WIDTH)
 
     def plot(self, ax: Any = None, file: str | os.PathLike[str] | None = None) -> Any:
         """Draw into axes, a file, or a new figure of pyplot, which a notebook shows.
@@ -415,11 +429,24 @@ def loop_panels(
     return output, error, command
 
 
+def apart_panel(predicted: Trace, measured: Trace, y_unit: str) -> Panel:
+    """What the measured output has beyond the predicted one: where both coincide, this is seen."""
+
+    def apart(ax: Axes) -> None:
+        n = min(len(predicted.t), len(measured.t))
+        draw(ax, measured.t[:n], measured.y[:n] - predicted.y[:n], "measured", width=FINE)
+        ax.axhline(0.0, color="#555555", lw=0.7)
+        _over_time(ax, lettered(f"difference [{y_unit}]" if y_unit else "difference"))
+
+    return apart
+
+
 def loop_drawing(
-    traces: Sequence[Trace], y_unit: str, u_unit: str, limits: tuple[float, float] | None = None
-) -> Drawing:
+    traces: Sequence[Trace], y_unit: str, u_unit: str, limits: tuple[float, float] | None = None,
+    *, heights: tuple[float, float, float] = (2.2, 1.3, 1.3),
+) -> Drawing:  # fmt: skip
     """Output, error and command below each other."""
-    return stacked(loop_panels(traces, y_unit, u_unit, limits), (2.2, 1.3, 1.3))
+    return stacked(loop_panels(traces, y_unit, u_unit, limits), heights)
 
 
 def fit_panels(

@@ -187,7 +187,7 @@ def report_card(model: Model, recording: Recording) -> tuple[dict[str, Any], dic
     with style():
         drawn = {
             name: svg(figure, f"check-{name}", CAPTIONS[name][1])
-            for name, figure in figures(card).items()
+            for name, figure in figures(card, page=True).items()
         }
     return {**card.to_json(), "figures": list(drawn)}, drawn
 

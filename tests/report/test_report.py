@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 import result_folder
 from fitted import made
+from moments import until
 from sewfast.errors import DataError, ModelFileError, SewfastError
 from sewfast.plotting import thin
 from sewfast.report import report
@@ -123,7 +124,7 @@ def test_identifiers_are_unique_and_every_reference_leads_somewhere(structure: S
 
 
 def test_the_first_screen_has_the_verdict_and_the_picture_of_the_loop(page: str) -> None:
-    verdict, picture = page.index("erified: on the trapezoid"), page.index('<figure id="opening">')
+    verdict, picture = page.index("erified</span> On the trap"), page.index('<figure id="opening">')
     assert page.index("<h1>") < verdict < picture < page.index('id="summary"')
 
 
@@ -242,6 +243,14 @@ def test_a_picture_zooms_and_goes_back(original: Path, page: str) -> None:
     try:
         driver.get((original / "report.html").resolve().as_uri())
         assert not [e for e in driver.get_log("browser") if "Security" in e["message"]]
+        height = "return document.documentElement.scrollHeight"
+        assert driver.execute_script(height) < 4000
+        driver.execute_script("location.hash = 'fig-19'")  # leads into a chapter that is folded
+        until(lambda: driver.find_element("id", "fig-19").is_displayed())
+        driver.execute_script(
+            "document.querySelectorAll('details').forEach(d => { d.open = true })"
+        )
+        assert driver.execute_script(height) < 12_000
         picture = driver.find_element("css selector", "figure svg")
 
         def box() -> str:

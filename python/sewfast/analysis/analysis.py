@@ -492,8 +492,10 @@ def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> li
     """Write everything, the PNGs optionally (the report does not use them); return the files.
     Raises `SettingError` if matplotlib is not installed or the folder cannot be written to.
     """
-    drawn = a.figures()
     from ..plotting import style, svg
+    from .figures import figures
+
+    drawn = figures(a, page=True)
 
     place = Path(folder) / FOLDER
     contents: dict[Path, bytes] = {}

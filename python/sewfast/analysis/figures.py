@@ -30,9 +30,10 @@ _STYLES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1, 2))
 LARGE_MS = 2.0
 
 
-def figures(a: Analysis) -> dict[str, Figure]:
+def figures(a: Analysis, *, page: bool = False) -> dict[str, Figure]:
     """All figures of an analysis by name. Raises `SettingError` if matplotlib is not installed."""
-    return {name: drawing(a, name).figure() for name in names(a)}
+    drawn = {name: drawing(a, name) for name in names(a)}
+    return {name: d.beside() if page else d.figure() for name, d in drawn.items()}
 
 
 def names(a: Analysis) -> list[str]:

@@ -31,11 +31,12 @@ _BUCKETS = 1200
 _FARTHEST = 20.0
 
 
-def figures(card: ReportCard) -> dict[str, Figure]:
+def figures(card: ReportCard, *, page: bool = False) -> dict[str, Figure]:
     """All figures of a card by name, as far as it has the evidence: `residuals`, `bands`, `bode`,
     `poles`, `region`. Raises `SettingError` if matplotlib is not installed.
     """
-    return {name: drawing(card, name).figure() for name in names(card)}
+    drawn = {name: drawing(card, name) for name in names(card)}
+    return {name: d.beside() if page else d.figure() for name, d in drawn.items()}
 
 
 def names(card: ReportCard) -> list[str]:

@@ -16,6 +16,7 @@ from ..plotting import Picture, Trace, loop_drawing, style, svg
 from ..readers import read_table
 from ..tables import Table, milliseconds, percent, rpm, significant, volt
 from .artefacts import drawing
+from .pictures import hero
 
 FORMAT = "sewfast.commissioning"
 VERSION = 1
@@ -58,6 +59,7 @@ def context(folder: Path) -> dict[str, Any]:
     with style():
         return {
             "found": found,
+            "opening": _opening(folder, found),
             "stages": _stages(found),
             "gains": _gains(found),
             "met": _met(found),
@@ -174,7 +176,7 @@ def _response(folder: Path) -> Picture | None:
     """The frequency response of the measured margins."""
     if not (folder / RESPONSE).is_file():
         return None
-    figure = load_response(folder / RESPONSE).drawing().figure()
+    figure = load_response(folder / RESPONSE).drawing().beside()
     key, alt = "frequency-response", "gain, phase and coherence over frequency, with 95 % bands"
     caption = (
         "From command to speed, measured under the controller with its reference shaken; bands "
@@ -217,16 +219,30 @@ def _apart(n: Mapping[str, Any], kind: str) -> str:
     return rpm(n["apart_rmse_rpm"]) if kind == "measured" else ""
 
 
-def _picture(folder: Path, name: str, n: Mapping[str, Any]) -> Picture:
-    kinds = [k for k in ("predicted", "measured") if n[k] is not None]
-    runs = {k: _columns(folder / run_file(name, k)) for k in kinds}
+def _opening(folder: Path, found: Mapping[str, Any]) -> Picture | None:
+    """The first reference that was run, as predicted and as measured."""
+    for name, n in found["references"].items():
+        return hero(_traces(folder, name, n), _in_words(name), "The ensemble's median run.")
+    return None
+
+
+def _traces(folder: Path, name: str, n: Mapping[str, Any]) -> list[Trace]:
     looks = {"predicted": "model", "measured": "machine"}
-    traces = [Trace.of(runs[kind], looks[kind], kind) for kind in kinds]
-    figure = loop_drawing(traces, "RPM", "V").figure()
+    kinds = [k for k in looks if n[k] is not None]
+    return [Trace.of(_columns(folder / run_file(name, k)), looks[k], k) for k in kinds]
+
+
+def _in_words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _picture(folder: Path, name: str, n: Mapping[str, Any]) -> Picture:
+    traces = _traces(folder, name, n)
+    figure = loop_drawing(traces, "RPM", "V", heights=(1.9, 1.0, 1.0)).beside()
     key = "run-" + "".join(c if c.isalnum() else "-" for c in name)
     alt = f"{name}: reference, predicted and measured speed, tracking error and command over time"
     caption = "The median of the ensemble's runs, and the machine."
-    return Picture(key, "", name, alt, caption, svg(figure, key, alt))
+    return Picture(key, "", _in_words(name), alt, caption, svg(figure, key, alt))
 
 
 def _columns(path: Path) -> Mapping[str, Any]:
@@ -369,7 +385,7 @@ def motor_section(folder: Path) -> dict[str, Any] | None:
     picture = Picture(
         "motor", "", "What it takes to hold a speed",
         alt, "The step at standstill is dry friction and the dead zone of the inverter.",
-        svg(motor.drawing().figure(), "motor", alt),
+        svg(motor.drawing().beside(), "motor", alt),
     )  # fmt: skip
     caption = (
         f"Free run on its record: {motor.fit_percent:.2f} %, {motor.rmse:.3g} {motor.speed_unit} "

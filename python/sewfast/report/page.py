@@ -382,12 +382,14 @@ def fill(template: str, context: Mapping[str, Any]) -> str:
         lstrip_blocks=True,
     )
     environment.filters.update(
-        significant=significant, rpm=rpm, percent=percent, milliseconds=milliseconds
-    )
+        significant=significant, rpm=rpm, percent=percent, milliseconds=milliseconds,
+        capitalize_first=lambda text: text[:1].upper() + text[1:],
+    )  # fmt: skip
     zoom = _source("zoom.js")
     digest = base64.b64encode(hashlib.sha256(zoom.encode()).digest()).decode()
     policy = f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
-    environment.globals.update(zoom=Markup(zoom), policy=policy)
+    sheet = (resources.files("sewfast") / "design.css").read_text(encoding="utf-8")
+    environment.globals.update(zoom=Markup(zoom), sheet=Markup(sheet), policy=policy)
     return environment.get_template(template).render(context)
 
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from ..plotting import (
     LOOKS,
-    Drawing,
     Float,
     Picture,
     Trace,
+    apart_panel,
     draw,
     legend,
     loop_drawing,
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 # --- Excitations and responses: Fig. 2 to 5, scaled in Fig. 7 and 12 ------------------------------
 
+
+THIRD = 4.2
+"""Width of a figure with two others beside it [inch]."""
 
 _RECORDED = (
     ("2", "step", "Step command and response"),
@@ -65,7 +68,7 @@ def scaled_pictures(artefacts: Artefacts) -> dict[str, Picture]:
 
 def _recorded(artefacts: Artefacts, number: str, record: str, title: str) -> Picture:
     columns = artefacts.recordings[record]
-    figure, axes = panels([2.1, 1.25])
+    figure, axes = panels([1.4, 1.0], width=THIRD)
     speed, command = axes[:, 0]
     draw(speed, columns["t"], columns["y"], "measured", "speed from encoder counts")
     if record == "step":
@@ -131,7 +134,7 @@ def _window_of_step(columns: Columns) -> tuple[float, float]:
 
 
 def _scaled(columns: Columns, number: str, title: str) -> Picture:
-    figure, axes = panels([1.5, 1.5])
+    figure, axes = panels([1.2, 1.2], width=THIRD)
     k = np.arange(len(columns["t"]), dtype=np.float64)
     for ax, values, label in (
         (axes[0, 0], columns["u"] / 10.0, "voltage / 10 V"),
@@ -173,7 +176,8 @@ _CASES = (
     _Case("chirp_lo_hi", "8", "9", "the training data"),
     _Case("chirp_hi_lo", "10", "11", "the Hi-Lo chirp, never trained on"),
     _Case("random", "13", "14", "the random record, never trained on"),
-    _Case("saturating", "A", "B", "the second saturating record, never trained on"),
+    # the paper has no such record: the current limit cuts the acceleration off
+    _Case("saturating", "A", "B", "a record in which the drive saturates, never trained on"),
 )
 
 
@@ -196,8 +200,7 @@ def arx_picture(artefacts: Artefacts) -> Picture:
 def _free_run(artefacts: Artefacts, case: _Case) -> Picture:
     return _compared(
         artefacts, case, ("paper", "neural_oe"), f"Free run on {case.purpose}",
-        "Light grey: the machine's true speed. Dark: the networks, which see the command alone. "
-        "Below, magnified, the two seconds around the largest error of the paper's network.",
+        "Grey: the machine. Below, the two seconds around the paper network's largest error.",
     )  # fmt: skip
 
 
@@ -207,7 +210,7 @@ def _compared(
     columns = artefacts.recordings[record_of(case.record)]
     t, truth = columns["t"], columns["speed_true"]
     predicted = {m: artefacts.predictions[case.record][f"{m}_simulation"] for m in models}
-    figure, axes = panels([2.2, 2.2], share_x=False)
+    figure, axes = panels([1.3, 1.3], share_x=False)
     window = _worst(t, truth - predicted[models[0]])
     for ax, inside in ((axes[0, 0], np.ones(len(t), dtype=bool)), (axes[1, 0], window)):
         draw(ax, t[inside], truth[inside], "truth", "machine")
@@ -218,12 +221,11 @@ def _compared(
     axes[0, 0].axvspan(t[window][0], t[window][-1], color="#f3ead2", zorder=0)
     axes[1, 0].set_title("magnified: the shaded window", pad=3)
     axes[1, 0].set_xlabel("time [s]")
-    legend(axes[0, 0])
+    legend(axes[0, 0], 3)
     alt = f"{title}: speed of the machine and of {_names(models)} over time, whole and magnified"
     key = f"fig-{case.free_run.lower()}"
     return Picture(
         key, f"Fig. {case.free_run}", title, alt, caption, svg(figure, key, alt),
-        _error_table(artefacts, case.record, models, {"free run": "simulation"}),
     )  # fmt: skip
 
 
@@ -232,7 +234,7 @@ def _errors(artefacts: Artefacts, case: _Case) -> Picture:
     t, truth = columns["t"], columns["speed_true"]
     predicted = artefacts.predictions[case.record]
     errors = {m: truth - predicted[f"{m}_simulation"] for m in _BESIDE}
-    figure, axes = panels([1.25] * len(errors), widths=[4.2, 1.0])
+    figure, axes = panels([0.88] * len(errors), widths=[4.2, 1.0])
     for row, (m, error) in zip(axes, errors.items(), strict=True):
         limit = 1.05 * max(float(np.abs(error).max()), 1e-9)
         _series(row[0], t, error, m, limit)
@@ -241,14 +243,9 @@ def _errors(artefacts: Artefacts, case: _Case) -> Picture:
     axes[-1, 1].set_xlabel("samples [%]")
     title = f"Errors over {case.purpose}"
     alt = f"{title}: free-run error series and histograms of {_names(_BESIDE)}"
-    caption = (
-        "True speed minus free run, each model with its own scale; on the right the share of "
-        "samples per error."
-    )
-    horizons = {"free run": "simulation", "one step": "one_step"}
-    numbers = _error_table(artefacts, case.record, _BESIDE, horizons)
+    caption = "True speed minus free run, each with its own scale; right: share of samples."
     key = f"fig-{case.errors.lower()}"
-    return Picture(key, f"Fig. {case.errors}", title, alt, caption, svg(figure, key, alt), numbers)
+    return Picture(key, f"Fig. {case.errors}", title, alt, caption, svg(figure, key, alt))
 
 
 def _series(ax: Any, t: Float, error: Float, model: str, limit: float) -> None:
@@ -277,21 +274,6 @@ def _worst(t: Float, error: Float) -> Any:
     start = float(t[int(np.argmax(np.abs(error)))]) - 0.5 * width
     start = min(max(start, float(t[0])), float(t[-1]) - width)
     return (t >= start) & (t <= start + width)
-
-
-def _error_table(
-    artefacts: Artefacts, record: str, models: tuple[str, ...], horizons: dict[str, str]
-) -> Table:
-    rows = []
-    for m in models:
-        cells = [labels.MODEL[m]]
-        for kind in horizons.values():
-            path = f"identification.{m}.{record}.{kind}"
-            cells.append(rpm(artefacts.number(f"{path}.rmse_rpm")))
-            cells.append(percent(artefacts.number(f"{path}.fit_percent")))
-        rows.append(tuple(cells))
-    header = [f"{h}, {what}" for h in horizons for what in ("rms error", "fit")]
-    return Table("", ("model", *header), tuple(rows))
 
 
 def _names(models: tuple[str, ...]) -> str:
@@ -363,23 +345,28 @@ _MAGNIFIED = 0.4
 
 
 def opening_picture(artefacts: Artefacts) -> Picture:
-    """The main result: the trapezoid as predicted and as measured, and its rise magnified."""
+    """The main result: the trapezoid as predicted and as measured, and what is between them."""
     names = {"model": "predicted on the model", "machine": "measured on the machine"}
     traces = [
         Trace.of(artefacts.runs["trapezoid", plant], plant, label) for plant, label in names.items()
     ]
-    output, _, _ = loop_panels(traces, "RPM", "V")
-    window = _rise(traces[0])
-
-    def whole(ax: Axes) -> None:
-        output(ax)
-        ax.set_xlabel("time [s]")
-
-    rows = ((whole, lambda ax: _magnify(ax, traces, window)),)
-    figure = Drawing(rows, (2.7,), (1.4, 1.0), share_x=False).figure()
-    title = "Closed loop, predicted and measured"
-    alt = f"{title}: a trapezoid of 3,000 RPM on the model and on the machine, its rise magnified"
     caption = "Fig. 19 shows the tracking error and the command of the same run."
+    return hero(traces, "A trapezoid of 3,000 RPM", caption)
+
+
+HERO_WIDTH = 12.0
+"""Width of the first picture [inch], which has a page's width for itself."""
+
+
+def hero(traces: list[Trace], title: str, caption: str) -> Picture:
+    """The first picture of a report: a loop as predicted and as measured, with the difference."""
+    output, _, _ = loop_panels(traces, "RPM", "V")
+    rows, heights = [output], [2.2]
+    if len(traces) > 1:
+        rows.append(apart_panel(traces[0], traces[1], "RPM"))
+        heights.append(1.1)
+    figure = stacked(rows, heights).figure(HERO_WIDTH)
+    alt = f"{title}: reference, predicted and measured speed, below measured minus predicted"
     return Picture("opening", "", title, alt, caption, svg(figure, "opening", alt))
 
 
@@ -410,14 +397,10 @@ def _tuned(artefacts: Artefacts, number: str, reference: str) -> Picture:
     title = f"Closed loop, {labels.REFERENCE[reference]} reference"
     key = f"fig-{number}"
     alt = f"{title}: reference, speed on model and machine, tracking error and command over time"
-    caption = (
-        f"{_PURPOSE[reference]} The same controller code runs on the identified networks "
-        "(prediction) and on the virtual machine."
-    )
+    caption = _PURPOSE[reference]
     figure = _loop_figure(runs, names, magnified=reference == "trapezoid")
     return Picture(
         key, f"Fig. {number}", title, alt, caption, svg(figure, key, alt),
-        _tuned_numbers(artefacts, reference),
     )  # fmt: skip
 
 
@@ -436,7 +419,7 @@ def _paper_gains(
 def _loop_figure(runs: dict[str, Columns], names: dict[str, str], *, magnified: bool) -> Figure:
     traces = [Trace.of(run, look, names[look]) for look, run in runs.items()]
     if not magnified:
-        return loop_drawing(traces, "RPM", "V").figure()
+        return loop_drawing(traces, "RPM", "V", heights=(1.9, 1.0, 1.0)).beside()
     output, error, command = loop_panels(traces, "RPM", "V")
     window = _rise(traces[0])
 
@@ -445,10 +428,10 @@ def _loop_figure(runs: dict[str, Columns], names: dict[str, str], *, magnified: 
         ax.axvspan(window[0], window[1], color="#f3ead2", zorder=0)
 
     drawing = stacked(
-        (whole, lambda ax: _magnify(ax, traces, window), error, command), (2.0, 1.9, 1.2, 1.2),
+        (whole, lambda ax: _magnify(ax, traces, window), error, command), (1.4, 1.3, 0.9, 0.9),
         share_x=False,
     )  # fmt: skip
-    return drawing.figure()
+    return drawing.beside()
 
 
 def _rise(trace: Trace) -> tuple[float, float]:
@@ -467,17 +450,6 @@ def _magnify(ax: Axes, traces: list[Trace], window: tuple[float, float]) -> None
     ax.set_ylabel("speed [RPM]")
     ax.set_xlabel("time [s]")
     ax.margins(x=0.01)
-
-
-def _tuned_numbers(artefacts: Artefacts, reference: str) -> Table:
-    path = f"control.{reference}"
-    plants = {"identified model": f"{path}.model", "machine": f"{path}.machine"}
-    apart = rpm(artefacts.number(f"{path}.model_vs_machine_rmse_rpm"))
-    caption = f"Model against machine: {apart} rms."
-    if reference == "trapezoid":
-        rise = milliseconds(artefacts.number(f"{path}.reference_rise_time_ms"))
-        caption += f" The reference itself rises within {rise}."
-    return _metric_table(artefacts, plants, with_step=reference == "trapezoid", caption=caption)
 
 
 def _metric_table(

@@ -1,5 +1,10 @@
 // Zoom into the pictures of the page: drag a rectangle, Ctrl and wheel; double click or Escape goes back.
 "use strict";
+// a link leads into a chapter that may be folded, and paper does not unfold
+const unfold = (within) => { for (const d of within) d.open = true; };
+const follow = () => { const at = document.getElementById(location.hash.slice(1)); if (at) { for (let e = at; e; e = e.parentElement) if (e.tagName === "DETAILS") e.open = true; at.scrollIntoView(); } };
+addEventListener("hashchange", follow); follow();
+addEventListener("beforeprint", () => unfold(document.querySelectorAll("details")));
 for (const picture of document.querySelectorAll("figure svg[viewBox]")) {
   const whole = picture.getAttribute("viewBox");
   const [, , width, height] = whole.split(/[\s,]+/).map(Number);
