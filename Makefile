@@ -29,7 +29,7 @@ MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest n
   night-bits night-logs night-computing night-waiting night-budgets
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning tracking drives faults nonsense motors fleet interrupts fuzz-logs mutations studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed parting laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning tracking drives faults nonsense motors fleet interrupts fuzz-logs mutations screens studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed parting laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -134,6 +134,9 @@ interrupts: $(DEV) ## Ctrl-C, 20 times in each command that runs over 1 s: ended
 studio: $(DEV) ## the studio in a real browser: from a slider's event to painted plots, from Esc to output off
 	$(BIN)/python benches/studio.py
 	$(BIN)/python benches/studio_stops.py
+
+screens: $(DEV) ## renders every step and state of the studio at four widths, light and dark, and measures it (target/screens; ONLY=word)
+	$(BIN)/python tests/support/screens.py $(if $(ONLY),--only $(ONLY))
 
 studio-hour: $(DEV) ## the studio through an hour of live signals: pictures a second, gaps, growth (SECONDS=3600)
 	$(BIN)/python benches/studio_hour.py --seconds $(or $(SECONDS),3600)

@@ -58,6 +58,7 @@ def arm(page: Any, studio: Studio, device: VirtualDevice) -> None:
     until(shown)
     port.clear()
     port.send_keys(device.port)
+    page.execute_script("document.querySelector('#drive details').open = true")
     page.find_element("id", "watchdog").send_keys(WATCHDOG_MS)
     press(page, "connect")
     press(page, "limits")

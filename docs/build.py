@@ -18,6 +18,7 @@ import shutil
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+SHEET = "python/sewfast/design.css"
 NOTEBOOKS = ("tutorial", "data-preparation", "physics")
 """Executed pages that one may want to change and run again."""
 _FILE = re.compile(r'^<!-- file (\w+) (\S+)(?: from "(.+)" to "(.+)")? -->$', re.MULTILINE)
@@ -34,6 +35,10 @@ def main(folder: Path) -> None:
     """Write the whole tree anew; what was in the folder before goes."""
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(ROOT / "docs" / "assets", folder / "assets")
+    shutil.copy(ROOT / SHEET, folder / "assets")
+    design = (ROOT / "docs" / "design.html").read_text(encoding="utf-8")
+    shown = design.replace(f"../{SHEET}", f"assets/{Path(SHEET).name}")
+    (folder / "design.html").write_text(shown, encoding="utf-8")
     for page in sorted((ROOT / "docs").glob("*.md")):
         text = page.read_text(encoding="utf-8")
         if page.stem in NOTEBOOKS:

@@ -1,4 +1,4 @@
-"""Draws assets/studio/tune.png, bode.png and look.png for README and studio.md, in Chromium.
+"""Draws assets/studio/*.png, the steps of the studio, for README and studio.md, in Chromium.
 
     python docs/studio_pictures.py [FOLDER]
 
@@ -21,7 +21,7 @@ from PIL import Image
 
 PATIENCE = 180.0
 """Seconds for a part of the page."""
-WIDE, HIGH = 1500, 990
+WIDE, HIGH = 1280, 800
 """Pixels of the window."""
 SEARCHED = 400
 """Controllers."""
@@ -58,47 +58,93 @@ def draw_studio(place: Path) -> list[Path]:
             page = webdriver.Chrome(options=options, service=service)
             try:
                 page.get(studio.address)
-                return [
-                    _tune(page, place / "tune.png"), _bode(page, place / "bode.png"),
-                    _look(page, place / "look.png"),
-                ]  # fmt: skip
+                drawn = {
+                    "tune": _tune, "look": _look, "bode": _bode, "model": _model,
+                    "commission": _commission, "drive": _drive,
+                }  # fmt: skip
+                return [draw(page, place / f"{name}.png") for name, draw in drawn.items()]
             finally:
                 page.quit()
 
 
 def _tune(page: Any, file: Path) -> Path:
     _until(lambda: _text(page, "cost").startswith("cost"))
-    page.find_element("id", "evaluations").clear()
-    page.find_element("id", "evaluations").send_keys(str(SEARCHED))
-    page.find_element("id", "search").click()
+    _write(page, "evaluations", SEARCHED)
+    _press(page, "search")
     _until(lambda: _text(page, "tune-progress").startswith("found"))
     _until(lambda: "(-" in _text(page, "cost"))
-    return _taken(page, file, WIDE, HIGH)
-
-
-def _bode(page: Any, file: Path) -> Path:
-    page.find_element("id", "view-bode").click()
-    _until(lambda: page.find_element("id", "bode-start").is_enabled())
-    page.find_element("id", "bode-start").click()
-    _until(lambda: "measured: " in _text(page, "loop-text"))
-    return _taken(page, file, 1200, 2130)
+    return _taken(page, file)
 
 
 def _look(page: Any, file: Path) -> Path:
-    page.find_element("id", "view-data").click()
-    page.find_element("id", "look").click()
-    _until(lambda: len(page.find_elements("css selector", "#signals canvas")) == 2)
-    page.find_element("css selector", "#model option:nth-child(2)").click()
-    page.find_element("id", "identify").click()
-    _until(lambda: page.find_element("id", "modeltext").is_displayed())
-    return _taken(page, file, 1200, 1900)
+    _press(page, "view-data")
+    _press(page, "look")
+    _until(lambda: page.find_element("id", "to-model").is_displayed())
+    return _taken(page, file)
 
 
-def _taken(page: Any, file: Path, width: int, height: int) -> Path:
-    size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+def _bode(page: Any, file: Path) -> Path:
+    page.execute_script("document.getElementById('bode-fold').open = true")
+    _press(page, "bode-start")
+    _until(lambda: page.find_element("id", "bode-text").is_displayed())
+    _press(page, "view-tune")
+    page.execute_script("document.getElementById('loop-fold').open = true")
+    _until(lambda: "measured: " in _text(page, "loop-text"))
+    return _taken(page, file, "loop-fold", 1100)
+
+
+def _model(page: Any, file: Path) -> Path:
+    _press(page, "view-model")
+    _press(page, "identify")
+    _until(lambda: page.find_element("id", "to-tune").is_displayed())
+    _press(page, "validate")
+    _until(lambda: page.find_element("id", "validated").is_displayed())
+    return _taken(page, file, high=1200)
+
+
+def _commission(page: Any, file: Path) -> Path:
+    _press(page, "view-commission")
+    _write(page, "networks", 2)
+    _write(page, "commission-tries", SEARCHED)
+    _press(page, "commission-start")
+    _until(lambda: page.find_element("id", "commission-fold").is_displayed())
+    return _taken(page, file)
+
+
+def _drive(page: Any, file: Path) -> Path:
+    _press(page, "view-drive")
+    _press(page, "connect")
+    _press(page, "limits")
+    _until(lambda: "in time" in _text(page, "prompt"))
+    _press(page, "arm")
+    page.find_element("css selector", "#signal option[value=random]").click()
+    _press(page, "record")
+    _until(lambda: "RPM" in _text(page, "speed"))
+    time.sleep(4.0)
+    drawn = _taken(page, file)
+    _press(page, "stop")
+    return drawn
+
+
+def _press(page: Any, name: str) -> None:
+    button = page.find_element("id", name)
+    _until(lambda: button.is_displayed() and button.is_enabled())
+    button.click()
+
+
+def _write(page: Any, name: str, value: int) -> None:
+    script = "document.getElementById(arguments[0]).value = arguments[1]"
+    page.execute_script(script, name, value)
+
+
+def _taken(page: Any, file: Path, top: str = "", high: int = HIGH) -> Path:
+    """The window, or what stands from an element on below the header."""
+    size = {"width": WIDE, "height": high, "deviceScaleFactor": 1, "mobile": False}
     page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     page.execute_cdp_cmd("Emulation.setScrollbarsHidden", {"hidden": True})
     page.execute_script("scrollTo(0, 0); document.activeElement.blur()")
+    if top:
+        page.execute_script("document.getElementById(arguments[0]).scrollIntoView()", top)
     time.sleep(1.0)  # the curves follow the window's size
     found = page.execute_cdp_cmd("Page.captureScreenshot", {})
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -436,7 +436,7 @@ def apart_panel(predicted: Trace, measured: Trace, y_unit: str) -> Panel:
         n = min(len(predicted.t), len(measured.t))
         draw(ax, measured.t[:n], measured.y[:n] - predicted.y[:n], "measured", width=FINE)
         ax.axhline(0.0, color="#555555", lw=0.7)
-        _over_time(ax, lettered(f"difference [{y_unit}]" if y_unit else "difference"))
+        _over_time(ax, lettered(f"difference\n[{y_unit}]" if y_unit else "difference"))
 
     return apart
 

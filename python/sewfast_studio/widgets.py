@@ -57,7 +57,7 @@ export default { render({ model, el }) {
 
 
 def tune_view(model: Model | str | Path, start: Controller | None = None) -> Any:
-    """The studio's view Tune below a notebook's cell.
+    """The studio's step Tune below a notebook's cell.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def tune_view(model: Model | str | Path, start: Controller | None = None) -> Any
 
 
 def look_view(data: Dataset) -> Any:
-    """The signals of a data set with advice, as in the studio's view Data.
+    """The signals of a data set with advice, as in the studio's step Look.
 
     Parameters
     ----------

@@ -438,7 +438,8 @@ def test_the_folder_holds_everything_and_its_page_is_written_anew(
         f"{c.reference}_{kind}.npz" for c in whole.comparisons for kind in ("predicted", "measured")
     }
     text = page.read_text()
-    assert "Commissioning of virtual: verified" in text
+    assert "Commissioning of the virtual machine" in text
+    assert ">verified</span>" in text
     assert '<figure id="analysis-bode">' in text
     page.unlink()
     assert report(out) == page

@@ -132,7 +132,7 @@ def test_the_navigation_is_short() -> None:
 def test_commands_and_code_fit_their_column(page: Path) -> None:
     """A page is 110 characters wide at 1,280 pixels; what is typed is not to be broken there.
 
-    What a command prints goes on below itself (docs/assets/tables.css).
+    What a command prints goes on below itself (docs/assets/site.css).
     """
     for block in blocks(page):
         typed = "\n".join(_typed(block)) if block.language == "console" else block.text

@@ -133,7 +133,7 @@ def _band(ax: Axes, card: ReportCard, i: int) -> None:
     ax.set_ylabel(lettered(labelled(card.output_name, card.unit)))
     ax.set_xlabel("time [s]")
     ax.set_title(
-        f"{lettered(run.name)} [{run.range_text}]: {100.0 * b.inside[i]:.1f} % of samples inside "
+        f"{lettered(run.name)} [{run.range_text}]: {100.0 * b.inside[i]:.1f} % of samples\ninside "
         f"the {100 * b.level:g} % band"
     )
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, fontsize=8)
@@ -159,7 +159,7 @@ def bode_drawing(card: ReportCard) -> Drawing:
         tuple(partial(_bode, card=card, i=i, phase=False) for i in inputs),
         tuple(partial(_bode, card=card, i=i, phase=True) for i in inputs),
     )
-    return Drawing(rows, (2.6, 2.6), (1.0,) * len(inputs))
+    return Drawing(rows, (2.2, 2.2), (1.0,) * len(inputs))
 
 
 def _bode(ax: Axes, card: ReportCard, i: int, phase: bool) -> None:

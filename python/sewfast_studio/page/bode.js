@@ -64,10 +64,10 @@ async function loop() {
   drawing = true; again = false;
   try {
     const f = await ask("loop", { ...asked, response }), c = f.curves, m = "measured_hertz", at = plot => f.marks.filter(k => k.plot === plot);
-    const both = (name, label) => [...curve(c, m, `measured_${name}`, "measured, 95 %", 1, true), ...curve(c, "hertz", name, label, 0)];
+    const both = (name, label) => [...curve(c, m, `measured_${name}`, "measured, 95 %", 0, true), ...curve(c, "hertz", name, label, 1)];
     charts.plant.draw(both("P_db", "model"), "gain of the plant over frequency"); charts.turn.draw(both("P_deg", "model"), "phase of the plant over frequency");
     charts.L.draw(both("L_db", "model"), "gain of L over frequency, margins marked", at("L_db")); charts.angle.draw(both("L_deg", "model"), "phase of L over frequency, phase margin marked", at("L_deg"));
-    charts.S.draw([...curve(c, m, "measured_S_db", "S measured", 1, true), ...curve(c, m, "measured_T_db", "T measured", 3, true), ...curve(c, "hertz", "S_db", "S", 0), ...curve(c, "hertz", "T_db", "T", 4)], "sensitivity over frequency, its peak marked", at("S_db"));
+    charts.S.draw([...curve(c, m, "measured_S_db", "S measured", 0, true), ...curve(c, m, "measured_T_db", "T measured", 2, true), ...curve(c, "hertz", "S_db", "S", 1), ...curve(c, "hertz", "T_db", "T", 4)], "sensitivity over frequency, its peak marked", at("S_db"));
     const whose = f.members > 1 ? `worst of ${f.members} members` : "model";
     $("loop-text").textContent = `${whose}, about ${Number(f.level.toPrecision(4))} ${tune.unit()}: ${f.text}` + (f.measured ? `\nmeasured: ${f.measured}` : "");
   } catch (error) { $("loop-text").textContent = error.message; }

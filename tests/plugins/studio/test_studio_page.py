@@ -326,8 +326,79 @@ def test_a_recording_is_added_by_a_file_picker_and_by_a_drop(studio: Studio, bro
 DROP = """
 const data = new DataTransfer(); data.items.add(new File([arguments[1]], arguments[0]));
 const how = { dataTransfer: data, bubbles: true, cancelable: true };
-document.getElementById("look").dispatchEvent(new DragEvent("drop", how));
+document.querySelector("main").dispatchEvent(new DragEvent("drop", how));
 """
+
+
+@pytest.mark.alone
+def test_three_clicks_lead_from_a_dropped_file_to_a_controller(
+    studio: Studio, browser: Any
+) -> None:
+    def press(name: str) -> None:
+        button = browser.find_element("id", name)
+        until(lambda: button.is_displayed() and button.is_enabled())
+        assert [button] == [
+            b for b in browser.find_elements("css selector", ".primary") if b.is_displayed()
+        ]
+        button.click()
+
+    browser.get(studio.address)
+    until(lambda: browser.find_element("id", "upload").is_enabled())
+    table = (studio.project.folder / "run.csv").read_text(encoding="utf-8")
+    browser.execute_script("document.getElementById('view-deploy').click()")
+    browser.execute_script(DROP, "dropped.csv", table.replace(EVIL, "z"))
+    until(lambda: len(browser.find_elements("css selector", "#signals canvas")) == 2)
+    # a linear model and a short search, which take seconds
+    browser.execute_script(
+        "document.getElementById('kind').value = 'oe';"
+        "document.getElementById('evaluations').value = 20;"
+    )
+    press("to-model")
+    press("to-tune")
+    press("search")
+    until(lambda: "found: cost" in browser.find_element("id", "tune-progress").text)
+
+
+SEEN = """
+const plots = [...document.querySelectorAll("#tune .charts .plot")];
+return plots.map(p => [p.querySelector(".read").hidden, p.querySelector(".read").textContent]);
+"""
+FILES = """
+const [done] = arguments;
+import("/curves.js").then(async ({ Chart }) => {
+  const place = document.querySelector("#step-plot"), chart = new Chart(place, { y: "y <&> [1]" });
+  chart.draw([{ name: "measured", x: [0, 1, 2], y: [0, 2, 1] }], "a test");
+  await new Promise(drawn => setTimeout(drawn, 200));
+  const svg = await (await chart.file("svg")).text(), png = await chart.file("png");
+  const parsed = new DOMParser().parseFromString(svg, "image/svg+xml");
+  chart.window(0.5, 1.5);
+  const part = chart.view; chart.window(-9, 9);
+  done([parsed.querySelector("parsererror") === null, parsed.querySelectorAll("text").length,
+        png.type, part, chart.view]);
+});
+"""
+
+
+@pytest.mark.alone
+def test_pictures_share_a_cursor_and_become_files(tuned: Studio, browser: Any) -> None:
+    from selenium.webdriver import ActionChains
+
+    browser.set_window_size(1600, 1000)
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    canvas = browser.find_element("css selector", "#command-plot canvas")
+    ActionChains(browser).move_to_element(canvas).perform()
+    shown = [text for hidden, text in browser.execute_script(SEEN) if not hidden]
+    assert len(shown) == 3  # those over time, and none over frequency
+    assert all(text.startswith("time ") and "now " in text for text in shown)
+    intact, texts, kind, part, whole = browser.execute_async_script(FILES)
+    assert intact
+    assert texts > 10
+    assert kind == "image/png"
+    assert part == [0.5, 1.5]
+    assert whole is None
+    assert browser.get_log("browser") == []
+
 
 COLOURS = """
 const { width, height } = document.querySelector("#step-plot canvas");
