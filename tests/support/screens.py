@@ -1,4 +1,5 @@
-"""Renders every step of the studio in its states at four widths, light and dark, and measures them.
+"""Renders every step of the studio in its states, a report and the page of the design at four
+widths, light and dark, and measures them.
 
     python tests/support/screens.py [FOLDER] [--only WORD]
 
@@ -177,6 +178,17 @@ def states(browser: Any, folder: Path) -> Iterator[str]:
         press("report")
         until(lambda: at("report-link").is_displayed(), "a report")
         yield "deploy-done"
+        page = browser.current_url
+        browser.get((demo / "commissioned" / "report.html").as_uri())
+        yield "report"
+        browser.execute_script(
+            "document.querySelectorAll('details').forEach(d => { d.open = true })"
+        )
+        yield "report-open"
+        browser.get((Path(__file__).parents[2] / "docs" / "design.html").as_uri())
+        yield "design"
+        browser.get(page)
+        until(lambda: at("control").text == "in control", "the studio again")
         first = browser.current_window_handle
         browser.switch_to.new_window("tab")
         browser.get(studio.address)

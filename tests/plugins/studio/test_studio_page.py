@@ -547,7 +547,7 @@ def test_a_question_that_is_cut_off_is_said_to_be(studio: Studio, browser: Any) 
     until(lambda: browser.execute_script("return document.querySelector('#inputs').length > 0"))
     browser.find_element("id", "look").click()
     studio.close()
-    until(lambda: "reload" in browser.find_element("id", "notice-text").text)
+    until(lambda: "Reload" in browser.find_element("id", "notice-text").text)
     until(lambda: browser.find_element("id", "look").is_enabled())
 
 
