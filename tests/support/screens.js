@@ -4,6 +4,7 @@ const shown = e => e.checkVisibility({ visibilityProperty: true, opacityProperty
 const all = [...document.querySelectorAll("body *")].filter(shown), style = new Map(all.map(e => [e, getComputedStyle(e)])), box = new Map(all.map(e => [e, e.getBoundingClientRect()]));
 const away = e => e.closest("header h1, svg, .plot .read, .plot .line") && (!e.closest("header h1") || style.get(e.closest("h1")).position === "absolute");
 const own = e => [...e.childNodes].some(n => n.nodeType === 3 && n.textContent.trim()), control = e => e.matches("button, input, select, summary, a.button");
+const wraps = e => style.get(e).display === "inline", scrolls = e => { for (let a = e.parentElement; a && a !== document.body; a = a.parentElement) if (/auto|scroll/.test(getComputedStyle(a).overflowX)) return true; return false; };
 const held = e => { for (let a = e; a && a !== document.body; a = a.parentElement) if (["sticky", "fixed"].includes(style.get(a)?.position)) return true; return false; };
 
 // --- clipped ---
@@ -11,7 +12,7 @@ const ruler = document.createElement("canvas").getContext("2d");
 for (const e of all) {
   if (away(e) || e.tagName === "OPTION" || e.tagName === "DATALIST") continue;
   const s = style.get(e), b = box.get(e);
-  if (b.right > document.documentElement.clientWidth + 1 || b.left < -1) faults.push(["clipped", `${name(e)} is out of the window: ${Math.round(b.left)} to ${Math.round(b.right)}`]);
+  if (!scrolls(e) && (b.right > document.documentElement.clientWidth + 1 || b.left < -1)) faults.push(["clipped", `${name(e)} is out of the window: ${Math.round(b.left)} to ${Math.round(b.right)}`]);
   if (!e.matches("select") && /hidden|clip/.test(s.overflowX + s.overflowY) && !e.title && s.fontSize !== "0px" && (e.scrollWidth > e.clientWidth + 1 || e.scrollHeight > e.clientHeight + 1) && !e.matches("input, canvas, progress, header, nav")) faults.push(["clipped", `${name(e)} ${e.scrollWidth}x${e.scrollHeight} in ${e.clientWidth}x${e.clientHeight}`]);
   if (/auto|scroll/.test(s.overflowX + s.overflowY) && !e.matches("select, html")) for (let a = e.parentElement; a && a !== document.body; a = a.parentElement) if (/auto|scroll/.test(getComputedStyle(a).overflowY)) faults.push(["clipped", `${name(e)} scrolls within what scrolls`]);
   const text = e.matches("input:not([type=range], [type=checkbox], [type=file])") ? e.value || e.placeholder : e.matches("select:not([multiple])") ? e.selectedOptions[0]?.text || "" : "";
@@ -27,6 +28,8 @@ const solid = all.filter(e => (control(e) || own(e)) && !away(e) && !e.closest("
 for (const group of [solid.filter(held), solid.filter(e => !held(e))]) for (let i = 0; i < group.length; i++) for (let j = i + 1; j < group.length; j++) {
   const [a, b] = [group[i], group[j]], p = box.get(a), q = box.get(b);
   if (a.contains(b) || b.contains(a)) continue;
+  // a text that breaks within a line has a box for each line
+  if (wraps(a) || wraps(b)) { if ([...a.getClientRects()].some(r => [...b.getClientRects()].some(t => Math.min(r.right, t.right) - Math.max(r.left, t.left) > 1 && Math.min(r.bottom, t.bottom) - Math.max(r.top, t.top) > 3))) faults.push(["overlap", `${name(a)} and ${name(b)}: lines`]); continue; }
   const wide = Math.min(p.right, q.right) - Math.max(p.left, q.left), high = Math.min(p.bottom, q.bottom) - Math.max(p.top, q.top);
   if (wide > 1 && high > 1) faults.push(["overlap", `${name(a)} and ${name(b)}: ${Math.round(wide)} x ${Math.round(high)} px`]);
 }

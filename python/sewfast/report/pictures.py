@@ -89,11 +89,7 @@ def _recorded(artefacts: Artefacts, number: str, record: str, title: str) -> Pic
 
 def _numbers(artefacts: Artefacts, record: str) -> Table:
     columns = artefacts.recordings[record]
-    facts = [
-        ("samples", f"{len(columns['t']):,} at 1 ms"),
-        ("command", f"{_range(columns['u'])} V"),
-        ("true speed", f"{_range(columns['speed_true'])} RPM"),
-    ]
+    facts = [("samples", f"{len(columns['t']):,} at 1 ms")]
     if record == "step":
         k, t, delay = (artefacts.number(f"fopdt.{n}") for n in "KTL")
         facts += [
@@ -104,7 +100,11 @@ def _numbers(artefacts: Artefacts, record: str) -> Table:
         ]
     else:
         error = columns["y"] - columns["speed_true"]
-        facts.append(("rms error of the speed", rpm(float(np.sqrt(np.mean(error**2))))))
+        facts += [
+            ("command", f"{_range(columns['u'])} V"),
+            ("true speed", f"{_range(columns['speed_true'])} RPM"),
+            ("rms error of the speed", rpm(float(np.sqrt(np.mean(error**2))))),
+        ]
     return Table("", tuple(name for name, _ in facts), (tuple(text for _, text in facts),))
 
 
