@@ -257,10 +257,15 @@ impl<T: Real> Ahead<T> {
         }
     }
 
-    /// The measurement that is expected at this sample, after the feedback's filter.
+    /// The measurement that is expected at this sample, after the feedback's filter. References so large that the
+    /// filter's sum overflows give none that is finite, which the PID skips; the filter then starts over.
     pub(crate) fn expected(&mut self, of: &Feedforward<T>) -> T {
         let (now, before) = (self.at(of.preview()), self.at(of.preview() + 1));
-        self.filter.step(now + of.late * (before - now))
+        let expected = self.filter.step(now + of.late * (before - now));
+        if !expected.is_finite() {
+            self.filter.reset();
+        }
+        expected
     }
 
     /// The filter's new settings with its memory.
