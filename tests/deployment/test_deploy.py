@@ -96,7 +96,7 @@ def test_the_sketch_controls_a_motor_as_the_core_would(tmp_path: Path) -> None:
 
 @pytest.mark.nightly(
     "the same for every controller",
-    by_day=["pi-f32", "everything-f64", "ramp-f64"],
+    by_day=["pi-f32", "everything-f64", "ramp-f64", "ahead-f32"],
 )
 @needs_compiler
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -132,10 +132,13 @@ def test_hostile_inputs_and_changes_of_mode_keep_the_bits(
         assert np.isfinite(found)
 
 
-CHANGING = ("pi", "paper", "p alone", "lag", "tracking", "slew", "biquads")
+CHANGING = (
+    "pi", "paper", "p alone", "lag", "tracking", "slew", "biquads", "ahead", "levels ahead",
+    "taps ahead",
+)  # fmt: skip
 
 
-@pytest.mark.nightly("the same for every controller", by_day=["tracking-f64", "biquads-f32"])
+@pytest.mark.nightly("the same for every controller", by_day=["tracking-f64", "taps ahead-f32"])
 @needs_compiler
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", CHANGING)
@@ -155,6 +158,8 @@ def test_gains_and_limits_change_as_the_core_changes_its_design(
         r, y = 500.0 + 1000.0 * (k // 700 % 2), rng.normal(450.0, 30.0)
         if rng.uniform() < 0.02:
             y = float(rng.choice([np.nan, np.inf, -np.inf, 3e4]))
+        if rng.uniform() < 0.02:
+            r = float(rng.choice([np.nan, np.inf, -np.inf, 0.0]))
         if rng.uniform() < 0.02:
             u = rng.uniform(-12.0, 12.0)
             code.code_set_manual(memory, u)
@@ -400,7 +405,7 @@ class Block:
                 lines.append(f"{indent}for {found[1]} in range({found[2]}, {found[3]} + 1):")
                 depth += 1
             else:
-                found = re.fullmatch(r"([\w\[\]]+) := (.*);", line)
+                found = re.fullmatch(r"(\w+|\w+\[[\w -]+\]) := (.*);", line)
                 assert found, line
                 lines.append(f"{indent}{found[1]} = {self._expression(found[2])}")
         assert depth == 0
@@ -438,6 +443,66 @@ def test_structured_text_has_the_bits_of_the_core(
             r=r, y=y, feedforward=real(-0.0), manual=manual, u_manual=real(1.0), restart=False
         )
         assert found == core.step(float(r), float(y), -0.0), k
+
+
+NO_NUMBERS = (math.nan, math.inf, -math.inf)
+HUGE = (1.7e308, -1e308, 3e38, -2e38, 1e30)
+
+
+@pytest.mark.nightly("every controller", by_day=["everything-f64", "everything ahead-f32"])
+@needs_compiler
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", deployed.CONTROLLERS)
+def test_what_is_no_number_does_the_same_everywhere(
+    name: str, precision: str, tmp_path: Path
+) -> None:
+    """NaN, infinity and numbers that overflow, at random in every input: core, C and PLC agree."""
+    controller = deployed.CONTROLLERS[name]
+    core = _core_of(controller, precision)
+    code = _library(controller, tmp_path, precision)
+    memory = ctypes.create_string_buffer(4096)
+    code.code_init(memory)
+    deploy(controller, tmp_path, to="st", precision=precision, name="block")
+    block = Block((tmp_path / "block.st").read_text())
+    real: Any = np.float32 if precision == "f32" else np.float64
+    rng = np.random.default_rng(41)
+    manual, moved = False, set()
+    for k in range(3000):
+        often = (0.01, 0.2)[k // 300 % 2]
+        r, y, extra, u = (float(v) for v in rng.normal(0.0, (900.0, 900.0, 3.0, 5.0)))
+        r, y, extra, u = (
+            float(rng.choice((*NO_NUMBERS, *HUGE[: 5 * (k > 1500)])))
+            if rng.uniform() < often
+            else v
+            for v in (r, y, extra, u)
+        )
+        with np.errstate(over="ignore"):
+            r, y, extra, u = (float(real(v)) for v in (r, y, extra, u))
+        manual = manual if rng.uniform() > 0.03 else not manual
+        if manual:
+            code.code_set_manual(memory, u)
+            if math.isfinite(u):
+                core.set_manual(u)
+        else:
+            code.code_set_automatic(memory)
+            core.set_automatic()
+        if restart := bool(rng.uniform() < 0.004):
+            code.code_init(memory)
+            core.reset()
+            if manual and math.isfinite(u):
+                code.code_set_manual(memory, u)
+                core.set_manual(u)
+        expected = core.step(r, y, extra)
+        found = code.code_step_with(memory, r, y, extra)
+        of_block = block.step(
+            r=real(r), y=real(y), feedforward=real(extra), manual=manual, u_manual=real(u),
+            restart=restart,
+        )  # fmt: skip
+        assert math.isfinite(expected)
+        assert (found, of_block) == (expected, expected), (k, r, y, extra, u, manual)
+        assert float(block.values["y_filtered"]) == core.filtered, k
+        moved.add(expected)
+    assert len(moved) > 200
 
 
 def test_a_model_is_no_function_block(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import deployed
 import kinds
 import sewfast
 from foreign_fmu import OF_MOTOR, motor_fmu
@@ -105,12 +107,13 @@ def test_the_free_run_is_that_of_the_package(name: str, slave: Any, tmp_path: Pa
     assert np.abs(y - expected).max() <= 1e-12 * np.ptp(expected)
 
 
-def test_a_controller_is_stepped_alike(slave: Any) -> None:
-    controller = paper_controller()
+@pytest.mark.parametrize("ahead", [None, deployed.LEAD], ids=["plain", "ahead"])
+def test_a_controller_is_stepped_alike(ahead: sewfast.Feedforward | None, slave: Any) -> None:
+    controller = replace(paper_controller(), feedforward=ahead)
     fmu, core = slave(controller, "loop"), controller.core()
     rng = np.random.default_rng(0)
     for k in range(300):
-        r, y = 500.0, float(rng.normal(300.0, 200.0))
+        r, y = 500.0 + 20.0 * (k % 40), float(rng.normal(300.0, 200.0))
         fmu.set(r=r, y=y, feedforward=0.1)
         fmu.step(k)
         assert fmu.get("u") == core.step(r, y, 0.1)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from portions import portion
-from sewfast import Biquad, Controller, Gains, Model, deploy
+from sewfast import Biquad, Controller, Feedforward, Gains, Model, deploy
 from sewfast.deployment.precision import combined_run, embedded_members
 
 EMULATED = Path(__file__).parent / "emulated"
@@ -188,6 +188,9 @@ def _size(controller: Controller) -> float:
 
 SECTIONS = (Biquad.notch(60.0), Biquad.low_pass(200.0), Biquad.lead_lag(40.0, 160.0))
 
+LEVELS = ((-3000.0, -9.1), (-60.0, -0.9), (60.0, 0.9), (1500.0, 4.7), (3000.0, 9.3))
+LEAD = Feedforward(8, 0.5, LEVELS, (0.004, 0.012, -0.003))
+
 CONTROLLERS = {
     "pi": Controller(Gains.standard(0.02, 0.25)),
     "paper": Controller(
@@ -204,16 +207,57 @@ CONTROLLERS = {
         Gains.standard(0.02, 0.05, 0.002), N=10.0, u_min=-8.0, u_max=8.0, biquads=SECTIONS
     ),
     "everything": Controller(
-        Gains.standard(0.02, 0.25, 0.004), alpha=0.4, beta=0.2, N=8.0, Tt=0.05, u_min=-20.0,
-        u_max=20.0, slew=4000.0, filter_samples=8, filter_time=0.002, observer_time=0.003,
-        r_rate=20000.0, biquads=SECTIONS,
+        Gains.standard(0.02, 0.25, 0.004),
+        alpha=0.4,
+        beta=0.2,
+        N=8.0,
+        Tt=0.05,
+        u_min=-20.0,
+        u_max=20.0,
+        slew=4000.0,
+        filter_samples=8,
+        filter_time=0.002,
+        observer_time=0.003,
+        r_rate=20000.0,
+        biquads=SECTIONS,
         schedule=(
             (300.0, Gains.standard(0.01, 0.3, 0.002)),
             (1000.0, Gains.standard(0.02, 0.2, 0.004)),
             (3000.0, Gains.standard(0.03, 0.1, 0.001)),
         ),
     ),
-}  # fmt: skip
+    "ahead": Controller(
+        Gains.standard(0.02, 0.05, 0.002),
+        N=10.0,
+        u_min=-16.0,
+        u_max=16.0,
+        filter_samples=5,
+        filter_time=0.002,
+        feedforward=LEAD,
+    ),
+    "levels ahead": Controller(
+        Gains.standard(0.02, 0.25), r_rate=30000.0, feedforward=Feedforward(0, 0.0, LEVELS[2:])
+    ),
+    "a level ahead": Controller(
+        Gains.standard(-0.5, np.inf),
+        u_min=-1.0,
+        u_max=3.0,
+        feedforward=Feedforward(30, 1.0, LEVELS[:1], (0.01,)),
+    ),
+    "taps ahead": Controller(
+        Gains.standard(0.02, 0.1, 0.01),
+        observer_time=0.005,
+        biquads=SECTIONS,
+        feedforward=Feedforward(1, 0.25, (), tuple(0.02 * 0.7**k for k in range(16))),
+    ),
+}
+CONTROLLERS["everything ahead"] = replace(
+    CONTROLLERS["everything"],
+    feedforward=Feedforward(
+        12, 0.5, ((-4000.0, -14.0), (-100.0, -1.5), *LEVELS[1:], (3500.0, 11.0), (4000.0, 14.0)),
+        tuple(0.01 * (-0.8) ** k for k in range(12)),
+    ),
+)  # fmt: skip
 
 
 def compilers() -> list[str]:

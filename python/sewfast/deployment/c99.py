@@ -26,11 +26,14 @@ from ..errors import SettingError
 from ..gains import Gains
 from ..models import Model
 from .precision import (
+    Lead,
     at_rest,
     combined_run,
     controller_step,
+    early,
     embedded_members,
     excitation,
+    lead_of,
     model_loss,
     signals,
 )
@@ -49,6 +52,12 @@ KEYWORDS = frozenset(
 _LARGEST = float(np.finfo(np.float32).max)
 _VECTORS = 200
 """Samples of the test that is written with the code."""
+_FILTERED = """    @_real samples[@@_SAMPLES];
+    @_real lag, speed, innovation; /* of the feedback filter */
+"""
+_FILTERED_AHEAD = """    @_filtering of_feedback, of_kept; /* measured, and expected */
+    @_real kept[@@_KEPT]; /* the last references, a ring */
+"""
 _LICENCE = "The code in this file may be used under MIT, Apache-2.0 or 0BSD, as you like."
 
 
@@ -381,14 +390,17 @@ def _controller(
         "No heap, no C library, no global state.",
     ]
     size = 4 if code.single else 8
+    lead = lead_of(numbers)
     kept = numbers["samples"] + 10 + 6 * len(numbers["biquads"]) + 7 * changeable
+    kept += lead.kept + numbers["samples"] + 3 if lead else 0
     functions = [f"{code.name}_init", f"{code.name}_step"]
     if changeable:
         functions += [f"{code.name}_set_gains", f"{code.name}_set_limits"]
     notes = [
-        f"PID as C99 in {code.real}: {', '.join(functions)}; about {kept * size + 10} bytes of "
-        "memory",
+        f"PID as C99 in {code.real}: {', '.join(functions)}; about "
+        f"{kept * size + 10 + 12 * bool(lead)} bytes of memory",
         *loss,
+        *early(numbers),
     ]
     return (
         _controller_header(controller, code, numbers, about, changeable),
@@ -417,8 +429,22 @@ def _controller_header(
     if changeable:
         members += "    @_terms terms;\n    @_real u_min, u_max;\n"
         flags += ", held"
+    memory, counter = _FILTERED, "    int next;\n"
+    filtering, ahead, told = "averaging, lagging, observing, ", "", ""
+    if lead := lead_of(numbers):
+        memory = _FILTERED_AHEAD
+        filtering, counter = "", "    int newest;\n"
+        flags += ", ahead"
+        ahead = code.template("ahead.h", PREVIEW=str(lead.preview), KEPT=str(lead.kept))
+        if lead.preview:
+            told = f"\n * The reference arrives {code.name.upper()}_PREVIEW samples early."
     body = code.template(
         "pid.h",
+        FILTER_MEMORY=memory,
+        FILTER_NEXT=counter,
+        FILTER_FLAGS=filtering,
+        AHEAD_TYPE=ahead,
+        EARLY=told,
         TS=Code(code.name, "f64").literal(controller.Ts),
         SAMPLES=str(numbers["samples"]),
         BIQUADS_TYPE=biquads,
@@ -452,19 +478,35 @@ def _controller_source(
             "        /* the integral stops where it pushes on, and still moves away */\n"
             "        kept = (integral - c->integral) * excess < R(0.0) ? c->integral : integral;"
         )
-    names = ("ALPHA", "BETA", "LAG", "RAMP", "CHANGE", "U_MIN", "U_MAX")
+    names = ("ALPHA", "BETA", "LAG", "U_MIN", "U_MAX")
     places = {name: number(name.lower()) for name in names}
     terms = code.template("terms.h", RATE=", rate" if changeable else "")
-    places |= dict.fromkeys(("BIQUADS", "OF_Y", "OF_R", "INIT", "HELD", "CHANGES"), "")
+    empty = ("BIQUADS", "AHEAD", "OF_Y", "OF_AHEAD", "OF_R", "INIT", "HELD", "CHANGES")
+    places |= dict.fromkeys(empty, "")
     places |= {"TERMS_TYPE": terms, "GAINS_NOW": "@_gains(filtered)"}
+    places |= {"MEMORY": "@_pid", "WITHIN": "c", "PASS": "@_hold(c)"}
+    if lead := lead_of(numbers):
+        places |= {
+            "MEMORY": "@_filtering",
+            "WITHIN": "&c->of_feedback",
+            "PASS": "@_pass(c, r)",
+            "AHEAD": _ahead(code, lead),
+            "OF_AHEAD": code.template("ahead_r.c"),
+            "INIT": "    c->newest = 0;\n    c->ahead = 0;\n",
+        }
+    # no bound is none at all: the largest number would be one, next to it
+    places |= {"FROM": "    (void)start;\n", "RAMPED": "r"}
+    if math.isfinite(numbers["ramp"]):
+        places["FROM"] = "    const @_real from = c->ramping ? c->ramped : start;\n"
+        places["RAMPED"] = "@_limit(r, from - {0}, from + {0})".format(number("ramp"))
     if numbers["biquads"]:
         rows = [f"{{{', '.join(map(code.literal, row))}}}" for row in numbers["biquads"]]
         places |= {
             "BIQUADS": code.template("biquads.c", SECTIONS=",\n    ".join(rows)),
-            "OF_Y": code.template("biquads_y.c"),
+            "OF_Y": code.template("biquads_y.c", PASS=places["PASS"]),
             "OF_R": code.template("biquads_r.c"),
-            "INIT": "    c->y_begun = 0;\n    c->r_begun = 0;\n",
         }
+        places["INIT"] += "    c->y_begun = 0;\n    c->r_begun = 0;\n"
     if changeable:
         step = {"FILTER": _derivative_lag(code, numbers), "STEP": code.literal(numbers["ts"])}
         own = ", ".join(
@@ -487,6 +529,11 @@ def _controller_source(
         }
     else:
         places["GAINS_OF"] = code.template("gains.c", GAINS=_gains(code, numbers).rstrip()) + "\n"
+    limited = f"@_limit(wanted, {places['U_MIN']}, {places['U_MAX']})"
+    if math.isfinite(numbers["change"]):
+        change = number("change")
+        limited = f"@_limit({limited}, c->u - {change}, c->u + {change})"
+    places["LIMITED"] = limited
     body = code.template(
         "pid.c",
         OBSERVER=observer,
@@ -496,6 +543,25 @@ def _controller_source(
     )
     opening = code.opening(f"{code.name}: a two-degree-of-freedom PID controller", about)
     return code.framed("frame.c", opening, body)
+
+
+def _ahead(code: Code, lead: Lead) -> str:
+    """The functions of a feedforward."""
+    levels, tabs = "", ",\n" + " " * 8
+    if len(lead.levels) == 1:
+        (y, u) = (_signed(code.literal(v)) for v in lead.levels[0])
+        levels = code.template("level.c", Y=y, U=u)
+    elif lead.levels:
+        rows = [f"{{{', '.join(map(code.literal, row))}}}" for row in lead.levels]
+        levels = code.template("levels.c", COUNT=str(len(rows)), TABLE=tabs.join(rows))
+    held = "@_held(c->kept[c->newest]) + " if levels else ""
+    if lead.taps:
+        table = code.literals(lead.taps, " " * 8)
+        needed = code.template("taps.c", COUNT=str(len(lead.taps)), TABLE=table, SUM=f"{held}sum")
+    else:
+        needed = f"    return {held}R(0.0);\n"
+    late = _signed(code.literal(lead.late))
+    return code.template("ahead.c", LATE=late, LEVELS=levels, NEEDED=needed)
 
 
 def _derivative_lag(code: Code, numbers: Mapping[str, Any]) -> str:

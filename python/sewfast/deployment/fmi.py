@@ -91,8 +91,12 @@ def files(
 def _of(what: Model | Controller, name: str) -> _System:
     if isinstance(what, Controller):
         u, y = what.gains.u_unit, what.gains.y_unit
+        ahead = what.feedforward.preview if what.feedforward else 0
+        title = (
+            f"PID controller, its reference {ahead} samples early" if ahead else "PID controller"
+        )
         return _System(
-            name, "PID controller", what.Ts, [("r", y), ("y", y), ("feedforward", u)],
+            name, title, what.Ts, [("r", y), ("y", y), ("feedforward", u)],
             (0.0, 0.0, 0.0), ("u", u), False, f"{name}_pid",
             f"return {name}_step_with(system, u[0], u[1], u[2]);", "return now->system.u;",
         )  # fmt: skip

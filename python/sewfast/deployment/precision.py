@@ -7,6 +7,8 @@ written.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -191,6 +193,39 @@ def _limit(controller: Controller) -> float:
     return max(
         (abs(v) for v in (controller.u_min, controller.u_max) if math.isfinite(v)), default=1.0
     )
+
+
+@dataclass(frozen=True)
+class Lead:
+    """A feedforward's numbers."""
+
+    preview: int
+    late: float
+    levels: list[list[float]]
+    taps: list[float]
+
+    @property
+    def kept(self) -> int:
+        """References that a step needs."""
+        return max(self.preview + 2, len(self.taps) + 1)
+
+
+def lead_of(numbers: Mapping[str, Any]) -> Lead | None:
+    """The feedforward of a controller; None where there is none."""
+    lead = Lead(*numbers["feedforward"])
+    return lead if lead.levels or lead.taps else None
+
+
+def early(numbers: Mapping[str, Any]) -> list[str]:
+    """A note on the reference of a controller with feedforward."""
+    lead = lead_of(numbers)
+    if lead is None or lead.preview == 0:
+        return []
+    plural = "s" if lead.preview > 1 else ""
+    return [
+        f"the reference arrives {lead.preview} sample{plural} early; where it is not known ahead, "
+        "give the present one and be followed that much later"
+    ]
 
 
 def signals(controller: Controller, count: int, precision: str) -> tuple[FloatArray, FloatArray]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from .. import __version__
 from ..control import Controller
 from ..errors import SettingError
 from ..models import Model
-from .precision import controller_step
+from .precision import controller_step, early, lead_of
 
 
 def files(what: Model | Controller, name: str, precision: str) -> tuple[dict[str, str], list[str]]:
@@ -26,7 +28,7 @@ def files(what: Model | Controller, name: str, precision: str) -> tuple[dict[str
     core, loss = controller_step(what, precision)
     block = _block(what, name, _Type("REAL" if precision == "f32" else "LREAL"), core.numbers)
     note = f"PID as structured text: FUNCTION_BLOCK {name.upper()}, call it every {what.Ts:g} s"
-    return {f"{name}.st": block}, [note, *loss]
+    return {f"{name}.st": block}, [note, *loss, *early(core.numbers)]
 
 
 class _Type:
@@ -54,21 +56,17 @@ def _block(controller: Controller, name: str, number: _Type, n: Mapping[str, Any
     value = {k: number(n[k]) for k in _NUMBERS}
     samples = n["samples"]
     first = number(min(max(0.0, n["u_min"]), n["u_max"]))
-    observer = ""
-    if n["observes"]:
-        observer = f"""
-  IF observing THEN
-    previous := speed;
-  ELSE
-    previous := y_filtered;
-    innovation := {zero};
-  END_IF;
-  innovation := {value["keep"]} * innovation + (y_filtered - previous);
-  speed := previous + {value["gain"]} * innovation;
-  observing := TRUE;
-  y_filtered := speed;
-"""
     declared, of_y, of_r, forgotten = _biquads(number, n["biquads"])
+    ahead = _ahead(number, n)
+    added = "added" if ahead else "feedforward"
+    around = _around("u", number, n["change"])
+    way = _ramp(number, n["ramp"])
+    if ahead:
+        declared += ahead.declared
+        forgotten += "  ahead := FALSE;\n"
+        way = f"{way}{ahead.way}END_IF;\nIF usable THEN\n"
+    preview = n["feedforward"][0]
+    early_by = f", {preview} samples early" if ahead and preview else ""
     if n["tracks"]:
         windup = f"        kept := integral_now + {value['tracking']} * excess;"
     else:
@@ -84,7 +82,7 @@ def _block(controller: Controller, name: str, number: _Type, n: Mapping[str, Any
    This text may be used under MIT, Apache-2.0 or 0BSD, as you like. *)
 FUNCTION_BLOCK {name.upper()}
 VAR_INPUT
-  r : {real}; (* reference, {y} *)
+  r : {real}; (* reference, {y}{early_by} *)
   y : {real}; (* measurement, {y} *)
   feedforward : {real}; (* added to the command before its limits, {u} *)
   manual : BOOL; (* the command is the operator's *)
@@ -98,8 +96,9 @@ END_VAR
 VAR
   samples : ARRAY[0..{samples - 1}] OF {real};
   next_sample, i : INT;
-  averaging, lagging, observing, ramping, started : BOOL;
+  averaging, lagging, observing, ramping, started, operated : BOOL;
   lag, speed, innovation, ramped, referred, integral, derivative, r_last, e_last : {real};
+  operator, y_last : {real};
   sum, previous, e, rate_input, change, derivative_now, integral_now, proportional : {real};
   kp, ki, kd, pole, wanted, excess, kept, low, high, distance, share, weight, td, lag_of_d : {real};
   usable : BOOL;
@@ -112,6 +111,7 @@ IF restart THEN
   observing := FALSE;
   ramping := FALSE;
 {forgotten}  started := FALSE;
+  operated := FALSE;
   integral := {zero};
   derivative := {zero};
   r_last := {zero};
@@ -119,34 +119,18 @@ IF restart THEN
   u := {first};
 END_IF;
 
+(* a command of the operator that is no number is not taken *)
+operated := operated AND manual;
+IF manual AND (u_manual - u_manual = {zero}) THEN
+  operated := TRUE;
+  operator := u_manual;
+END_IF;
+
 (* a measurement that is no number leaves the command as it was *)
+y_last := y_filtered;
 usable := y - y = {zero};
 IF usable THEN
-  IF NOT averaging THEN
-    FOR i := 0 TO {samples - 1} DO
-      samples[i] := y;
-    END_FOR;
-  END_IF;
-  averaging := TRUE;
-  samples[next_sample] := y;
-  next_sample := next_sample + 1;
-  IF next_sample >= {samples} THEN
-    next_sample := 0;
-  END_IF;
-  sum := {zero};
-  FOR i := 0 TO {samples - 1} DO
-    sum := sum + samples[i];
-  END_FOR;
-  sum := sum / {number(float(samples))};
-  previous := sum;
-  IF lagging THEN
-    previous := lag;
-  END_IF;
-  lag := previous + {value["lag"]} * (sum - previous);
-  lagging := TRUE;
-  y_filtered := lag;
-{observer}
-  usable := y_filtered - y_filtered = {zero};
+{_filter(number, n, "y", "y_filtered", "")}  usable := y_filtered - y_filtered = {zero};
   IF NOT usable THEN
     averaging := FALSE;
     next_sample := 0;
@@ -154,23 +138,12 @@ IF usable THEN
     observing := FALSE;
   END_IF;
 END_IF;
-{of_y}
-IF usable THEN
-  IF NOT ramping THEN
-    ramped := y_filtered;
-  END_IF;
-  ramping := TRUE;
-  low := ramped - {value["ramp"]};
-  high := ramped + {value["ramp"]};
-  ramped := r;
-  IF ramped < low THEN
-    ramped := low;
-  END_IF;
-  IF ramped > high THEN
-    ramped := high;
-  END_IF;
-  referred := ramped;
-{of_r}{_gains(number, n)}
+{of_y}IF NOT usable THEN
+  y_filtered := y_last;
+END_IF;
+
+IF {"usable OR ahead" if ahead else "usable"} THEN
+{way}{of_r}{_gains(number, n)}
   e := referred - y_filtered;
   rate_input := e - {value["beta"]} * referred;
   change := {zero};
@@ -180,16 +153,24 @@ IF usable THEN
   derivative_now := pole * derivative + kd * change;
   integral_now := integral + ki * e;
   proportional := kp * (e - {value["alpha"]} * referred);
-  wanted := proportional + integral_now + derivative_now + feedforward;
-  usable := wanted - wanted = {zero};
+  wanted := proportional + integral_now + derivative_now + {added};
+  usable := (wanted - wanted = {zero}) AND (rate_input - rate_input = {zero});
+  IF NOT usable AND (rate_input - rate_input = {zero}) AND ({added} - {added} = {zero}) THEN
+    (* the memory is to blame: begin again at this sample *)
+    r_last := referred;
+    e_last := e;
+    started := TRUE;
+    derivative := {zero};
+    IF NOT (integral - integral = {zero}) THEN
+      integral := u;
+    END_IF;
+  END_IF;
 END_IF;
 
-IF usable OR manual THEN
-  low := u - {value["change"]};
-  high := u + {value["change"]};
-  previous := u;
-  IF manual THEN
-    u := u_manual;
+IF usable OR operated THEN
+{around}  previous := u;
+  IF operated THEN
+    u := operator;
   ELSE
     u := wanted;
   END_IF;
@@ -199,18 +180,12 @@ IF usable OR manual THEN
   IF u > {value["u_max"]} THEN
     u := {value["u_max"]};
   END_IF;
-  IF u < low THEN
-    u := low;
-  END_IF;
-  IF u > high THEN
-    u := high;
-  END_IF;
-  IF NOT (u - u = {zero}) THEN
+{_within("u") if around else ""}  IF NOT (u - u = {zero}) THEN
     u := previous;
   END_IF;
   IF usable THEN
-    IF manual THEN
-      integral := u - proportional - derivative_now - feedforward;
+    IF operated THEN
+      integral := u - proportional - derivative_now - {added};
     ELSE
       excess := u - wanted;
       kept := integral_now;
@@ -235,6 +210,158 @@ _NUMBERS = (
     "kp", "ki", "kd", "pole", "tracking", "lag", "keep", "gain", "ramp", "change", "alpha", "beta",
     "u_min", "u_max", "ts",
 )  # fmt: skip
+
+
+def _filter(number: _Type, n: Mapping[str, Any], taken: str, given: str, of: str) -> str:
+    """Statements from a measurement to the filtered one; the names in its memory end with `of`."""
+    lines = [
+        f"IF NOT averaging{of} THEN",
+        f"  FOR i := 0 TO {n['samples'] - 1} DO",
+        f"    samples{of}[i] := {taken};",
+        "  END_FOR;",
+        "END_IF;",
+        f"averaging{of} := TRUE;",
+        f"samples{of}[next_sample{of}] := {taken};",
+        f"next_sample{of} := next_sample{of} + 1;",
+        f"IF next_sample{of} >= {n['samples']} THEN",
+        f"  next_sample{of} := 0;",
+        "END_IF;",
+        f"sum := {number(0.0)};",
+        f"FOR i := 0 TO {n['samples'] - 1} DO",
+        f"  sum := sum + samples{of}[i];",
+        "END_FOR;",
+        f"sum := sum / {number(float(n['samples']))};",
+        "previous := sum;",
+        f"IF lagging{of} THEN",
+        f"  previous := lag{of};",
+        "END_IF;",
+        f"lag{of} := previous + {number(n['lag'])} * (sum - previous);",
+        f"lagging{of} := TRUE;",
+        f"{given} := lag{of};",
+    ]
+    if n["observes"]:
+        lines += [
+            f"IF observing{of} THEN",
+            f"  previous := speed{of};",
+            "ELSE",
+            f"  previous := {given};",
+            f"  innovation{of} := {number(0.0)};",
+            "END_IF;",
+            f"innovation{of} := {number(n['keep'])} * innovation{of} + ({given} - previous);",
+            f"speed{of} := previous + {number(n['gain'])} * innovation{of};",
+            f"observing{of} := TRUE;",
+            f"{given} := speed{of};",
+        ]
+    return "".join(f"  {line}\n" for line in lines)
+
+
+def _ramp(number: _Type, change: float) -> str:
+    """Statements from `r` to `referred`; a reference that is no number passes without effect."""
+    bounds = _around("ramped", number, change)
+    lines = [
+        "referred := r;",
+        f"IF r - r = {number(0.0)} THEN",
+        "  IF NOT ramping THEN",
+        "    ramped := y_filtered;",
+        "  END_IF;",
+        "  ramping := TRUE;",
+        *bounds.splitlines(),
+        "  ramped := r;",
+        *(_within("ramped").splitlines() if bounds else ()),
+        "  referred := ramped;",
+        "END_IF;",
+    ]
+    return "".join(f"  {line}\n" for line in lines)
+
+
+def _around(name: str, number: _Type, change: float) -> str:
+    """Statements that set low and high around a value; none for an infinite change."""
+    if math.isinf(change):
+        return ""
+    return f"  low := {name} - {number(change)};\n  high := {name} + {number(change)};\n"
+
+
+def _within(name: str) -> str:
+    """Statements that keep a value between low and high."""
+    return "".join(
+        f"  IF {name} {sign} {bound} THEN\n    {name} := {bound};\n  END_IF;\n"
+        for sign, bound in (("<", "low"), (">", "high"))
+    )
+
+
+@dataclass(frozen=True)
+class _Ahead:
+    """A feedforward: its variables, and its statements after the ramp."""
+
+    declared: str
+    way: str
+
+
+def _ahead(number: _Type, n: Mapping[str, Any]) -> _Ahead | None:
+    """The feedforward of a controller; None where there is none."""
+    lead = lead_of(n)
+    if lead is None:
+        return None
+    real, zero, last, samples = number.name, number(0.0), lead.kept - 1, n["samples"]
+    declared = f"""  known : ARRAY[0..{last}] OF {real}; (* references, the newest first *)
+  samples_r : ARRAY[0..{samples - 1}] OF {real};
+  next_sample_r : INT;
+  averaging_r, lagging_r, observing_r, ahead : BOOL;
+  lag_r, speed_r, innovation_r, added, own, held, expected : {real};
+"""
+    way = [
+        f"IF NOT (referred - referred = {zero}) AND ahead THEN",
+        "  referred := known[0];",
+        "END_IF;",
+        f"IF referred - referred = {zero} THEN",
+        "  IF NOT ahead THEN",
+        f"    FOR i := 0 TO {last} DO",
+        "      known[i] := referred;",
+        "    END_FOR;",
+        *(f"    {line}" for line in _FORGET_R),
+        "  END_IF;",
+        f"  FOR i := 1 TO {last} DO",
+        f"    known[{lead.kept} - i] := known[{last} - i];",
+        "  END_FOR;",
+        "  known[0] := referred;",
+        "  ahead := TRUE;",
+        "END_IF;",
+        "added := feedforward;",
+        "IF ahead THEN",
+        f"  own := {zero};",
+    ]
+    for age, tap in enumerate(lead.taps):
+        way.append(f"  own := own + {number(tap)} * (known[{age}] - known[{age + 1}]);")
+    if lead.levels:
+        way += [f"  {line}" for line in _held(number, lead.levels)]
+    late, p = number(lead.late), lead.preview
+    way += [
+        "  added := feedforward + own;",
+        f"  expected := known[{p}] + {late} * (known[{p + 1}] - known[{p}]);",
+    ]
+    body = "".join(f"  {line}\n" for line in way)
+    filtered = _filter(number, n, "expected", "referred", "_r").splitlines()
+    body += "".join(f"  {line}\n" for line in filtered)
+    rest = [f"  IF NOT (referred - referred = {zero}) THEN", *(f"    {x}" for x in _FORGET_R)]
+    body += "".join(f"  {line}\n" for line in [*rest, "  END_IF;", "END_IF;"])
+    return _Ahead(declared, body)
+
+
+_FORGET_R = (
+    "averaging_r := FALSE;", "next_sample_r := 0;", "lagging_r := FALSE;", "observing_r := FALSE;",
+)  # fmt: skip
+
+
+def _held(number: _Type, levels: Sequence[Sequence[float]]) -> list[str]:
+    """Statements that add the command which holds the newest reference to `own`."""
+    pairs = list(pairwise(levels)) or [(levels[0], levels[0])]
+    lines = []
+    for i, ((y, u), (next_y, next_u)) in enumerate(pairs):
+        apart = f"({number(next_y)} - {number(y)})" if next_y > y else number(1.0)
+        rise = f"({number(next_u)} - {number(u)})"
+        held = f"held := {number(u)} + (known[0] - {number(y)}) * {rise} / {apart};"
+        lines += [f"IF known[0] >= {number(y)} THEN", f"  {held}", "END_IF;"] if i else [held]
+    return [*lines, "own := held + own;"]
 
 
 def _biquads(number: _Type, sections: Sequence[Sequence[float]]) -> tuple[str, str, str, str]:

@@ -12,7 +12,7 @@ static @_real @_limit(@_real x, @_real low, @_real high)
 
 @GAINS_OF
 /* Mean of the last samples, then a lag@FILTER_WORDS. */
-static @_real @_filter(@_pid *c, @_real y)
+static @_real @_filter(@MEMORY *c, @_real y)
 {
     @_real sum = R(0.0), from;
     int i;
@@ -35,7 +35,7 @@ static @_real @_filter(@_pid *c, @_real y)
 @OBSERVER    return y;
 }
 
-@BIQUADSstatic void @_reset_filter(@_pid *c)
+@BIQUADSstatic void @_reset_filter(@MEMORY *c)
 {
     c->averaging = 0;
     c->next = 0;
@@ -46,11 +46,10 @@ static @_real @_filter(@_pid *c, @_real y)
 /* The reference moves no faster than its ramp, from the measured output on. */
 static @_real @_ramp(@_pid *c, @_real r, @_real start)
 {
-    const @_real from = c->ramping ? c->ramped : start;
-    if (!@_is_finite(r)) {
+@FROM    if (!@_is_finite(r)) {
         return r;
     }
-    c->ramped = @_limit(r, from - @RAMP, from + @RAMP);
+    c->ramped = @RAMPED;
     c->ramping = 1;
     return c->ramped;
 }
@@ -58,7 +57,7 @@ static @_real @_ramp(@_pid *c, @_real r, @_real start)
 /* The one way to the command: within the limits, no further from the last one than slew allows, and finite. */
 static @_real @_limited(const @_pid *c, @_real wanted)
 {
-    const @_real u = @_limit(@_limit(wanted, @U_MIN, @U_MAX), c->u - @CHANGE, c->u + @CHANGE);
+    const @_real u = @LIMITED;
     return @_is_finite(u) ? u : c->u;
 }
 
@@ -73,9 +72,9 @@ static @_real @_hold(@_pid *c)
     return c->u;
 }
 
-void @_init(@_pid *c)
+@AHEADvoid @_init(@_pid *c)
 {
-@INIT    @_reset_filter(c);
+@INIT    @_reset_filter(@WITHIN);
     c->ramping = 0;
     c->integral = R(0.0);
     c->derivative = R(0.0);
@@ -98,16 +97,16 @@ void @_init(@_pid *c)
     @_terms g;
     @_real filtered, e, rate_input, change, derivative, integral, proportional, wanted, excess, kept;
     if (!@_is_finite(y)) {
-        return @_hold(c);
+        return @PASS;
     }
-    filtered = @_filter(c, y);
+    filtered = @_filter(@WITHIN, y);
     if (!@_is_finite(filtered)) {
-        @_reset_filter(c);
-        return @_hold(c);
+        @_reset_filter(@WITHIN);
+        return @PASS;
     }
 @OF_Y    c->filtered = filtered;
     r = @_ramp(c, r, filtered);
-@OF_R    g = @GAINS_NOW;
+@OF_AHEAD@OF_R    g = @GAINS_NOW;
     e = r - filtered;
     rate_input = e - @BETA * r;
     change = rate_input - (c->e - @BETA * c->r);

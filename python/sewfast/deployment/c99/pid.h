@@ -1,16 +1,13 @@
 #define @@_TS @TS /* s */
 #define @@_SAMPLES @SAMPLES /* of the moving average */
 
-@BIQUADS_TYPE@TERMS_TYPEtypedef struct @_pid {
-    @_real samples[@@_SAMPLES];
-    @_real lag, speed, innovation; /* of the feedback filter */
-    @_real ramped; /* the reference after its ramp */
+@BIQUADS_TYPE@AHEAD_TYPE@TERMS_TYPEtypedef struct @_pid {
+@FILTER_MEMORY    @_real ramped; /* the reference after its ramp */
     @_real integral, derivative;
     @_real r, e; /* of the last sample */
     @_real u, operator_u;
     @_real filtered; /* the measurement after its filter */
-@MEMBERS    int next;
-    unsigned char averaging, lagging, observing, ramping, manual, started@FLAGS;
+@MEMBERS@FILTER_NEXT    unsigned char @FILTER_FLAGSramping, manual, started@FLAGS;
 } @_pid;
 
 /* At rest, in automatic. */
@@ -18,7 +15,7 @@ void @_init(@_pid *c);
 
 /* From reference and measurement [@UNIT_Y] to the command [@UNIT_U]. A measurement that is not finite leaves the
  * command as it was. Whatever comes, the command is finite, within its limits and no further from the last
- * one than slew allows. */
+ * one than slew allows.@EARLY */
 @_real @_step(@_pid *c, @_real r, @_real y);
 
 /* The same with a command that is added before the limits. */

@@ -1,0 +1,5 @@
+    @_keep(c, r);
+    if (c->ahead) {
+        r = @_expected(c);
+        feedforward = feedforward + @_needed(c);
+    }
