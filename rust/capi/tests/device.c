@@ -112,7 +112,8 @@ void board_identity(sewfast_identity *identity) {
     identity->period = 1000;
     identity->counts_per_rev = 1572.0f;
     identity->capabilities =
-        SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN | SEWFAST_CAN_BIQUADS;
+        SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN | SEWFAST_CAN_BIQUADS |
+        SEWFAST_CAN_FEEDFORWARD;
     identity->ceilings = (sewfast_limits){20.0f, 4000.0f, 60000.0f, INFINITY};
     identity->channels = channels;
     identity->channel_count = sizeof channels / sizeof channels[0];
@@ -343,7 +344,8 @@ static void pid_is_its_equation(void) {
     } place;
     sewfast_pid_settings settings = {0.02f, 0.25f, 0.0f,     0.4f,  0.2f, INFINITY, 0.0f,
                                      -20.0f, 20.0f, INFINITY, 0.001f, 0.0f, 1,     0.0f,
-                                     INFINITY, 0, {{0.0f, 0.0f, 0.0f, 0.0f}}, 0, {{0.0f, 0.0f, 0.0f, 0.0f}}};
+                                     INFINITY, 0, {{0.0f, 0.0f, 0.0f, 0.0f}}, 0, {{0.0f, 0.0f, 0.0f, 0.0f}}, 0, 0, 0, 0.0f,
+                                     {{0.0f, 0.0f}}, {0.0f}};
     int32_t refusal = -1;
     CHECK(sewfast_pid_size() <= SEWFAST_PID_SIZE);
     sewfast_pid *pid = sewfast_pid_init(&place, sizeof place, &settings, &refusal);
@@ -383,7 +385,7 @@ static void pid_is_its_equation(void) {
     CHECK(sewfast_pid_notch(&notch, 50.0f, 0.0f, 0.5f, 1e-3f));
     sewfast_pid_settings stopped = {1.0f, INFINITY, 0.0f,     0.0f,  0.0f, INFINITY, 0.0f,
                                     -20.0f, 20.0f,   INFINITY, 1e-3f, 0.0f, 1,        0.0f, INFINITY, 0,
-                                    {{0.0f, 0.0f, 0.0f, 0.0f}}, 1, {notch}};
+                                    {{0.0f, 0.0f, 0.0f, 0.0f}}, 1, {notch}, 0, 0, 0, 0.0f, {{0.0f, 0.0f}}, {0.0f}};
     pid = sewfast_pid_init(&place, sizeof place, &stopped, &refusal);
     CHECK(pid != NULL);
     float most = 0.0f;
@@ -396,6 +398,47 @@ static void pid_is_its_equation(void) {
     CHECK(sewfast_pid_change(pid, &stopped) == 17);
     stopped.biquad_count = 5;
     CHECK(sewfast_pid_init(&place, sizeof place, &stopped, &refusal) == NULL && refusal == 17);
+}
+
+/* A reference two samples early: the command of its level, two of its changes, and the PID on what is expected now. */
+static void pid_feeds_its_reference_forward(void) {
+    static union {
+        uint64_t align;
+        unsigned char bytes[SEWFAST_PID_SIZE];
+    } place;
+    sewfast_pid_settings settings = {0.5f, INFINITY, 0.0f,     0.0f,  0.0f, INFINITY, 0.0f,
+                                     -20.0f, 20.0f,  INFINITY, 1e-3f, 0.0f, 1,        0.0f, INFINITY, 0,
+                                     {{0.0f, 0.0f, 0.0f, 0.0f}}, 0, {{0.0f, 0.0f, 0.0f, 0.0f}}, 2, 2, 2, 0.5f,
+                                     {{-10.0f, -3.0f}, {10.0f, 2.0f}}, {0.75f, -0.25f}};
+    int32_t refusal = -1;
+    sewfast_pid *pid = sewfast_pid_init(&place, sizeof place, &settings, &refusal);
+    CHECK(pid != NULL && refusal == 0);
+    const float r[] = {4.0f, 4.0f, 5.0f, 7.0f, 7.0f, 3.0f, 3.0f, NAN, 6.0f};
+    float given[4] = {4.0f, 4.0f, 4.0f, 4.0f}; /* the newest first; before the first one it was always the same */
+    for (size_t k = 0; k < sizeof r / sizeof r[0]; k++) {
+        memmove(given + 1, given, sizeof given - sizeof given[0]);
+        given[0] = r[k] == r[k] ? r[k] : given[1];
+        const float held = -3.0f + (given[0] + 10.0f) * 5.0f / 20.0f;
+        const float changes = 0.75f * (given[0] - given[1]) - 0.25f * (given[1] - given[2]);
+        const float expected = given[2] + 0.5f * (given[3] - given[2]);
+        const float u = sewfast_pid_step(pid, r[k], 1.0f);
+        CHECK(fabsf(u - (0.5f * (expected - 1.0f) + held + changes)) < 1e-5f);
+    }
+    settings.preview = SEWFAST_PID_AHEAD + 1;
+    CHECK(sewfast_pid_change(pid, &settings) == 18);
+    settings.preview = SEWFAST_PID_AHEAD;
+    CHECK(sewfast_pid_change(pid, &settings) == 0);
+    settings.level_count = SEWFAST_PID_LEVELS + 1;
+    CHECK(sewfast_pid_change(pid, &settings) == 18);
+    settings.level_count = 2;
+    settings.tap_count = 200;
+    CHECK(sewfast_pid_change(pid, &settings) == 18);
+    settings.tap_count = 2;
+    settings.late = 1.5f;
+    CHECK(sewfast_pid_init(&place, sizeof place, &settings, &refusal) == NULL && refusal == 18);
+    settings.late = 0.5f;
+    settings.levels[1].y = -10.0f;
+    CHECK(sewfast_pid_init(&place, sizeof place, &settings, &refusal) == NULL && refusal == 18);
 }
 
 static sewfast_device *computed;
@@ -444,6 +487,7 @@ int main(void) {
     silence_stops_it();
     stop_is_safe_before_it_is_answered();
     pid_is_its_equation();
+    pid_feeds_its_reference_forward();
     credit_lets_a_computed_device_advance();
     printf("a device takes %zu bytes, a controller %zu\n", sewfast_device_size(), sewfast_pid_size());
     return 0;

@@ -53,7 +53,8 @@ impl Host {
                 | capability::DRIVE
                 | capability::CURRENT
                 | capability::DESIGN
-                | capability::BIQUADS,
+                | capability::BIQUADS
+                | capability::FEEDFORWARD,
             ceilings: Limits {
                 volt: 20.0,
                 speed: 4000.0,

@@ -67,7 +67,8 @@ impl<B: Board> Firmware<B> {
                 | capability::PID
                 | capability::DRIVE
                 | capability::DESIGN
-                | capability::BIQUADS,
+                | capability::BIQUADS
+                | capability::FEEDFORWARD,
             ceilings: Limits {
                 volt: 20.0,
                 speed: 4000.0,
