@@ -108,6 +108,15 @@ def samples() -> list[dict[str, Any]]:
     ]
 
 
+def feedforward(preview: int, late: float, levels: int, taps: int) -> bytes:
+    """Body of FEEDFORWARD: levels of 3 V at 1000 RPM, taps that fall by halves."""
+    body = struct.pack("<BfB", preview, late, levels)
+    for k in range(levels):
+        y = 1000.0 * (k - levels // 2)
+        body += struct.pack("<ff", y, 0.003 * y)
+    return body + struct.pack(f"<B{taps}f", taps, *(0.5**j for j in range(taps)))
+
+
 def catalogue() -> list[tuple[str, Frame]]:
     """Frames that reach every edge of the layout."""
     dice = random.Random(7)
@@ -127,6 +136,9 @@ def catalogue() -> list[tuple[str, Frame]]:
         ("DRIVE at 1.5", (0x21, boot, 5, at(1_040_000), struct.pack("<If", 50_000, 1.5))),
         ("CREDIT", (0x22, boot, 6, at(1_050_000), struct.pack("<IQ", 50_000, 2**40))),
         ("ECHO of 200 bytes", (0x0B, boot, 7, at(2**32 + 1_060_000), bytes(range(200)))),
+        ("FEEDFORWARD of two levels", (0x0E, boot, 8, at(1_070_000), feedforward(8, 0.5, 2, 3))),
+        ("FEEDFORWARD in full", (0x0E, boot, 9, at(1_080_000), feedforward(30, 1.0, 8, 16))),
+        ("FEEDFORWARD of none", (0x0E, boot, 10, at(1_090_000), feedforward(0, 0.0, 0, 0))),
         (
             "the longest without a zero",
             (0x0B, 0x0101, 0x01010101, 2**64 // 255, b"\x01" * MAX_BODY),
