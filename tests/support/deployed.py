@@ -385,6 +385,16 @@ def costs() -> Iterator[tuple[str, Model | Controller]]:
     yield "everything: schedule, observer, ramp, slew", replace(everything, biquads=())
     four = (*SECTIONS, Biquad.notch(90.0))
     yield "everything and four biquads", replace(everything, biquads=four)
+    levels = [(1000.0 * k, 3.0 * k) for k in range(-3, 4)]
+    short = replace(
+        CONTROLLERS["filter"], feedforward=Feedforward(8, 0.5, levels[1:-1], [0.01] * 8)
+    )
+    yield "mean of 8, derivative, feedforward of 5 levels and 8 taps", short
+    whole = Feedforward(30, 0.5, [*levels, (4000.0, 12.0)], [0.01] * 16)
+    yield (
+        "everything and feedforward of 8 levels and 16 taps",
+        replace(everything, biquads=(), feedforward=whole),
+    )
     yield "linear model, second order", kinds.model_of("oe")
     rng, width, hidden = np.random.default_rng(4), 4, 8
     core = _core.NeuralOE(

@@ -484,12 +484,13 @@ def _controller_source(
     empty = ("BIQUADS", "AHEAD", "OF_Y", "OF_AHEAD", "OF_R", "INIT", "HELD", "CHANGES")
     places |= dict.fromkeys(empty, "")
     places |= {"TERMS_TYPE": terms, "GAINS_NOW": "@_gains(filtered)"}
-    places |= {"MEMORY": "@_pid", "WITHIN": "c", "PASS": "@_hold(c)"}
+    places |= {"MEMORY": "@_pid", "WITHIN": "c", "PASS": "held", "PASSED": ""}
     if lead := lead_of(numbers):
         places |= {
             "MEMORY": "@_filtering",
             "WITHIN": "&c->of_feedback",
-            "PASS": "@_pass(c, r)",
+            "PASS": "passed",
+            "PASSED": code.template("passed.c"),
             "AHEAD": _ahead(code, lead),
             "OF_AHEAD": code.template("ahead_r.c"),
             "INIT": "    c->newest = 0;\n    c->ahead = 0;\n",

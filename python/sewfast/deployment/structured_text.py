@@ -116,6 +116,7 @@ IF restart THEN
   derivative := {zero};
   r_last := {zero};
   e_last := {zero};
+  y_filtered := {zero};
   u := {first};
 END_IF;
 

@@ -45,13 +45,3 @@ static @_real @_needed(const @_pid *c)
 {
 @NEEDED}
 
-/* A sample without measurement: the reference goes on. */
-static @_real @_pass(@_pid *c, @_real r)
-{
-    if (c->ahead) {
-        @_keep(c, @_ramp(c, r, r));
-        @_expected(c);
-    }
-    return @_hold(c);
-}
-

@@ -4,5 +4,5 @@
     filtered = @_through(c->of_y, filtered);
     c->y_begun = (unsigned char)@_is_finite(filtered);
     if (!c->y_begun) {
-        return @PASS;
+        goto @PASS;
     }

@@ -97,12 +97,12 @@ static @_real @_hold(@_pid *c)
     @_terms g;
     @_real filtered, e, rate_input, change, derivative, integral, proportional, wanted, excess, kept;
     if (!@_is_finite(y)) {
-        return @PASS;
+        goto @PASS;
     }
     filtered = @_filter(@WITHIN, y);
     if (!@_is_finite(filtered)) {
         @_reset_filter(@WITHIN);
-        return @PASS;
+        goto @PASS;
     }
 @OF_Y    c->filtered = filtered;
     r = @_ramp(c, r, filtered);
@@ -126,7 +126,7 @@ static @_real @_hold(@_pid *c)
                 c->integral = c->u;
             }
         }
-        return @_hold(c);
+        goto held;
     }
     c->u = @_limited(c, c->manual ? c->operator_u : wanted);
     excess = c->u - wanted;
@@ -140,6 +140,8 @@ static @_real @_hold(@_pid *c)
     c->e = e;
     c->started = 1;
     return c->u;
+@PASSEDheld:
+    return @_hold(c);
 }
 
 int @_set_manual(@_pid *c, @_real u)
