@@ -371,6 +371,11 @@ def make_controllers(folder: Path) -> list[Path]:
             schedule=[(0.0, gains), (500.0, sewfast.Gains.standard(0.01, 0.3, 0.0))],
         ),
         sewfast.StateFeedback.from_model(model_of("oe"), u_min=-9.0, u_max=9.0),
+        sewfast.Controller(
+            gains, u_min=-20, u_max=20, Ts=TS, filter_samples=4, feedforward=sewfast.Feedforward(
+                8, 0.5, ((-900.0, -3.0), (-50.0, -0.8), (50.0, 0.8), (900.0, 3.0)), (0.01, 0.02),
+            ),
+        ),
     )  # fmt: skip
     return saved(folder, "controller", made)
 

@@ -223,10 +223,8 @@ def test_a_file_of_version_1_is_read() -> None:
 def test_a_file_of_version_1_holds_nothing_of_version_2(tmp_path: Path) -> None:
     path = tmp_path / "mixed.json"
     paper_controller().save(path)
-    later = ("kind", "feedforward")
-    found = {k: v for k, v in json.loads(path.read_text()).items() if k not in later}
-    path.write_text(json.dumps({**found, "version": 1}))
-    with pytest.raises(ModelFileError, match=r"observer_time|r_rate|schedule"):
+    path.write_text(json.dumps({**json.loads(path.read_text()), "version": 1}))
+    with pytest.raises(ModelFileError, match=r"observer_time|r_rate|schedule|kind"):
         load_controller(path)
 
 

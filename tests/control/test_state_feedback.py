@@ -50,7 +50,7 @@ def test_files_come_back_and_pids_keep_their_version(
     assert load_controller(path) == whole
     assert json.loads(path.read_text())["version"] == 4
     sewfast.paper_controller().save(tmp_path / "pid.json")
-    assert json.loads((tmp_path / "pid.json").read_text())["version"] == 3
+    assert json.loads((tmp_path / "pid.json").read_text())["version"] == 5
     assert load_controller(tmp_path / "pid.json") == load_pid(tmp_path / "pid.json")
     with pytest.raises(ModelFileError) as error:
         load_pid(path)
