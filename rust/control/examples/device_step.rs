@@ -6,7 +6,7 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use sewfast_control::link::{
-    Body, Channel, Device, Encoding, Header, Identity, Limits, MAX_WIRE, Measurement, Source,
+    Body, Channel, Deframer, Device, Encoding, Header, Identity, Limits, MAX_WIRE, Measurement, Source,
     State, capability, encode,
 };
 
@@ -111,11 +111,32 @@ impl Host {
         black_box(&out);
     }
 
-    /// Starts a run that only STOP ends, in mode 0, 1 or 2; `whole`: with observer, ramp and a schedule of 8 points.
-    fn run(mode: u8, whole: bool) -> Self {
+    /// The key in the reply to HELLO, which ARM repeats.
+    fn key(&mut self) -> u32 {
+        let (mut heard, mut out) = (Deframer::new(), [0; 64]);
+        loop {
+            self.device.poll(self.now);
+            let count = self.device.transmit(&mut out);
+            assert!(count > 0, "no reply to HELLO");
+            let mut input = &out[..count];
+            while let Some(found) = heard.next(&mut input) {
+                if let Ok(frame) = found
+                    && frame.header.kind == 0x81
+                {
+                    let last = frame.body.last_chunk().expect("a whole reply");
+                    return u32::from_le_bytes(*last);
+                }
+            }
+        }
+    }
+
+    /// Starts a run that only STOP ends, in mode 0, 1 or 2; `whole`: with observer, ramp and a schedule of 8 points;
+    /// `ahead`: with a feedforward of 8 levels and 16 taps.
+    fn run(mode: u8, whole: bool, ahead: bool) -> Self {
         let mut host = Self::new();
         (0..150).for_each(|_| host.period(0));
         host.say(0x01, Body::new().u8(3).u8(3).u32(1));
+        let key = host.key();
         host.say(
             0x04,
             Body::new()
@@ -140,8 +161,20 @@ impl Host {
             }
         }
         host.say(0x09, &gains);
+        if ahead {
+            let mut body = Body::new();
+            body.u8(30).f32(0.5).u8(8);
+            for k in 0..8u8 {
+                body.f32(500.0 * f32::from(k)).f32(1.5 * f32::from(k));
+            }
+            body.u8(16);
+            (0..16).for_each(|_| {
+                body.f32(0.01);
+            });
+            host.say(0x0E, &body);
+        }
         host.say(0x08, Body::new().u8(mode & 1).u32(0).u32(0));
-        host.say(0x05, Body::new().u32(50_000));
+        host.say(0x05, Body::new().u32(50_000).u32(key));
         let length = if mode == 2 { 0 } else { SAMPLES };
         let mut start = Body::new();
         start
@@ -174,13 +207,15 @@ impl Host {
 
 fn main() {
     let runs = [
-        (0, false, "open loop"),
-        (1, false, "PID"),
-        (1, true, "whole design"),
-        (2, false, "direct drive"),
+        (0, false, false, "open loop"),
+        (1, false, false, "PID"),
+        (1, false, true, "PID, ahead"),
+        (1, true, false, "whole design"),
+        (1, true, true, "whole, ahead"),
+        (2, false, false, "direct drive"),
     ];
-    for (mode, whole, what) in runs {
-        let mut host = Host::run(mode, whole);
+    for (mode, whole, ahead, what) in runs {
+        let mut host = Host::run(mode, whole, ahead);
         let clock = Instant::now();
         for sample in 0..SAMPLES {
             if mode != 2 && sample % 40 == 0 {
