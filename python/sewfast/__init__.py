@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .control.controller import Controller, paper_controller
     from .control.feedforward import Feedforward
     from .control.files import load_controller
-    from .control.loop import ClosedLoopRun, planned, run
+    from .control.loop import ClosedLoopRun, run
     from .control.machine import Machine, record
     from .control.margins import Margins, margins, operating_point
     from .control.state_feedback import StateFeedback
@@ -132,7 +132,6 @@ __all__ = [
     "paper_controller",
     "pareto",
     "physics",
-    "planned",
     "read",
     "read_table",
     "record",
@@ -168,7 +167,7 @@ _HOMES = {
     "greybox": "Motor load_motor physics",
     "identification": "identify",
     "identification.least_squares": "LeastSquaresResult least_squares",
-    "control.loop": "ClosedLoopRun planned run",
+    "control.loop": "ClosedLoopRun run",
     "control.machine": "Machine record",
     "machine": "VirtualMachine",
     "models": "ARX IV Ensemble LinearOE Model NeuralOE NeuralSS load_model",

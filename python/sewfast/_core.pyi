@@ -563,11 +563,6 @@ def inverse_taps(
     """The taps of a feedforward for each preview and smoothing, on plants about levels: A, B, C, D of one input, its delay and
     the slope of the command over the level."""
 
-def planned(
-    reference: _F, ahead: tuple[int, float, list[tuple[float, float]], list[float]], *, low: float, high: float, smooth: int
-) -> _F:
-    """The nearest reference that commands within the limits can follow; corners are rounded over ``smooth`` samples."""
-
 @final
 class Controller:
     """The controller's arithmetic, one sample at a time (paper Fig. 16). Gains in standard form."""

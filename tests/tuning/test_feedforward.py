@@ -11,7 +11,7 @@ import pytest
 from sewfast import _core, signals
 from sewfast.control import Controller, Feedforward, Gains, load_controller
 from sewfast.control.feedforward import reduced
-from sewfast.control.loop import planned, run
+from sewfast.control.loop import run
 from sewfast.errors import ModelFileError, SettingError
 from sewfast.machine import VirtualMachine
 from sewfast.models import LinearOE
@@ -120,31 +120,6 @@ def test_a_limit_of_overshoot_holds_with_it() -> None:
     limited = Constraints(overshoot=1.0)
     found = tune(drive(), [RAMP], constraints=limited, evaluations=300, threads=2)
     assert run(found.controller, drive(), RAMP).metrics()["overshoot_percent"] <= 1.0
-
-
-def test_a_step_is_planned_and_then_followed_on_the_machine() -> None:
-    found = tune(drive(), "trapezoid", evaluations=300, threads=2)
-    step = np.where(np.arange(1500) < 100, 0.0, 3000.0)
-    reference = planned(step, found.controller)
-    loop = run(found.controller, drive(), reference)
-    assert rms(loop.y - loop.r) < 30.0
-    assert np.abs(loop.u).max() < 20.0
-    # within .1 s of what the limits alone allow: 490 RPM/V within .25 s, 18 V
-    assert int(np.argmax(reference == 3000.0)) < 100 + 120
-    calm = planned("trapezoid", found.controller, smooth=0.0)
-    np.testing.assert_allclose(calm, signals.reference("trapezoid", 0), atol=1e-9)
-
-
-def test_what_cannot_be_planned_is_refused_with_what_it_needs() -> None:
-    with pytest.raises(SettingError, match=r"10000.*sample 1"):
-        planned([0.0, 10000.0], PI)
-    with pytest.raises(SettingError, match="feedforward"):
-        planned([0.0, 100.0], replace(PI, feedforward=None))
-    with pytest.raises(SettingError, match="limits"):
-        planned([0.0, 100.0], replace(PI, u_max=np.inf))
-    for room in (1.0, -0.1):
-        with pytest.raises(SettingError, match="room"):
-            planned([0.0, 100.0], PI, room=room)
 
 
 def test_it_stands_without_a_command_and_begins_early() -> None:

@@ -81,11 +81,6 @@ def add(commands: Commands) -> None:
         help="reference to track; default: a trapezoid over the recorded range of the model (none "
         "for a drive)",
     )  # fmt: skip
-    parser.add_argument(
-        "--planned", action="store_true",
-        help="the nearest reference that the drive can follow, by the model behind the "
-        "controller's feedforward: a step becomes a ramp",
-    )  # fmt: skip
     add_output(
         parser, "OUT",
         "CSV, .npz, .mat or Parquet, for a drive also .mcap; default: CSV to standard output",
@@ -112,12 +107,11 @@ def run_command(args: argparse.Namespace) -> int | None:
     if not is_port(args.on):
         require_no_drive_options(args)
         if is_fmu(args.on):
-            machine, reference = machine_of(args.on), _wanted(args, controller)
-            found = run(controller, machine, reference, name=name)
+            found = run(controller, machine_of(args.on), _wanted(args, controller), name=name)
             _show_run(args, found, None)
             return None
         plant = plant_of(args.on)
-        reference = _wanted(args, controller, plant)
+        reference = _wanted(args, controller)
         found = run(controller, plant, reference, name=name)
         calm = None
         if noise_in_loop(controller, plant) > 0.0:
@@ -202,16 +196,11 @@ def plant_of(text: str) -> Plant:
     return load_model(text)
 
 
-def _wanted(args: argparse.Namespace, controller: SampledController, plant: Any = None) -> Any:
-    """The reference of a run, planned if so asked; None for the plant's default."""
-    from ..control.loop import planned
-
-    if args.reference is None and args.planned:
-        raise SettingError("--planned: expected a --reference to plan, received none")
+def _wanted(args: argparse.Namespace, controller: SampledController) -> Any:
+    """The reference of a run; None for the plant's default."""
     if args.reference is None:
         return None
-    wanted = reference_of(args.reference, controller.Ts, controller.y_unit)
-    return planned(wanted, controller, plant=plant) if args.planned else wanted
+    return reference_of(args.reference, controller.Ts, controller.y_unit)
 
 
 def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:

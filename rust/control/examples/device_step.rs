@@ -6,8 +6,8 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use sewfast_control::link::{
-    Body, Channel, Deframer, Device, Encoding, Header, Identity, Limits, MAX_WIRE, Measurement, Source,
-    State, capability, encode,
+    Body, Channel, Deframer, Device, Encoding, Header, Identity, Limits, MAX_WIRE, Measurement,
+    Source, State, capability, encode,
 };
 
 const SAMPLES: u32 = 2_000_000;

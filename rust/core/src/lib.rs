@@ -44,7 +44,6 @@ pub mod neural_ss;
 pub mod oe;
 pub mod orders;
 pub mod output_error;
-pub mod planned;
 pub mod proposal;
 pub mod random;
 mod regression;

@@ -1,6 +1,6 @@
 //! Bindings of the controller, one sample at a time, in double precision and in the single precision of most microcontrollers.
 
-use numpy::{PyArray1, PyReadonlyArray1, PyReadonlyArray2};
+use numpy::{PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::{
@@ -10,7 +10,7 @@ use sewfast_control::{
 use sewfast_core::inverse::{self, Local};
 use sewfast_core::{Error, Result as CoreResult};
 
-use crate::seam::{array1, raise, slice};
+use crate::seam::{raise, slice};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Controller>()?;
@@ -18,8 +18,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<StateFeedback>()?;
     module.add_class::<SingleStateFeedback>()?;
     module.add_function(wrap_pyfunction!(biquad, module)?)?;
-    module.add_function(wrap_pyfunction!(inverse_taps, module)?)?;
-    module.add_function(wrap_pyfunction!(planned, module)?)
+    module.add_function(wrap_pyfunction!(inverse_taps, module)?)
 }
 
 /// The controller's arithmetic (paper Fig. 16). Gains in standard form.
@@ -131,23 +130,6 @@ fn inverse_taps(
     each.map(|&(preview, smoothing)| inverse::taps(&plants, preview, count, smoothing))
         .collect::<CoreResult<_>>()
         .map_err(|e| raise(py, e))
-}
-
-/// The nearest reference that the commands from `low` to `high` can follow, by the feedforward's model.
-#[pyfunction]
-#[pyo3(signature = (reference, ahead, *, low, high, smooth))]
-fn planned<'py>(
-    py: Python<'py>,
-    reference: PyReadonlyArray1<'py, f64>,
-    ahead: Ahead,
-    low: f64,
-    high: f64,
-    smooth: usize,
-) -> PyResult<Bound<'py, PyArray1<f64>>> {
-    let r = slice(&reference, "reference")?;
-    let ahead = feedforward(&Some(ahead)).map_err(|e| raise(py, Error::from(e)))?;
-    let made = sewfast_core::planned::planned(r, &ahead, (low, high), smooth);
-    made.map(|made| array1(py, made)).map_err(|e| raise(py, e))
 }
 
 fn schedule(rows: &[Given]) -> Result<Schedule<f64>, Refused> {
