@@ -10,7 +10,7 @@ use std::mem::{offset_of, size_of, size_of_val};
 use std::process::{Command, Stdio};
 
 use sewfast_capi::device::{CAPACITY, CChannel, CIdentity, CLimits, CMeasurement, COutput};
-use sewfast_capi::pid::{CBiquad, CPoint, CSettings};
+use sewfast_capi::pid::{CBiquad, CLevel, CPoint, CSettings};
 
 /// Size of a struct, and size and offset of its fields, as assertions in C. A new field in Rust must be named here,
 /// because the pattern has no `..`.
