@@ -332,12 +332,11 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
     if c.feedforward is not None and not identity.capabilities & wire.FEEDFORWARD:
         unknown.append("feedforward")
     if unknown:
-        ahead = "feedforward" in unknown
         raise SettingError(
             name="controller", expected=f"one without {' and '.join(unknown)} for this device",
             received="one that its firmware does not support",
-            remedy=f"leave it out{' (tune --no-feedforward)' if ahead else ''}, or build the "
-            f"firmware with this sewfast{' and set SEWFAST_CAN_FEEDFORWARD' if ahead else ''}",
+            remedy="leave it out (a feedforward: tune --no-feedforward), or build the firmware with "
+            "this sewfast and its capabilities (SEWFAST_CAN_FEEDFORWARD)",
         )  # fmt: skip
     values = (
         g.Kp, g.Ti, g.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew, c.filter_time,
