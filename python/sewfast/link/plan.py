@@ -335,8 +335,8 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
         raise SettingError(
             name="controller", expected=f"one without {' and '.join(unknown)} for this device",
             received="one that its firmware does not support",
-            remedy="leave it out (a feedforward: tune --no-feedforward), or build the firmware with "
-            "this sewfast and its capabilities (SEWFAST_CAN_FEEDFORWARD)",
+            remedy="leave it out (a feedforward: tune --no-feedforward), or build the firmware "
+            "with this sewfast and its capabilities (SEWFAST_CAN_FEEDFORWARD)",
         )  # fmt: skip
     values = (
         g.Kp, g.Ti, g.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew, c.filter_time,
