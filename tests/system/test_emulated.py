@@ -93,14 +93,15 @@ def test_recordings_on_credit_are_equal_and_the_processor_is_measured() -> None:
             figures = board.figures()
             made.append((chirp.counts, run.y, run.u))
         # ceilings, as an embedded developer plans by them
-        # state feedback and its command took 4.5 KB more than the PID alone
-        assert figures.code <= 46 * 1024
+        # state feedback and its command took 4.5 KB more than the PID alone, feedforward and its
+        # own 5.1; the longest period begins a run, and copies its controller
+        assert figures.code <= 49 * 1024
         assert figures.stack <= 4096
         assert figures.memory <= 16 * 1024
         assert figures.steps >= 4000
         assert figures.instructions is not None
         least, mean, most = figures.instructions
-        assert 100 < least < mean < most < 10_000
+        assert 100 < least < mean < most < 12_000
     for first, second in zip(*made, strict=True):
         np.testing.assert_array_equal(first, second)
     assert abs(made[0][1][-1] - 1000.0) < 20.0
