@@ -266,7 +266,7 @@ class Studio:
                     was_writer = self._writer is page
                     self._writer = None if was_writer else self._writer
                 if was_writer and self._line.may_move:
-                    self._line.stop("the page that held the control was closed")
+                    self._line.stop("the page in control was closed")
                 if upload is not None:
                     upload.abandon()
                 page.end()
@@ -374,7 +374,7 @@ class Studio:
                 return {"held_s": time.monotonic() - self._since, "moves": line.may_move}
             page.told, self._writer, self._since = None, page, time.monotonic()
         if before is not page and line.may_move:
-            line.stop("another page has taken the control")
+            line.stop("another page has taken control")
         if others is not None:
             others.send(to_text({"event": "lost"}))
         self._tell_all()
