@@ -68,8 +68,8 @@ pub fn taps(plants: &[Local], preview: usize, count: usize, smoothing: f64) -> R
     for Local { response, slope } in plants {
         let mut held = 0.0;
         let shifted = |i: usize, j: usize| i.checked_sub(j).map_or(0.0, |lag| response[lag]);
-        for i in 0..response.len() {
-            held += response[i];
+        for (i, now) in response.iter().enumerate() {
+            held += now;
             // sample i - preview: the step of the reference comes at 0
             let wanted = f64::from(u8::from(i >= preview)) - slope * held;
             for j in 0..count {
@@ -97,6 +97,8 @@ pub fn taps(plants: &[Local], preview: usize, count: usize, smoothing: f64) -> R
 
 #[cfg(test)]
 mod tests {
+    use std::slice::from_ref;
+
     use super::*;
 
     fn answer(plant: &Local, preview: usize, taps: &[f64]) -> Vec<f64> {
@@ -113,7 +115,7 @@ mod tests {
         // y(k+1) = .98 y(k) + .5 u(k-2)
         let plant = Local::new(&[0.98], &[0.5], &[1.0], 0.0, 2, 0.02 / 0.5);
         assert_eq!(plant.response[..5], [0.0, 0.0, 0.0, 0.5, 0.5 * 0.98]);
-        let found = taps(&[plant.clone()], 3, 4, 1e-9).unwrap();
+        let found = taps(from_ref(&plant), 3, 4, 1e-9).unwrap();
         assert!((found[0] - 0.98 / 0.5).abs() < 1e-3, "{found:?}");
         assert!(found[1..].iter().all(|tap| tap.abs() < 1e-3), "{found:?}");
         let y = answer(&plant, 3, &found);
@@ -125,7 +127,7 @@ mod tests {
         // b(q) = q (-.5 + q): y(k) = .9 y(k-1) - .5 u(k-1) + u(k-2)
         let plant = Local::new(&[0.9], &[1.0], &[-0.5 * 0.9 + 1.0], -0.5, 1, 0.1 / 0.5);
         let worst = |preview: usize| {
-            let found = taps(&[plant.clone()], preview, 16, 1e-6).unwrap();
+            let found = taps(from_ref(&plant), preview, 16, 1e-6).unwrap();
             let y = answer(&plant, preview, &found);
             y.iter().map(|y| (y - 1.0).abs()).fold(0.0, f64::max)
         };
@@ -136,7 +138,7 @@ mod tests {
     #[test]
     fn an_integrator_is_moved_by_its_taps_alone_and_several_plants_share_them() {
         let integrator = Local::new(&[1.0], &[0.1], &[1.0], 0.0, 1, 0.0);
-        let found = taps(&[integrator.clone()], 2, 4, 1e-9).unwrap();
+        let found = taps(from_ref(&integrator), 2, 4, 1e-9).unwrap();
         assert!((found.iter().sum::<f64>() - 10.0).abs() < 1e-3, "{found:?}");
         let faster = Local::new(&[1.0], &[0.2], &[1.0], 0.0, 1, 0.0);
         let both = taps(&[integrator, faster], 2, 4, 1e-9).unwrap();
@@ -152,7 +154,7 @@ mod tests {
             assert!(taps(&plants, 2, 4, 1e-3).is_err());
         }
         let plant = Local::new(&[0.9], &[1.0], &[1.0], 0.0, 1, 0.1);
-        assert!(taps(&[plant.clone()], 2, 0, 1e-3).is_err());
+        assert!(taps(from_ref(&plant), 2, 0, 1e-3).is_err());
         assert!(taps(&[plant], 2, 4, 0.0).is_err());
     }
 }
