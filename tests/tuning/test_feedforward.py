@@ -17,7 +17,7 @@ from sewfast.machine import VirtualMachine
 from sewfast.models import LinearOE
 from sewfast.models.rest import Rest
 from sewfast.tuning import Constraints, tune
-from sewfast.tuning.lead import choices
+from sewfast.tuning.lead import _mirrored, choices
 from sewfast.tuning.task import TuningTask
 
 LEVELS = ((-3000.0, -6.5), (-9.0, -0.5), (0.0, 0.0), (9.0, 0.5), (3000.0, 6.5))
@@ -196,3 +196,28 @@ def test_every_reference_by_name_has_its_shape() -> None:
         early = PI.early(r)
         np.testing.assert_array_equal(early[: len(r) - 8], r[8:])
         assert np.all(early[-8:] == r[-1])
+
+
+def test_models_of_several_recordings_share_their_levels() -> None:
+    plants = [
+        replace(drive(), training={**drive().training, "output_range": [-a, a]}) for a in (2e3, 3e3)
+    ]
+    lead = tune(plants, [RAMP, -0.6 * RAMP], evaluations=60, threads=2).pid.feedforward
+    assert lead is not None
+    assert len(lead.levels) >= 2
+
+
+def test_the_level_at_rest_stays_however_straight_the_line() -> None:
+    line = [(float(y), 2.0 * y + 1e-4 * (y == 3)) for y in range(7)]
+    assert [y for y, _ in reduced(line, always=3.0)] == [0.0, 3.0, 6.0]
+    assert [y for y, _ in reduced(line)] == [0.0, 6.0]
+
+
+def test_a_side_known_only_about_rest_is_the_mirror_of_the_other() -> None:
+    rest = Rest((1.0,), 10.0)
+    levels = [(9.0, 0.5), (11.0, 1.5), (500.0, 3.0), (1000.0, 5.0)]
+    mirrored = _mirrored(levels, rest, 250.0)
+    assert mirrored[:3] == [(-980.0, -3.0), (-480.0, -1.0), (9.0, 0.5)]
+    assert mirrored[3:] == levels[1:]
+    both = [(-900.0, -4.0), *levels]
+    assert _mirrored(both, rest, 250.0) == both

@@ -116,16 +116,19 @@ class Feedforward:
         return f"{counts}, preview of {self.preview} samples"
 
 
-def reduced(levels: Sequence[tuple[float, float]], most: int = LEVELS) -> list[tuple[float, float]]:
+def reduced(
+    levels: Sequence[tuple[float, float]], most: int = LEVELS, always: float | None = None
+) -> list[tuple[float, float]]:
     """The fewest of these levels, at most `most`, that draw the line through all of them.
 
+    The output `always` stays if it is among them.
     One level after another is added where the line is farthest off, until it is within a thousandth
     of the commands' range.
     """
     if len(levels) < 3:
         return list(levels)
     y, u = np.array(levels).T
-    kept = [0, len(levels) - 1]
+    kept = sorted({0, len(levels) - 1, *np.flatnonzero(y == always).tolist()})
     while len(kept) < most:
         off = np.abs(np.interp(y, y[kept], u[kept]) - u)
         worst = int(off.argmax())

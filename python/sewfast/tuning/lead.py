@@ -43,6 +43,9 @@ its full size there, as a jump cannot be drawn."""
 LEADING, PART = 0.15, 0.6
 """Part of a time budget that the search leaves to the feedforward, and part of what is left
 then that this may take."""
+SHARES = (1.0, 0.95, 0.9, 0.8)
+"""Shares of the best feedforward, of which the first that no plant loses by is taken: a drive whose
+gain is a quarter too large needs less of it."""
 PARTS = (0.25, 0.5, 1.0)
 """The other levels, as shares of the way from rest to the ends of the range."""
 
@@ -65,13 +68,16 @@ def choices(task: TuningTask, lead: Lead, deadline: Deadline | None = None) -> C
     models = [p for p in task.plants if isinstance(p, Model)]
     if not (isinstance(task.start, Controller) and models):
         return Choices(reason="only a PID that is tuned on models has feedforward")
-    points = [list(_points(model, task, deadline)) for model in models]
+    rest, ends = task.rest, _ends(models, task)
+    points = [list(_points(model, rest, ends, deadline)) for model in models]
     local = [point for found in points for _, point, is_moving in found if is_moving]
     if not all(points) or not local:
         return Choices(reason="a model does not stand still within the references")
     if any(max(abs(p.poles), default=0.0) > 1.0 + ROUNDING for p in local):
         return Choices(reason="a model is unstable, and has no inverse that one may trust")
-    levels = reduced(_with_rest(_mean(points), task.rest))
+    moving = PARTS[0] * max(ends[1] - rest.y, rest.y - ends[0])
+    known = _with_rest(_mirrored(_mean(points), rest, moving), rest)
+    levels = reduced(known, always=rest.y)
     delay = min(p.delay for p in local)
     previews = {min(delay + more, AHEAD) for more in FURTHER} if lead == "preview" else {0}
     pairs = [(preview, smoothing) for preview in sorted(previews) for smoothing in SMOOTHINGS]
@@ -86,12 +92,27 @@ def choices(task: TuningTask, lead: Lead, deadline: Deadline | None = None) -> C
     )
 
 
-def _points(model: Model, task: TuningTask, deadline: Deadline | None = None) -> Iterator[Point]:
-    """Steady states within the range of references and record."""
-    rest = model.rest.y
+def _part(one: Feedforward, share: float, rest: Rest) -> Feedforward:
+    """A share of it, about rest."""
+    if share == 1.0:
+        return one
+    u = rest.u[0]
+    levels = tuple((y, u + share * (held - u)) for y, held in one.levels)
+    return replace(one, levels=levels, taps=tuple(share * tap for tap in one.taps))
+
+
+def _ends(models: Sequence[Model], task: TuningTask) -> tuple[float, float]:
+    """The range of references and records, the same for all models: their levels must agree."""
     ends = [float(f(r)) for r in task.references for f in (np.min, np.max)]
-    ends += [rest, *(recorded_outputs(model) or ())]
-    low, high = min(ends), max(ends)
+    ends += [task.rest.y, *(y for model in models for y in recorded_outputs(model) or ())]
+    return min(ends), max(ends)
+
+
+def _points(
+    model: Model, at: Rest, ends: tuple[float, float], deadline: Deadline | None = None
+) -> Iterator[Point]:
+    """Steady states within the range."""
+    rest, (low, high) = at.y, ends
     moving = PARTS[0] * max(high - rest, rest - low)
     beside, grid = BESIDE * (high - low), command_grid(model)
     for end in (low, high):
@@ -116,6 +137,21 @@ def _mean(points: Sequence[Sequence[Point]]) -> list[tuple[float, float]]:
                 known.setdefault(level, []).append(float(point.u[0]))
     everywhere = {y: u for y, u in known.items() if len(u) == len(points)}
     return [(y, float(np.mean(u))) for y, u in sorted(everywhere.items())]
+
+
+def _mirrored(
+    levels: list[tuple[float, float]], rest: Rest, moving: float
+) -> list[tuple[float, float]]:
+    """The levels, with the other side's mirrored about rest where a side knows nothing but the
+    neighbourhood of rest: the line through dry friction must not be drawn on.
+    """
+    for side in (-1.0, 1.0):
+        own = [level for level in levels if side * (level[0] - rest.y) > 0.0]
+        others = [level for level in levels if side * (level[0] - rest.y) < 0.0]
+        if others and all(abs(y - rest.y) < 0.999 * moving for y, _ in own):
+            made = [(2.0 * rest.y - y, 2.0 * rest.u[0] - u) for y, u in others]
+            return sorted([*others, *made])
+    return levels
 
 
 def _with_rest(levels: list[tuple[float, float]], rest: Rest) -> list[tuple[float, float]]:
@@ -187,8 +223,11 @@ def with_lead(
     judged = _judged(task, tried, deadline)
     best = min(range(len(tried)), key=lambda k: judged[k][::-1])
     led = Led(alone, judged[best][0], _judged(task, [alone], deadline)[0][0])
-    if all(_is_better(one, tried[best], alone, deadline) for one in (task, *others)):
-        return tried[best], led
+    for share in SHARES:
+        part = _part(among.feedforwards[best], share, task.rest)
+        controller = replace(tried[best], feedforward=part)
+        if all(_is_better(one, controller, alone, deadline) for one in (task, *others)):
+            return controller, replace(led, cost=_judged(task, [controller], deadline)[0][0])
     return alone, replace(led, reason="on a model, or in its spread, a loop follows worse with one")
 
 
