@@ -23,7 +23,7 @@ from ..gains import Gains
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
 from ..rules import Fopdt, Rule, eq_12, simc
-from ..tuning.lead import with_lead
+from ..tuning.lead import Effort, with_lead
 from ..tuning.objective import LARGEST_MS, Constraints, Cost, LoadStep
 from ..tuning.search import TuningResult, costs, recoveries, tune
 from ..tuning.task import TuningTask
@@ -243,13 +243,15 @@ def led(
     references: Mapping[str, FloatArray],
     cost: Cost,
     disturbances: Sequence[FloatArray] | None,
+    threads: int,
 ) -> TuningResult:
     """The tuned gains with a feedforward, if no member follows the references worse with it."""
     task = TuningTask.of(
         ensemble, list(references.values()), start=tuning.pid, first={}, cost=cost,
         aggregate="mean", constraints=None, variations=None, disturbances=disturbances,
     )  # fmt: skip
-    controller, found = with_lead(task, tuning.pid, "preview")
+    effort = Effort(threads=threads)
+    controller, found = with_lead(task, tuning.pid, "preview", effort=effort)
     return replace(tuning, controller=controller, lead=found)
 
 

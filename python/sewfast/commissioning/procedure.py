@@ -542,7 +542,7 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
     journal.keep(models=ensemble, rmse=trained.errors_of(ensemble))
     plants = "a linear model" if is_alone else "an ensemble of networks"
     if plan.thinning.k == 1:
-        tuning = led(tuning, ensemble, practice, cost, plan.pushes)
+        tuning = led(tuning, ensemble, practice, cost, plan.pushes, asked.threads)
     tuned = plan.thinning.fine(tuning.pid)
     controller = replace(tuned, notes=f"commissioned on {plants}")
     if tuning.warning is not None:

@@ -6,7 +6,7 @@ import contextlib
 import itertools
 import math
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -15,6 +15,7 @@ from .. import _core
 from ..control.controller import Controller
 from ..control.defaults import recorded_outputs
 from ..control.feedforward import AHEAD, TAPS, Feedforward, reduced
+from ..control.loop import titles
 from ..control.margins import command_grid, point_within
 from ..errors import FitError, SettingError
 from ..models import Model
@@ -25,7 +26,7 @@ from .task import Deadline
 
 if TYPE_CHECKING:
     from ..evidence import OperatingPoint
-    from .task import Budget, TuningTask
+    from .task import TuningTask
 
 Lead: TypeAlias = Literal["preview", "causal", "none"]
 """With the reference known ahead, in time only, or without feedforward."""
@@ -35,8 +36,8 @@ WEIGHTS = ("alpha", "beta")
 
 SMOOTHINGS = (1e-3, 1e-2, 1e-1)
 """Multiples of the squared taps among which costs choose, from a sharp inverse to a calm one."""
-FURTHER = (0, 2, 4, 6, 8, 12)
-"""Samples of preview beyond the plant's delay among which the costs choose."""
+FURTHER, FEW = (0, 2, 4, 6, 8, 12), (4, 8)
+"""Samples of preview beyond the plant's delay among which costs choose; few until a deadline."""
 BESIDE = 2e-3
 """Distance from rest of the first levels to either side, as a share of the range: dry friction has
 its full size there, as a jump cannot be drawn."""
@@ -56,6 +57,24 @@ dry friction."""
 
 
 @dataclass(frozen=True)
+class Effort:
+    """How much may be tried: until a deadline few, on so many threads."""
+
+    deadline: Deadline | None = None
+    threads: int = field(default_factory=available)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether there is time for all."""
+        return self.deadline is None or self.deadline.budget.seconds is None
+
+    def check(self) -> None:
+        """Raise `TimeUp` at the deadline."""
+        if self.deadline is not None:
+            self.deadline(1, 1, 0.0)
+
+
+@dataclass(frozen=True)
 class Choices:
     """Feedforwards among which the costs choose; `reason` says why there are none."""
 
@@ -63,28 +82,31 @@ class Choices:
     reason: str = ""
 
 
-def choices(task: TuningTask, lead: Lead, deadline: Deadline | None = None) -> Choices:
+def choices(task: TuningTask, lead: Lead, effort: Effort | None = None) -> Choices:
     """The feedforwards that the models of a task allow; raises `TimeUp` at a deadline."""
+    effort = effort or Effort()
     models = [p for p in task.plants if isinstance(p, Model)]
     if not (isinstance(task.start, Controller) and models):
         return Choices(reason="only a PID that is tuned on models has feedforward")
     rest, ends = task.rest, _ends(models, task)
-    points = [list(_points(model, rest, ends, deadline)) for model in models]
-    local = [point for found in points for _, point, is_moving in found if is_moving]
+    points = [list(_points(model, rest, ends, effort)) for model in models]
+    local = [(level, point) for found in points for level, point, moves in found if moves]
     if not all(points) or not local:
         return Choices(reason="a model does not stand still within the references")
-    if any(max(abs(p.poles), default=0.0) > 1.0 + ROUNDING for p in local):
+    if any(max(abs(p.poles), default=0.0) > 1.0 + ROUNDING for _, p in local):
         return Choices(reason="a model is unstable, and has no inverse that one may trust")
     moving = PARTS[0] * max(ends[1] - rest.y, rest.y - ends[0])
     known = _with_rest(_mirrored(_mean(points), rest, moving), rest)
     levels = reduced(known, always=rest.y)
-    delay = min(p.delay for p in local)
-    previews = {min(delay + more, AHEAD) for more in FURTHER} if lead == "preview" else {0}
-    pairs = [(preview, smoothing) for preview in sorted(previews) for smoothing in SMOOTHINGS]
+    delay = min(p.delay for _, p in local)
+    further, smoothings = (FURTHER, SMOOTHINGS) if effort.is_whole else (FEW, SMOOTHINGS[1:2])
+    previews = {min(delay + more, AHEAD) for more in further} if lead == "preview" else {0}
+    pairs = [(preview, smoothing) for preview in sorted(previews) for smoothing in smoothings]
+    plants = [_local(p, _slope(levels, level, rest.y)) for level, p in local]
     try:
-        taps = _core.inverse_taps([_local(p) for p in local], pairs, count=TAPS)
-    except SettingError as error:
-        return Choices(reason=str(error))
+        taps = _core.inverse_taps(plants, pairs, count=TAPS)
+    except SettingError:
+        return Choices(reason="a model answers a command within 256 samples with nothing finite")
     late = 0.5 if task.start.counts_per_unit > 0.0 else 0.0
     made = zip(pairs, taps, strict=True)
     return Choices(
@@ -108,9 +130,7 @@ def _ends(models: Sequence[Model], task: TuningTask) -> tuple[float, float]:
     return min(ends), max(ends)
 
 
-def _points(
-    model: Model, at: Rest, ends: tuple[float, float], deadline: Deadline | None = None
-) -> Iterator[Point]:
+def _points(model: Model, at: Rest, ends: tuple[float, float], effort: Effort) -> Iterator[Point]:
     """Steady states within the range."""
     rest, (low, high) = at.y, ends
     moving = PARTS[0] * max(high - rest, rest - low)
@@ -120,8 +140,7 @@ def _points(
         if abs(way) <= beside:
             continue
         for off in (math.copysign(beside, way), *(part * way for part in PARTS)):
-            if deadline is not None:
-                deadline(1, 1, 0.0)
+            effort.check()
             # a level that the model does not reach, or at which it jumps, is left out
             with contextlib.suppress(SettingError, FitError):
                 point = point_within(model, grid, rest + off)
@@ -160,9 +179,19 @@ def _with_rest(levels: list[tuple[float, float]], rest: Rest) -> list[tuple[floa
     return sorted([*kept, (rest.y, rest.u[0])]) if kept else []
 
 
-def _local(point: OperatingPoint) -> tuple[Any, ...]:
-    gain = float(point.dc_gain[0])
-    slope = 1.0 / gain if math.isfinite(gain) and gain != 0.0 else 0.0
+def _slope(levels: Sequence[tuple[float, float]], y: float, rest: float) -> float:
+    """The slope of the line through the levels at an output, towards rest; 0 without a line."""
+    if len(levels) < 2:
+        return 0.0
+    outputs, commands = np.array(levels).T
+    side: Literal["left", "right"] = "left" if y > rest else "right"
+    i = int(np.clip(np.searchsorted(outputs, y, side) - (side == "left"), 0, len(levels) - 2))
+    if side == "right" and outputs[i] == y and y > rest:
+        i = max(i - 1, 0)
+    return float((commands[i + 1] - commands[i]) / (outputs[i + 1] - outputs[i]))
+
+
+def _local(point: OperatingPoint, slope: float) -> tuple[Any, ...]:
     A, B, C = (np.ascontiguousarray(m) for m in (point.A, point.B[:, 0], point.C[0]))
     return A, B, C, float(point.D[0, 0]), point.delay, slope
 
@@ -206,29 +235,36 @@ def with_lead(
     lead: Lead,
     searched: Collection[str] = WEIGHTS,
     others: Sequence[TuningTask] = (),
-    time: Budget | None = None,
+    effort: Effort | None = None,
 ) -> tuple[Controller, Led]:
     """A PID with feedforward, if that costs less over all plants of this task and of the others,
     and no more on any of them in any variation; otherwise the PID alone.
-    The feedforward does the work of set-point weights, which become 1 if they are `searched`. The
-    gains stay: what they owe to loads, noise and other plants, margins included, they keep.
+    The feedforward does the work of alpha and beta, which become 0 if they are `searched`. The
+    gains stay: what they owe to loads, noise and other plants, margins included, they keep. Raises
+    `TimeUp` at a deadline.
     """
-    deadline = None if time is None else Deadline(time, time.share(PART), None)
-    among = choices(task, lead, deadline)
+    effort = effort or Effort()
+    among = choices(task, lead, effort)
     weights: dict[str, Any] = {name: 0.0 for name in WEIGHTS if name in searched}
     tried = [replace(alone, feedforward=one, **weights) for one in among.feedforwards]
     if not tried:
         return alone, Led(alone, reason=among.reason)
     task, others = _following(task), [_following(other) for other in others]
-    judged = _judged(task, tried, deadline)
+    judged = _judged(task, tried, effort)
     best = min(range(len(tried)), key=lambda k: judged[k][::-1])
-    led = Led(alone, judged[best][0], _judged(task, [alone], deadline)[0][0])
-    for share in SHARES:
+    led = Led(alone, judged[best][0], _judged(task, [alone], effort)[0][0])
+    objection = ""
+    for share in SHARES if effort.is_whole else SHARES[:1]:
         part = _part(among.feedforwards[best], share, task.rest)
         controller = replace(tried[best], feedforward=part)
-        if all(_is_better(one, controller, alone, deadline) for one in (task, *others)):
-            return controller, replace(led, cost=_judged(task, [controller], deadline)[0][0])
-    return alone, replace(led, reason="on a model, or in its spread, a loop follows worse with one")
+        said = (_objection(one, controller, alone, effort) for one in (task, *others))
+        objection = next(filter(None, said), "")
+        if not objection:
+            return controller, replace(led, cost=_judged(task, [controller], effort)[0][0])
+    kept = [name for name in WEIGHTS if name not in weights and getattr(alone, name) != 0.0]
+    if kept:
+        objection += f"; {' and '.join(kept)} do the same work: search them, or start with 0"
+    return alone, replace(led, reason=objection)
 
 
 def _following(task: TuningTask) -> TuningTask:
@@ -241,28 +277,37 @@ def _following(task: TuningTask) -> TuningTask:
     return replace(task, cost=cost, constraints=limits, loads=[])
 
 
-def _is_better(
-    task: TuningTask, controller: Controller, alone: Controller, deadline: Deadline | None
-) -> bool:
-    """Whether a controller costs less than another, and no more on any plant in any variation."""
-    (cost, violation), (other, own) = _judged(task, [controller, alone], deadline)
-    if not cost < other or violation > own:
-        return False
-    for plant, variation in itertools.product(task.plants, task.variations):
-        one = replace(task, plants=[plant], variations=[variation])
-        (cost, _), (other, _) = _judged(one, [controller, alone], deadline)
+def _objection(task: TuningTask, controller: Controller, alone: Controller, effort: Effort) -> str:
+    """Why a controller is not better than another over all plants, and no worse on any in any
+    variation; empty if it is.
+    """
+    (cost, violation), (other, own) = _judged(task, [controller, alone], effort)
+    unit = alone.y_unit or "y"
+    if not cost < other:
+        return f"following costs {cost:.3g} {unit} with one and {other:.3g} without"
+    if violation > own:
+        return "a constraint is violated with one"
+    every = zip(task.plants, titles(task.plants), strict=True)
+    for (plant, title), (gain, delay) in itertools.product(every, task.variations):
+        one = replace(task, plants=[plant], variations=[(gain, delay)])
+        (cost, _), (other, _) = _judged(one, [controller, alone], effort)
         if not cost <= other:
-            return False
-    return True
+            changed = f" with {gain:g} times the gain and {delay} samples more delay"
+            return (
+                f"on {title}{changed if (gain, delay) != (1.0, 0) else ''} following costs "
+                f"{cost:.3g} {unit} with one and {other:.3g} without"
+            )
+    return ""
 
 
 def _judged(
-    task: TuningTask, controllers: Sequence[Controller], deadline: Deadline | None
+    task: TuningTask, controllers: Sequence[Controller], effort: Effort
 ) -> list[tuple[float, float]]:
     """Cost and violation of the constraints of each controller; raises `TimeUp` at a deadline."""
     rest = task.rest
     cores = [controller.about(rest).core() for controller in controllers]
-    judged = _core.tuning_costs(task.core(), cores, threads=available(), progress=deadline)
-    if deadline is not None:
-        deadline(1, 1, 0.0)
+    judged = _core.tuning_costs(
+        task.core(), cores, threads=effort.threads, progress=effort.deadline
+    )
+    effort.check()
     return judged

@@ -19,7 +19,7 @@ from ..errors import FitError, Interrupted, SettingError
 from ..gains import whole
 from ..progress import TimeUp, shown_in_notebooks
 from ..tables import Table, significant
-from .lead import LEADING, LEADS, WEIGHTS, Lead, Led, with_lead
+from .lead import LEADING, LEADS, PART, WEIGHTS, Effort, Lead, Led, with_lead
 from .objective import Constraints, Cost, LoadStep
 from .opinion import SHARE, SecondOpinion, second_opinion
 from .robustness import HAIR, within_default
@@ -349,6 +349,9 @@ def tune(
         raise SettingError(
             name="feedforward", expected=f"one of {', '.join(LEADS)}", received=repr(feedforward)
         )
+    if isinstance(start, Controller):
+        # a feedforward is made anew, of these models
+        start = replace(start, feedforward=None)
     task = TuningTask.of(
         models,
         references,
@@ -375,7 +378,7 @@ def tune(
         result = _asked(result, task, other.with_loops(time), search, variables)
         if result.opinion is not None and result.opinion.objection is not None:
             known.append(result.opinion.objection)
-    result = _led(result, task, feedforward, time, other)
+    result = _led(result, task, feedforward, time, other, search.threads)
     try:
         verdict = verdict_of(task, result.controller, time, limit=task.constraints.Ms, others=known)
     except KeyboardInterrupt:
@@ -488,16 +491,22 @@ def _asked(
 
 
 def _led(
-    result: TuningResult, task: TuningTask, lead: Lead, time: Budget, rival: TuningTask | None
+    result: TuningResult,
+    task: TuningTask,
+    lead: Lead,
+    time: Budget,
+    rival: TuningTask | None,
+    threads: int,
 ) -> TuningResult:
     """The result with a feedforward, if that is better."""
     alone = result.controller
-    if lead == "none" or not isinstance(alone, Controller) or alone.feedforward is not None:
+    if lead == "none" or not isinstance(alone, Controller):
         return result
     others = [] if rival is None else [rival]
     names = [v.name for v in result.variables]
     try:
-        controller, led = with_lead(task, alone, lead, names, others, time)
+        effort = Effort(Deadline(time, time.share(PART), None), threads)
+        controller, led = with_lead(task, alone, lead, names, others, effort)
     except TimeUp:
         time.lose("the feedforward")
         return result

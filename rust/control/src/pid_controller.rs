@@ -3,6 +3,7 @@
 //!
 //! Biquads act on the reference and on the feedback alike. As the PID is linear in both, this equals biquads after it,
 //! on the command, where drives have them: the machine's resonance is neither fed back nor excited by the reference.
+//! The command of a feedforward is added behind them.
 //! But limits, slew, anti-windup and the operator's command act on the command that the machine receives.
 
 use crate::biquad::Memory;
@@ -207,7 +208,7 @@ impl<T: Real> PidController<T> {
     /// memory, new biquads begin at rest, and the integral term absorbs the change of the other terms.
     ///
     /// A feedforward with another preview begins at rest at the reference that the PID used last; the integral term absorbs the
-    /// change of its command.
+    /// change of its command. This is without a bump while the reference stands; on a ramp the command may step.
     ///
     /// New biquads begin at the output of the former ones or, if they magnify a step, at the values of the reference's
     /// ramp and of the new filter. So they never magnify what filters hold back, not even the last place by which a
