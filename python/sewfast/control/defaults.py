@@ -166,7 +166,7 @@ def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
     step settles, `SettingError` for several inputs or limits that are not finite or both 0.
     """
     require_one_input(model)
-    size, about = _largest_step(model, u_min, u_max), model.rest
+    size, about = _known_step(model, u_min, u_max), model.rest
     if not np.isfinite(size) or size == 0.0:
         raise SettingError(
             name="u_min, u_max",
@@ -220,6 +220,29 @@ def _largest_step(model: Model, u_min: float, u_max: float) -> float:
     """The larger of the two changes of the command from rest to its limits [u]."""
     up, down = u_max - model.rest.u[0], u_min - model.rest.u[0]
     return up if up >= -down else down
+
+
+def _known_step(model: Model, u_min: float, u_max: float) -> float:
+    """As `_largest_step`, but the other way if the model is lost that way: the output leaves the
+    recorded ones, or moves the same way under both commands, and less. A network of a drive that
+    was recorded in one direction has any sign in the other.
+    """
+    size = _largest_step(model, u_min, u_max)
+    up, down = u_max - model.rest.u[0], u_min - model.rest.u[0]
+    other = down if size == up else up
+    known = recorded_outputs(model)
+    if not (math.isfinite(size) and math.isfinite(other)) or size * other >= 0.0 or known is None:
+        return size
+    (ours, theirs), margin = _moved(model, (size, other)), 0.1 * (known[1] - known[0])
+    inside = [known[0] - margin <= model.rest.y + y <= known[1] + margin for y in (ours, theirs)]
+    is_lost = inside == [False, True] or (ours * theirs > 0.0 and abs(theirs) > abs(ours))
+    return other if is_lost else size
+
+
+def _moved(model: Model, sizes: Sequence[float]) -> tuple[float, ...]:
+    """Changes of the output after the first of the steps of each size [y]."""
+    first = [next(_steps(size))[0] for size in sizes]
+    return tuple(float(_from_rest(model, u)[-1]) - model.rest.y for u in first)
 
 
 def _from_rest(model: Model, u: FloatArray) -> FloatArray:

@@ -117,7 +117,8 @@ def point_within(model: Any, grid: Sequence[OperatingPoint], speed: float) -> Op
             remedy=f"from {low:.4g} to {high:.4g} it reaches {min(reached):.4g} to "
             f"{max(reached):.4g}",
         )  # fmt: skip
-    below, above = pairs[0]
+    # a network may hold an output in two ways, one of them where no data were
+    below, above = max(pairs, key=lambda pair: pair[0].known + pair[1].known)
     # bisection, as steady outputs can jump where friction breaks away
     for _ in range(_HALVINGS):
         found = operating_range(model, [0.5 * (below.u + above.u)]).points[0]
