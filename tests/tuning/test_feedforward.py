@@ -17,7 +17,7 @@ from sewfast.machine import VirtualMachine
 from sewfast.models import LinearOE
 from sewfast.models.rest import Rest
 from sewfast.tuning import Constraints, tune
-from sewfast.tuning.lead import _mirrored, choices
+from sewfast.tuning.lead import _mirrored, _slope, choices
 from sewfast.tuning.task import TuningTask
 
 LEVELS = ((-3000.0, -6.5), (-9.0, -0.5), (0.0, 0.0), (9.0, 0.5), (3000.0, 6.5))
@@ -191,6 +191,22 @@ def test_few_levels_draw_the_line_through_many() -> None:
     assert len(reduced(bent)) == 4
     curve = [(float(y), float(np.tanh(0.3 * y))) for y in range(-30, 31)]
     assert len(reduced(curve)) == 8
+
+
+def test_the_slope_at_a_level_is_that_towards_rest_and_never_that_of_friction() -> None:
+    outer = 6.0 / 2991.0
+    for y in (-3000.0, -1500.0, 1500.0, 3000.0):
+        assert _slope(LEVELS, y, 0.0) == pytest.approx(outer)
+    assert _slope(LEVELS, 5.0, 0.0) == pytest.approx(0.5 / 9.0)
+    assert _slope(LEVELS, 9000.0, 0.0) == _slope(LEVELS, -9000.0, 0.0) == pytest.approx(outer)
+    assert _slope(LEVELS[:1], 0.0, 0.0) == 0.0
+
+
+def test_a_drive_that_runs_both_ways_is_led_both_ways() -> None:
+    both = np.concatenate([RAMP, RAMP[::-1], -RAMP, -RAMP[::-1]])
+    found = tune(drive(), [both], evaluations=300, threads=2)
+    with_it, alone = followed(found, drive(), both)
+    assert with_it < 0.1 * alone
 
 
 def test_every_reference_by_name_has_its_shape() -> None:

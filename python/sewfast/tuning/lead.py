@@ -184,10 +184,8 @@ def _slope(levels: Sequence[tuple[float, float]], y: float, rest: float) -> floa
     if len(levels) < 2:
         return 0.0
     outputs, commands = np.array(levels).T
-    side: Literal["left", "right"] = "left" if y > rest else "right"
-    i = int(np.clip(np.searchsorted(outputs, y, side) - (side == "left"), 0, len(levels) - 2))
-    if side == "right" and outputs[i] == y and y > rest:
-        i = max(i - 1, 0)
+    before = np.searchsorted(outputs, y, "left" if y > rest else "right") - 1
+    i = int(np.clip(before, 0, len(levels) - 2))
     return float((commands[i + 1] - commands[i]) / (outputs[i + 1] - outputs[i]))
 
 
