@@ -98,9 +98,16 @@ def operating_point(model: Any, speed: float) -> OperatingPoint:
 
 
 def command_grid(model: Any) -> Sequence[OperatingPoint]:
-    """Steady states over the range of the commands that a model was identified on."""
+    """Steady states over the range of the commands that a model was identified on.
+    Each is searched from its neighbour towards rest: a network may have others where no data were,
+    and would be held there.
+    """
     low, high = model.training.get("input_range", [[-1.0, 1.0]])[0]
-    return operating_range(model, [np.array([u]) for u in np.linspace(low, high, _GRID)]).points
+    grid = [np.array([u]) for u in np.linspace(low, high, _GRID)]
+    middle = min(range(_GRID), key=lambda k: abs(float(grid[k][0]) - model.rest.u[0]))
+    up = operating_range(model, grid[middle:]).points
+    down = operating_range(model, grid[middle::-1]).points
+    return (*down[:0:-1], *up)
 
 
 def point_within(model: Any, grid: Sequence[OperatingPoint], speed: float) -> OperatingPoint:
