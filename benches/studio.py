@@ -6,18 +6,21 @@ Four members, 4,000 samples a loop. Needs the extra `studio`, selenium, chromium
 from __future__ import annotations
 
 import json
-import shutil
+import sys
 import tempfile
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
 
 from sewfast_studio import Project, Studio, make_demo
 from sewfast_studio.server import PAGE
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
+from chromium import open_browser
 
 PRESSES = 150
 DRAG_EVENTS = 300
@@ -45,13 +48,7 @@ return performance.getEntriesByType('resource').reduce((n, e) => n + e.decodedBo
 
 
 def browser() -> Any:
-    options = webdriver.ChromeOptions()
-    options.binary_location = str(shutil.which("chromium"))
-    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1600,1000"):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    service = webdriver.ChromeService(executable_path=shutil.which("chromedriver"))
-    return webdriver.Chrome(options=options, service=service)
+    return open_browser(1600, 1000)
 
 
 def spread(values: Any) -> dict[str, float]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
+import runpy
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -255,14 +256,7 @@ def feedforward(file: Path) -> None:
     """The README's drive along a trapezoid, with feedforward and without, for feedforward.md."""
     machine = sewfast.VirtualMachine()
 
-    def record(signal: str) -> sewfast.Dataset:
-        machine.reset()
-        u = sewfast.signals.excitation(signal)
-        counts = machine.run(u).counts
-        y = sewfast.speed_from_counts(counts, machine.Ts, machine.counts_per_rev)
-        units = {"input_units": "V", "output_unit": "RPM"}
-        return sewfast.Dataset.from_arrays(u, y, machine.Ts, **units)
-
+    record = runpy.run_path(str(DOCS / "free_run.py"))["record"]
     training = sewfast.Dataset.concat(map(record, ("chirp_lo_hi", "saturating")))
     model = sewfast.identify(training, model="grey_box", seed=0)
     found = sewfast.tune(model, counts_per_rev=machine.counts_per_rev)

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 import base64
-import shutil
 import sys
 import tempfile
 import time
@@ -29,6 +28,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from chromium import open_browser
 from sewfast_studio import Project, Studio, make_demo
 
 WIDTHS = (360, 768, 1280, 1920)
@@ -208,25 +208,13 @@ def until(true: Callable[[], object], what: str) -> None:
         time.sleep(0.1)
 
 
-def open_browser() -> Any:
-    from selenium import webdriver
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = str(shutil.which("chromium"))
-    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,800"):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    service = webdriver.ChromeService(executable_path=shutil.which("chromedriver"))
-    return webdriver.Chrome(options=options, service=service)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description="Renders and measures the pages.")
     parser.add_argument("folder", nargs="?", type=Path, default=Path("target/screens"))
     parser.add_argument("--only", default="", help="states with this word in their name")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
-    browser = open_browser()
+    browser = open_browser(1280, 800)
     screens = Screens(browser, given.folder)
     screens.size(1280)
     try:

@@ -490,7 +490,7 @@ def _show_gains(args: argparse.Namespace, controller: SampledController) -> None
             "feedback: with the noise that the model's record shows, without an encoder's steps; "
             "--counts-per-rev puts an encoder in the loop"
         )
-    lead = getattr(controller, "feedforward", None)
+    lead = controller.feedforward
     if lead is not None and lead.preview:
         early = f"{lead.preview} samples ({1e3 * lead.preview * controller.Ts:.3g} ms)"
         print(

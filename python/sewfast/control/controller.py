@@ -87,6 +87,11 @@ class SampledController:
         return counts_per_unit(self.counts_per_rev, self.y_unit)
 
     @property
+    def feedforward(self) -> Feedforward | None:
+        """The command that a model needs for the reference; None for kinds that have none."""
+        return None
+
+    @property
     def pace(self) -> float:
         """An estimate of the plant's time constant from the controller alone [s]."""
         raise NotImplementedError
@@ -112,7 +117,7 @@ class SampledController:
                 remedy="leave the schedule out, or identify the model from data that begin at 0",
             )  # fmt: skip
         low, high = self.u_min - rest.u[0], self.u_max - rest.u[0]
-        lead = getattr(self, "feedforward", None)
+        lead = self.feedforward
         changes = {} if lead is None else {"feedforward": lead.about(rest)}
         return replace(self, u_min=low, u_max=high, **changes)  # type: ignore[type-var]
 
@@ -120,7 +125,7 @@ class SampledController:
         """The reference as a step of the compiled controller takes it: with a feedforward `preview`
         samples early, otherwise in time.
         """
-        lead = getattr(self, "feedforward", None)
+        lead = self.feedforward
         return vector("reference", reference) if lead is None else lead.early(reference)
 
     def sent(self) -> tuple[int, list[float]]:

@@ -89,13 +89,13 @@ def choices(task: TuningTask, lead: Lead, effort: Effort | None = None) -> Choic
     if not (isinstance(task.start, Controller) and models):
         return Choices(reason="only a PID that is tuned on models has feedforward")
     rest, ends = task.rest, _ends(models, task)
-    points = [list(_points(model, rest, ends, effort)) for model in models]
+    moving = PARTS[0] * max(ends[1] - rest.y, rest.y - ends[0])
+    points = [list(_points(model, rest.y, ends, moving, effort)) for model in models]
     local = [(level, point) for found in points for level, point, moves in found if moves]
     if not all(points) or not local:
         return Choices(reason="a model does not stand still within the references")
     if any(max(abs(p.poles), default=0.0) > 1.0 + ROUNDING for _, p in local):
         return Choices(reason="a model is unstable, and has no inverse that one may trust")
-    moving = PARTS[0] * max(ends[1] - rest.y, rest.y - ends[0])
     known = _with_rest(_mirrored(_mean(points), rest, moving), rest)
     levels = reduced(known, always=rest.y)
     delay = min(p.delay for _, p in local)
@@ -130,10 +130,11 @@ def _ends(models: Sequence[Model], task: TuningTask) -> tuple[float, float]:
     return min(ends), max(ends)
 
 
-def _points(model: Model, at: Rest, ends: tuple[float, float], effort: Effort) -> Iterator[Point]:
-    """Steady states within the range."""
-    rest, (low, high) = at.y, ends
-    moving = PARTS[0] * max(high - rest, rest - low)
+def _points(
+    model: Model, rest: float, ends: tuple[float, float], moving: float, effort: Effort
+) -> Iterator[Point]:
+    """Steady states within the range; dynamics count from the distance `moving` on."""
+    low, high = ends
     beside, grid = BESIDE * (high - low), command_grid(model)
     for end in (low, high):
         way = end - rest
@@ -248,9 +249,9 @@ def with_lead(
     if not tried:
         return alone, Led(alone, reason=among.reason)
     task, others = _following(task), [_following(other) for other in others]
-    judged = _judged(task, tried, effort)
+    *judged, (alone_cost, _) = _judged(task, [*tried, alone], effort)
     best = min(range(len(tried)), key=lambda k: judged[k][::-1])
-    led = Led(alone, judged[best][0], _judged(task, [alone], effort)[0][0])
+    led = Led(alone, judged[best][0], alone_cost)
     objection = ""
     for share in SHARES if effort.is_whole else SHARES[:1]:
         part = _part(among.feedforwards[best], share, task.rest)
