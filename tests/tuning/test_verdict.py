@@ -189,6 +189,18 @@ def test_a_loop_that_is_stuck_at_a_limit_is_unfit_only_if_its_reference_is_calm(
     assert _at_limit(run(QUIET, model, far), model) == 0.0
 
 
+def test_gains_that_do_not_bring_the_model_to_a_held_level_are_poor() -> None:
+    lazy = replace(QUIET, gains=Gains.parallel(0.002, 0.0, 0.0))
+    settings: dict[str, Any] = {**FIXED, "feedforward": "none"}
+    found = tune(drive(), [SHORT], start=lazy, **settings)
+    assert found.verdict.grade == "poor"
+    assert "RPM that the reference holds" in (found.warning or "")
+    assert "holds" not in (tune(drive(), [SHORT], start=QUIET, **settings).warning or "")
+    # a level that the command cannot hold is no fault of the gains
+    far = np.interp(np.arange(3000), [0, 1000, 3000], [0.0, 12_000.0, 12_000.0])
+    assert "holds" not in (tune(drive(), [far], start=QUIET, **settings).warning or "")
+
+
 @pytest.mark.parametrize(("top", "grade"), [(1000.0, "good"), (3000.0, "unfit")])
 def test_a_loop_outside_the_record_is_unfit(top: float, grade: str) -> None:
     model = drive(input_range=[[0.0, 3.0]], output_range=[0.0, 1400.0])

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..causes import Cause
 from ..control.controller import Controller, SampledController
-from ..control.loop import ClosedLoopRun, run
+from ..control.loop import ClosedLoopRun, held_levels, missed_levels, run
 from ..control.machine import WATCHED
 from ..dataset import FloatArray
 from ..errors import FitError
@@ -204,7 +204,7 @@ def restless(c: Comparison, cost: Cost) -> Swing | None:
     assert run is not None
     if cost.of(run) <= POOR * max(cost.of(m) for m in c.members):
         return None
-    for _, hold in _holds(c.predicted.r):
+    for _, hold in held_levels(c.predicted.r):
         rest = unsettled(run.u[hold])
         if rest.std() > EXPECTED * max(unsettled(m.u[hold]).std() for m in c.members):
             return Swing(1.0, frequency_of(rest, run.Ts), float(rest.std()), 0.0)
@@ -338,10 +338,10 @@ def unreached(comparisons: Sequence[Comparison]) -> str:
         alike = c.alike
         if alike is None:
             continue
-        for level, hold in _holds(c.predicted.r):
-            mean = float(np.nanmean(alike.y[hold]))
-            if abs(mean - level) > APART * c.span:
-                said.append(f"{mean:.4g} of {level:.4g} RPM on {c.reference!r}")
+        said += [
+            f"{mean:.4g} of {level:.4g} RPM on {c.reference!r}"
+            for mean, level, _ in missed_levels(alike, APART * c.span)
+        ]
         off = _off_at_limit(alike.r, alike.y, alike.u, alike.controller)
         far = off > APART * c.span
         if np.abs(np.diff(alike.r)).max() <= APART * c.span and np.mean(far) > APART:
@@ -371,16 +371,6 @@ def _off_at_limit(
 def _at_limit(found: ClosedLoopRun) -> float:
     """Share of samples at a limit of the command."""
     return found.metrics()["saturated"] or 0.0
-
-
-def _holds(r: FloatArray) -> list[tuple[float, slice]]:
-    """Levels held for a tenth of a reference or at its end, with the last quarter of each."""
-    edges = np.flatnonzero(np.diff(r, prepend=np.nan, append=np.nan) != 0.0)
-    pairs = zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
-    long = [
-        (a, b) for a, b in pairs if b - a >= (WATCHED if b == len(r) else max(2.0, 0.1 * len(r)))
-    ]
-    return [(float(r[a]), slice(b - max(1, (b - a) // 4), b)) for a, b in long]
 
 
 def judged(predicted: tuple[Comparison, ...], ensemble: Ensemble) -> Judgement:

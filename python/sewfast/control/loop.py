@@ -163,6 +163,32 @@ class ClosedLoopRun:
         return "\n".join(lines)
 
 
+LEAST_HELD, PART_HELD = 20, 0.1
+"""A level is held for so many samples at the end of a reference, for such a part elsewhere."""
+
+
+def held_levels(r: FloatArray) -> list[tuple[float, slice]]:
+    """Levels that a reference holds for a tenth of its length or at its end, with the last quarter
+    of each hold.
+    """
+    edges = np.flatnonzero(np.diff(r, prepend=np.nan, append=np.nan) != 0.0)
+    pairs = zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+    long = [
+        (a, b)
+        for a, b in pairs
+        if b - a >= (LEAST_HELD if b == len(r) else max(2.0, PART_HELD * len(r)))
+    ]
+    return [(float(r[a]), slice(b - max(1, (b - a) // 4), b)) for a, b in long]
+
+
+def missed_levels(found: ClosedLoopRun, within: float) -> list[tuple[float, float, slice]]:
+    """Held levels that a run does not meet within a distance [y] in the mean over the last quarter
+    of the hold: the mean, the level, and that quarter.
+    """
+    met = [(float(np.nanmean(found.y[hold])), level, hold) for level, hold in held_levels(found.r)]
+    return [(mean, level, hold) for mean, level, hold in met if not abs(mean - level) <= within]
+
+
 def _rise(ms: float | None) -> str:
     if ms is None:
         return "unknown"

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import in_unit
 from ..control.controller import SampledController
@@ -18,7 +19,7 @@ from ..control.defaults import (
     recorded_limits,
     recorded_outputs,
 )
-from ..control.loop import ClosedLoopRun, run
+from ..control.loop import ClosedLoopRun, missed_levels, run
 from ..dataset import FloatArray
 from ..errors import FitError, SettingError
 from ..models import Model
@@ -38,6 +39,8 @@ MOST = 0.5
 """Share of a run above which gains that saturate, or leave the record, are unfit: most of it."""
 ROOM = 0.05
 """Share of the command's range that a calm reference leaves to either limit."""
+MISSED = 0.05
+"""Part of a reference's span by which a held level is missed, as `commission` has it."""
 WIDER = 0.1
 """Share of a recorded range by which it is wider at either end, as the guards of models have it."""
 
@@ -190,7 +193,7 @@ def _of_loops(
 def _of_runs(task: TuningTask, controller: SampledController) -> list[Objection]:
     """What the references show on the models as they are, each share in the mean of the models."""
     models = [p for p in task.plants if isinstance(p, Model)]
-    at_limit, outside = 0.0, 0.0
+    at_limit, outside, missed = 0.0, 0.0, ""
     for r in task.references if models else ():
         try:
             runs = [run(controller, model, r) for model in models]
@@ -204,7 +207,19 @@ def _of_runs(task: TuningTask, controller: SampledController) -> list[Objection]
         pairs = list(zip(runs, models, strict=True))
         at_limit = max(at_limit, float(np.mean([_at_limit(*pair) for pair in pairs])))
         outside = max(outside, float(np.mean([_outside(*pair) for pair in pairs])))
+        each = [_missed(*pair) for pair in pairs]
+        if sum(map(bool, each)) > MOST * len(each):
+            missed = next(filter(None, each))
     found = []
+    if missed:
+        found.append(
+            Objection(
+                "poor",
+                f"on the model the loop ends at {missed} that the reference holds, although the "
+                "command is not at a limit",
+                "search more variables, or check the model at that level",
+            )
+        )
     if at_limit > MOST:
         found.append(
             Objection(
@@ -240,9 +255,27 @@ def _at_limit(found: ClosedLoopRun, model: Model) -> float:
     calm = (needed > c.u_min + room) & (needed < c.u_max - room)
     if not np.mean(calm) > MOST:
         return 0.0
+    return float(np.mean(_railed(found)[calm]))
+
+
+def _missed(found: ClosedLoopRun, model: Model) -> str:
+    """The first held level that the loop does not meet where the command could still do something;
+    empty if there is none.
+    """
+    r, rest = found.r, model.rest.y
+    span = max(float(r.max()), rest) - min(float(r.min()), rest)
+    for mean, level, hold in missed_levels(found, MISSED * span):
+        if not np.any(_railed(found)[hold]):
+            return f"{mean:.4g} instead of {in_unit(f'{level:.4g}', found.controller.y_unit)}"
+    return ""
+
+
+def _railed(found: ClosedLoopRun) -> NDArray[np.bool_]:
+    """Samples at a limit of the command."""
+    c = found.controller
     hair = 1e-9 * (c.u_max - c.u_min)
-    railed = (found.u >= c.u_max - hair) | (found.u <= c.u_min + hair)
-    return float(np.mean(railed[calm]))
+    railed: NDArray[np.bool_] = (found.u >= c.u_max - hair) | (found.u <= c.u_min + hair)
+    return railed
 
 
 def command_for(model: Model, r: FloatArray, u_min: float, u_max: float) -> FloatArray:
