@@ -409,6 +409,11 @@ def fit_iv(
 ) -> LinearFit:
     """Refined instrumental variables (SRIV); "small_step" is the only success. Weights other than 1 are refused."""
 
+def fit_innovations(
+    experiments: _Experiments, *, nk: int | None = None, max_iterations: int = 60, progress: _Progress = None
+) -> LinearFit:
+    """ARMAX by the prediction error, its order and delay by the BIC; `cost` is of one step, poles may be unstable."""
+
 @final
 class NeuralSSFit:
     """A trained state-space model with the record of its training."""

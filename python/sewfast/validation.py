@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -330,6 +331,43 @@ def judged(fit: float, error: float, noise: float, share: float) -> tuple[str, s
     )
 
 
+def doubling(model: DynamicModel) -> int | None:
+    """Samples in which the free run of an unstable linear model doubles; None for other models."""
+    largest = max(map(abs, getattr(model, "poles", ())), default=0.0)
+    return max(1, round(math.log(2.0) / math.log(largest))) if largest > 1.0 else None
+
+
+def scored_runs(model: DynamicModel, data: Dataset, init: int) -> list[FloatArray]:
+    """Free runs over all experiments, as `simulate`. Those of an unstable model would leave all
+    bounds, as its plant would: they begin anew whenever they have doubled, from the state that the
+    measured outputs before give, as many or `INIT`.
+    """
+    ahead = doubling(model)
+    if ahead is None:
+        return model.simulate(data, init=init)
+    return [_restarted(model, e, ahead) for e in data.experiments]
+
+
+def _restarted(model: DynamicModel, e: Experiment, ahead: int) -> FloatArray:
+    before = min(max(INIT, ahead), len(e))
+    places = range(before, max(len(e), before + 1), ahead)
+    counts = [int(np.isfinite(e.y[at - before : at]).sum()) for at in places]
+    # where too few outputs are known a run goes on
+    kept = [(at, n) for at, n in zip(places, counts, strict=True) if n >= INIT]
+    if not kept:
+        raise DataError(
+            f"{e.name}: expected {INIT} measured outputs among {before} samples to begin a free "
+            "run of an unstable model with, received fewer; give a longer range"
+        )
+    edges = [0, *(at for at, _ in kept[1:]), len(e)]
+    y = np.empty(len(e))
+    for (at, n), (begin, end) in zip(kept, itertools.pairwise(edges), strict=True):
+        window = e.cut(at - before, end)
+        state = model.initial_state(window, n)
+        y[begin:end] = model.core.simulate(window.u, state)[begin - end :]
+    return y
+
+
 def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
     """`free_run_error` with the inputs held at their means after the initial samples.
     An experiment that begins at rest would have stayed there: the mean of a single step is nearly
@@ -343,7 +381,7 @@ def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
         held.append(replace(e, u=u))
 
     def run() -> list[FloatArray]:
-        runs = model.simulate(replace(data, experiments=tuple(held)), init=init)
+        runs = scored_runs(model, replace(data, experiments=tuple(held)), init)
         rests = [model.standing(e) for e in data.experiments]
         return [y if s is None else np.full(len(y), s.y) for y, s in zip(runs, rests, strict=True)]
 
@@ -354,7 +392,7 @@ def free_run_error(model: DynamicModel, data: Dataset, init: int) -> float:
     """Root mean square error of the free run [output unit]; infinite if the run diverges.
     It is weighted, over the known outputs after the initial samples.
     """
-    return _error(lambda: model.simulate(data, init=init), data, init)
+    return _error(lambda: scored_runs(model, data, init), data, init)
 
 
 def _error(simulated: Callable[[], list[FloatArray]], data: Dataset, init: int) -> float:
@@ -414,7 +452,7 @@ def validate(
     series = zip(
         given.experiments,
         data.experiments,
-        model.simulate(data, init=init),
+        scored_runs(model, data, init),
         model.predict(data, init=init),
         strict=True,
     )
@@ -478,8 +516,15 @@ def _target(experiment: Experiment, against: str | None, first: int) -> FloatArr
 
 
 def _beyond_training(model: DynamicModel, data: Dataset) -> list[str]:
-    """Notes on inputs that exceed their training range by more than a hundredth of it."""
+    """Notes on inputs that exceed their training range by more than a hundredth of it, and on how
+    an unstable model runs.
+    """
     notes = []
+    if (ahead := doubling(model)) is not None:
+        notes.append(
+            f"the model is unstable, as its plant has to be: its free run begins anew every "
+            f"{ahead} samples, in which it doubles"
+        )
     known = model.training.get("input_range", [])
     for name, (low, high), (least, most) in zip(
         data.input_names, known, data.input_range, strict=False

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
@@ -10,7 +12,8 @@ from effort import FULL
 from sewfast import Controller, Dataset, Gains, _core, identify, run, tune
 from sewfast.arrays import FloatArray
 from sewfast.dataset import diagnose
-from sewfast.models import LinearOE
+from sewfast.errors import FitError
+from sewfast.models import ARX, LinearOE
 
 Plant = tuple[FloatArray, FloatArray]
 
@@ -99,25 +102,57 @@ def test_a_stable_model_of_an_unstable_plant_is_useless(seed: int) -> None:
     verdict = model.training["verdict"]
     assert verdict["grade"] == "useless"
     assert "unstable plant in a closed loop" in verdict["text"]
-    assert "--model arx" in verdict["next"][0]
+    assert "leave the kind of model to the search" in verdict["next"][0]
 
 
-def test_an_unstable_plant_is_identified_one_step_ahead_and_stabilised() -> None:
+def held(samples: int = 1500) -> tuple[LinearOE, Dataset]:
+    """A falling body, and its record under a controller with a dither on the command."""
     truth = LinearOE.from_tf([0.0, 1.6e-3, 1.6e-3], [1.0, -2.0024, 1.0], 0.01)
     rng = np.random.default_rng(2)
-    held = Controller(
+    own = Controller(
         Gains.standard(2.5, np.inf, 0.2, y_unit="rad"), Ts=0.01, N=20.0, u_min=-9.0, u_max=9.0
     )
-    loop = run(held, truth, np.zeros(1500), feedforward=0.3 * rng.standard_normal(1500))
-    y = loop.y + 5e-4 * rng.standard_normal(1500)
-    data = Dataset.from_arrays(loop.u, y, 0.01, input_units=("V",), output_unit="rad")
+    loop = run(own, truth, np.zeros(samples), feedforward=0.3 * rng.standard_normal(samples))
+    y = loop.y + 5e-4 * rng.standard_normal(samples)
+    return truth, Dataset.from_arrays(loop.u, y, 0.01, input_units=("V",), output_unit="rad")
+
+
+def test_an_unstable_plant_is_identified_and_tuned_without_an_option() -> None:
+    truth, data = held()
     assert diagnose(data).find("unstable") is not None
-    model = identify(data, model="arx", na=8, nb=8)
-    poles = np.sort(np.abs(np.roots(np.concatenate([[1.0], model.core.a]))))
-    assert poles[-1] == pytest.approx(np.roots([1.0, -2.0024, 1.0]).max(), abs=5e-3)
+    model = identify(data)
+    assert model.kind == "arx"
+    assert model.orders == {"na": 2, "nb": 2, "nk": 1}
+    assert isinstance(model, ARX)
+    assert np.abs(model.poles) == pytest.approx([1.0502, 0.9522], abs=3e-3)
+    assert "by ARMAX, prediction error" in str(model)
     verdict = model.training["verdict"]
     assert verdict["grade"] == "fair"
-    assert "as far ahead as it doubles" in verdict["text"]
-    found = tune(model, np.repeat([0.0, 0.1], 300), start=held, evaluations=300, threads=1)
-    after = run(found.controller, truth, np.repeat([0.0, 0.1], 600))
-    assert np.abs(after.y[-100:] - 0.1).max() < 0.02
+    assert "free runs as long as it doubles, 14 samples" in verdict["text"]
+    assert verdict["fit_percent"] > 90.0
+    found = tune(model, np.repeat([0.0, 0.05], 300), evaluations=300, threads=1)
+    assert found.verdict.grade == "fair"
+    after = run(found.controller, truth, np.repeat([0.0, 0.05], 600))
+    assert np.abs(after.y[-100:] - 0.05).max() < 0.01
+
+
+def test_least_squares_of_many_orders_say_what_noise_leaves_of_them() -> None:
+    _, data = held()
+    verdict = identify(data, model="arx", na=8, nb=8).training["verdict"]
+    assert "unstable, as its plant has to be" in verdict["text"]
+
+
+def test_an_unstable_plant_that_no_pid_holds_is_refused() -> None:
+    # it doubles within two samples, and answers after six
+    model = LinearOE.from_tf([0.0] * 6 + [0.4], [1.0, -1.4], 0.01)
+    model = replace(model, training={"input_range": [[-1.0, 1.0]], "output_range": [-1.0, 1.0]})
+    with pytest.raises(FitError, match=r"none of \d+ PIDs holds"):
+        tune(model, evaluations=10)
+
+
+@pytest.mark.parametrize("seed", range(8 if FULL else 2))
+def test_unstable_plants_are_stabilised_or_refused(seed: int) -> None:
+    data, pole = looped(seed)
+    model = identify(data, threads=1)
+    assert isinstance(model, ARX)
+    assert max(np.abs(model.poles)) == pytest.approx(pole, abs=2e-3)

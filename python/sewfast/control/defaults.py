@@ -22,6 +22,7 @@ from ..evidence.operating import integrating_pole
 from ..evidence.region import stored_region
 from ..gains import real
 from ..models import Model
+from ..models.linear import LinearDifference
 from ..rules import Fopdt, fit_fopdt
 from ..units import spelled
 from .controller import SampledController
@@ -53,6 +54,9 @@ _SLOW_RUN = 0.3
 """Lowest level as a share of the top for a drive that cannot brake: it coasts down to that."""
 _HELD = 0.95
 """Largest distance of a held level from the record's mean, as a share of the region's bound."""
+_HELD_UNSTABLE = 0.3
+"""Top of the references as a share of the output that an unstable plant can be held at with the
+least of the commands' limits: beyond it nothing brings the plant back."""
 _MARGIN = 0.1
 """Share of the output at the limit that the ramps leave to the controller."""
 _EDGES = 8
@@ -268,6 +272,13 @@ def _slowest(fopdt: Fopdt, y: FloatArray, Ts: float) -> float:
     return max(fopdt.T, (int(outside[-1]) + 1) * Ts / 3.0 if len(outside) else 0.0)
 
 
+def growth_rate(model: Model) -> float:
+    """The rate at which an unstable linear model leaves its rest [1/s]; 0 for others."""
+    largest = max(map(abs, model.poles)) if isinstance(model, LinearDifference) else 0.0
+    # an integrator's pole is 1 but for its estimate
+    return math.log(largest) / model.Ts if largest > 1.0 and not integrating_pole(model) else 0.0
+
+
 def moves_on(model: Model, u_min: float, u_max: float) -> bool:
     """Whether the output keeps moving as long as a command acts, so that no step settles."""
     size = _largest_step(model, u_min, u_max)
@@ -369,10 +380,15 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
     except FitError:
         if pace is None or not math.isfinite(high - low):
             raise
-        # the command that holds a level is unknown: use the recorded range alone
         rest = model.rest.y
         way = high - rest if abs(high - rest) >= abs(low - rest) else low - rest
-        return _Span(rest, rest, rest + _RECORDED * way, rest, 4.0 * pace)
+        # the command that holds a level is known of linear models only: else the record is all
+        gain = math.inf
+        if isinstance(model, LinearDifference) and growth_rate(model):
+            gain = abs(model.dc_gain[0])
+        room = min(u_max - model.rest.u[0], model.rest.u[0] - u_min)
+        top = math.copysign(min(_RECORDED * abs(way), _HELD_UNSTABLE * gain * room), way)
+        return _Span(rest, rest, rest + top, rest, 4.0 * pace)
     fopdt, rest = step.fopdt, step.rest
     reach = [fopdt.K * u + fopdt.offset - rest for u in (u_min, u_max)]
     up = max(0.0, min(_RECORDED * (high - rest), _REACHED * max(reach)))

@@ -235,9 +235,8 @@ def _unstable_fault(data: Dataset) -> Iterator[Fault]:
         "unstable",
         f"{y} is that of an unstable plant in a closed loop: a pole at {pole:.5g}, so that it "
         f"doubles every {duration(doubles)} without its controller",
-        'identify it one step ahead, with model="arx" and 8 or more orders (--model arx --na 8 '
-        "--nb 8), and tune from the controller that holds it (--start); or name the loop's "
-        "reference as input",
+        "leave the kind of model to the search, which takes an unstable one then; or name the "
+        "loop's reference as input",
         {"pole": pole, "doubles": doubles},
     )
 

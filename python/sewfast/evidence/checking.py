@@ -13,7 +13,7 @@ from ..dataset.experiment import in_effect
 from ..dataset.pieces import thinned
 from ..dynamic_model import INIT, DynamicModel
 from ..errors import FitError, SewfastError
-from ..validation import Scores, by_input, noise_of, without_input
+from ..validation import Scores, by_input, doubling, noise_of, without_input
 from . import verdicts
 from .card import Line, ReportCard
 from .operating import operating_range
@@ -71,7 +71,7 @@ def check(
     DataError
         If the data do not match the model or leave nothing to judge.
     FitError
-        If the model diverges on these inputs.
+        If the model is unstable, or diverges on these inputs.
     SettingError
         For a level out of range.
     """
@@ -82,6 +82,13 @@ def check(
         require_dataset(training, "training")
         training = weighed if training is data else in_effect(training)
     data = weighed
+    if doubling(model) is not None:
+        raise FitError(
+            name="model", expected="one whose free run can be judged",
+            received="an unstable one, which only a loop holds",
+            remedy="validate it, whose free runs begin anew before they leave all bounds, and look "
+            "at the margins of its controller (sewfast analyse)",
+        )  # fmt: skip
     free = Residuals.of(model, data, init, "free run")
     has_gaps = not all(np.isfinite(e.y).all() for e in data.experiments)
     horizon: Horizon = "one step" if model.kind == "arx" and not has_gaps else "free run"

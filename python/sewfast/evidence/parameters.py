@@ -209,6 +209,8 @@ def estimate(model: DynamicModel, residuals: Residuals) -> Parameters | None:
     inverse = information.inverse()
     effective = float(np.trace(inverse @ information.gram))
     coloured = _core.coloured_information(residuals.columns(), spent=effective)
+    if not np.isfinite(coloured).all():
+        return None  # the sensitivities of an unstable model outgrow all numbers
     covariance = inverse @ coloured @ inverse
     values, names = _values(model, residuals)
     condition, lost = information.conditioning()

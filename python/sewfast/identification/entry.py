@@ -9,8 +9,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Literal
 
-import numpy as np
-
 from ..arrays import require_whole
 from ..dataset import Dataset, diagnose, require_dataset
 from ..dataset.experiment import in_effect
@@ -22,9 +20,9 @@ from ..evidence import with_training_evidence
 from ..kinds import KINDS, Kind, spelled
 from ..models import Model
 from ..models.files import STRUCTURED
-from ..models.linear import LinearDifference
 from ..progress import shown_in_notebooks
 from ..threads import Workers, available, require_workers
+from ..validation import doubling
 from . import further, grey_box, lagged, linear, mixture
 from .folds import TEXTS, UNSEEN_DATA, Split, unstable_verdict, verdict
 from .outputs import OUTPUTS
@@ -225,7 +223,10 @@ def identify(
             # stopped before its first step: it keeps the evidence from its own data
             return _with_losses(found, clock)
     else:
-        found = _within_budget(_KINDS[kind], task)
+        asked = _KINDS[kind]
+        if kind == "auto" and any(f.kind == "unstable" for f in faults):
+            asked = _unstable
+        found = _within_budget(asked, task)
     said = [*found.training.get("notes", []), *(f.warning for f in faults if f.kind not in _JUDGED)]
     if said:
         found = with_provenance(found, {"notes": said})
@@ -271,6 +272,11 @@ def seeded(
 def _in_effect(data: Dataset, what: str) -> Dataset:
     require_dataset(data, what)
     return in_effect(data)
+
+
+def _unstable(task: Task) -> Model:
+    """The plant that a loop held, or what the search finds if its poles are stable."""
+    return linear.held_by_a_loop(task) or mixture.searched(task)
 
 
 def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
@@ -334,11 +340,7 @@ def _judged_by(model: Model, faults: Sequence[Fault]) -> Model:
             # it may fit, with a delay that the plant does not have, or one part
             grade = "poor" if grade in ("good", "fair") else grade
             text = f"{TEXTS[grade]}: {fault.text} ({evidence})"
-        elif (
-            fault.kind == "unstable"
-            and grade in ("poor", "useless")
-            and _largest_pole(model) <= 1.0
-        ):
+        elif fault.kind == "unstable" and grade in ("poor", "useless") and doubling(model) is None:
             # a free run that explains the record would show that the pole is none of the plant's
             grade = "useless"
             text = f"useless: {fault.text}, and no free run describes it ({evidence})"
@@ -354,8 +356,8 @@ def _verdict(model: Model, data: Dataset, validation: Dataset | None) -> Provena
     """
     part = Split(data, validation or data, is_given=validation is not None)
     where = UNSEEN_DATA if part.is_given else "its own training data"
-    if (pole := _largest_pole(model)) > 1.0:
-        return unstable_verdict(model, part, pole, where)
+    if doubling(model) is not None:
+        return unstable_verdict(model, part, where)
     found = verdict(model, data, part, where=where)
     if model.kind in ("arx", "iv", "oe") and found["grade"] in ("good", "fair"):
         slowest, longest = linear.time_constant(model.core), max(len(e) for e in data.experiments)
@@ -369,12 +371,6 @@ def _verdict(model: Model, data: Dataset, validation: Dataset | None) -> Provena
             )
             found["next"].insert(0, "lower na, or leave model out and let the search choose")
     return found
-
-
-def _largest_pole(model: Model) -> float:
-    """Modulus of a linear model's largest pole; 0 for other kinds."""
-    poles = model.poles if isinstance(model, LinearDifference) else ()
-    return float(np.abs(poles).max(initial=0.0))
 
 
 def _preset(preset: str, kind: str, orders: Mapping[str, int | None]) -> str:

@@ -17,10 +17,12 @@ from ..models import Model
 from ..validation import (
     GOOD,
     by_input,
+    doubling,
     free_run_error,
     grade_of,
     judged,
     noise_of,
+    scored_runs,
     without_input,
 )
 from .task import Provenance, sources
@@ -323,15 +325,14 @@ def verdict(
     }
 
 
-def unstable_verdict(model: Model, part: Split, pole: float, where: str) -> Provenance:
-    """`verdict` on an unstable model, which leaves all bounds in free run.
-    It is judged by its predictions as far ahead as it doubles, and is at most "fair": nobody has
-    seen its plant run freely.
+def unstable_verdict(model: Model, part: Split, where: str) -> Provenance:
+    """`verdict` on an unstable model, by free runs of as many samples as it doubles in. It is at
+    most "fair": nobody has seen its plant run freely.
     """
-    ahead = max(1, round(math.log(2.0) / math.log(pole)))
+    ahead, pole = doubling(model), max(map(abs, getattr(model, "poles", (math.nan,))))
     try:
-        runs = model.predict(part.held, ahead)
-    except FitError:
+        runs = scored_runs(model, part.held, INIT)
+    except (DataError, FitError):
         runs = [np.full(len(e), np.inf) for e in part.held.experiments]
     outputs = np.concatenate([e.y for e in part.held.experiments])
     error, spread = errors_of(runs, part).rmse, float(np.nanstd(outputs))
@@ -343,11 +344,11 @@ def unstable_verdict(model: Model, part: Split, pole: float, where: str) -> Prov
         "grade": grade,
         "fit_percent": fit if math.isfinite(fit) else None,
         "text": f"{TEXTS[grade]}: unstable, as its plant has to be, with a pole at {pole:.5g}; "
-        f"predictions as far ahead as it doubles, {ahead} samples, explain {fit:.1f} % of {where} "
+        f"free runs as long as it doubles, {ahead} samples, explain {fit:.1f} % of {where} "
         f"(rmse {error:.3g}{unit})",
         "next": [
-            "tune from the controller that holds the plant (--start)" if grade == "fair"
-            else "raise na and nb, up to 20, as measurement noise asks for many"
+            "tune, best from the controller that holds the plant (--start)" if grade == "fair"
+            else "record longer, with a dither on the command that moves the output clearly"
         ],
     }  # fmt: skip
 

@@ -16,8 +16,20 @@ from ..dataset.experiment import mean_square, weights_of
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted
 from ..models import ARX, IV, LinearOE, Model
+from ..validation import doubling
 from .delays import delay, reach
-from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs, with_run_up
+from .folds import (
+    RUNAWAY,
+    UNSEEN_DATA,
+    Errors,
+    Split,
+    compared,
+    errors_of,
+    folds,
+    free_runs,
+    unstable_verdict,
+    with_run_up,
+)
 from .task import (
     Look,
     Pool,
@@ -29,6 +41,8 @@ from .task import (
     fit_provenance,
     with_provenance,
 )
+
+ARMAX = "ARMAX, prediction error"
 
 
 def arx(task: Task) -> Model:
@@ -58,6 +72,32 @@ def oe(task: Task) -> Model:
     """Linear output error."""
     fit = _core.fit_oe(arrays(task.data), **task.fit_options())
     return completed(task.model(LinearOE, fit.model, linear_provenance(fit)))
+
+
+def held_by_a_loop(task: Task) -> Model | None:
+    """The unstable plant of a record that a loop held: an ARMAX model by its prediction error, of
+    the order and delay that its BIC prefers. None if its poles are stable.
+    The verdict is that of a fit to the earlier part of the record, on the rest.
+    """
+
+    def plant(data: Dataset) -> Model | None:
+        fit = _core.fit_innovations(arrays(data), nk=task.nk, progress=task.progress)
+        if fit.termination == "interrupted":
+            raise KeyboardInterrupt
+        known = linear_provenance(fit)
+        known |= {"initial_state": "measured", "cost_horizon": "one step", "method": ARMAX}
+        found = task.model(ARX, fit.model, known)
+        return None if doubling(found) is None else found
+
+    try:
+        model = plant(task.data)
+        part = next(iter(folds(task.data, task.validation)), None)
+        earlier = model if part is None else plant(part.fitted)
+    except (DataError, FitError):
+        return None
+    if model is None or part is None or earlier is None:
+        return model and earlier
+    return with_provenance(model, {"verdict": unstable_verdict(earlier, part, UNSEEN_DATA)})
 
 
 def linear_provenance(fit: _core.LinearFit) -> Provenance:

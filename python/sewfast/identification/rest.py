@@ -87,9 +87,10 @@ def _level(model: Model, u: FloatArray) -> float | None:
 
 
 def _noisy(model: M, data: Dataset) -> M:
-    """Third differences show white noise, and fast motion beside it that a free run explains.
-    What is rounded to a grid has at least the noise of rounding (Widrow, Kollar and Liu 1996). An
-    output that was computed from counts has none: a loop then has the encoder itself.
+    """Third differences show white noise, and fast motion beside it that a free run explains, or
+    for an unstable plant a prediction of one step. What is rounded to a grid has at least the noise
+    of rounding (Widrow, Kollar and Liu 1996). An output that was computed from counts has none: a
+    loop then has the encoder itself.
     """
     if model.counts is not None:
         return model
@@ -97,6 +98,9 @@ def _noisy(model: M, data: Dataset) -> M:
     found = [noise_of(outputs)]
     with contextlib.suppress(FitError):  # a free run that diverges explains nothing
         found.append(noise_of([y - f for y, f in zip(outputs, model.simulate(data), strict=True)]))
+    if model.training.get("cost_horizon") == "one step":
+        # what a model does not predict one step ahead is at least the noise
+        found.append(math.sqrt(2.0 * model.training["cost"]))
     white = min((n for n in found if math.isfinite(n)), default=0.0)
     rounded = min((quantum(y) or 0.0 for y in outputs), default=0.0) / math.sqrt(12.0)
     noise = max(white, rounded)

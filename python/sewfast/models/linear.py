@@ -295,10 +295,16 @@ class LinearDifference(SingleModel):
 
 
 class ARX(LinearDifference):
-    """ARX model by least squares on the one-step error (paper Eq. 8; Ljung 1999, section 7.3)."""
+    """ARX model by least squares on the one-step error (paper Eq. 8; Ljung 1999, section 7.3).
+    An unstable plant that a loop held is one by the prediction error of an ARMAX model (ibid.,
+    section 4.2): `training["method"]` says so.
+    """
 
     kind: ClassVar[str] = "arx"
-    title: ClassVar[str] = "ARX by least squares"
+    title: ClassVar[str] = "ARX"
+
+    def describe(self) -> list[str]:
+        return [f"by {self.training.get('method', 'least squares')}", *super().describe()]
 
 
 class IV(LinearDifference):

@@ -19,6 +19,7 @@ from ..control.defaults import (
     default_references,
     drive_step,
     filter_length,
+    growth_rate,
     rate_step,
     require_one_input,
 )
@@ -35,6 +36,7 @@ from ..control.loop import (
     plant_units,
     reference_samples,
 )
+from ..control.margins import loop_response, margins
 from ..errors import FitError, SettingError
 from ..gains import Gains, real, vector, whole
 from ..models import Model
@@ -42,7 +44,7 @@ from ..models.rest import Rest
 from ..progress import TimeUp, latest
 from ..rules import Fopdt, Rule, table_1
 from ..threads import available
-from ..units import revolutions_per_second, spelled
+from ..units import duration, revolutions_per_second, spelled
 from .objective import Constraints, Cost, LoadStep
 from .robustness import LinearLoops, linear_loops
 
@@ -404,13 +406,23 @@ def first_controller(
 ) -> Controller:
     """A conservative controller from a model's own step response by Table 1 (nearest row), with the
     parameters of `tune`. If the output integrates the command, such as a position, SIMC on the
-    rate's step response is used instead. The moving average's delay counts as dead time. Raises
-    `SettingError` for a machine, for limits that are neither given nor recorded, and for an encoder
-    on an output of unknown unit; `FitError` if no step of the model settles.
+    rate's step response is used instead; for an unstable linear model, the gains of the least Ms.
+    The moving average's delay counts as dead time. Raises `SettingError` for a machine, for limits
+    that are neither given nor recorded, and for an encoder on an output of unknown unit; `FitError`
+    if no step of the model settles, or no gains hold it.
     """
     plant = _require_model(plant)
     low, high, note = command_limits([plant], u_min, u_max)
     u_unit, y_unit = _units(plant, output_unit)
+    if (growth := growth_rate(plant)) > 0.0:
+        blank = Controller(
+            gains=Gains.standard(1.0, math.inf, u_unit=u_unit, y_unit=y_unit), Ts=plant.Ts,
+            N=DERIVATIVE_FILTER, u_min=low, u_max=high,
+            filter_samples=max(1, whole("filter_samples", filter_samples or 1)),
+            counts_per_rev=_encoder(plant, counts_per_rev, y_unit),
+            notes="; ".join(n for n in ("least Ms of an unstable plant", note) if n),
+        )  # fmt: skip
+        return _holding(plant, blank, growth)
     moving = rate_step(plant, low, high)
     step = drive_step(plant, low, high) if moving is None else moving
     if filter_samples is None:
@@ -434,6 +446,43 @@ def first_controller(
         counts_per_rev=_encoder(plant, counts_per_rev, y_unit),
         notes="; ".join(n for n in (f"{said} on the model's step response", note) if n),
     )
+
+
+CROSSOVERS = (1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0, 25.0)
+"""Crossovers that are tried for an unstable plant, in rates at which it grows; a limit of Ms asks
+for about twice that rate, and a delay for no more than it leaves (Astrom and Murray, *Feedback
+Systems*, section 14.2)."""
+LEADS = (0.0, 0.5, 1.0, 2.0, 4.0)
+"""Td that are tried, in reciprocals of the crossover."""
+INTEGRAL = 10.0
+"""Ti in reciprocals of the crossover."""
+
+
+def _holding(plant: Model, blank: Controller, growth: float) -> Controller:
+    """The gains of the least Ms for a plant that grows at this rate [1/s] without its controller.
+    Raises `FitError` if none of those tried holds it.
+    """
+    own = blank.gains
+    found: list[tuple[float, Controller]] = []
+    for share in CROSSOVERS:
+        w = share * growth
+        for lead in LEADS if w * plant.Ts < 1.0 else ():
+            gains = Gains.standard(
+                1.0, INTEGRAL / w, lead / w, u_unit=own.u_unit, y_unit=own.y_unit
+            )
+            unit = float(abs(loop_response(replace(blank, gains=gains), plant, [w])[0]))
+            for Kp in (1.0 / unit, -1.0 / unit) if unit > 0.0 else ():
+                one = replace(blank, gains=replace(gains, Kp=Kp))
+                found.append((margins(one, plant).Ms, one))
+    Ms, best = min(found, key=lambda pair: pair[0], default=(math.inf, blank))
+    if not math.isfinite(Ms):
+        raise FitError(
+            name="model", expected="a plant that a PID can hold",
+            received=f"one that doubles every {duration(math.log(2.0) / growth)}, which none of "
+            f"{len(found)} PIDs holds",
+            remedy="give the controller that holds it to start from",
+        )  # fmt: skip
+    return best
 
 
 def _of_position(rate: Fopdt, Ts: float) -> Rule:

@@ -24,6 +24,7 @@ mod gram;
 pub mod greybox;
 pub mod guard;
 pub mod hammerstein;
+pub mod innovations;
 pub mod inverse;
 pub mod iv;
 pub mod lagged;

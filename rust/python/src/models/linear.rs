@@ -8,7 +8,7 @@ use pyo3::types::PyDict;
 use sewfast_core::hammerstein::{self, Knots};
 use sewfast_core::lagged::{Lagged, Lags};
 use sewfast_core::output_error::Fit;
-use sewfast_core::{Error, arx, iv, linear, oe};
+use sewfast_core::{Error, arx, innovations, iv, linear, oe};
 
 use super::{Kind, Model, Rows, Values};
 use crate::seam::{Experiments, array1, array2, raise, records, rows, samples, slice, watched};
@@ -18,6 +18,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<LinearFit>()?;
     module.add_function(wrap_pyfunction!(fit_arx, module)?)?;
     module.add_function(wrap_pyfunction!(fit_iv, module)?)?;
+    module.add_function(wrap_pyfunction!(fit_innovations, module)?)?;
     module.add_function(wrap_pyfunction!(fit_oe, module)?)?;
     module.add_class::<HammersteinWiener>()?;
     module.add_class::<HammersteinWienerFit>()?;
@@ -198,6 +199,22 @@ fn fit_iv(
     let records = records(py, &experiments)?;
     let inner = watched(py, progress.as_ref(), |monitor| {
         iv::fit(&records, na, nb, nk, offset, max_iterations, monitor)
+    })?;
+    Ok(LinearFit { inner })
+}
+
+#[pyfunction]
+#[pyo3(signature = (experiments, *, nk = None, max_iterations = 60, progress = None))]
+fn fit_innovations(
+    py: Python<'_>,
+    experiments: Experiments<'_>,
+    nk: Option<usize>,
+    max_iterations: usize,
+    progress: Option<Bound<'_, PyAny>>,
+) -> PyResult<LinearFit> {
+    let records = records(py, &experiments)?;
+    let inner = watched(py, progress.as_ref(), |monitor| {
+        innovations::fit(&records, nk, max_iterations, monitor)
     })?;
     Ok(LinearFit { inner })
 }
