@@ -17,9 +17,12 @@ pub use front::{Front, Objective, pareto};
 pub use load::{LoadLimit, LoadStep};
 pub use variable::{Parameter, Variable};
 
+use std::iter;
+
 use sewfast_control::{AnyDesign, Design};
 
 use crate::closed_loop::{Plant, Signals};
+use crate::random::Random;
 use crate::search::{
     Candidate, Found, Judgement, Options, Problem, Termination, cma_es, genetic, several,
 };
@@ -98,6 +101,9 @@ pub struct Tuned {
 
 /// Share of the candidates judged on a part of the runs.
 const SCOUTS: f64 = 0.75;
+/// Candidates of one search on a part, of which there are as many as fit. Each ends in one of a few basins, as those of a PI and of a PID
+/// are: of eight heaters and tanks, six seeds each, the worst single search cost up to 95 % more than the best, of whatever length it was.
+const SCOUTED: usize = 560;
 
 /// Costs that differ by less than this share count as equal in the test whether a population has converged.
 pub const TOLERANCE: f64 = 1e-5;
@@ -155,7 +161,8 @@ pub fn tune<P: Plant + Clone + Send + Sync>(
 /// First searches on a part of the runs for the region of the minimum, then on all runs for the minimum itself.
 ///
 /// Runs of different plants along different references say much the same about a controller. In the part each reference
-/// has one plant, so most of the search costs as little as a search on one plant.
+/// has one plant, so most of the search costs as little as a search on one plant. Several searches there begin alike and draw other
+/// candidates; the best of them goes on.
 fn staged<P: Plant + Clone + Send + Sync>(
     task: &Task<'_, P>,
     bench: &Bench<P>,
@@ -173,30 +180,45 @@ fn staged<P: Plant + Clone + Send + Sync>(
         Method::Genetic => genetic::search(problem, Some(start), options, monitor),
         Method::CmaEs => cma_es::search(problem, Some(start), options, monitor),
     };
+    let (part, whole) = (on(Extent::Part), on(Extent::Whole));
     let scouts = (SCOUTS * options.evaluations as f64) as usize;
     if task.plants.len() == 1 || scouts == 0 {
-        return search(&on(Extent::Whole), options);
+        return search(&whole, options);
     }
-    let part = Options {
-        evaluations: scouts,
-        ..options
-    };
-    let scouted = search(&on(Extent::Part), part)?;
-    let mut trace = vec![Judgement::HOPELESS; scouted.trace.len()];
-    let Some(last) = trace.last_mut() else {
-        return Ok(scouted);
-    };
     // a stop request must not lose what has been found
-    let judge = |design| bench.clone().judge_one(task, &design, &Monitor::default());
-    let design = designed(task.variables, &scouted.point, &task.start);
-    let judgement = design.map_or(Judgement::HOPELESS, judge);
-    *last = judgement;
-    let found = Found {
-        judgement,
-        trace,
-        ..scouted
+    let never = Monitor::default();
+    let judge = |design| bench.clone().judge_one(task, &design, &never);
+    let searches = (scouts / SCOUTED).max(1);
+    let mut random = Random::new(options.seed);
+    let mut seeds = iter::once(options.seed).chain(iter::from_fn(|| Some(random.next_u64())));
+    let mut best: Option<Found> = None;
+    let mut trace = Vec::new();
+    for _ in 0..searches {
+        let own = Options {
+            evaluations: scouts / searches,
+            seed: seeds.next().unwrap_or_default(),
+            ..options
+        };
+        let mut found = search(&part, own)?;
+        let design = designed(task.variables, &found.point, &task.start);
+        found.judgement = design.map_or(Judgement::HOPELESS, judge);
+        let known = best.as_ref().map_or(Judgement::HOPELESS, |b| b.judgement);
+        trace.resize(trace.len() + found.trace.len(), known);
+        if best.is_none() || found.judgement.beats(&known) {
+            best = Some(found);
+        }
+        if let (Some(last), Some(best)) = (trace.last_mut(), &best) {
+            *last = best.judgement;
+        }
+        if monitor.stopped() {
+            break;
+        }
+    }
+    let Some(best) = best else {
+        return search(&whole, options);
     };
-    cma_es::refine(&on(Extent::Whole), found, options, monitor)
+    let found = Found { trace, ..best };
+    cma_es::refine(&whole, found, options, monitor)
 }
 
 /// What each design costs, and by how much it violates the constraints; infinite if a run diverges.
