@@ -421,6 +421,24 @@ def test_a_pole_that_the_record_cannot_show_is_said() -> None:
     assert not all(spared)
 
 
+def test_a_step_soon_after_the_start_is_no_motion_that_began_before() -> None:
+    """A dead time that a model lacks makes it begin in motion, with any gain and a good fit."""
+    rng = np.random.default_rng(21)
+    u, x, y = np.zeros(600), np.zeros(600), np.zeros(600)
+    u[3:] = 8.0
+    for k in range(1, 600):
+        x[k] = x[k - 1] + (20.0 * u[max(k - 4, 0)] - x[k - 1]) / 20.0
+        y[k] = y[k - 1] + (x[k] - y[k - 1]) / 12.0
+    y += 293.15 + 0.15 * rng.normal(size=600)
+    data = Dataset.from_arrays(u, y, 5.0, input_units="%", output_unit="degC")
+    for kind in ("oe", "auto"):
+        model = identify(data, model=kind)
+        assert isinstance(model, LinearOE)
+        assert model.dc_gain[0] == pytest.approx(20.0, rel=0.02)
+        assert model.orders["nk"] > 2
+    assert identify(data, model="oe", nk=1).orders["nk"] == 1
+
+
 def test_a_model_that_runs_away_is_useless() -> None:
     rng = np.random.default_rng(0)
     u, y = rng.normal(size=120), np.zeros(120)

@@ -106,8 +106,9 @@ def identify(
         Past outputs and past inputs in the regressor of a lagged model; None: 2, but `na` = 1 for a
         Hammerstein-Wiener model if that does about as well.
     nk : int or None
-        Delay [samples]. None: 1 for a lagged model; a search uses 1 unless the data suggest another
-        delay. A plant of a control loop needs 1 or more.
+        Delay [samples]. None: 1 for a lagged model, but for `oe` the best one if the inputs move
+        once only; a search uses 1 unless the data suggest another delay. A plant of a control loop
+        needs 1 or more.
     nx : int or None
         States of `neural_ss`; None: searched.
     hidden : int or None

@@ -27,6 +27,7 @@ from .folds import (
     errors_of,
     folds,
     free_runs,
+    moves_once,
     unstable_verdict,
     with_run_up,
 )
@@ -69,8 +70,22 @@ def iv(task: Task) -> Model:
 
 
 def oe(task: Task) -> Model:
-    """Linear output error."""
+    """Linear output error.
+    Where the inputs move once only, a dead time is found with it unless the delay is given: too
+    short a delay makes a start in motion explain what is none, and the gain with it is any.
+    """
     fit = _core.fit_oe(arrays(task.data), **task.fit_options())
+    nk, idle = fit.model.nk, 0
+    try:
+        while task.nk is None and moves_once(task.data) and idle < PATIENCE:
+            nk += 1
+            other = _tried(task.data, task.fit_options(nk=nk))
+            if other is not None and other.cost < fit.cost:
+                fit, idle = other, 0
+            else:
+                idle += 1
+    except KeyboardInterrupt:
+        raise Interrupted(task.model(LinearOE, fit.model, linear_provenance(fit))) from None
     return completed(task.model(LinearOE, fit.model, linear_provenance(fit)))
 
 
