@@ -122,11 +122,9 @@ def cause_of(
 def cause_among(
     runs: Sequence[Recording], *, volt: float = math.inf, speed: float = math.inf
 ) -> Cause | None:
-    """The cause that ended a series of runs.
-
-    The last run is looked at alone, compared with those before it that a motor explains, and with
-    all of them; the change that leaves the smallest error is the cause. If that shows nothing, a
-    fault may have come unseen in an earlier run.
+    """The cause that ended a series of runs. The last run is looked at alone, compared with those
+    before it that a motor explains, and with all of them; the change that leaves the smallest error
+    is the cause. If that shows nothing, a fault may have come unseen in an earlier run.
     """
     if not runs:
         return None

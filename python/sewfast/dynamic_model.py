@@ -348,7 +348,6 @@ class DynamicModel(ABC):
         return rest
 
     def _inputs(self, values: ArrayLike) -> FloatArray:
-        """Inputs as (N, n_inputs)."""
         n = len(self.input_names)
         expected = "(N,) or (N, 1)" if n == 1 else f"(N, {n})"
         if values is None or isinstance(values, (str, os.PathLike)):
@@ -456,7 +455,6 @@ class DynamicModel(ABC):
         return "\n".join([*lines, *self.describe(), *self._story()])
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         first, *lines = str(self).splitlines()
         return html_of("\n".join([first, f"orders: {lines[0]}", *lines[1:]]))
 

@@ -218,7 +218,6 @@ def _name(seed: int | None, parameters: Mapping[str, float]) -> str:
 
 
 def _parameters(query: str, name: str) -> dict[str, float]:
-    """Parameters by name, from ``a=1&b=2``."""
     found = {}
     for part in query.split("&") if query else ():
         key, _, value = part.partition("=")

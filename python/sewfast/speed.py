@@ -118,9 +118,8 @@ SHORTEST = 5
 def speed_between_gaps(
     counts: FloatArray, Ts: float, counts_per_rev: float, *, method: Method = "kalman"
 ) -> FloatArray:
-    """As `speed_from_counts`, separately for each piece between gaps (NaN); shape (N,).
-    The speed is NaN in gaps and in pieces too short for the method. Raises `DataError` if no piece
-    is long enough.
+    """As `speed_from_counts`, separately for each piece between gaps (NaN); shape (N,). The speed
+    is NaN in gaps and in pieces too short for the method.
     """
     if not np.isnan(counts).any():
         return speed_from_counts(counts, Ts, counts_per_rev, method=method)

@@ -28,11 +28,10 @@ AT_THE_NOISE = 1.5
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of an error series.
-    The fit is 100 (1 - |y - yhat| / |y - mean(y)|) in Euclidean norms, NaN for constant y; `rmse`
-    and the largest magnitude `max_abs` are in the unit of the output. With weights, rmse is
-    sqrt(sum w e^2 / sum w), means are weighted, and norms are of sqrt(w) times their argument; the
-    largest magnitude is not weighted.
+    """Scores of an error series. The fit is 100 (1 - |y - yhat| / |y - mean(y)|) in Euclidean
+    norms, NaN for constant y; `rmse` and the largest magnitude `max_abs` are in the unit of the
+    output. With weights, rmse is sqrt(sum w e^2 / sum w), means are weighted, and norms are of
+    sqrt(w) times their argument; the largest magnitude is not weighted.
     """
 
     rmse: float
@@ -77,7 +76,6 @@ class ExperimentErrors:
 
     @property
     def one_step_error(self) -> FloatArray:
-        """One-step error, shape (N,)."""
         return self.y - self.one_step
 
     @property
@@ -87,7 +85,6 @@ class ExperimentErrors:
 
     @property
     def n(self) -> int:
-        """Samples scored."""
         return len(self.y) - self.init - self.unmeasured
 
     def scored(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -237,7 +234,6 @@ class Validation(Plotted):
         return stacked(panels, (2.6, 1.7))
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         unit = f" [{self.unit}]" if self.unit else ""
         rows = [("free run", self.simulation), ("one step ahead", self.one_step)]
         if len(self.experiments) > 1:
@@ -351,9 +347,7 @@ def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
 
 
 def free_run_error(model: DynamicModel, data: Dataset, init: int) -> float:
-    """Root mean square error of the free run [output unit]; infinite if the run diverges.
-    It is weighted, over the known outputs after the initial samples.
-    """
+    """Weighted rms error of the free run [output unit]; infinite if the run diverges."""
     return _error(lambda: model.simulate(data, init=init), data, init)
 
 

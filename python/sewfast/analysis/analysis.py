@@ -489,9 +489,7 @@ ALT = {
 
 
 def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> list[Path]:
-    """Write everything, the PNGs optionally (the report does not use them); return the files.
-    Raises `SettingError` if matplotlib is not installed or the folder cannot be written to.
-    """
+    """Write everything, the PNGs optionally (the report does not use them); return the files."""
     from ..plotting import style, svg
     from .figures import figures
 

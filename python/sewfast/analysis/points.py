@@ -89,8 +89,7 @@ def plant_points(
     plants: Sequence[Plant], names: Sequence[str], speeds: Sequence[float] | None
 ) -> tuple[tuple[PlantPoint, ...], ...]:
     """The plants at each of the operating points, without those that cannot rest there. `speeds`
-    are steady outputs [y], by default spread over the training data of the first model. Raises
-    `SettingError` for a model with several inputs, or if no plant can rest at any of the outputs.
+    are steady outputs [y], by default spread over the training data of the first model.
     """
     for plant in plants:
         if isinstance(plant, Model) and len(plant.input_names) != 1:
@@ -188,7 +187,6 @@ def two_lags(gain: float, T1: float, T2: float, Ts: float) -> StateSpace:
 
 
 def to_json(point: PlantPoint) -> dict[str, Any]:
-    """As JSON values."""
     return {
         "plant": point.plant,
         "u": point.u,

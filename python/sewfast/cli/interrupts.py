@@ -28,9 +28,8 @@ _end_at = 0.0
 
 
 def listen() -> None:
-    """Interrupt the command at the first signal, and end the process `GRACE` later.
-    Further signals are ignored, so that they cannot interrupt what the first one made the command
-    do. A signal that is ignored, as in a job in the background, stays ignored.
+    """Interrupt the command at the first signal, end the process `GRACE` later, ignore further
+    ones; a signal that a background job ignores stays ignored.
     """
     for number in SIGNALS:
         if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL):

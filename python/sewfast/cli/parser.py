@@ -64,9 +64,7 @@ exit codes:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest name for a typo; without a command it shows its help.
-    argparse uses the same class for the parsers of the commands.
-    """
+    """A parser that suggests the nearest name for a typo; without a command it shows its help."""
 
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: Any = None

@@ -104,9 +104,7 @@ class Project:
 
 
 def find(folder: Path | None = None) -> Project:
-    """The project that a folder belongs to: its own file's, or that of the next folder above.
-    Raises `SettingError` if the file cannot be read or has invalid content.
-    """
+    """The project that a folder belongs to: its own file's, or that of the next folder above."""
     try:
         folder = Path.cwd() if folder is None else folder
         places = (place / NAME for place in (folder, *folder.parents))
@@ -130,9 +128,7 @@ def _is_trusted(path: Path) -> bool:
 
 
 def load(path: Path) -> Project:
-    """The project that a file describes.
-    Raises `SettingError` if the file cannot be read or has invalid content.
-    """
+    """The project that a file describes."""
     found = _parsed(path)
     _require_known(path, "", found, _TOP)
     tables = {name: _table(path, found, name) for name in ("columns", "units", "limits")}
@@ -238,9 +234,7 @@ def _number(path: Path, where: str, value: Any) -> float:
 
 
 def with_units(table: Table, args: argparse.Namespace) -> Table:
-    """A table with the project's units for columns whose file states none.
-    Raises `SettingError` if the file states another unit: one of the two is wrong.
-    """
+    """A table with the project's units where its file states none; another is refused."""
     units: dict[str, str] = getattr(args, "units", {})
     known = {name: unit for name, unit in units.items() if name in table}
     if not known:
@@ -375,9 +369,7 @@ def init_command(args: argparse.Namespace) -> None:
 
 
 def _described(recording: str) -> tuple[str, str]:
-    """The lines on columns and units of a recording.
-    Raises `SettingError` if its columns do not show which is the input and which the output.
-    """
+    """The lines on columns and units of a recording."""
     from ..readers import read_table, roles
 
     table = read_table(recording)

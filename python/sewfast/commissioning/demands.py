@@ -62,30 +62,12 @@ SAMPLE_TIMES = (1e-5, 0.1)
 
 @dataclass(frozen=True)
 class Demands:
-    """Limits, working range and effort.
-
-    Attributes
-    ----------
-    u_max : float
-        Largest command in either direction [V].
-    speed : float
-        Top of the working range [RPM].
-    references : mapping of name to array, or None
-        References for the verification [RPM]; None for those of `excitations.standard`.
-    practice : mapping of name to array, or None
-        References for tuning [RPM]; None for the same, or for shorter versions of the standard
-        ones.
-    members, evaluations : int
-        Models in the ensemble; controllers that the search tries.
-    load : float or None
-        Size of the load step in command [V]; None for a share of `u_max`, 0 for no such
-        requirement.
-    Ms : float or None
-        Largest sensitivity on the small signals; None for no such requirement.
-    time_budget : float or None
-        Longest time of the search [s].
-    stated : float
-        Speed above which the machine ends a run [RPM].
+    """Limits, working range and effort. `u_max` [V] and `speed` [RPM] bound command and working
+    range; `references` are those of the verification [RPM] and `practice` those of tuning, None for
+    those of `excitations.standard`. `members` models make the ensemble, and the search tries
+    `evaluations` controllers for `time_budget` [s]. `load` is a step of command [V] (None: a share
+    of `u_max`; 0: not required), `Ms` the largest sensitivity on the small signals; above `stated`
+    [RPM] the machine ends a run.
     """
 
     u_max: float
@@ -122,9 +104,7 @@ def demands(
     Ms: float | None = LARGEST_MS,
     time_budget: float | None = None,
 ) -> Demands:
-    """The demands, checked against the machine's limits.
-    Raises `SettingError` for a value outside its range or beyond a limit.
-    """
+    """The demands, checked against the machine's limits."""
     _require_machine(machine)
     volt = machine.volt if u_max is None else real("u_max", u_max)
     if not 0.0 < volt < math.inf:

@@ -35,9 +35,7 @@ STALLS, STALLING = 3, 0.2
 
 @dataclass(frozen=True)
 class Motion:
-    """Speed is about `gain (u - threshold)`.
-    `gain` is in [RPM/V]; `threshold` is the command that friction uses up [V].
-    """
+    """Speed is about `gain (u - threshold)` [RPM], gain in [RPM/V], threshold in [V]."""
 
     gain: float
     threshold: float

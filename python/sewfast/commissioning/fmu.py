@@ -295,9 +295,7 @@ def is_fmu(text: str) -> bool:
 
 
 def fmu_of(text: str) -> SteppedBench:
-    """The machine of `FILE.fmu?volt=24&input=u&speed=w`, the arguments of `fmu_bench` by name.
-    Raises as `fmu_bench`, and `SettingError` for unknown arguments.
-    """
+    """The machine of `FILE.fmu?volt=24&input=u&speed=w`, the arguments of `fmu_bench` by name."""
     path, _, query = text.partition("?")
     given: dict[str, Any] = {}
     for part in filter(None, query.split("&")):

@@ -64,9 +64,7 @@ class FmuProcess:
         self._ended: BaseException | None = None
 
     def begin(self) -> tuple[float, ...]:
-        """Begin a run; return the variables at its beginning.
-        Raises `SettingError` if the FMU refuses, crashes, or does not answer in time.
-        """
+        """Begin a run; return the variables at its beginning."""
         return self._ask(b"r", 0.0, "an instance that begins")
 
     def step(self, u: float, sample: int) -> tuple[float, ...]:
@@ -74,7 +72,6 @@ class FmuProcess:
         return self._ask(b"s", u, f"a step of {self.Ts:g} s from {sample * self.Ts:g} s")
 
     def close(self) -> None:
-        """End the process."""
         with contextlib.suppress(OSError):
             self._requests.close()
         try:

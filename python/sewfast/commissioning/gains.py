@@ -161,9 +161,7 @@ def start_of(
     cost: Cost,
     threads: int,
 ) -> Controller:
-    """The start of the search: the rule's gains, with alpha and beta of least cost on a grid.
-    The rule's own alpha and beta are for a step of the reference; slow references need others.
-    """
+    """The rule's gains, with alpha and beta of least cost on a grid: the rule's suit steps only."""
     tried = [replace(rule, alpha=a, beta=b) for a, b in product(ALPHAS, BETAS)]
     found = costs([rule, *tried], models, list(references.values()), cost=cost, threads=threads)
     return [rule, *tried][int(np.argmin(found))]
@@ -446,9 +444,7 @@ def held(demands: Demands, fastest: float, Ts: float) -> tuple[FloatArray, int]:
 def swing_of(
     found: ClosedLoopRun, settled: int, share: float = 1.0, expected: float = 0.0
 ) -> Swing | None:
-    """The oscillation of the command at a held speed; None for a quiet loop.
-    `expected` is its standard deviation according to the models [V].
-    """
+    """The oscillation of a command at a held speed beyond the `expected` rms [V]; None if quiet."""
     u, limits = found.u[settled:], found.controller
     u = u[np.isfinite(u)]
     reach = 0.5 * (limits.u_max - limits.u_min)
@@ -467,7 +463,6 @@ def unsettled(u: FloatArray) -> FloatArray:
 
 
 def frequency_of(rest: FloatArray, Ts: float) -> float:
-    """The frequency of an oscillation [Hz]."""
     power = np.abs(np.fft.rfft(rest * np.hanning(len(rest)))) ** 2
     return (1 + int(np.argmax(power[1:]))) / (len(rest) * Ts)
 

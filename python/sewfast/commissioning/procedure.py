@@ -306,7 +306,6 @@ def _place(
 def _carry_out(
     machine: RecordedBench, asked: Demands, cost: Cost | None, journal: Journal
 ) -> Commissioning:
-    """Run the stages."""
     journal.enter("first motion")
     motion = first_motion(machine, asked)
     journal.keep(motion=motion)
@@ -424,9 +423,7 @@ def _compared(
     plan: _Plan,
     journal: Journal,
 ) -> Controller:
-    """Predict and measure every reference; the controller with its gains lowered until it is calm.
-    Raises `Refusal` if it is restless even with half of them.
-    """
+    """Predict and measure every reference with gains lowered until it is calm, or `Refusal`."""
     thinning = plan.thinning
     pushes = thinning.pushes(load, verify, machine.Ts)
     swings = ""
@@ -453,9 +450,7 @@ def _compared(
 
 
 def _instead(rival: Rival | None, judge: Recording, refusal: Refusal, journal: Journal) -> Trained:
-    """The linear rival in place of networks that failed.
-    Raises the networks' `refusal` if the rival does not predict well enough either.
-    """
+    """The linear rival in place of networks that failed; their `refusal` if it fails, too."""
     if rival is None or not rival.is_fit:
         raise refusal
     journal.say(f"tuned on the linear model alone, as the networks failed: {refusal}")
@@ -616,9 +611,7 @@ Progress: TypeAlias = Callable[[int, int, str], object]
 
 
 class Journal:
-    """Collects the results; `result` makes a `Commissioning` of them at any time.
-    The callbacks and `cancel` are those of `commission`.
-    """
+    """Collects the results; `result` makes a `Commissioning` of them at any time."""
 
     def __init__(
         self,
@@ -640,22 +633,18 @@ class Journal:
 
     @property
     def first(self) -> Controller:
-        """The first gains."""
         found: Controller = self._values["first"]
         return found
 
     def recording(self, name: str) -> Recording:
-        """A recording by its name."""
         found: Recording = self._values["recordings"][name]
         return found
 
     @property
     def stage(self) -> str:
-        """The present stage."""
         return self._began[-1][0] if self._began else STAGES[0]
 
     def enter(self, stage: str) -> None:
-        """Begin a stage."""
         # register it first: the callbacks can raise to stop
         self._began.append((stage, time.perf_counter()))
         self._report(STAGES.index(stage), stage)
@@ -688,7 +677,6 @@ class Journal:
             self._progress(done, len(STAGES), text)
 
     def keep(self, **values: Any) -> None:
-        """Store results."""
         self._values |= values
 
     def say(self, note: str) -> None:
@@ -707,7 +695,6 @@ class Journal:
         return found
 
     def result(self, verdict: str, reason: str = "") -> Commissioning:
-        """The results so far."""
         ends = [t for _, t in self._began[1:]] + [time.perf_counter()]
         seconds = {s: end - t for (s, t), end in zip(self._began, ends, strict=True)}
         return Commissioning(

@@ -239,7 +239,6 @@ class Commissioning:
         return loop_drawing(traces, units["y"], units["u"]).plot(ax, file)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         return html_of(str(self))
 
     def __str__(self) -> str:
@@ -336,9 +335,7 @@ _SHORT = 5.0
 
 
 def require_own(folder: Path, *, overwrite: bool) -> None:
-    """Refuse (`SettingError`) a folder with files that a commissioning of a virtual machine cannot
-    repeat.
-    """
+    """Refuse a folder with files that a commissioning of a virtual machine cannot repeat."""
     if not overwrite:
         require_repeatable(folder)
         _require_own_artefacts(folder)

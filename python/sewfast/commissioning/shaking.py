@@ -401,9 +401,7 @@ def _in_open_loop(
 
 
 def _kept(error: LinkError, lead: int, plan: _Plan, *, is_whole: bool) -> Recording:
-    """The recording of an aborted run up to its first gap.
-    Raises the given `error` if that is less than a period.
-    """
+    """The recording of an aborted run up to its first gap; its `error` if below a period."""
     found = getattr(error.recording, "recording", error.recording)
     if is_whole or not isinstance(found, Recording):
         raise error
@@ -521,9 +519,7 @@ def _response(
 
 
 def _working_point(machine: Machine, speed: float) -> tuple[float, int, float]:
-    """The command that holds the speed [V], the samples until it does, the time constant [s].
-    It is found by the secant method, as a machine is not linear.
-    """
+    """The command that holds the speed [V], by secants; the samples until then, the lag [s]."""
     tried: list[tuple[float, float]] = [(0.0, 0.0)]
     u, hold = math.copysign(0.15 * machine.volt, speed), HOLD
     for _ in range(TRIES):

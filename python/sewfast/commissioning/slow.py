@@ -121,9 +121,7 @@ class _Unexplained:
 
     @classmethod
     def of(cls, ensemble: Ensemble, whole: Recording, k: int) -> _Unexplained:
-        """The residual of the median of the members' free runs.
-        Raises `FitError` if a member diverges.
-        """
+        """The residual of the median of the members' free runs; `FitError` if a member diverges."""
         thinning = Thinning(k)
         recording = thinning.recording(whole)
         runs = [m.simulate(recording.dataset(), init=0)[0] for m in ensemble.members]
@@ -131,9 +129,7 @@ class _Unexplained:
         return cls(recording.y - np.median(runs, axis=0), turns, recording.Ts, thinning)
 
     def span(self, ratio: float) -> float:
-        """Span of the moving mean to remove [s]. It removes slow changes such as friction that
-        varies with temperature, but keeps the load of a slow output shaft.
-        """
+        """Span of the mean to remove [s]: it takes warming friction, and leaves a slow load."""
         rate = float(self.turns[-1]) / (len(self.rest) * self.Ts)
         return max(SLOW, SLOW_TURNS / max(ratio * rate, 1e-9)) if ratio < 1.0 else SLOW
 
@@ -249,8 +245,8 @@ class Thinning:
         return cls(max(1, round(coarse / fine)))
 
     def recording(self, r: Recording) -> Recording:
-        """The mean command over k samples, and the speed from every k-th count.
-        The command is averaged and not picked, as in a closed loop it changes at every sample.
+        """The mean command over k samples (it may change at each), and the speed from every k-th
+        count.
         """
         if self.k == 1:
             return r
@@ -266,9 +262,7 @@ class Thinning:
     def pushes(
         self, load: TurnLoad | None, references: Mapping[str, FloatArray], Ts: float
     ) -> list[FloatArray] | None:
-        """The load's command along references at the machine's sample time, thinned. At high speeds
-        its harmonics lie above half the coarse sample rate: averaging keeps them from aliasing.
-        """
+        """The load's command along references, averaged and not picked: harmonics would alias."""
         if load is None:
             return None
         return [self.mean(load.along(r, Ts)) for r in references.values()]
@@ -283,9 +277,7 @@ class Thinning:
         return means
 
     def coarse(self, c: Controller) -> Controller:
-        """The controller for simulations at the coarse sample time. Its moving average is k times
-        shorter, as a difference of counts over k samples is already the mean of k speeds.
-        """
+        """The controller at coarse samples; their counts are already means of k speeds."""
         if self.k == 1:
             return c
         return replace(
@@ -319,9 +311,7 @@ class Thinning:
         return fopdt if self.k == 1 else replace(fopdt, L=fopdt.L + (self.k - 1) * Ts)
 
     def variations(self) -> Sequence[tuple[float, int]] | None:
-        """Gain and delay of the plants for tuning; None for the usual ones.
-        The coarse sample time alone is more delay than the usual ones add.
-        """
+        """Gain and delay of the plants for tuning; None if the samples are not coarse."""
         return None if self.k == 1 else ((1.0, 0), (0.8, 0), (1.25, 0))
 
     def cost(self, cost: Cost) -> Cost:

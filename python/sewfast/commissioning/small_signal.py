@@ -70,9 +70,7 @@ LEAST_FIT = 90.0
 
 @dataclass(frozen=True)
 class Resonance:
-    """A pair of lightly damped poles; `frequency` is the undamped one [Hz], `damping` their damping
-    ratio.
-    """
+    """Lightly damped poles: the undamped `frequency` [Hz] and the `damping` ratio."""
 
     frequency: float
     damping: float
@@ -151,7 +149,6 @@ class Shaken:
         return float(self.turns[-1] - self.turns[0]) / self.seconds
 
     def dataset(self) -> Dataset:
-        """Command and speed as a data set."""
         return Dataset.from_arrays(
             self.u, self.speed, self.Ts, input_units="V", output_unit="RPM", name=self.name
         )
@@ -233,8 +230,8 @@ def fitted(
 
 
 def _smooth(shaken: Shaken) -> Dataset | None:
-    """The record with the free run of a model of high order in place of the speed.
-    It has the dynamics and hardly any noise (B. Wahlberg, IEEE Trans. Automatic Control 34, 1989).
+    """The record with a high-order model's free run, almost noiseless, as speed (Wahlberg 1989,
+    IEEE Trans. Automatic Control 34).
     """
     try:
         core = _core.fit_arx(arrays(shaken.dataset()), na=MANY, nb=MANY, nk=1, offset=True)

@@ -131,9 +131,7 @@ def beyond_record(models: Sequence[Any], u_min: float, u_max: float) -> str:
 
 
 def filter_length(Ts: float, time_constant: float) -> int:
-    """Samples of the feedback's moving average: 8 ms, at most a tenth of the time constant.
-    It is 1, no filter, if the sample time is longer than that.
-    """
+    """Samples of the feedback's mean: 8 ms, at most a tenth of the time constant, at least one."""
     wanted = min(FILTER_TIME, _FILTER_SHARE * time_constant) / Ts
     return int(min(max(1, round(wanted)), _MOST_FILTERED))
 
@@ -279,9 +277,7 @@ def moves_on(model: Model, u_min: float, u_max: float) -> bool:
 
 
 def _moves_on(model: Model, size: float) -> bool:
-    """Whether the response still changes in the second half of a long step.
-    A pole at 1 that a zero nearly cancels does not integrate.
-    """
+    """Whether a long step moves on: a pole at 1 that a zero nearly cancels does not."""
     samples = _STEP_SAMPLES[-1]
     u = np.zeros(samples)
     # after some samples, as the model's rest state assumes the first command before the start
@@ -302,9 +298,7 @@ class _Span:
 
 
 def catalogue_fits(model: Any, u_min: float, u_max: float, unit: str) -> bool:
-    """Whether the references of `sewfast.signals` suit a drive's unit, sample time and range.
-    A plant without a stored range is assumed to suit them.
-    """
+    """Whether `sewfast.signals` suit a drive's unit, sample time and range, if that is known."""
     if spelled(unit) != "rpm" or not math.isclose(model.Ts, signals.TS, rel_tol=1e-9):
         return False
     known = _output_range(model) if isinstance(model, Model) else None

@@ -87,7 +87,6 @@ class Diagnosis:
         return {"findings": [f.to_json() for f in self.findings]}
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         if not self.findings:
             return Table(str(self), (), ()).to_html()
         rows = tuple((f.kind, f.text, f.remedy) for f in self.findings)

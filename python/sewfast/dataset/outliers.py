@@ -41,10 +41,7 @@ def white_noise(column: FloatArray) -> float:
 
 
 def quantum(column: FloatArray) -> float | None:
-    """The step of a grid on which all values lie; None if there is none.
-    It requires at least three values that occur twice or more on average: a few values always lie
-    on some grid.
-    """
+    """The step of a grid of all values, which occur twice or more on average; None without one."""
     return _core.quantum(np.ascontiguousarray(column))
 
 

@@ -43,8 +43,6 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class _System:
-    """The contents of an FMU."""
-
     name: str
     title: str
     Ts: float

@@ -32,9 +32,7 @@ _FARTHEST = 20.0
 
 
 def figures(card: ReportCard, *, page: bool = False) -> dict[str, Figure]:
-    """All figures of a card by name, as far as it has the evidence: `residuals`, `bands`, `bode`,
-    `poles`, `region`. Raises `SettingError` if matplotlib is not installed.
-    """
+    """All figures of a card for which it has the evidence, by name."""
     drawn = {name: drawing(card, name) for name in names(card)}
     return {name: d.beside() if page else d.figure() for name, d in drawn.items()}
 
@@ -50,9 +48,7 @@ def names(card: ReportCard) -> list[str]:
 
 
 def drawing(card: ReportCard, name: str | None = None) -> Drawing:
-    """One figure of a card; by default `bands`, else the first for which it has evidence.
-    Raises `SettingError` for a figure for which the card has no evidence.
-    """
+    """One figure of a card; by default `bands`, else the first for which it has evidence."""
     there = names(card)
     if name is None and there:
         name = "bands" if "bands" in there else there[0]
@@ -64,9 +60,7 @@ def drawing(card: ReportCard, name: str | None = None) -> Drawing:
 
 
 def save(card: ReportCard, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write every figure as a PNG into a folder, which is created if needed.
-    Raises `SettingError` if matplotlib is not installed or the folder cannot be written to.
-    """
+    """Write every figure as a PNG into a folder, which is created if needed."""
     contents: dict[Path, bytes] = {}
     for name, figure in figures(card).items():
         content = io.BytesIO()

@@ -22,8 +22,8 @@ INTEGRATES = 2.5e-4
 
 
 def integrating_pole(model: DynamicModel) -> float | None:
-    """The pole at 1, or so close that no practical step settles; None if there is none.
-    A record of a position determines it up to noise and friction.
+    """The pole at 1, or so close, given noise and friction, that no practical step settles; or
+    None.
     """
     try:
         small = linearise(representative(model).core, np.zeros(len(model.input_names)))

@@ -208,11 +208,9 @@ class TrainingRegion:
 
     @property
     def n_inputs(self) -> int:
-        """Inputs of the model."""
         return len(self.centre) - 1
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values."""
         return {
             "form": FORM,
             "lag": self.lag,
@@ -241,7 +239,6 @@ class TrainingRegion:
 
 
 def training_region(model: DynamicModel, data: Dataset) -> dict[str, Any]:
-    """The region of a model on its training data, for its `training["region"]`."""
     return _region(model, data).to_json()
 
 
@@ -321,9 +318,7 @@ def _lag(y: FloatArray) -> int:
 
 
 def _spread_out(points: FloatArray) -> tuple[FloatArray, float]:
-    """Up to `CENTRES` points, each farthest from those before, and the largest distance left.
-    The greedy k-centre of Gonzalez (1985): extremes are among the first.
-    """
+    """Up to `CENTRES` points by greedy k-centre (Gonzalez 1985), and the largest distance left."""
     chosen = [int(np.argmin(np.square(points).sum(axis=1)))]
     nearest = np.square(points - points[chosen[0]]).sum(axis=1)
     while len(chosen) < CENTRES:
@@ -362,9 +357,7 @@ def _nearest(points: FloatArray, centres: FloatArray) -> FloatArray:
 def _window(
     signals: Sequence[FloatArray], centre: FloatArray, peak: FloatArray, lag: int
 ) -> tuple[int, FloatArray]:
-    """The window and the bounds of the level: the shortest with the doubled inputs outside.
-    Inputs are doubled about their mean and about zero. If no window suffices, the best one.
-    """
+    """The shortest window, with the level's bounds, that has doubled inputs outside."""
     n = sum(map(len, signals))
     whole = np.sqrt(sum(np.square(x - centre).sum(axis=0) for x in signals) / n)
     window, largest = max(4, 2 * lag), max(4, 2 * lag, n // _LARGEST_WINDOW)

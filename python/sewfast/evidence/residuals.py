@@ -27,19 +27,10 @@ Horizon: TypeAlias = Literal["free run", "one step"]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One experiment.
-
-    Attributes
-    ----------
-    y, yhat : array, shape (N,)
-        Measured (NaN where it is not) and computed output [output unit].
-    counts : array of bool, shape (N,)
-        Measured samples after the initial ones.
-    psi : array, shape (N, p)
-        Sensitivity of yhat to the parameters.
-    state : array, shape (N, s)
-        Orthonormal basis of the changes of yhat due to the initial state, zero where a sample does
-        not count.
+    """One experiment: `y` (N,), NaN where not measured, `yhat` [output unit], and `counts`, the
+    measured samples after the initial ones. `psi` (N, p) is the sensitivity of yhat to the
+    parameters, `state` (N, s) an orthonormal basis of its changes due to the initial state, zero
+    where a sample does not count.
     """
 
     name: str
@@ -258,7 +249,6 @@ class HorizonScores:
     names: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values."""
         return {
             horizon: {
                 **scores.to_json(),
@@ -274,9 +264,7 @@ class HorizonScores:
 def horizon_scores(
     model: DynamicModel, data: Dataset, residuals: Residuals, steps: tuple[int, ...] = STEPS
 ) -> HorizonScores:
-    """Errors at every horizon; those some steps ahead only if the outputs are complete.
-    `residuals` are those of the free run.
-    """
+    """Errors of the free run, and some steps ahead if the outputs are complete."""
     series: dict[str, list[FloatArray]] = {"free run": [r.yhat for r in residuals.runs]}
     if all(np.isfinite(e.y).all() for e in data.experiments):
         for k in steps:

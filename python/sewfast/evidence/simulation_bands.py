@@ -66,7 +66,6 @@ class Uncertainty:
         return float(np.interp(normal(probability), at, self.quantiles))
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values."""
         return {
             "spread": self.spread,
             "factor": [[float(f"{v:.6e}") for v in row] for row in self.factor],
@@ -209,7 +208,6 @@ def bands_of(
 
 
 def uncertainty(model: DynamicModel, data: Dataset, init: int = INIT) -> Uncertainty:
-    """Uncertainty of a model from its training data."""
     residuals = Residuals.of(model, data, init, "free run")
     found = None if model.members else estimate(model, residuals)
     return uncertainty_of(model, data, residuals, found)

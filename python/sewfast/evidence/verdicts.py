@@ -195,12 +195,10 @@ def bias(residuals: Residuals) -> Line:
 
 
 def residuals_power(residuals: Residuals) -> float:
-    """Mean square of the residuals."""
     return sum(float(r.error @ r.error) for r in residuals.runs) / residuals.n
 
 
 def correlation(t: ResidualTest) -> Line:
-    """Line with the verdict of one residual test."""
     limit = f"p >= {LEVEL:g}"
     if not math.isfinite(t.p_value):
         text = (

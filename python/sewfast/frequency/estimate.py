@@ -212,9 +212,7 @@ def _segment(segment: int | None, n: int) -> int:
 
 
 def record_of(u: ArrayLike, y: ArrayLike, r: ArrayLike | None) -> list[FloatArray]:
-    """Input, output and, if there is one, reference of a record, of one length and finite power.
-    Raises `DataError` for an input or a reference that does not move.
-    """
+    """Input, output and, if there is one, reference of a record, of one length and finite power."""
     given = {"u": u, "y": y} if r is None else {"u": u, "y": y, "r": r}
     signals = {name: _signal(name, values) for name, values in given.items()}
     lengths = [len(s) for s in signals.values()]

@@ -99,7 +99,6 @@ OUTSIDE = 1.0, 99.0
 def of_record(
     on: Recording | Dataset, reference: str | None, method: str | None, segment: int | None
 ) -> FrequencyResponse:
-    """`bode` of a record, with the same arguments."""
     if method not in (None, *get_args(RecordMethod)):
         raise SettingError(
             name="method", expected=" or ".join(get_args(RecordMethod)), received=repr(method)

@@ -344,9 +344,7 @@ def load_response(path: str | os.PathLike[str]) -> FrequencyResponse:
 
 
 def response_of(fields: storage.Fields) -> FrequencyResponse:
-    """The response of the values of `FrequencyResponse.to_dict`; anything else is a
-    `ModelFileError`.
-    """
+    """The response of the values of `FrequencyResponse.to_dict`, or a `ModelFileError`."""
     hertz = fields.vector("hertz")
     noise = None if fields.any("noise") is None else fields.vector("noise")
     arrays = {name: fields.vector(name) for name in ("real", "imaginary", "variance", "coherence")}

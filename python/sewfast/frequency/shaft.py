@@ -217,9 +217,7 @@ def sampled_model(theta: FloatArray, Ts: float, u_unit: str, y_unit: str) -> Lin
 
 
 def _usable(response: FrequencyResponse) -> tuple[FloatArray, Complex, FloatArray, float]:
-    """Frequencies, values and deviations of the usable lines, in units of their median magnitude,
-    and that.
-    """
+    """Frequencies, values and deviations of usable lines over their median magnitude, and that."""
     hertz, value = np.asarray(response.hertz), np.asarray(response.value)
     variance = np.asarray(response.variance)
     usable = (response.coherence > 0.5) & (hertz > 0.0) & (np.abs(value) > LEAST_GAIN)

@@ -232,10 +232,7 @@ class Simulation:
     """Whether the function takes all columns at once."""
 
     def derivative(self, x: FloatArray, u: float, p: Mapping[str, Any]) -> FloatArray:
-        """Derivative of the state (n,) or (n, columns), with its shape checked.
-        Raises `FitError` if the function raises, and `SettingError` if it returns another shape, or
-        no numbers.
-        """
+        """Derivative of the state (n,) or (n, columns), with its shape checked."""
         try:
             found = self.equations(x, u, p)
         except Exception as e:
@@ -258,9 +255,7 @@ class Simulation:
         return array.reshape(x.shape)
 
     def settle(self, theta: FloatArray, u: float, speed: float) -> None:
-        """Test whether the function accepts all columns at once, with the same results.
-        Raises as `derivative`, at the start; also if it returns no finite number there.
-        """
+        """Find out whether the function accepts all columns at once, with the same results."""
         x = np.zeros(self.states)
         x[0] = speed
         single = self.derivative(x, u, dict(zip(self.names, map(float, theta), strict=True)))

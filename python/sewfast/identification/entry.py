@@ -349,9 +349,7 @@ def _judged_by(model: Model, faults: Sequence[Fault]) -> Model:
 
 
 def _verdict(model: Model, data: Dataset, validation: Dataset | None) -> Provenance:
-    """The verdict on a kind requested by name, for which no data were held out.
-    It is judged on the validation data, else on its training data; the text states which.
-    """
+    """The verdict on a kind requested by name, on validation, else on training data."""
     part = Split(data, validation or data, is_given=validation is not None)
     where = UNSEEN_DATA if part.is_given else "its own training data"
     if (pole := _largest_pole(model)) > 1.0:

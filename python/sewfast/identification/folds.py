@@ -40,10 +40,9 @@ RUN_UP = 10 * INIT
 
 @dataclass(frozen=True)
 class Split:
-    """Data to fit to and data to choose by.
-    Parts of `held` begin in the fitted data, which give their state. If `is_given`, it is the
-    user's own validation data, which are never trained on. `sources` are the scored ranges, as
-    JSON values.
+    """Data to fit to and data to choose by. Parts of `held` begin in the fitted data, which give
+    their state. If `is_given`, it is the user's own validation data, which are never trained on.
+    `sources` are the scored ranges, as JSON values.
     """
 
     fitted: Dataset

@@ -70,10 +70,9 @@ def paper(task: Task) -> Model:
 
 
 def neural_oe(task: Task) -> Model:
-    """The network, trained in free run from the linear output-error model.
-    The result is always a trained network. If the held-out blocks stop the training before its
-    first step, because no step is better there than the linear model, the network is trained on all
-    data instead, with a note.
+    """The network, trained in free run from the linear output-error model. The result is always a
+    trained network. If the held-out blocks stop the training before its first step, because no step
+    is better there than the linear model, the network is trained on all data instead, with a note.
     """
     networks = Networks.of(task)
     return networks.selected() if task.select else networks.unselected()
@@ -245,9 +244,8 @@ def _linear(task: Task) -> _core.LinearModel:
 
 
 def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
-    """The start of the training: the linear model, or a smaller one if that one is misled.
-    Networks that start at a slow pole which the drive does not have (`linear.is_misled`) rarely
-    leave it.
+    """The start of the training: the linear model, or a smaller one if that one is misled. Networks
+    that start at a slow pole which the drive does not have (`linear.is_misled`) rarely leave it.
     """
     orders = task.orders
     na, nb = orders["na"] - 1, orders["nb"] - 1
@@ -274,9 +272,7 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
 
 
 def _with_blocks_held_out(data: Dataset, lag: int) -> tuple[Dataset, Dataset | None]:
-    """The data without two of eight blocks of every experiment, and these blocks.
-    None is held out if the blocks would be too short.
-    """
+    """The data without two of eight blocks of every experiment, and these, unless too short."""
     kept: list[Experiment] = []
     held: list[Experiment] = []
     for e in data.experiments:

@@ -32,22 +32,11 @@ SHOWN = 12
 
 @dataclass(frozen=True)
 class Structure:
-    """One row: a linear model's orders and its errors.
-
-    Attributes
-    ----------
-    parameters : int
-        Number of parameters that the training data determine.
-    one_step : float
-        rms one-step error of the ARX model on later data [output unit].
-    free_run : float
-        rms free-run error on later data of that model, or of its refinement by instrumental
-        variables if that is better; inf if both diverge.
-    aic, aicc, bic, fpe : float
-        Criteria of the ARX model on the training data, the same samples for every structure (Ljung
-        1999, section 16.4). FPE in the output's unit squared.
-    lipschitz : float
-        Index of He and Asada (1993) of a model with these lags, linear or not; relative to others.
+    """One row: a linear model's orders, the number of `parameters` that the data determine, and its
+    errors. `one_step` and `free_run` are rms errors on later data [output unit], the latter also of
+    its refinement by instrumental variables if that is better. The criteria are those of the ARX
+    model on the same training samples (Ljung 1999, section 16.4); `lipschitz` is the index of He
+    and Asada (1993) for these lags, relative to others.
     """
 
     na: int

@@ -79,9 +79,8 @@ class Structure:
 
 @dataclass(frozen=True)
 class Start:
-    """One trained start.
-    `cost` is J on held-out data, else on the training data; `fault` is what the guard found, empty
-    for a sound start.
+    """One trained start. `cost` is J on held-out data, else on the training data; `fault` is what
+    the guard found, empty for a sound start.
     """
 
     model: Network
@@ -96,9 +95,8 @@ class Start:
 
 @dataclass(frozen=True)
 class Request:
-    """Some starts of one structure on some data.
-    `initial` are models to train further, one start each; otherwise `starts` new ones are drawn
-    around `linear`, numbered from `first` on.
+    """Some starts of one structure on some data. `initial` are models to train further, one start
+    each; otherwise `starts` new ones are drawn around `linear`, numbered from `first` on.
     """
 
     structure: Structure
@@ -112,7 +110,6 @@ class Request:
 
     @property
     def count(self) -> int:
-        """Starts."""
         return len(self.initial) or self.starts
 
     @property
@@ -239,9 +236,7 @@ def guarded(
     bounds: list[_core.LinearModel],
     pool: Pool,
 ) -> list[list[Start]]:
-    """The starts with the guard's findings on whole records.
-    `bounds` are linear models whose memory of the initial state bounds that of networks.
-    """
+    """Starts with the guard's findings; the memory of linear `bounds` limits that of networks."""
     flat = [start for starts in found for start in starts]
 
     def fault(start: Start, look: Look) -> str:

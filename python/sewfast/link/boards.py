@@ -410,8 +410,8 @@ class PolledBoard(Unique, ABC):
         return line.decode("ascii", "replace").strip()
 
     def _discard(self) -> bool:
-        """Discard received bytes: answers to an earlier program or an aborted exchange.
-        Return whether the line became quiet; with telemetry on, it never does.
+        """Discard bytes of an earlier exchange; whether the line became quiet, as telemetry never
+        does.
         """
         self._waiting = b""
         deadline = self._clock.monotonic() + QUIET_WITHIN

@@ -171,9 +171,7 @@ class Connection(Unique):
 
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """Use the connection from this thread alone; a second thread is refused, not queued.
-        Raises `SettingError` if another thread uses it: their frames and replies would mix.
-        """
+        """Use the connection from this thread alone; refuse a second one: frames would mix."""
         if not self._owner.acquire(blocking=False):
             raise SettingError(
                 name="drive", expected="one thread that uses it",
@@ -208,13 +206,10 @@ class Connection(Unique):
         return reply
 
     def ask(self, kind: Kind, body: bytes = b"") -> bytes:
-        """The body of a command's reply.
-        Raises `LinkError` as `request`, and if the device refuses.
-        """
+        """The body of a command's reply; `LinkError` as `request`, and if the device refuses."""
         return self.request(kind, body).checked()
 
     def status(self) -> wire.Status:
-        """Ask the device for its status."""
         return wire.status(self.request(Kind.STATUS))
 
     def stop(self) -> None:
@@ -504,9 +499,7 @@ def _slopes(low: _Points, high: _Points) -> tuple[float, float]:
 
 
 def _offsets(low: _Points, high: _Points, slopes: tuple[float, float]) -> tuple[float, float]:
-    """Least and greatest value at 0 of such a line.
-    They are reached at the least or greatest slope, or at the slope of an edge of a hull.
-    """
+    """Least and greatest value at 0 of such a line: at an extreme slope, or an edge of a hull."""
     at = [np.clip(s, *slopes) for s in (*slopes, *_edges(low), *_edges(high))]
     least = min(float(np.max(low[:, 1] - s * low[:, 0])) for s in at)
     greatest = max(float(np.min(high[:, 1] - s * high[:, 0])) for s in at)

@@ -148,9 +148,7 @@ class Metered(Port):
 
 
 def checkup(port: Metered, echoes: int) -> Iterator[Finding]:
-    """Check the device behind an open port, one finding after the other.
-    Raises `LinkError` if no device answers, or it stops answering.
-    """
+    """Check the device behind an open port, finding by finding; `LinkError` if it is mute."""
     link = Connection(port, watchdog=0.05, patience=PATIENCE, resume=0.0)
     drive = Drive(link)
     yield _identity(drive)
@@ -580,9 +578,7 @@ def permission_remedy(found: Access, vid: int | None = None, pid: int | None = N
 
 
 def holders(path: str, proc: Path = PROC) -> list[tuple[int, str]]:
-    """Number and name of the other processes that hold a port open, as far as this user can see.
-    Empty on a system without /proc.
-    """
+    """Number and name of other processes that hold a port, as far as /proc shows them."""
     wanted = os.path.realpath(path)
     found = []
     for folder in proc.glob("[0-9]*"):
@@ -615,9 +611,7 @@ def _command(folder: Path) -> str:
 
 
 def latency_timer(path: str, root: Path = SYS) -> tuple[int, Path] | None:
-    """Milliseconds for which an FTDI adapter holds bytes back, and the file to change them in.
-    None for an adapter without such a timer, and on a system that does not show it.
-    """
+    """Milliseconds for which an FTDI adapter holds bytes, and the file to change them in."""
     file = root / Path(os.path.realpath(path)).name / "device" / "latency_timer"
     try:
         return int(file.read_text()), file

@@ -328,10 +328,7 @@ def _memory(path: Path) -> mmap.mmap:
 
 
 def _examined(firmware: Path) -> tuple[str, int, int]:
-    """The board, and bytes of code and constants and of static memory, from an ELF file's headers.
-    Raises `SettingError` for anything but a 32-bit little-endian ELF file for ARM, and for another
-    board.
-    """
+    """The board, and bytes of code with constants and of static memory, of an ELF file."""
     remedy = "build one by `make firmware` in a source checkout"
     raw = file_bytes(firmware, SettingError)
     if len(raw) < 52 or raw[:6] != b"\x7fELF\x01\x01" or raw[18:20] != b"\x28\x00":

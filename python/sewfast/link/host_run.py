@@ -324,7 +324,6 @@ class HostLoopRun(Plotted):
         return stacked((*panels, self.jitter.panel), (2.2, 1.3, 1.3, 2.4), share_x=False)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         caption = f"{self.reference} on {self.plant} from this computer, {self.outcome}"
         return run_html(self, caption)
 

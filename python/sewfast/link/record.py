@@ -59,9 +59,7 @@ class Recorder:
         self._early: list[tuple[str, int | None, dict[str, Any]]] = []
 
     def samples(self, first: int, columns: Mapping[str, FloatArray]) -> None:
-        """Take a batch of samples; called by the thread that owns the link.
-        Raises `DataError` if the file cannot be written.
-        """
+        """Take a batch of samples; called by the thread that owns the link."""
         self._begin()
         if self._file is not None:
             self._file.samples(first, columns)

@@ -134,9 +134,7 @@ def arm_at_rest(link: Connection) -> None:
 
 
 class Run:
-    """One run: `upload`, `begin`, `pump`, `finish` in this order, or `abort` at any time. The
-    `profile` is None in mode "direct".
-    """
+    """One run: `upload`, `begin`, `pump`, `finish` in this order, or `abort` at any time."""
 
     def __init__(
         self, link: Connection, plan: Plan, layout: Layout, profile: LinkUpload | None, sink: Sink
@@ -250,8 +248,8 @@ class Run:
             self._beat()
 
     def _is_deaf(self, now: float) -> bool:
-        """Whether the device has been silent for too long.
-        Then heartbeats stop, so that its watchdog stops the motor that nobody sees.
+        """Whether the device is silent for so long that heartbeats end: its watchdog stops the
+        motor.
         """
         after = self._deaf_after
         if self.start_us is None:
@@ -420,9 +418,7 @@ class Run:
     # --- the end ----------------------------------------------------------------------------------
 
     def finish(self, reason: str | None = None) -> Outcome:
-        """Ask the device how many samples it took, and list those that did not arrive.
-        `reason` is why the host ended it; None if the device did.
-        """
+        """Ask how many samples were taken, list those that did not arrive."""
         status = self.link.status()
         if self.start_us is not None:
             self.collect(self.start_us)
@@ -437,9 +433,7 @@ class Run:
         return self._outcome(status.state, reason or ended, taken)
 
     def abort(self, error: BaseException | None) -> Outcome:
-        """Stop the motor before anything else, then collect the samples that arrived.
-        `error` is why; None if the run was cancelled.
-        """
+        """Stop the motor first, then collect what arrived; `error` is why, None if cancelled."""
         link, resume = self.link, self.link.resume
         link.each_turn = None
         # wait for a vanished port as long as the motor can still turn, to send it STOP

@@ -286,9 +286,7 @@ def _require_place(name: str, place: object, pipes: ExitStack) -> None:
 
 
 def _require_free(link: Path) -> None:
-    """Refuse a link to something that exists: the pty of another device, or a user's file.
-    A dangling link was left over by a killed device, and is replaced.
-    """
+    """Refuse to replace what exists by a link, except a dangling one of a killed device."""
     if link.is_symlink() and link.exists():
         raise LinkError(
             name=str(link), expected="a free name",

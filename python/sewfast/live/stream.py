@@ -72,9 +72,7 @@ def _is_local(address: str) -> bool:
 
 
 class Gate:
-    """Listens, reads the heads of requests and forwards those that pass to the server `behind`.
-    Port 0 takes any free one. Raises `OSError` if the port is taken.
-    """
+    """Forwards requests whose heads pass to the server `behind`; port 0 takes any free one."""
 
     def __init__(self, host: str, port: int, behind: tuple[str, int]) -> None:
         self._behind = behind
@@ -175,9 +173,7 @@ fewer. Samples not sent in one second can be made up for in the next."""
 
 
 class Tail:
-    """The samples of a feed since the last read.
-    Their time stamps start from the wall clock `now` [s].
-    """
+    """The samples of a feed since the last read, with time stamps from the wall clock `now` [s]."""
 
     def __init__(self, feed: Feed, now: Callable[[], float] = time.time) -> None:
         self._feed, self._now = feed, now
@@ -252,10 +248,7 @@ _INFO = 2
 
 
 class FoxgloveView:
-    """Topics `/drive` (one message a sample) and `/log` (the lines of status).
-    It listens on `host` and `port`; clients see `name`. Raises `SettingError` without the package
-    foxglove-sdk, or for a port that is taken.
-    """
+    """Topics `/drive` (one message a sample) and `/log` (the lines of status)."""
 
     def __init__(self, host: str, port: int, name: str) -> None:
         try:
@@ -284,7 +277,6 @@ class FoxgloveView:
 
     @property
     def port(self) -> int:
-        """Port for clients."""
         return self._gate.port
 
     def run(self, feed: Feed) -> None:

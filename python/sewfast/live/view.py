@@ -289,17 +289,13 @@ def report_failure(e: Exception) -> None:
 
 
 class View(Protocol):
-    """Shows a feed."""
-
     def run(self, feed: Feed) -> None:
         """Show the feed until it is closed; runs in its own thread or process."""
         ...
 
 
 def resolve(kind: ViewKind) -> ViewKind:
-    """Replace `auto` by `terminal` or `none`.
-    Raises `SettingError` for `terminal` if standard error is not a terminal.
-    """
+    """Replace `auto` by `terminal`, if standard error is one, or `none`."""
     terminal = sys.stderr is not None and sys.stderr.isatty()
     if kind.name == "auto":
         return ViewKind("terminal" if terminal else "none")
@@ -312,9 +308,7 @@ def resolve(kind: ViewKind) -> ViewKind:
 
 
 def make(kind: ViewKind, feed: Feed) -> View | None:
-    """The view of a kind; None for `none`. Raises `SettingError` as `resolve`, and for a host
-    without an address, a port that is taken or a missing package.
-    """
+    """The view of a kind; None for `none`."""
     kind = resolve(kind)
     if kind.name == "terminal":
         return TerminalView(sys.stderr)

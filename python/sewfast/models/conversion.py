@@ -158,10 +158,7 @@ def transfer_function(core: _core.LinearModel) -> tuple[FloatArray, FloatArray]:
 
 
 def difference_equation(num: ArrayLike, den: ArrayLike, offset: float) -> _core.LinearModel:
-    """The model of a transfer function in powers of z^-1, the inverse of `transfer_function`.
-    Leading zeros common to all numerators become the delay; trailing ones are dropped. Raises
-    `SettingError` if the denominator begins with zero.
-    """
+    """The model of a transfer function in z^-1: common leading zeros are the delay."""
     numerators, denominator = np.atleast_2d(_finite(num, "num")), _finite(den, "den")
     if numerators.ndim != 2 or denominator.ndim != 1 or 0 in (numerators.size, denominator.size):
         raise SettingError(
@@ -224,10 +221,7 @@ def from_state_space(
 def with_common_denominator(
     numerators: list[FloatArray], denominators: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Fractions in descending powers of z, one per input, as rows in z^-1 over one denominator.
-    Raises `SettingError` if a numerator has a higher degree than its denominator, which is not
-    causal.
-    """
+    """Fractions in descending powers of z, one per input, as rows in z^-1 over one denominator."""
     distinct: list[FloatArray] = []
     for den in denominators:
         if not any(np.array_equal(den, other) for other in distinct):
@@ -255,9 +249,7 @@ def in_descending_powers(core: _core.LinearModel) -> tuple[list[FloatArray], Flo
 
 
 def offset_at(core: _core.LinearModel, u0: ArrayLike, y0: float) -> float:
-    """The offset that makes (u0, y0) a steady point: `(1 + sum a) y0 - sum_j u0_j sum_i b_ji`.
-    Raises `SettingError` if `u0` has not one finite value per input.
-    """
+    """The offset that makes (u0, y0) a steady point: `(1 + sum a) y0 - sum_j u0_j sum_i b_ji`."""
     u = np.atleast_1d(_finite(u0, "operating point"))
     if u.shape != (len(core.b),):
         raise SettingError(
@@ -356,9 +348,7 @@ def scipy_system(numerators: list[FloatArray], den: FloatArray, s: StateSpace, T
 
 
 def polynomials_of(system: Any, Ts: float | None) -> tuple[FloatArray, FloatArray, float]:
-    """Numerators and denominator in powers of z^-1, and the sample time [s], of a system's object.
-    Raises `SettingError` for continuous time, several outputs or no sample time.
-    """
+    """Numerators and denominator in powers of z^-1 of a system, and its sample time [s]."""
     dt = _sample_time(getattr(system, "dt", None), Ts)
     if all(hasattr(system, name) for name in "ABCD"):
         num, den = from_state_space(system.A, system.B, system.C, system.D)

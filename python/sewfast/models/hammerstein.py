@@ -19,9 +19,7 @@ _SAMPLES = 5
 
 
 class Characteristic(NamedTuple):
-    """A static curve: `name` is that of its input, or of the output; `x` and `y` are points on the
-    curve, including the knots.
-    """
+    """A static curve through `x` and `y`, knots included, of an input or the output by `name`."""
 
     name: str
     x: FloatArray

@@ -25,28 +25,11 @@ MAX_COLUMNS = 10_000
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Table:
-    """Columns of one file by name; `table["speed"]` is a float64 array of shape (N,).
-
-    Attributes
-    ----------
-    columns : mapping of name to array
-        Columns can differ in length if the format allows it (`.mat`, `.npz`).
-    units : mapping of name to text
-        From headers such as `u [V]` or `speed (RPM)`; absent where unknown.
-    unusable : mapping of name to text
-        Columns without a usable series of numbers, each with the reason.
-    lines : sequence of int or None
-        Line of each row in a text file, 1-based.
-    Ts : float or None
-        Sample time [s] where the file states it.
-    Ts_source : str
-        The place of that statement, for messages.
-    notes : sequence of str
-        Rows and columns left out when the file was read.
-    counts_per_rev : float or None
-        Encoder counts of one turn, of the column `counts`, where the file states it.
-    moments : sequence of str
-        Columns that were dates or times of day, now in seconds from the first one.
+    """Columns of one file by name; `table["speed"]` is a float64 array of shape (N,), and lengths
+    can differ if the format allows it. `units` come from headers, `unusable` has the reason for
+    columns without numbers, `lines` the row's line in a text (1-based), `notes` what was left out.
+    `Ts` [s] and `counts_per_rev` are what the file states, at `Ts_source`; `moments` are columns
+    that were dates or times, in seconds from the first one.
     """
 
     path: Path
@@ -74,9 +57,7 @@ class Table:
         return f"Table({self.path.name!r}: {', '.join(self.names)})"
 
     def resolve(self, name: str) -> str:
-        """The column's own name for `name`, which can also be the whole header (`u [V]`).
-        Raises `DataError` if the file has no such column, or it cannot be used.
-        """
+        """The column's own name for `name`, which can also be the whole header (`u [V]`)."""
         name = printable(name)
         for candidate in (name, split_unit(name)[0]):
             if candidate in self.columns:

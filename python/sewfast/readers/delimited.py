@@ -169,9 +169,8 @@ def _layout(path: Path, text: str) -> _Layout:
 
 
 def _below_preamble(path: Path, text: str) -> _Layout | None:
-    """The layout of a table with lines above its header.
-    None where the table begins in the first line with content, or where its beginning is not clear:
-    the first line is then the header.
+    """The layout of a table with lines above its header. None where the table begins in the first
+    line with content, or where its beginning is not clear: the first line is then the header.
     """
     lines: list[tuple[int, str]] = []
     for offset, line in _lines(text):

@@ -60,10 +60,7 @@ def is_log(raw: bytes) -> bool:
 
 
 def read_log(path: Path, raw: bytes) -> Table:
-    """Read every signal of a log.
-    Raises `DataError` if it is damaged or holds no series of numbers, and `SettingError` if its
-    package is not installed.
-    """
+    """Read every signal of a log."""
     name = _kind_of(raw)
     assert name is not None
     kind = _KINDS[name]
@@ -108,9 +105,7 @@ def _from_a_process(path: Path, raw: bytes, name: str) -> list[Signal]:
 
 
 def send(name: str) -> None:
-    """Write the signals of the file named on the command line to stdout, as `.npz`.
-    This is the whole program of a reader's process.
-    """
+    """The program of a reader's process: the signals of the file in argv to stdout, as `.npz`."""
     out, sys.stdout = sys.stdout.buffer, sys.stderr
     path = Path(sys.argv[1])
     raw = file_bytes(path)
@@ -141,9 +136,7 @@ def _bound_memory(most: int) -> None:
 
 
 def joined(path: Path, signals: Sequence[Signal], kind: str) -> Table:
-    """One table of all signals; time is its column `t`, from the first sample of any.
-    Raises `DataError` if there is no series of numbers, or there are too many.
-    """
+    """One table of all signals; time is its column `t`, from the first sample of any."""
     names = _unique([printable(s.name) for s in signals])
     usable: dict[str, Signal] = {}
     unusable: dict[str, str] = {}
@@ -283,9 +276,7 @@ def _rosbag(path: Path, raw: bytes) -> Iterator[Signal]:
 
 
 def _mcap(path: Path, raw: bytes) -> Iterator[Signal]:
-    """MCAP files with JSON messages: `/topic.field`, stamped when they were logged.
-    Topics in other encodings are listed without values.
-    """
+    """MCAP's messages in JSON: `/topic.field`, stamped when they were logged."""
     from mcap.reader import make_reader
 
     series: dict[str, tuple[list[int], list[float]]] = {}

@@ -72,11 +72,10 @@ class TimeBase:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """An even grid over uneven time stamps.
-    `count` is the number of the table's rows; `rows` are the indices of those used, of several with
-    one time stamp the last, and `t` (rows,) their times [s], the first at 0. `Ts` is the step of
-    the grid [s], and `period` the median step of the time stamps [s]. If `exact`, every row lies on
-    the grid: nothing is interpolated, rows are missing.
+    """An even grid over uneven time stamps. `count` is the number of the table's rows; `rows` are
+    the indices of those used, of several with one time stamp the last, and `t` (rows,) their times
+    [s], the first at 0. `Ts` is the step of the grid [s], and `period` the median step of the time
+    stamps [s]. If `exact`, every row lies on the grid: nothing is interpolated, rows are missing.
     """
 
     count: int
@@ -261,9 +260,7 @@ def _jumps(table: Table, name: str) -> Iterator[str]:
 
 
 def time_base(table: Table, given: float | None, column: str | None = None) -> TimeBase:
-    """Sample time and, where its time stamps are uneven, a grid for a table, as `_time_base`.
-    Where the time shows no lost rows, a column that numbers them can, which the notes state.
-    """
+    """`_time_base`, with the rows that a column of numbers shows as lost."""
     base = _time_base(table, given, column)
     if base.grid is not None and base.grid.exact:
         return base
@@ -349,10 +346,9 @@ def _unit(table: Table, name: str) -> tuple[float | None, tuple[str, ...]]:
 def _guessed(
     table: Table, name: str, step: float, given: float | None
 ) -> tuple[float, tuple[str, ...]]:
-    """Seconds per unit of a time column that states no unit, from its median step.
-    The unit is seconds, unless the caller's sample time fits a smaller one. Steps that are long for
-    a drive cause a warning, since the column then probably counts milliseconds. Raises
-    `SettingError` if seconds would make a sample time that no machine uses.
+    """Seconds per unit of a time column that states no unit, from its median step. The unit is
+    seconds, unless the caller's sample time fits a smaller one. Steps that are long for a drive
+    cause a warning, since the column then probably counts milliseconds.
     """
     for unit, scale in _SMALLER if given is not None and given < 0.01 * step else ():
         # not for a grid far finer than the rows
@@ -380,10 +376,7 @@ def _guessed(
 
 
 def _seconds(table: Table, name: str, unit: float) -> FloatArray:
-    """Times [s] from 0 on, never decreasing.
-    Raises `DataError` for fewer than two times, values that are not finite, or a time that goes
-    back.
-    """
+    """Times [s] from 0 on, never decreasing."""
     raw = table[name]
     if len(raw) < 2:
         raise DataError(

@@ -65,9 +65,7 @@ def require_writable(path: Path, *, overwrite: bool) -> None:
 
 
 def _own(path: Path, file: int) -> None:
-    """Lock an open file: two recorders would overwrite each other's chunks.
-    Raises `SettingError` if another recorder holds the lock.
-    """
+    """Lock an open file: two recorders would overwrite each other's chunks."""
     try:
         _lock(file)
     except BlockingIOError:
@@ -82,9 +80,7 @@ def _own(path: Path, file: int) -> None:
 
 
 def _lock(file: int, *, free: bool = False) -> None:
-    """Take or release the lock of an open file; the code for Windows has not run there.
-    Raises `BlockingIOError` if another process holds it.
-    """
+    """Take or release a lock (never run on Windows); `BlockingIOError` if another holds it."""
     try:
         import fcntl
     except ImportError:
@@ -122,10 +118,7 @@ def _folder(path: Path) -> DataError:
 
 
 class Sink:
-    """An open file; a piece that cannot be written completely is removed again.
-    Raises `SettingError` if the file exists and `overwrite` is False, or another recorder is
-    writing to it, and `DataError` if it cannot be created.
-    """
+    """An open file; a piece that cannot be written completely is removed again."""
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         self.path = path
@@ -154,8 +147,8 @@ class Sink:
             raise
 
     def append(self, piece: bytes) -> None:
-        """Pass a piece to the operating system: from then on it survives `kill -9`.
-        Raises `OSError` if it does not fit; the file then ends before the piece.
+        """Pass a piece to the system, where it survives `kill -9`; `OSError`, and nothing, if it is
+        full.
         """
         rest = memoryview(piece)
         try:
@@ -190,9 +183,7 @@ def batched(pieces: Iterable[bytes]) -> Iterator[bytes]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside a file, renamed to the file if the block succeeds.
-    Raises `DataError` if the file cannot be written.
-    """
+    """A temporary name beside a file, renamed to the file if the block succeeds."""
     temporary = path
     try:
         temporary, target = names(path)

@@ -212,9 +212,7 @@ def _plain(what: str, content: object) -> Mapping[str, Any]:
 
 
 def plain(what: str, content: Mapping[str, Any]) -> dict[str, Any]:
-    """A deep copy of finite numbers, text, lists and dicts; NumPy's values become Python's.
-    Raises `SettingError` if a value is none of these.
-    """
+    """A deep copy of finite numbers, text, lists and dicts; NumPy's values become Python's."""
     try:
         text = json.dumps(dict(content), allow_nan=False, ensure_ascii=False, default=_python)
         # half of a surrogate pair could not be printed

@@ -67,10 +67,9 @@ class Chunk(NamedTuple):
 
 
 def chunks(raw: bytes) -> Iterator[Chunk]:
-    """Every chunk that is whole, in the file's order.
-    Raises `DataError` for a file with more heads without chunks than damage can explain, and for
-    one that unpacks to more than `MOST_RATIO` times its size; `SettingError` if a chunk is
-    compressed and zstandard is not installed.
+    """Every chunk that is whole, in the file's order. Raises `DataError` for a file with more heads
+    without chunks than damage can explain, and for one that unpacks to more than `MOST_RATIO` times
+    its size; `SettingError` if a chunk is compressed and zstandard is not installed.
     """
     at, left, unpacked = 0, BUDGET * len(raw) + LARGEST_CHUNK, 0
     while (at := raw.find(CHUNK.to_bytes(1, "little"), at)) >= 0:
@@ -188,9 +187,7 @@ def is_index(raw: bytes, start: int, stop: int) -> bool:
 
 
 def ending_fault(raw: bytes, start: int, *, damaged: bool) -> str | None:
-    """The fault behind the last chunk; None if the checksums of the whole file are valid.
-    In a file known to be `damaged`, the checksum over all of it is not tested.
-    """
+    """The fault behind the last chunk, or None; a `damaged` file's total checksum is not tested."""
     at = start
     for _, begin, end in records(raw, start, len(raw)):
         if not is_index(raw, begin - RECORD.size, end):
@@ -376,9 +373,7 @@ def read_recording(path: str | os.PathLike[str]) -> RecordedFile:
 
 
 def read_header(path: str | os.PathLike[str]) -> Header:
-    """Read the header of a recording, without its samples.
-    Raises `DataError` as `read_recording`.
-    """
+    """Read the header of a recording, without its samples."""
     path = _named(path)
     # both copies of the header message are in the first bytes, not compressed
     raw, found = _bytes(path, 3 * LARGEST_HEADER), _Contents()

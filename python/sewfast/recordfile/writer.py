@@ -31,9 +31,7 @@ _COMPUTED = 1 << 5
 
 
 def require_ending(path: str | os.PathLike[str]) -> Path:
-    """The path of a recording, whose ending other programs rely on.
-    Raises `SettingError` for another ending.
-    """
+    """The path of a recording, whose ending other programs rely on."""
     if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
         raise SettingError(
             name="file", expected="a file's name", received=repr(path),
@@ -68,9 +66,7 @@ def require_replaceable(path: str | os.PathLike[str], *, overwrite: bool) -> Non
 
 
 def require_free(paths: Iterable[str | os.PathLike[str] | None], *, overwrite: bool) -> None:
-    """Refuse to overwrite any file: for output that is the only record of a run on a drive.
-    Raises `SettingError` if one of the files exists.
-    """
+    """Refuse to overwrite any file: for output that is the only record of a run on a drive."""
     for path in paths:
         if path is not None and not overwrite and _is_there(Path(path)):
             raise SettingError(
@@ -360,8 +356,7 @@ def save_curves(
 ) -> None:
     """Write a recording again with one message per sample; the file is complete or absent.
     `read_recording` reads it like any other. Samples in gaps have no message, damaged parts are
-    left out, and a torn recording stays marked as torn. Raises `DataError` if the file cannot be
-    written, and `SettingError` for compression without zstandard.
+    left out, and a torn recording stays marked as torn.
     """
     with replacing(Path(path)) as temporary:
         assembler = Assembler(recording.header.columns, single=True, compress=compress)

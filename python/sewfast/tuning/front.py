@@ -154,7 +154,6 @@ class ParetoFront(Plotted):
         return drawing(self)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         header = [f"{n} [{self.units[n]}]" if self.units[n] else n for n in self.objectives]
         rows = tuple(
             ("the knee" if i == self.pick else "", *map(significant, row))
@@ -373,9 +372,7 @@ def wide(column: NDArray[np.float64]) -> bool:
 
 
 def knee(values: NDArray[np.float64]) -> int:
-    """The row closest to the minimum of every column at once, relative to the columns' ranges; wide
-    ranges are on a logarithmic scale.
-    """
+    """The row closest to the minimum of all columns at once, over their (wide: log) ranges."""
     columns = [np.log(c) if wide(c) else c for c in values.T]
     shares = [(c - c.min()) / (np.ptp(c) or 1.0) for c in columns]
     return int(np.argmin(np.sum(np.square(shares), axis=0)))

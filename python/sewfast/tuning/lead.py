@@ -69,7 +69,6 @@ class Effort:
         return self.deadline is None or self.deadline.budget.seconds is None
 
     def check(self) -> None:
-        """Raise `TimeUp` at the deadline."""
         if self.deadline is not None:
             self.deadline(1, 1, 0.0)
 
@@ -197,17 +196,9 @@ def _local(point: OperatingPoint, slope: float) -> tuple[Any, ...]:
 
 @dataclass(frozen=True)
 class Led:
-    """What a feedforward is worth.
-
-    Attributes
-    ----------
-    alone : Controller
-        The PID without it.
-    cost, alone_cost : float
-        Cost with and without it over all plants in all variations, in which overshoot has no weight
-        unless one was given: it counts percents of small edges [y].
-    reason : str
-        Why it was not taken; empty if it was.
+    """What a feedforward is worth: the PID `alone`, and costs [y] with and without it over all
+    plants in all variations, where overshoot (percents of small edges) has no weight unless one was
+    given. `reason` says why it was not taken.
     """
 
     alone: Controller
@@ -216,7 +207,6 @@ class Led:
     reason: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values."""
         costs = {"cost": self.cost, "cost_without": self.alone_cost}
         known = {name: c if math.isfinite(c) else None for name, c in costs.items()}
         return {"taken": not self.reason, **known, "reason": self.reason}
@@ -237,10 +227,9 @@ def with_lead(
     effort: Effort | None = None,
 ) -> tuple[Controller, Led]:
     """A PID with feedforward, if that costs less over all plants of this task and of the others,
-    and no more on any of them in any variation; otherwise the PID alone.
-    The feedforward does the work of alpha and beta, which become 0 if they are `searched`. The
-    gains stay: what they owe to loads, noise and other plants, margins included, they keep. Raises
-    `TimeUp` at a deadline.
+    and no more on any of them in any variation; otherwise the PID alone. The feedforward does the
+    work of alpha and beta, which become 0 if they are `searched`. The gains stay: what they owe to
+    loads, noise and other plants, margins included, they keep. Raises `TimeUp` at a deadline.
     """
     effort = effort or Effort()
     among = choices(task, lead, effort)
@@ -267,9 +256,7 @@ def with_lead(
 
 
 def _following(task: TuningTask) -> TuningTask:
-    """The task without load steps and Ms, which a feedforward does not change, and without a weight
-    of overshoot unless one was given.
-    """
+    """The task without load steps and Ms, or a weight of overshoot that was not given."""
     weight = 0.0 if task.cost.overshoot is None else task.cost.overshoot
     limits = replace(task.constraints, Ms=math.inf, recovery=None, load=None)
     cost = replace(task.cost, overshoot=weight, recovery=0.0, load=0.0)
@@ -277,9 +264,7 @@ def _following(task: TuningTask) -> TuningTask:
 
 
 def _objection(task: TuningTask, controller: Controller, alone: Controller, effort: Effort) -> str:
-    """Why a controller is not better than another over all plants, and no worse on any in any
-    variation; empty if it is.
-    """
+    """Why a controller is not better over all plants and no worse on any; empty if it is."""
     (cost, violation), (other, own) = _judged(task, [controller, alone], effort)
     unit = alone.y_unit or "y"
     if not cost < other:

@@ -178,7 +178,6 @@ class TuningResult:
         return loop_drawing(traces, after.units["y"], after.units["u"], limits).plot(ax, file)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         unit = self.controller.y_unit or "y"
         rows = tuple(
             (v.name, significant(v.value, 4), significant(v.low), significant(v.high))

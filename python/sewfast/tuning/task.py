@@ -458,9 +458,7 @@ def first_of(
     filter_samples: int | None = None,
     output_unit: str | None = None,
 ) -> SampledController:
-    """The first controller of a kind; parameters are those of `tune`, errors those of
-    `first_controller`.
-    """
+    """The first controller of a kind, with the parameters of `tune`."""
     if controller == Controller.KIND:
         return first_controller(
             plant, u_min=u_min, u_max=u_max, counts_per_rev=counts_per_rev,
