@@ -24,7 +24,6 @@ _NAMES = {
     "parallel_wiener_hammerstein": "ParWH",
     "f16": "F16",
 }
-_DEFAULT_WINDOW = 50
 
 
 class Benchmark(NamedTuple):
@@ -107,4 +106,4 @@ def _dataset(records: list[Any]) -> Dataset:
 
 def _window(records: list[Any]) -> int:
     found = [r.state_initialization_window_length for r in records]
-    return max((int(n) for n in found if n is not None), default=_DEFAULT_WINDOW)
+    return max((int(n) for n in found if n is not None), default=50)

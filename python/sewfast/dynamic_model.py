@@ -488,10 +488,6 @@ def _require_no_state(initial_state: ArrayLike | None) -> None:
 # --- The choice of `identify` as a table for `print` ----------------------------------------------
 
 
-_COLUMNS = 5
-_MOST_ROWS = 40
-
-
 def choice_lines(training: Mapping[str, Any], unit: str) -> list[str]:
     """The candidates with their free-run errors on data not trained on, and the reason."""
     choice = training.get("choice")
@@ -499,7 +495,7 @@ def choice_lines(training: Mapping[str, Any], unit: str) -> list[str]:
         return []
     listed = choice.get("candidates")
     listed = listed if isinstance(listed, Sequence) else ()
-    candidates = [c for c in listed if isinstance(c, Mapping)][:_MOST_ROWS]
+    candidates = [c for c in listed if isinstance(c, Mapping)][:40]
     lines = _table(candidates, choice, unit) if candidates else []
     return [*lines, f"chosen: {choice.get('chosen')}; {choice.get('reason')}"]
 
@@ -517,7 +513,7 @@ def _table(
 ) -> list[str]:
     heading = f"free-run rmse{f' [{unit}]' if unit else ''} on data not trained on:"
     rows = [_row(c, choice) for c in candidates]
-    widths = [max(len(r[i]) for r in rows) for i in range(_COLUMNS)]
+    widths = [max(len(r[i]) for r in rows) for i in range(5)]
     padded = (["  ", *(t.ljust(w + 2) for t, w in zip(r, widths, strict=True))] for r in rows)
     return [heading, *("".join(p).rstrip() for p in padded)]
 

@@ -20,10 +20,6 @@ from .tables import Table, percent, significant
 
 GOOD, FAIR, POOR = 90.0, 70.0, 30.0
 """Least fit of the free run [%] for a model to be good, fair, poor; below, it is useless."""
-FEW = 100
-"""Scored samples below which a verdict has little evidence."""
-AT_THE_NOISE = 1.5
-"""An error below this multiple of the measurement noise cannot be improved."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +167,8 @@ class Validation(Plotted):
     @property
     def verdict(self) -> str:
         """The grade in a sentence."""
-        few = f"; {self.n} samples are few to judge by" if self.n < FEW else ""
+        # scored samples below which a verdict has little evidence
+        few = f"; {self.n} samples are few to judge by" if self.n < 100 else ""
         return self._judged() + few
 
     def _judged(self) -> str:
@@ -291,7 +288,8 @@ def grade_of(fit: float, rmse: float, noise: float) -> str:
     """
     if not math.isfinite(fit):
         return ""
-    explained = fit >= POOR and rmse <= AT_THE_NOISE * noise
+    # an error below this multiple of the measurement noise cannot be improved
+    explained = fit >= POOR and rmse <= 1.5 * noise
     if fit >= GOOD or explained:
         return "good"
     return "fair" if fit >= FAIR else "poor" if fit >= POOR else "useless"

@@ -345,9 +345,6 @@ drop, flip (a bit), duplicate, reorder, delay (.02 s), stall (both directions, .
 device reboots), unplug (the port vanishes, .3 s)
 """
 
-_LOOK = 0.05
-"""Longest delay of a signal [s]."""
-
 
 def add_device(commands: Commands) -> None:
     parser = add_command(
@@ -430,7 +427,8 @@ def device_command(args: argparse.Namespace) -> int | None:
 
 def _serve(device: VirtualDevice, *, as_json: bool) -> None:
     _say(json.dumps({"port": device.port}) if as_json else f"port {device.port}")
-    while not device.wait(_LOOK):
+    # longest delay of a signal [s]
+    while not device.wait(0.05):
         pass
 
 

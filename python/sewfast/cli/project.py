@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from ..readers import Table
 
 NAME = "sewfast.toml"
-_LARGEST = 1 << 20
 _RANGE = ("u_min", "u_max")
 _KEYS: dict[str, tuple[str, ...]] = {
     "columns": ("input", "output", "time", "counts", "counts_per_rev", "ts", "weights"),
@@ -174,7 +173,7 @@ def _parsed(path: Path) -> dict[str, Any]:
         raise not_installed("tomli", f"{path} on Python 3.10") from None
     from ..storage import file_bytes  # loads NumPy
 
-    raw = file_bytes(path, SettingError, largest=_LARGEST)
+    raw = file_bytes(path, SettingError, largest=1 << 20)
     try:
         found: dict[str, Any] = toml.loads(raw.decode("utf-8-sig"))
     except (UnicodeDecodeError, ValueError, RecursionError) as e:

@@ -56,10 +56,6 @@ ROOM = 1.1
 1.25 times the working range, where it was their limit."""
 
 
-SAMPLE_TIMES = (1e-5, 0.1)
-"""Shortest and longest sample time of a machine [s]: the signals are planned in seconds."""
-
-
 @dataclass(frozen=True)
 class Demands:
     """Limits, working range and effort. `u_max` [V] and `speed` [RPM] bound command and working
@@ -152,7 +148,8 @@ def demands(
 
 def _require_machine(machine: Machine) -> None:
     """Refuse a machine with impossible figures before it moves."""
-    for name, low, high in (("Ts", *SAMPLE_TIMES), ("counts_per_rev", 1.0, 1e9)):
+    # shortest and longest sample time of a machine [s]: the signals are planned in seconds
+    for name, low, high in (("Ts", 1e-5, 0.1), ("counts_per_rev", 1.0, 1e9)):
         value = real(name, getattr(machine, name))
         if not low <= value <= high:
             raise SettingError(

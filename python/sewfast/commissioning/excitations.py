@@ -27,10 +27,8 @@ MOVED = 0.02
 """Turns that count as motion."""
 ENOUGH = 0.2
 """Share of the top speed at which the trials end."""
-LEAST_TURNS = 1.0
-"""Travel within which a load over the turn can stop the machine."""
 STALLS, STALLING = 3, 0.2
-"""Number of such stalls that are allowed, and the largest share of the command for them."""
+"""Stalls under a load that are allowed, and the largest share of the command for them."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,8 @@ def _judged(recording: Recording, u: float, *, may_stall: bool) -> float | None:
     speed = 60.0 * (turns[-1] - turns[-tail]) / ((tail - 1) * recording.Ts)
     first = turns[: len(turns) // 2]
     stopped = turns[-1] == turns[-tail] and np.ptp(first) > MOVED
-    if stopped and may_stall and np.max(np.abs(turns)) < LEAST_TURNS:
+    # travel within which a load over the turn can stop the machine
+    if stopped and may_stall and np.max(np.abs(turns)) < 1.0:
         # a load that varies over the turn stops a small command at its hardest angle
         return None
     require(
@@ -134,8 +133,6 @@ def _motion(levels: list[tuple[float, float]], stood: float) -> Motion:
 # --- The step response: gain, time constant and dead time -----------------------------------------
 
 
-SHARE = 0.6
-"""Target of the step as a share of the top speed."""
 DURATIONS = (2.0, 6.0, 20.0)
 """Durations to try until the response settles [s]."""
 LEAST_FIT = 80.0
@@ -147,7 +144,8 @@ def step_response(machine: Machine, demands: Demands, motion: Motion) -> Fopdt:
     Each longer step is so small that even a machine that integrates stays below the top speed.
     Raises `Refusal` if none settles, the fit is poor, or the command cannot reach the top speed.
     """
-    u = min(motion.command(SHARE * demands.speed), demands.u_max)
+    # target of the step as a share of the top speed
+    u = min(motion.command(0.6 * demands.speed), demands.u_max)
     reason: Exception | None = None
     for k, seconds in enumerate(DURATIONS):
         recording = machine.excite(step(u, seconds, machine.Ts), "step")
@@ -195,21 +193,10 @@ def _checked(fopdt: Fopdt, demands: Demands, threshold: float, u: float) -> None
 # --- Signals for a machine of which only a first order with dead time is known --------------------
 
 
-SPANS = 0.02, 0.01, 0.005
-"""Spans for differences of speed, long enough to average the encoder's noise [s]; the shorter ones
-are for fast machines, whose pulses are shorter."""
 FIRST_SHARE, FAIR_SHARE = 0.2, 0.35
 """Shares of the top speed: aim of the first single pulse, and speed that ends the series."""
-LONGEST_PULSE = 1.0
-"""Longest pulse of the series [s]."""
-LEAST_HARD = 50
-"""Samples near the largest command needed for an estimate of the acceleration."""
 LONGEST = 60.0
 """Longest excitation [s]."""
-PULSES = 20.0
-"""Length of the pulses in time constants."""
-HARD = 0.25
-"""Least size of a pulse as a share of the largest command; a current limit takes about half."""
 SLOW = 0.15
 """Speed between the trapezoids as a share of the top: a shaft held by friction shows nothing."""
 TRAPEZOIDS = (
@@ -235,10 +222,13 @@ def acceleration_shown(recording: Recording, demands: Demands) -> float:
     much as it hinders here.
     """
     hard = recording.u >= 0.7 * demands.u_max
-    for span in (max(1, round(seconds / recording.Ts)) for seconds in SPANS):
+    # spans for differences of speed, long enough to average the encoder's noise [s]; the shorter
+    # ones are for fast machines, whose pulses are shorter
+    for span in (max(1, round(seconds / recording.Ts)) for seconds in (0.02, 0.01, 0.005)):
         whole = np.convolve(hard, np.ones(span), "valid")[:-1] >= span
         change = (recording.y[span:] - recording.y[:-span])[: len(whole)][whole]
-        if len(change) >= LEAST_HARD and np.quantile(change, 0.9) > 0.0:
+        # samples near the largest command needed for an estimate of the acceleration
+        if len(change) >= 50 and np.quantile(change, 0.9) > 0.0:
             return float(np.quantile(change, 0.9)) / (span * recording.Ts)
     return float("inf")
 
@@ -254,7 +244,8 @@ def acceleration_from_rest(machine: Machine, fastest: float, demands: Demands) -
         recording = machine.excite(_single(demands.u_max, samples, machine.Ts), f"limit_{samples}")
         reached = float(np.max(recording.y))
         # a pulse of twice the length reaches at most about twice the speed
-        if reached >= FAIR_SHARE * demands.top or seconds >= LONGEST_PULSE:
+        # longest pulse of the series [s]
+        if reached >= FAIR_SHARE * demands.top or seconds >= 1.0:
             return max(reached, 1e-3 * demands.top) / seconds
         samples *= 2
 
@@ -317,12 +308,14 @@ def pulses(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int)
     """
     T = fopdt.T
     return _core.jumps(
-        duration=min(PULSES * T, LONGEST),
+        # length of the pulses in time constants
+        duration=min(20.0 * T, LONGEST),
         Ts=Ts,
         speed_low=SLOW * demands.top,
         speed_high=demands.top,
         change_min=0.25 * demands.top,
-        level_min=HARD * demands.u_max,
+        # least size of a pulse as a share of the largest command; a current limit takes about half
+        level_min=0.25 * demands.u_max,
         level_max=demands.u_max,
         hold_min=0.4 * T,
         hold_max=2.0 * T,
@@ -338,10 +331,6 @@ def pulses(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int)
 
 GENTLE = 0.75
 """Largest acceleration of the standard references as a share of the machine's."""
-BRIEF = 2.5
-"""Largest pace at which the references for tuning still get longer; beyond it they cover less."""
-SHORT = 0.35
-"""Length of the sweeps for tuning as a share of those for the verification."""
 
 
 def pace_of(fastest: float, demands: Demands) -> float:
@@ -358,9 +347,11 @@ def standard(fastest: float, demands: Demands, Ts: float, *, short: bool) -> dic
     """
     pace = pace_of(fastest, demands)
     size = demands.speed / 2000.0
-    share = SHORT if short else 1.0
+    # length of the sweeps for tuning as a share of those for the verification
+    share = 0.35 if short else 1.0
     # the complete sweeps of a slow machine would take minutes in every loop that a search simulates
-    brief = min(pace, BRIEF) if short else pace
+    # largest pace at which the references for tuning still get longer; beyond it they cover less
+    brief = min(pace, 2.5) if short else pace
     # the change of random levels is half a cosine, steepest in its middle
     change = max(0.2 * pace, 0.5 * math.pi * 1800.0 * size / (GENTLE * fastest))
     return {

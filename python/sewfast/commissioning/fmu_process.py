@@ -26,8 +26,6 @@ _REQUEST = struct.Struct("<cd")
 _ANSWER = struct.Struct("<?3d")
 """Whether it succeeded, and the measured variables; after a failure, the first is the size of the
 message that follows."""
-_FAREWELL = 5.0
-"""Time for an FMU to end by itself [s]."""
 
 
 class FmuProcess:
@@ -75,7 +73,8 @@ class FmuProcess:
         with contextlib.suppress(OSError):
             self._requests.close()
         try:
-            self._process.wait(0.0 if self._ended else _FAREWELL)
+            # time for an FMU to end by itself [s]
+            self._process.wait(0.0 if self._ended else 5.0)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

@@ -70,12 +70,6 @@ MEMBERS = 4
 EVALUATIONS = 3000
 SHORTEST = 2 * WATCHED
 """Least samples of a reference: fewer cannot be judged."""
-FALLS_SHORT = 0.7
-"""Share of the planned acceleration; a drive that reaches less limits its current."""
-TWICE = 2.0
-"""Multiple of the largest planned speed at which a machine that states no limit is too fast."""
-LEAST_OF_STEP = 0.1
-"""Share of the step's acceleration that a larger command must reach."""
 
 References = Mapping[str, ArrayLike] | Sequence[str]
 Between = Callable[[str, Commissioning], object]
@@ -237,7 +231,8 @@ def commission(
                 return None
             return checkpoint.found_run(journal.stage, name, key, controller, machine.name)
 
-        recorded = RecordedBench(machine, note, kept, kept_run, most=TWICE * asked.top)
+        # multiple of the largest planned speed at which a machine that states no limit is too fast
+        recorded = RecordedBench(machine, note, kept, kept_run, most=2.0 * asked.top)
         try:
             return _carry_out(recorded, asked, cost, journal)
         except (Refusal, LinkError) as stop:
@@ -427,7 +422,8 @@ def _compared(
     thinning = plan.thinning
     pushes = thinning.pushes(load, verify, machine.Ts)
     swings = ""
-    for share in CALMER:
+    # shares of Kp under which the references run, one after the other until the loop is calm
+    for share in (1.0, 0.7, 0.5):
         tried = scaled(controller, share)
         if share < 1.0:
             note = f"gains lowered to {100 * share:.0f} %, as the machine {swings}"
@@ -468,9 +464,11 @@ def _pulses(machine: Machine, fopdt: Fopdt, asked: Demands) -> tuple[float, list
     shown = excitations.acceleration_shown(found[0], asked)
     if math.isinf(shown):
         shown = excitations.acceleration_from_rest(machine, fastest, asked)
-    if shown > FALLS_SHORT * fastest:
+    # share of the planned acceleration; a drive that reaches less limits its current
+    if shown > 0.7 * fastest:
         return min(shown, fastest), found
-    slowest = LEAST_OF_STEP * fopdt.K * fopdt.u_high / fopdt.T
+    # share of the step's acceleration that a larger command must reach
+    slowest = 0.1 * fopdt.K * fopdt.u_high / fopdt.T
     require(
         shown > slowest,
         f"expected the largest command to accelerate the machine by at least {slowest:.3g} RPM/s, "
@@ -480,10 +478,6 @@ def _pulses(machine: Machine, fopdt: Fopdt, asked: Demands) -> tuple[float, list
     found.append(machine.excite(u, "pulses_limited"))
     again = excitations.acceleration_shown(found[1], asked)
     return shown if math.isinf(again) else again, found
-
-
-CALMER = (1.0, 0.7, 0.5)
-"""Shares of Kp under which the references run, one after the other until the loop is calm."""
 
 
 @dataclass(frozen=True)

@@ -330,8 +330,6 @@ def _comparison(c: Comparison) -> str:
 
 
 _FOLDERS = ("recordings", "models", "controllers", "runs", "analysis")
-_SHORT = 5.0
-"""Longest reference for the analysis [s]."""
 
 
 def require_own(folder: Path, *, overwrite: bool) -> None:
@@ -450,7 +448,8 @@ def _analysis(found: Commissioning, folder: Path) -> None:
     if found.controller is None or found.models is None:
         return
     runs = [c.predicted for c in found.comparisons]
-    references = [r.r for r in runs if r.t[-1] <= _SHORT] or [r.r for r in runs[:1]] or None
+    # longest reference for the analysis [s]
+    references = [r.r for r in runs if r.t[-1] <= 5.0] or [r.r for r in runs[:1]] or None
     coarse = Thinning.between(found.models.members[0].Ts, found.controller.Ts)
     with suppress(SettingError):
         analyse(

@@ -28,22 +28,14 @@ from ..recording import Recording
 from ..speed import speed_from_counts
 from .bench import bench_of
 
-SHARE = 0.6
-"""Default amplitude of the multisine as a share of the command left at the working point."""
 STEPS = 0.05
 """Default amplitude of the reference under a controller, as a share of the working speed."""
-HIGHEST = 0.4
-"""Highest excited frequency as a share of the sample rate."""
 HARMONICS, APART = 8, 1.0
 """Multiples of the turn that lines avoid, and the least distance from them [Hz]."""
 HOLD, LONGEST = 2.0, 32.0
 """First and longest hold of a command for measuring its speed [s]."""
 NEAR, SETTLED = 0.03, 0.02
 """Tolerance of the working point, and of a settled speed, as shares of the speed."""
-TRIES = 8
-CLIPPING = 0.8
-"""Share of its peak at which a multisine is repeatedly clipped to lower its crest factor."""
-ROUNDS = 100
 SWING, MOST = 0.5, 0.8
 """Largest predicted swing as a share of the working speed: by default, and on request. Nearer to
 standstill, friction would act like a step."""
@@ -231,7 +223,6 @@ def _shaken(
 AGAIN, LEAST_SHAKEN = 0.5, 0.2
 """Factor for the amplitude if the command reached a limit; the least share of it to try."""
 MARGINS = ("Ms", "phase_margin_deg", "gain_margin")
-UNBOUNDED = 1e6
 
 
 def margins_at_work(
@@ -260,7 +251,7 @@ def margins_at_work(
             "predicted": {name: getattr(predicted, name) for name in MARGINS},
             "measured": {name: getattr(measured, name) for name in MARGINS}
             # a confidence circle that contains -1 gives no bound
-            | {"Ms_band": [x if x < UNBOUNDED else math.inf for x in measured.Ms_band]},
+            | {"Ms_band": [x if x < 1e6 else math.inf for x in measured.Ms_band]},
         }
         return found, response
     return None
@@ -310,7 +301,8 @@ class _Plan:
                 name="periods", expected="at least two in all", received="one",
                 remedy="use periods=2 or more: noise is estimated from repetitions",
             )  # fmt: skip
-        highest = HIGHEST / Ts if f_max is None else real("f_max", f_max)
+        # highest excited frequency as a share of the sample rate
+        highest = 0.4 / Ts if f_max is None else real("f_max", f_max)
         if not 0.0 < real("f_min", f_min) < highest <= 0.5 / Ts:
             raise SettingError(
                 name="f_min, f_max",
@@ -343,10 +335,11 @@ class _Plan:
         random = np.random.default_rng([self.seed, realisation])
         phases = random.uniform(0.0, 2.0 * math.pi, len(self.lines))
         spectrum = np.zeros(self.samples // 2 + 1, dtype=np.complex128)
-        for _ in range(ROUNDS):
+        for _ in range(100):
             spectrum[self.lines] = np.exp(1j * phases)
             x = np.fft.irfft(spectrum, self.samples)
-            bound = CLIPPING * np.abs(x).max()
+            # share of its peak at which a multisine is repeatedly clipped to lower its crest factor
+            bound = 0.8 * np.abs(x).max()
             phases = np.angle(np.fft.rfft(np.clip(x, -bound, bound))[self.lines])
         found: FloatArray = x / np.abs(x).max()
         return found
@@ -378,7 +371,8 @@ def _in_open_loop(
     left = machine.volt - abs(level)
     swing = _swing(plan, plan.speed / level, time)
     room = min(abs(plan.speed), machine.speed - abs(plan.speed))
-    peak = min(SHARE * left, SWING * room / swing)
+    # default amplitude of the multisine as a share of the command left at the working point
+    peak = min(0.6 * left, SWING * room / swing)
     if amplitude is not None:
         peak = real("amplitude", amplitude)
         most = min(left, MOST * room / swing)
@@ -522,7 +516,7 @@ def _working_point(machine: Machine, speed: float) -> tuple[float, int, float]:
     """The command that holds the speed [V], by secants; the samples until then, the lag [s]."""
     tried: list[tuple[float, float]] = [(0.0, 0.0)]
     u, hold = math.copysign(0.15 * machine.volt, speed), HOLD
-    for _ in range(TRIES):
+    for _ in range(8):
         held = _held(machine, u, hold)
         while not held.settled and hold < LONGEST:
             hold *= 2.0

@@ -29,22 +29,14 @@ from .small_signal import SmallSignal
 
 HARMONICS = 6
 """Harmonics of a turn that are fitted."""
-WORTH_IT = 0.97
-"""Largest ratio of the residuals with and without the load, on a recording not used for the fit."""
 SLOW = 0.5
 """Span of the moving mean removed before the fit [s], for a load on the encoder's shaft."""
-SLOW_TURNS = 2.0
-"""The same for a load behind a gear, in turns of the load."""
 LEAST_TURNS = 8.0
 """Least turns of a load in the recordings: fewer cannot be distinguished from friction."""
 GEARED = 0.95
 """Largest ratio (turns of the load per turn of the encoder) of a load behind a gear."""
 BIWEIGHT, REWEIGHTED = 4.685, 5
 """Cut-off of the biweight in standard deviations, the usual value; rounds of reweighting."""
-CELLS = 32
-"""Cells per turn of the encoder's shaft in the search for a line; a load turns less often."""
-REFINED = 15
-"""Ratios tried within the resolution of the record."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +96,9 @@ def turn_load(
         solution = _robust(rows, rest)
         row, rest = other.parts(plant, ratio, span)
         before, after = float(np.mean(rest**2)), float(np.mean((rest - row @ solution) ** 2))
-        if after < WORTH_IT**2 * before and before - after > gained:
+        # largest ratio of the residuals with and without the load, on a recording not used for the
+        # fit
+        if after < 0.97**2 * before and before - after > gained:
             best = TurnLoad(solution[:HARMONICS], solution[HARMONICS:], ratio)
             gained = before - after
     return best
@@ -131,7 +125,8 @@ class _Unexplained:
     def span(self, ratio: float) -> float:
         """Span of the mean to remove [s]: it takes warming friction, and leaves a slow load."""
         rate = float(self.turns[-1]) / (len(self.rest) * self.Ts)
-        return max(SLOW, SLOW_TURNS / max(ratio * rate, 1e-9)) if ratio < 1.0 else SLOW
+        # behind a gear, two turns of the load
+        return max(SLOW, 2.0 / max(ratio * rate, 1e-9)) if ratio < 1.0 else SLOW
 
     def parts(
         self, plant: Model, ratio: float, span: float, harmonics: int = HARMONICS
@@ -177,7 +172,8 @@ def _behind_a_gear(plant: Model, known: Sequence[_Unexplained]) -> list[float]:
     rest = _fast(longest.rest, max(3, round(longest.span(LEAST_TURNS / total) / longest.Ts)))
     lowest, end = math.ceil(2.0 * LEAST_TURNS), math.ceil(2.0 * GEARED * total)
     first = step * (lowest + int(np.argmax(_lines(turns, rest, total)[lowest:end])))
-    near = first + np.linspace(-step, step, REFINED)
+    # ratios tried within the resolution of the record
+    near = first + np.linspace(-step, step, 15)
     return [float(near[int(np.argmin([_left(plant, longest, ratio) for ratio in near]))])]
 
 
@@ -186,7 +182,8 @@ def _lines(turns: FloatArray, rest: FloatArray, total: float) -> FloatArray:
     This is one Fourier transform of sums over cells of angle; sums over all samples for each of
     thousands of ratios took four seconds of a slow drive's commissioning.
     """
-    cells = math.ceil(CELLS * total)
+    # cells per turn of the encoder's shaft in the search for a line; a load turns less often
+    cells = math.ceil(32 * total)
     at = np.rint(turns * (cells / total)).astype(int) % (2 * cells)
     powers: FloatArray = np.abs(np.fft.rfft(np.bincount(at, rest, 2 * cells))) ** 2
     return powers
@@ -219,8 +216,6 @@ PER_CONSTANT = 200
 """Samples kept per time constant: as many as the nominal machine has at 1 ms."""
 MOST = 10
 """Largest k."""
-LONGEST_FILTER = 64
-"""Longest moving average of the feedback [samples]."""
 SHARPEST = 50.0
 """Largest derivative filter N of the search; a coarse controller gets it if its sample time alone
 filters more than its N."""
@@ -299,7 +294,8 @@ class Thinning:
         return replace(
             c,
             Ts=Ts,
-            filter_samples=min(LONGEST_FILTER, self.k * c.filter_samples),
+            # longest moving average of the feedback [samples]
+            filter_samples=min(64, self.k * c.filter_samples),
             N=_derivative_filter(c, c.Ts - Ts),
         )
 

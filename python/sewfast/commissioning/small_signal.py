@@ -33,21 +33,15 @@ from .excitations import Motion
 
 SHAKEN_AT = 0.5
 """Working speed as a share of the top speed."""
-FASTER = 0.8
-"""Second working speed, used if something oscillates, as a share of the top speed."""
 NEAR = 0.1
 """Search range about a frequency, as a share of it. The two speeds lie further apart, so that fixed
 frequencies and those that move with the speed stay separate."""
-CLEAR = 4.0
-"""Least power of a load over the power at the place of a resonance, and over its surroundings."""
 TWICE = 2.0
 """Least number of periods in a record: fewer cannot be distinguished from drift."""
 SHARE, MOST = 0.1, 60.0
 """Least share of a spectral line in the residual for a second look; its largest frequency [Hz]."""
 BESIDE = (0.4, 0.8), (1.25, 1.8)
 """Surroundings of a line, as shares of its frequency."""
-LOADS = 4
-"""Most rounds of removing loads over the turn."""
 SIZE = 0.1
 """Amplitude as a share of the largest command: small enough for linear dynamics."""
 SAMPLES, LONGEST = 4_000, 12.0
@@ -64,8 +58,6 @@ SWINGS = 0.3
 """Damping ratio below which a pair of poles is a resonance."""
 LOWEST, HIGHEST = 2.0, 0.4
 """Range of resonances: least frequency [Hz], largest as a share of the sample rate."""
-LEAST_FIT = 90.0
-"""Least fit of first order with dead time to the model's own step response [%]."""
 
 
 @dataclass(frozen=True)
@@ -104,9 +96,11 @@ def small_signal(
     found = explained(slow, fopdt)
     if found is None or not _suspects(found.model, slow):
         return found
-    u, settled = shaking(demands, motion, fopdt, machine.Ts, FASTER)
+    # second working speed, used if something oscillates, as a share of the top speed
+    u, settled = shaking(demands, motion, fopdt, machine.Ts, 0.8)
     fast = Shaken.of(machine.excite(u, "small_signals_faster"), settled)
-    for _ in range(LOADS):
+    # most rounds of removing loads over the turn
+    for _ in range(4):
         loads = [turns_of(f, slow, fast) for f in _suspects(found.model, slow)]
         taken = [ratio for ratio in loads if ratio is not None]
         if not taken:
@@ -313,7 +307,8 @@ def turns_of(frequency: float, slow: Shaken, fast: Shaken) -> float | None:
     stayed = max(_power(f * t, rest) for f in near)
     shares = np.concatenate([np.linspace(*BESIDE[0], 21), np.linspace(*BESIDE[1], 21)])
     beside = np.median([_power(ratio * share * fast.turns, rest) for share in shares])
-    is_load = _power(ratio * fast.turns, rest) > CLEAR * max(stayed, float(beside))
+    # least power of a load over the power at the place of a resonance, and over its surroundings
+    is_load = _power(ratio * fast.turns, rest) > 4.0 * max(stayed, float(beside))
     return ratio if is_load else None
 
 
@@ -350,4 +345,5 @@ def _first_order(core: _core.LinearModel, Ts: float, recorded: Fopdt) -> Fopdt |
         found = fit_fopdt(u, y, Ts=Ts)
     except (DataError, FitError):
         return None
-    return found if found.K > 0.0 and found.fit_percent >= LEAST_FIT else None
+    # least fit of first order with dead time to the model's own step response [%]
+    return found if found.K > 0.0 and found.fit_percent >= 90.0 else None

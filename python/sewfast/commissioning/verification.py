@@ -213,8 +213,6 @@ WINDOW = 0.25
 TIMES, FLOOR = 4.0, 0.05
 """Chatter that ends a run: a multiple of the largest predicted one, but at least this share of the
 largest command, rms from sample to sample."""
-SURE = 1.1
-"""Multiple of the allowed distance at which a run is hopeless, whatever its rest."""
 
 
 class Watching:
@@ -234,7 +232,8 @@ class Watching:
         n = self._k * len(predicted.r)
         self._u, self._counts = np.full(n, np.nan), np.full(n, np.nan)
         self._judged, self._squares, self._railed = 0, 0.0, 0
-        self._allowed = n * (SURE * APART * span(predicted.r)) ** 2
+        # multiple of the allowed distance at which a run is hopeless, whatever its rest
+        self._allowed = n * (1.1 * APART * span(predicted.r)) ** 2
         self._window = max(10, round(WINDOW / self._Ts))
         self._most = max(
             TIMES * self._chatter_predicted(), FLOOR * max(abs(controller.u_min), controller.u_max)

@@ -14,8 +14,6 @@ from .outliers import white_noise
 if TYPE_CHECKING:
     from .experiment import Experiment
 
-LEAST = 3
-"""Fewest measured outputs by which a drift can be told from noise."""
 SIGMAS = 3.0
 """Standard errors beyond which a drift, or a level, is not noise."""
 _ROUNDING = 1e-9
@@ -46,7 +44,8 @@ def standing(experiment: Experiment) -> Standing | None:
         return None
     n = int(np.argmax(moved))
     k = np.flatnonzero(np.isfinite(e.y[:n]))
-    if len(k) < LEAST:
+    # fewest measured outputs by which a drift can be told from noise
+    if len(k) < 3:
         return None
     y, spread = e.y[k], float(np.nanmax(e.y) - np.nanmin(e.y))
     about = k - k.mean()

@@ -19,10 +19,6 @@ if TYPE_CHECKING:
 
 LEAST_REST = 20
 """Least samples at rest at the beginning for `steady`."""
-MOVED = 0.02
-"""Part of its range by which an input at rest can differ from its first value."""
-SETTLED = 0.05
-"""Part of its range by which the output can drift over the second half of the rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +187,8 @@ def _rest(e: Experiment, data: Dataset) -> Trend:
         )
     spread = np.ptp(e.y[np.isfinite(e.y)])
     drift = abs(y[: len(y) // 2].mean() - y[len(y) // 2 :].mean())
-    if drift > SETTLED * spread > 0.0:
+    # part of its range by which the output can drift over the second half of the rest
+    if drift > 0.05 * spread > 0.0:
         raise DataError(
             f"{e.name} [{e.range_text}]: expected an output that has settled before the input "
             f"moves, but it still moves by {drift:g} of a range of {spread:g}; wait longer before "
@@ -209,7 +206,8 @@ def _samples_at_rest(e: Experiment) -> int:
         if len(known) == 0:
             return 0
         off = np.abs(column - np.median(known[:10]))
-        moved |= ~(off <= MOVED * np.ptp(known))
+        # part of its range by which an input at rest can differ from its first value
+        moved |= ~(off <= 0.02 * np.ptp(known))
     return int(np.argmax(moved)) if moved.any() else len(e)
 
 

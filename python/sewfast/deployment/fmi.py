@@ -25,8 +25,6 @@ from ..models import Model
 from . import c99
 from .precision import at_rest, embedded_members
 
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Date of all files within, so that the same model gives the same bytes."""
 _UNITS = {
     "V": ("kg=1, m=2, s=-3, A=-1", 1.0),
     "A": ("A=1", 1.0),
@@ -236,7 +234,8 @@ def _zipped(entries: dict[str, bytes]) -> bytes:
     place = io.BytesIO()
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
         for path, content in sorted(entries.items()):
-            entry = zipfile.ZipInfo(path, _EPOCH)
+            # date of all files within, so that the same model gives the same bytes
+            entry = zipfile.ZipInfo(path, (1980, 1, 1, 0, 0, 0))
             entry.external_attr = 0o644 << 16
             entry.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(entry, content)

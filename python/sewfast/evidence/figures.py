@@ -28,7 +28,6 @@ _STYLES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1, 2))
 _MARKERS = "osD^vP"
 _MOST_PANELS = 6
 _BUCKETS = 1200
-_FARTHEST = 20.0
 
 
 def figures(card: ReportCard, *, page: bool = False) -> dict[str, Figure]:
@@ -277,7 +276,7 @@ def _region(ax: Axes, card: ReportCard, i: int) -> None:
     ax.set_ylabel("distance / radius")
     ax.set_xlabel("time [s]")
     ax.margins(x=0.01)
-    ax.set_ylim(0.0, min(max(1.2, 1.05 * float(d.max())), _FARTHEST))
+    ax.set_ylim(0.0, min(max(1.2, 1.05 * float(d.max())), 20.0))
 
 
 _DRAWINGS: dict[str, Callable[[ReportCard], Drawing]] = {

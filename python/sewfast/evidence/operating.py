@@ -40,9 +40,6 @@ def integrating_pole(model: DynamicModel) -> float | None:
 
 
 POINTS = 9
-FREQUENCIES = 120
-_CLOSING = 3
-"""Rounds that narrow the range of an input to the values near the training data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +214,7 @@ class OperatingRange:
             for p in self.points
         ]
         low = 0.05 / (2.0 * math.pi * max(*slowest, self.Ts))
-        return np.geomspace(min(low, 0.05 / self.Ts), 0.5 / self.Ts, FREQUENCIES)
+        return np.geomspace(min(low, 0.05 / self.Ts), 0.5 / self.Ts, 120)
 
     def __str__(self) -> str:
         header = [*self.input_names, self.output_name, "gain", "slowest [s]", "bandwidth [Hz]", ""]
@@ -290,7 +287,8 @@ def _closed_in(
 ) -> list[FloatArray]:
     """Values of input i near the training data: the height of a pulse, say, was never held."""
     low, high = limits[i]
-    for _ in range(_CLOSING):
+    # rounds that narrow the range of an input to the values near the training data
+    for _ in range(3):
         line = _line(limits, i, low, high, points)
         known = [k for k, p in enumerate(_points(model, line, region)) if p.known]
         if not known or len(known) > 0.7 * points:

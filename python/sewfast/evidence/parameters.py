@@ -56,8 +56,6 @@ class Criteria:
 
 DETERMINED = 1e-10
 """Least information of a direction, relative to the largest; double precision ends there."""
-NOTHING = 1e-60
-"""Least length of a sensitivity's column, relative to the longest, to carry information."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +143,8 @@ def _unit_scale(squares: FloatArray) -> FloatArray:
     """
     lengths = np.sqrt(squares)
     largest = lengths.max(initial=0.0) or 1.0
-    return np.where(lengths > NOTHING * largest, lengths, largest)
+    # least length of a sensitivity's column, relative to the longest, to carry information
+    return np.where(lengths > 1e-60 * largest, lengths, largest)
 
 
 @dataclass(frozen=True)

@@ -34,15 +34,6 @@ from .residuals import Residuals
 LEVEL = 0.95
 BLOCKS = 10
 _TAILS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.35, 0.5)
-_KEPT_VARIANCE = 0.999
-_FOLLOWED = 1e-4
-"""Least relative information of a direction in which parameters move when a block is left out.
-
-In weaker directions a network is nonlinear long before the first-order step is reached.
-"""
-_WIDEST = 10.0
-_LARGEST_GROWTH = 3.0
-"""Largest growth of a residual when its block is left out: the limit of the first order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,9 +177,7 @@ def bands_of(
     low, high = known.quantile(tail), known.quantile(1.0 - tail)
     spreads = _spreads(model, data, residuals, known)
     if place is not None:
-        spreads = [
-            s * np.clip(d, 1.0, _WIDEST) for s, d in zip(spreads, place.distances, strict=True)
-        ]
+        spreads = [s * np.clip(d, 1.0, 10.0) for s, d in zip(spreads, place.distances, strict=True)]
     lower = tuple(r.yhat + low * s for r, s in zip(residuals.runs, spreads, strict=True))
     upper = tuple(r.yhat + high * s for r, s in zip(residuals.runs, spreads, strict=True))
     hits = [
@@ -256,7 +245,7 @@ def _factor(found: Parameters, residuals: Residuals) -> FloatArray:
     moved, turn = np.linalg.eigh(root.T @ residuals.gram @ root)
     order = np.argsort(moved)[::-1]
     share = np.cumsum(moved[order]) / max(moved.sum(), 1e-300)
-    kept = order[: int(np.searchsorted(share, _KEPT_VARIANCE)) + 1]
+    kept = order[: int(np.searchsorted(share, 0.999)) + 1]
     factor: FloatArray = root @ turn[:, kept]
     return factor
 
@@ -273,7 +262,10 @@ def _left_out(model: DynamicModel, residuals: Residuals) -> list[FloatArray]:
     for run, e, out in zip(residuals.runs, errors, found, strict=True):
         for a, b in _blocks(len(e), residuals.n):
             psi = run.sensitivity[a:b]
-            inverse = information.inverse(gram(psi), _FOLLOWED)
+            # least relative information of a direction in which parameters move when a block is
+            # left out. In weaker directions a network is nonlinear long before the first-order step
+            # is reached
+            inverse = information.inverse(gram(psi), 1e-4)
             change = psi @ (inverse @ (psi.T @ e[a:b]))
             out[a:b] = e[a:b] + _bounded(change, e[a:b])
     return found
@@ -289,7 +281,8 @@ def _blocks(length: int, total: int) -> list[tuple[int, int]]:
 
 
 def _bounded(change: FloatArray, e: FloatArray) -> FloatArray:
-    largest = _LARGEST_GROWTH * float(np.linalg.norm(e))
+    # largest growth of a residual when its block is left out: the limit of the first order
+    largest = 3.0 * float(np.linalg.norm(e))
     size = float(np.linalg.norm(change))
     return change if size <= largest else change * (largest / size)
 

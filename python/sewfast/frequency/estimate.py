@@ -14,9 +14,6 @@ from ..arrays import FloatArray, is_whole
 from ..errors import DataError, SettingError
 from .response import Complex, FrequencyResponse
 
-SEGMENTS = 16
-"""Default number of segments, which overlap by half: gives bands of a fifth of the gain at a
-coherence of one half."""
 LEAST = 16
 """Least samples of a segment or period."""
 LARGEST, SMALLEST = 1e150, 1e-60
@@ -203,7 +200,9 @@ def _explained(value: Complex, Suu: FloatArray, residual: FloatArray) -> FloatAr
 
 def _segment(segment: int | None, n: int) -> int:
     if segment is None:
-        return max(2 * (n // (SEGMENTS + 1)), LEAST)
+        # default number of segments, which overlap by half: gives bands of a fifth of the gain at a
+        # coherence of one half
+        return max(2 * (n // (16 + 1)), LEAST)
     if not is_whole(segment) or segment < LEAST:
         raise SettingError(
             name="segment", expected=f"at least {LEAST} samples", received=repr(segment)

@@ -86,14 +86,6 @@ RecordMethod: TypeAlias = Literal["segments", "local"]
 
 LEAST_RUN = 3
 """Equal samples in a row at the largest or smallest value that count as a command at a limit."""
-MOVES = 0.9
-"""Least share of the other samples that differ from the one before; a staircase has fewer."""
-REVERSED = 0.02
-"""A mean speed over 20 ms in the opposite direction counts as a reversal from this share of the
-largest speed on."""
-MEAN = 0.02
-OUTSIDE = 1.0, 99.0
-"""Percentiles of the second half of a record; one that begins outside them has a run-up."""
 
 
 def of_record(
@@ -164,10 +156,12 @@ def _cautions(u: FloatArray, y: FloatArray, Ts: float, *, is_speed: bool) -> dic
             f"u rests at its largest or smallest value in {len(at)} samples, the first at "
             f"{at[0] * Ts:.4g} s: if it was limited after it was recorded, the response is wrong"
         )
-    k = max(1, round(MEAN / Ts))
+    k = max(1, round(0.02 / Ts))
     if is_speed and len(y) >= k and np.isfinite(y).all():
         means = np.convolve(y, np.ones(k) / k, "valid")
-        back = np.flatnonzero(means * np.sign(means.sum()) < -REVERSED * np.abs(means).max())
+        # a mean speed over 20 ms in the opposite direction counts as a reversal from this share of
+        # the largest speed on
+        back = np.flatnonzero(means * np.sign(means.sum()) < -0.02 * np.abs(means).max())
         if len(back):
             found.append(
                 f"the speed changes its sign, first at {back[0] * Ts:.4g} s: there friction acts "
@@ -175,7 +169,8 @@ def _cautions(u: FloatArray, y: FloatArray, Ts: float, *, is_speed: bool) -> dic
             )
     if len(y) >= LEAST_RUN and np.isfinite(y).all():
         later = y[len(y) // 2 :]
-        low, high = np.percentile(later, OUTSIDE)
+        # percentiles of the second half of a record; one that begins outside them has a run-up
+        low, high = np.percentile(later, (1.0, 99.0))
         ends = np.flatnonzero((y >= low) & (y <= high))
         if not low <= y[: k + 1].mean() <= high and len(ends):
             found.append(
@@ -194,7 +189,8 @@ def _limited(u: FloatArray) -> Any:
     starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
     long = stops - starts >= LEAST_RUN
     moves = np.mean(np.diff(u)[~extreme[1:]] != 0.0) if not extreme[1:].all() else 0.0
-    if not long.any() or moves < MOVES:
+    # least share of the other samples that differ from the one before; a staircase has fewer
+    if not long.any() or moves < 0.9:
         return np.zeros(0, dtype=np.intp)
     return np.concatenate([np.arange(a, b) for a, b in zip(starts[long], stops[long], strict=True)])
 

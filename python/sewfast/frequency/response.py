@@ -37,8 +37,6 @@ LEVEL = 0.95
 """Confidence level of the bands."""
 LEAST_LINES = 3
 """For margins."""
-BETWEEN = 4
-"""Points per measured line at which a search evaluates the sensitivity."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -191,7 +189,8 @@ class FrequencyResponse:
             )  # fmt: skip
         hertz, value, radius = self.hertz[seen], self.value[seen], self.radius()[seen]
         n = len(hertz)
-        fine = np.interp(np.arange(0, n - 1 + 1e-9, 1.0 / BETWEEN), np.arange(n), hertz)
+        # points per measured line at which a search evaluates the sensitivity
+        fine = np.interp(np.arange(0, n - 1 + 1e-9, 1.0 / 4), np.arange(n), hertz)
         size = np.interp(fine, hertz, np.log(np.maximum(np.abs(value), 1e-300)))
         turn = np.interp(fine, hertz, np.unwrap(np.angle(value)))
         found: Complex = np.exp(size + 1j * turn)

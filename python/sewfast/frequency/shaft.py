@@ -35,9 +35,6 @@ LEAST, LEAST_GAIN = 20, 1e-300
 """Least number of frequencies for a fit, and least magnitude of a usable one."""
 NEIGHBOURS = 10
 """Lines to either side over which the uncertainty is smoothed: few blocks estimate it poorly."""
-FLOOR = 0.005
-"""Part of the gain that no fit has to explain: friction and dead time distort every response a
-little, which could otherwise outweigh a less visible resonance."""
 CONFIDENCE = 1.96
 DEPTHS, WIDTHS = (0.02, 0.7), (0.1, 2.0)
 """Limits of depth and width of a proposed notch."""
@@ -241,7 +238,9 @@ def _usable(response: FrequencyResponse) -> tuple[FloatArray, Complex, FloatArra
         )  # fmt: skip
     g = value[usable] / level
     spread = np.minimum(np.sqrt(np.maximum(variance[usable], 0.0)) / level, 1e100)
-    sigma = np.sqrt(0.5 * _smoothed(spread**2) + (FLOOR * np.abs(g)) ** 2)
+    # part of the gain that no fit has to explain: friction and dead time distort every response a
+    # little, which could otherwise outweigh a less visible resonance
+    sigma = np.sqrt(0.5 * _smoothed(spread**2) + (0.005 * np.abs(g)) ** 2)
     return f, g, sigma, level
 
 

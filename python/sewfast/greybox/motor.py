@@ -32,10 +32,6 @@ FORMAT = "sewfast-motor"
 VERSION = 3
 """Version 1 has `untold` for `undetermined`, version 2 no `orders`; both are read."""
 NAMES = tuple(_core.GREYBOX_PARAMETERS)
-OLDER = NAMES.index("limit") + 1
-"""First of the parameters that files before version 3 lack."""
-VAGUE = 1.0
-"""Half-width of an interval, relative to the value, above which a parameter is not printed."""
 
 APART = 10.0
 """Half-width, relative to the value, above which other parameters can replace it."""
@@ -419,7 +415,10 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
     if document["version"] < VERSION:  # terms added later
         document.setdefault("orders", [0] * len(WAVES))
         if isinstance(document.get("theta"), dict):
-            document["theta"] = dict.fromkeys(NAMES[OLDER:], 0.0) | document["theta"]
+            # first of the parameters that files before version 3 lack
+            document["theta"] = (
+                dict.fromkeys(NAMES[NAMES.index("limit") + 1 :], 0.0) | document["theta"]
+            )
     fields = storage.Fields(str(path), document)
     fields.require_only(
         [
@@ -491,7 +490,8 @@ def motor_of(found: Estimated, volts: float | None, *, profile: bool) -> Motor:
         value = of(known)
         slope = slope_of(known, of, names, spreads)
         half = CONFIDENCE * math.sqrt(max(float(slope @ found.covariance @ slope), 0.0))
-        vague = half >= VAGUE * abs(value)
+        # half-width of an interval, relative to the value, above which a parameter is not printed
+        vague = half >= 1.0 * abs(value)
         if name == "delay":  # a delay of zero is a valid result
             vague = half >= APART * max(value, records.Ts)
         if not math.isfinite(half) or vague:

@@ -53,7 +53,6 @@ _SEARCHED = ("auto", "neural_ss")
 """Kinds without given lags: their structure is searched."""
 _LAGS = 2
 _PAPER = {"na": 2, "nb": 2, "nk": 1, "hidden": 8}
-_PAPER_STARTS = 8
 
 
 @shown_in_notebooks("identify")
@@ -178,7 +177,7 @@ def identify(
             )
     if preset is not None:
         kind = _preset(preset, kind, {"na": na, "nb": nb, "nk": nk, "hidden": hidden})
-        starts = _PAPER_STARTS if starts is None else starts
+        starts = 8 if starts is None else starts
     _require_settings(
         na=na, nb=nb, nk=nk, nx=nx, hidden=hidden, starts=starts, seed=seed,
         iterations=iterations, threads=threads,

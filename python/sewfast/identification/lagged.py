@@ -36,13 +36,6 @@ HELD_OUT = (2, 5)
 LEAST_BLOCK = 2 * INIT
 DECAYS = (1e-2, 1e-4)
 """Weight decays of the default network, the strongest first."""
-ABOUT_AS_WELL = 1.25
-"""Largest ratio to the best held-out error for which a stronger weight decay is chosen."""
-SAME = 1e-6
-"""Relative difference of two errors below which the network is still its linear start."""
-NOTHING_LEFT = 1e-6
-"""J in scaled units below which a linear model explains everything."""
-_USUAL_STARTS = 4
 LINEAR_SHARE = 0.4
 """Share of a time budget for the linear fits, so that some is left for the network."""
 _LINEAR_FITS = "linear fits at which the network begins"
@@ -82,7 +75,7 @@ def _options(task: Task) -> dict[str, Any]:
     """Settings of a network's training that every network of a task shares."""
     return {
         **task.fit_options(), "hidden": task.hidden_or_usual, "seed": task.seed,
-        "starts": _USUAL_STARTS if task.starts is None else task.starts, "threads": task.threads,
+        "starts": 4 if task.starts is None else task.starts, "threads": task.threads,
     }  # fmt: skip
 
 
@@ -135,7 +128,8 @@ class Networks:
             # a strong decay would pull the network back to its linear part
             network = self._trained(self.task.data, None, DECAYS[-1])
             # J is in scaled units: a linear model without error needs no step
-            if len(network.trace) < 2 and network.cost > NOTHING_LEFT:
+            # J in scaled units below which a linear model explains everything
+            if len(network.trace) < 2 and network.cost > 1e-6:
                 raise FitError(
                     f"{self.task.data.source}: expected a network that does better than its linear "
                     "start, found none; ask for model oe, or give more iterations or starts"
@@ -184,7 +178,8 @@ class Networks:
         fits = [self._trained(data, held, decay) for decay in decays]
         errors = [math.sqrt(2.0 * (f.validation_cost or 0.0)) for f in fits]
         able = [i for i, f in enumerate(fits) if f.sound] or list(range(len(fits)))
-        bound = ABOUT_AS_WELL * min(errors[i] for i in able)
+        # largest ratio to the best held-out error for which a stronger weight decay is chosen
+        bound = 1.25 * min(errors[i] for i in able)
         chosen = next(i for i in able if errors[i] <= bound)
         tried = [
             {"weight_decay": d, "held_out_error": e or None, "sound": f.sound}
@@ -227,7 +222,8 @@ def _is_still_linear(choice: Provenance) -> bool:
     network, linear = rmse.get("neural_oe"), rmse.get("oe")
     if network is None or linear is None:
         return False
-    return bool(abs(network - linear) <= SAME * linear)
+    # relative difference of two errors below which the network is still its linear start
+    return bool(abs(network - linear) <= 1e-6 * linear)
 
 
 def _linear(task: Task) -> _core.LinearModel:

@@ -23,10 +23,6 @@ from .delays import DelayEstimate, delay, reach
 
 Progress: TypeAlias = Callable[[int, int, float], object]
 
-ABOUT_AS_WELL = 1.005
-"""Ratio of free-run errors below which they count as equal: a tenth of the noise, if only that."""
-EXACT = 1e-3
-"""Error due to the unknown inputs before the later part, in standard deviations of the output."""
 SHOWN = 12
 
 
@@ -260,7 +256,8 @@ def orders(
         )
         for orders, parameters, one_step, blocks, (aic, aicc, bic, fpe), index in tried
     ]
-    exact = EXACT * float(np.nanstd(np.concatenate([e.y for e in later.experiments])))
+    # error due to the unknown inputs before the later part, in standard deviations of the output
+    exact = 1e-3 * float(np.nanstd(np.concatenate([e.y for e in later.experiments])))
     choice, reason = _chosen(rows, errors, exact)
     output = labelled(data.output_name, data.output_unit)
     return OrderTable(tuple(rows), choice, reason, found, output)
@@ -325,7 +322,8 @@ def _chosen(rows: list[Structure], errors: list[FloatArray], exact: float) -> tu
             "expected a structure with a finite free run, found none; check units and signs, or "
             "record with more excitation"
         )
-    good = max(ABOUT_AS_WELL * rows[best].free_run, exact)
+    # ratio of free-run errors below which they count as equal: a tenth of the noise, if only that
+    good = max(1.005 * rows[best].free_run, exact)
     able = [
         i
         for i, row in enumerate(rows)

@@ -22,12 +22,8 @@ from .wire import Event, Identity, Kind, Reply
 
 WATCHDOG = 0.1
 WATCHDOG_ON_CREDIT = 0.25
-GREETED_WITHIN = 0.1
-"""Longest wait for the answer to one HELLO on a reopened port [s]."""
 RETRY = 0.05
 """Time between two attempts to open a port that vanished [s]."""
-HALTED_WITHIN = 30.0
-"""Longest wait for another thread's run to end; after its STOP it waits for rest [s]."""
 SILENCE = 0.02
 """Longest wait for bytes in one turn [s]; Ctrl-C and cancelling are checked at least as often."""
 
@@ -234,7 +230,8 @@ class Connection(Unique):
             return
         self.halted = True
         try:
-            if self._owner.acquire(timeout=HALTED_WITHIN):
+            # longest wait for another thread's run to end; after its STOP it waits for rest [s]
+            if self._owner.acquire(timeout=30.0):
                 self._owner.release()
         finally:
             self.halted = False
@@ -359,7 +356,8 @@ class Connection(Unique):
                 self.port.reopen(max(RETRY, lost + self.resume - time.monotonic()))
                 if self._is_closed:
                     self.port.close()
-                return self._greet(GREETED_WITHIN)
+                # longest wait for the answer to one HELLO on a reopened port [s]
+                return self._greet(0.1)
             except LinkError as failed:
                 if time.monotonic() - lost + RETRY > self.resume:
                     raise LinkError(

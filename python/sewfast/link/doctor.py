@@ -102,12 +102,7 @@ SHORT, LONG = 0, 200
 SPARE = 0.4
 """Share of the link that a recording at full rate should leave free."""
 BATCH = 10
-SLOW_TRIP = 0.01
-LOSSY = 0.01
-"""Share of lost frames above which loss is a failure rather than a warning."""
 DRIFT_PPM = 500.0
-MEASURABLE = 20e-6
-"""Least difference of times from which a rate can be computed [s]."""
 
 
 class Metered(Port):
@@ -241,7 +236,7 @@ def _round_trip(times: dict[int, list[float]]) -> Finding:
     median, worst = statistics.median(times[SHORT]), max(times[SHORT])
     values = {"median_s": median, "worst_s": worst}
     detail = f"median {_time(median)}, worst {_time(worst)} of {len(times[SHORT])}"
-    if median <= SLOW_TRIP:
+    if median <= 0.01:
         return Finding("round trip", "ok", detail, values=values)
     return Finding(
         "round trip", "warn", detail,
@@ -258,7 +253,8 @@ def _throughput(times: dict[int, list[float]], drive: Drive, port: Port) -> Find
     size = wire.wire_size(wire.body_size(encodings, BATCH))
     needed = size / (BATCH * drive.identity.Ts)
     values = {"needed_bytes_per_s": needed, "stated_baud": port.baud}
-    if cost < MEASURABLE:
+    # least difference of times from which a rate can be computed [s]
+    if cost < 20e-6:
         detail = f"too fast to be measured; {needed:.0f} B/s are needed for counts and command"
         return Finding("throughput", "ok", detail, values=values)
     rate = 2 * (LONG - SHORT) / cost
@@ -300,7 +296,8 @@ def _loss(
     )
     if not bad and not odd:
         return Finding("loss", "ok", f"none of {echoes} echoes", values=values)
-    verdict: Verdict = "fail" if bad > LOSSY * 2 * echoes else "warn"
+    # share of lost frames above which loss is a failure rather than a warning
+    verdict: Verdict = "fail" if bad > 0.01 * 2 * echoes else "warn"
     return Finding(
         "loss", verdict, detail,
         "shorten or shield the cable, connect the grounds, lower the baud rate, and make sure "
@@ -366,7 +363,6 @@ def _time(seconds: float) -> str:
 
 
 ECHOES = 200
-LATENCY_TIMER_MS = 2
 
 
 def examine(url: str, *, baud: int = 115_200, echoes: int = ECHOES) -> Diagnosis:
@@ -482,7 +478,7 @@ def _latency(url: str) -> Iterator[Finding]:
         return
     milliseconds, file = found
     values = {"latency_timer_ms": milliseconds}
-    if milliseconds <= LATENCY_TIMER_MS:
+    if milliseconds <= 2:
         yield Finding("latency timer", "ok", f"{milliseconds} ms", values=values)
         return
     yield Finding(

@@ -34,7 +34,6 @@ _FASTEST = struct.Struct("<f")
 _STACK_TOP = 1 << 20
 _STACK = 64 << 10
 _PAINT = b"\xa5"
-_MEMORY = 16 << 20
 
 _SHIFT = 5
 """An instruction takes 2**5 ns of the board's time; a tick of its timer is 40 ns."""
@@ -320,7 +319,7 @@ class EmulatedBoard:
 def _memory(path: Path) -> mmap.mmap:
     """The board's memory as a file, its stack painted to show how deep it was used."""
     with path.open("w+b") as file:
-        file.truncate(_MEMORY)
+        file.truncate(16 << 20)
         file.seek(_STACK_TOP - _STACK)
         file.write(_PAINT * _STACK)
         file.flush()

@@ -26,8 +26,6 @@ from .plan import Layout, Plan
 from .run import ARMS_WITHIN, MOVING
 from .wire import refusal
 
-WATCHDOG_PERIODS = 4
-"""Periods that the device runs on without a command, unless its watchdog time is longer."""
 BATCHES = (10, 9, 8, 7, 6, 5)
 """Samples in a frame: the first that divides a period, so all ticks see equally old samples."""
 PRIORITY = 50
@@ -112,7 +110,8 @@ def run_on_host(
     r = _reference(reference, controller, seed)
     plan = Plan("direct", r, columns=columns, batch=batch or _batch(ratio))
     streamed = drive.prepare_direct(plan, controller)
-    wait = max(drive.watchdog, WATCHDOG_PERIODS * controller.Ts) if watchdog is None else watchdog
+    # periods that the device runs on without a command, unless its watchdog time is longer
+    wait = max(drive.watchdog, 4 * controller.Ts) if watchdog is None else watchdog
     until = time.monotonic() + ARMS_WITHIN
     while True:
         with drive.lent() as session, _scheduling(real_time) as scheduling:

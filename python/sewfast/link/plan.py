@@ -28,7 +28,6 @@ DEFAULTS: dict[str, tuple[str, ...]] = {
 }
 """Streamed besides `counts` and `u` if the device has them; a low baud rate drops the last."""
 BATCH = 10
-SPARE = 0.1
 _CAPABILITIES = {"commands": wire.PROFILE, "controller": wire.PID, "direct": wire.DIRECT}
 
 
@@ -225,7 +224,7 @@ def _fits(encodings: Sequence[int], batch: int, identity: Identity, baud: float)
     if not 1 <= batch <= 255 or body > wire.MAX_BODY:
         return False
     seconds = batch * identity.Ts
-    return wire.wire_size(body) * 10.0 / seconds <= (1.0 - SPARE) * baud
+    return wire.wire_size(body) * 10.0 / seconds <= (1.0 - 0.1) * baud
 
 
 def _too_much(plan: Plan, out: Sequence[Channel], identity: Identity, baud: float) -> SettingError:

@@ -25,7 +25,6 @@ __all__ = ["VirtualDevice"]
 Faults: TypeAlias = "str | Mapping[str, float | tuple[float, float]]"
 
 _LARGEST_SEED = 2**64 - 1
-_BAUD = (300, 100_000_000)
 
 
 class VirtualDevice(Unique):
@@ -102,7 +101,7 @@ class VirtualDevice(Unique):
         pty = _checked_endpoint(endpoint, link) == "pty"
         _check_range("seed", seed, 0, _LARGEST_SEED)
         if baud is not None:
-            _check_range("baud", baud, *_BAUD)
+            _check_range("baud", baud, *(300, 100_000_000))
         if duration is not None and not 0.0 < real("duration", duration) < 1e9:
             raise SettingError(name="duration", expected="above 0 s", received=repr(duration))
         _require_switches(fast=fast, once=once, anyone=anyone)

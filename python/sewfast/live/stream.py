@@ -26,12 +26,8 @@ from .feed import Feed
 # neither header, so the gate checks them and forwards the requests that pass.
 
 
-LONGEST = 16_384
-"""Bytes of a request's head."""
 PATIENCE = 5.0
 """Longest wait for the head [s]."""
-CONNECTIONS = 16
-"""Most connections at once; further ones are closed."""
 _REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 _END = b"\r\n\r\n"
 
@@ -81,7 +77,8 @@ class Gate:
         self.port = int(self._listener.getsockname()[1])
         self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
-        self._room = threading.BoundedSemaphore(CONNECTIONS)
+        # most connections at once; further ones are closed
+        self._room = threading.BoundedSemaphore(16)
         self._closed = False
         self._start(self._accept)
 
@@ -124,7 +121,8 @@ class Gate:
     def _admit(self, client: socket.socket) -> None:
         client.settimeout(PATIENCE)
         head = b""
-        while _END not in head and len(head) < LONGEST:
+        # bytes of a request's head
+        while _END not in head and len(head) < 16_384:
             piece = client.recv(4096)
             if not piece:
                 return
@@ -244,8 +242,6 @@ _LOG = {
 }
 """The part used of Foxglove's own schema foxglove.Log, which its log panel shows."""
 
-_INFO = 2
-
 
 class FoxgloveView:
     """Topics `/drive` (one message a sample) and `/log` (the lines of status)."""
@@ -316,7 +312,7 @@ def _send(tail: Tail, drive: Any, log: Any) -> None:
     for text in tail.notes():
         at = round((stamp or tail.now) * 1e9)
         time = {"sec": at // 10**9, "nsec": at % 10**9}
-        message = {"timestamp": time, "level": _INFO, "message": text, "name": "sewfast"}
+        message = {"timestamp": time, "level": 2, "message": text, "name": "sewfast"}
         log.log(encode(message), log_time=at)
 
 

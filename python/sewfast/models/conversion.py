@@ -15,11 +15,6 @@ from ..errors import SettingError, not_installed
 # --- ContinuousModel: the differential equation behind a zero-order hold --------------------------
 
 
-NODES = 8
-"""Nodes of the quadrature, the [8/8] Pade approximant: exact to rounding within 0.25 of I."""
-NEAR = 0.25
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class ContinuousModel:
     """dx/dt = A x + B u(t - dead_time), y = C x + D u(t - dead_time), in deviations.
@@ -97,10 +92,11 @@ def logarithm(matrix: FloatArray) -> FloatArray:
     11). `log(I + X) = int_0^1 X (I + t X)^-1 dt`, and the logarithm of a square root is half of it.
     """
     eye, roots = np.eye(len(matrix)), 0
-    while np.linalg.norm(matrix - eye, 1) > NEAR and roots < 60:
+    while np.linalg.norm(matrix - eye, 1) > 0.25 and roots < 60:
         matrix, roots = _square_root(matrix), roots + 1
     x = matrix - eye
-    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    # the [8/8] Pade approximant: exact to rounding within .25 of I
+    nodes, weights = np.polynomial.legendre.leggauss(8)
     terms = (
         w / 2 * np.linalg.solve(eye + (t + 1) / 2 * x, x)
         for t, w in zip(nodes, weights, strict=True)

@@ -12,8 +12,6 @@ from ..dataset import FloatArray
 from ..storage import Fields
 from .base import StructuredModel
 
-PIECES = 8
-"""Pieces of a curve, unless `identify` is given a number."""
 _SAMPLES = 5
 """Points of a drawn curve for each piece."""
 
@@ -119,7 +117,8 @@ class HammersteinWiener(StructuredModel):
     @staticmethod
     def structures(size: int | None) -> tuple[Mapping[str, int], ...]:
         """A curve before the dynamics, one behind them, or both, with `size` pieces each."""
-        n = PIECES if size is None else size
+        # pieces of a curve, unless `identify` is given a number
+        n = 8 if size is None else size
         pairs = ((n, 1), (1, n), (n, n))
         return tuple({"input_pieces": i, "output_pieces": o} for i, o in pairs)
 

@@ -21,9 +21,6 @@ TOLERANCE = 0.01
 """Part of the period by which even steps can differ from it."""
 GAP = 3.5
 """Steps of more periods than this are gaps, in which nothing is known."""
-LATEST = 1e300
-"""Largest time [s]; sums of larger ones would overflow."""
-_MOST_PER_ROW = 100
 _SECONDS = {
     "": 1.0, "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3,
     "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "usec": 1e-6, "ns": 1e-9, "min": 60.0,
@@ -391,7 +388,8 @@ def _seconds(table: Table, name: str, unit: float) -> FloatArray:
     with np.errstate(over="ignore", invalid="ignore"):
         t: FloatArray = (raw - raw[0]) * unit
         steps = np.diff(t)
-    if not (np.abs(t) <= LATEST).all():
+    # largest time [s]; sums of larger ones would overflow
+    if not (np.abs(t) <= 1e300).all():
         raise DataError(
             f"{table.path}: column {name!r}: expected times within the numbers, received "
             f"{raw.min():g} to {raw.max():g}; check the column"
@@ -438,7 +436,7 @@ def _grid(table: Table, name: str, t: FloatArray, period: float, given: float | 
         and (given is None or abs(given - fitted) <= TOLERANCE * given)
     )
     Ts = fitted if exact else period if given is None else float(given)
-    most = max(_MOST_PER_ROW * len(t), 10_000)
+    most = max(100 * len(t), 10_000)
     # in this order: a quotient of the largest time stamps would not be finite
     if not t[-1] < most * Ts:
         k = int(np.argmax(np.diff(t)))

@@ -24,7 +24,6 @@ from .header import Header, bearable
 # --- Sink: a file that grows by whole pieces ------------------------------------------------------
 
 
-_BATCH = 1 << 16
 _LOCKED = 0x7FFF_0000
 """The byte to lock on Windows, beyond any recording: others cannot read locked bytes there."""
 
@@ -175,7 +174,7 @@ def batched(pieces: Iterable[bytes]) -> Iterator[bytes]:
     batch = bytearray()
     for piece in pieces:
         batch += piece
-        if len(batch) >= _BATCH:
+        if len(batch) >= (1 << 16):
             yield bytes(batch)
             batch.clear()
     yield bytes(batch)
@@ -215,8 +214,6 @@ MESSAGE_SAMPLES = 100
 """Samples at which a message is written."""
 OLDEST = 0.2
 """Longest wait of a sample for a full message [s]; the operating system gets it within .25 s."""
-MOST_WAITING = 10_000
-"""Most samples that wait for the disk before `put` blocks."""
 
 
 class Block(NamedTuple):
@@ -272,7 +269,8 @@ class Filing:
 
     def put(self, item: Item) -> None:
         """Queue an item; returns at once unless the disk is far behind."""
-        while self._given - self._received > MOST_WAITING and self.failure is None:
+        # most samples that wait for the disk before `put` blocks
+        while self._given - self._received > 10_000 and self.failure is None:
             time.sleep(0.001)
         self._items.put(item)
         if isinstance(item, Block):

@@ -24,8 +24,6 @@ MOST_MISSING = 50_000_000
 """Most values in all gaps of a recording together: a reader allocates them."""
 SHORTEST_TS, LONGEST_TS = 1e-9, 1e6
 """Sample times [s]: the file counts nanoseconds."""
-LAST_NS = 2**64 - 1
-"""The last time that the file can state, in the year 2554."""
 _TAKEN = ("t", "index")
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
 
@@ -121,7 +119,8 @@ class Header:
 
     def time_ns(self, index: int) -> int:
         """Time of sample `index` in nanoseconds since 1970-01-01 UTC."""
-        return min(self.start_ns() + round(index * self.Ts * 1e9), LAST_NS)
+        # the last time that the file can state, in the year 2554
+        return min(self.start_ns() + round(index * self.Ts * 1e9), 2**64 - 1)
 
     def encode(self) -> bytes:
         """The header message: JSON with format and version."""

@@ -54,8 +54,6 @@ LARGEST_FILE = 4 << 30
 """Bytes: more than a day of four columns at 1 kHz."""
 LARGEST_CHUNK = 4 << 20
 """Bytes; a recording's own chunks are far smaller."""
-BUDGET = 4
-"""Budget of failed checksums, in multiples of the file; each damaged chunk costs one."""
 
 
 class Chunk(NamedTuple):
@@ -71,7 +69,8 @@ def chunks(raw: bytes) -> Iterator[Chunk]:
     without chunks than damage can explain, and for one that unpacks to more than `MOST_RATIO` times
     its size; `SettingError` if a chunk is compressed and zstandard is not installed.
     """
-    at, left, unpacked = 0, BUDGET * len(raw) + LARGEST_CHUNK, 0
+    # budget of failed checksums, in multiples of the file; each damaged chunk costs one
+    at, left, unpacked = 0, 4 * len(raw) + LARGEST_CHUNK, 0
     while (at := raw.find(CHUNK.to_bytes(1, "little"), at)) >= 0:
         claim = _claimed(raw, at)
         chunk = None if claim is None else _chunk_at(raw, at, claim)

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 EVALUATIONS = 3000
 SIZE = 40
-_WIDE = 10.0
 _TUNED = 0.25
 """Share of the evaluations for the tuned controller from which the front starts."""
 
@@ -368,7 +367,7 @@ def _units(objectives: Sequence[str], controller: Controller) -> dict[str, str]:
 
 def wide(column: NDArray[np.float64]) -> bool:
     """Whether values are so far apart that ratios matter more than differences."""
-    return bool(column.min() > 0.0 and column.max() > _WIDE * column.min())
+    return bool(column.min() > 0.0 and column.max() > 10.0 * column.min())
 
 
 def knee(values: NDArray[np.float64]) -> int:
@@ -394,8 +393,6 @@ NAMES = {
     "load": "deviation under a load",
     "Ms": "largest sensitivity Ms",
 }
-HEIGHT = 3.6
-"""Height of a panel [inch]."""
 
 
 def drawing(front: ParetoFront) -> Drawing:
@@ -405,7 +402,8 @@ def drawing(front: ParetoFront) -> Drawing:
     columns = min(2, len(panels))
     panels += [None] * (-len(panels) % columns)
     rows = tuple(tuple(panels[k : k + columns]) for k in range(0, len(panels), columns))
-    return Drawing(rows, (HEIGHT,) * len(rows), (1.0,) * columns, share_x=False, legend=2)
+    # height of a panel [inch]
+    return Drawing(rows, (3.6,) * len(rows), (1.0,) * columns, share_x=False, legend=2)
 
 
 def _panel(axis: Axes, front: ParetoFront, i: int, j: int) -> None:

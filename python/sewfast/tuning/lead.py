@@ -38,9 +38,6 @@ SMOOTHINGS = (1e-3, 1e-2, 1e-1)
 """Multiples of the squared taps among which costs choose, from a sharp inverse to a calm one."""
 FURTHER, FEW = (0, 2, 4, 6, 8, 12), (4, 8)
 """Samples of preview beyond the plant's delay among which costs choose; few until a deadline."""
-BESIDE = 2e-3
-"""Distance from rest of the first levels to either side, as a share of the range: dry friction has
-its full size there, as a jump cannot be drawn."""
 LEADING, PART = 0.15, 0.6
 """Part of a time budget that the search leaves to the feedforward, and part of what is left
 then that this may take."""
@@ -134,7 +131,9 @@ def _points(
 ) -> Iterator[Point]:
     """Steady states within the range; dynamics count from the distance `moving` on."""
     low, high = ends
-    beside, grid = BESIDE * (high - low), command_grid(model)
+    # distance from rest of the first levels to either side, as a share of the range: dry friction
+    # has its full size there, as a jump cannot be drawn
+    beside, grid = 2e-3 * (high - low), command_grid(model)
     for end in (low, high):
         way = end - rest
         if abs(way) <= beside:

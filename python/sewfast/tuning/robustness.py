@@ -90,15 +90,12 @@ def linear_loops(task: TuningTask, time: Budget) -> LinearLoops:
             remedy="give plant=[response, fit_shaft(response).to_model()]",
         )  # fmt: skip
     found = LinearLoops(measured=measured)
-    ends = time.share(LOOKING)
+    # part of a time budget for linearising: a grey box takes .14 s for each level
+    ends = time.share(0.1)
     for plant in plants:
         if not hasattr(plant, "lines"):
             found += _of(plant, task, controller, time, ends)
     return found
-
-
-LOOKING = 0.1
-"""Part of a time budget for linearising: a grey box takes .14 s for each level."""
 
 
 def _of(

@@ -387,9 +387,6 @@ def _one(given: Any, start: SampledController) -> list[tuple[str, tuple[float, f
 # --- The controller to start from -----------------------------------------------------------------
 
 
-DERIVATIVE_FILTER = 10.0
-"""N of the first controller."""
-
 Encoder: TypeAlias = float | Literal["model"] | None
 
 
@@ -427,7 +424,7 @@ def first_controller(
         Ts=plant.Ts,
         alpha=rule.alpha,
         beta=rule.beta,
-        N=DERIVATIVE_FILTER,
+        N=10.0,
         u_min=low,
         u_max=high,
         filter_samples=filter_samples,
