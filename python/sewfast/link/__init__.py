@@ -4,8 +4,8 @@ Read in this order: `ports` (transports and their failures), `wire` (the frames'
 `connection` (a session: the core's client on a port, and the device's clock), `drive` (`Drive`),
 `plan` (a run's commands, its checks and its outcome), `run` (the loop of a run, and how it ends),
 `record` (into memory, a file and a live view). Then `host_loop` and `host_run` (a controller on
-this computer), `doctor`, `virtual` and `emulated` (devices without a motor), and `boards` with
-`makers` (boards of other makers, polled over text: ODrive, SimpleFOC).
+this computer), `doctor`, `virtual` (a device without a motor), and `boards` with `makers` (boards
+of other makers, polled over text: ODrive, SimpleFOC).
 """
 
 from .boards import PolledBoard

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ..errors import LinkError, SettingError
-from ..storage import file_bytes
+from sewfast.errors import LinkError, SettingError
+from sewfast.storage import file_bytes
 
 BOARDS = {"mps2-an386": 0x21000000, "mps2-an500": 0x60000000}
 """QEMU's boards, a Cortex-M4 and a Cortex-M7, with the address of the memory shared with us."""

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from .. import _core
-from ..control import Controller
-from ..dataset import FloatArray
-from ..errors import FitError, SettingError
-from ..models import Ensemble, Model
+from sewfast import _core
+from sewfast.control import Controller
+from sewfast.dataset import FloatArray
+from sewfast.errors import FitError, SettingError
+from sewfast.models import Ensemble, Model
 
 MOST_LOSS = 0.01
 """Largest change by single precision that is accepted, as a share of the output's span."""

@@ -18,10 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
-from .. import __version__
-from ..control import Controller
-from ..errors import SettingError
-from ..models import Model
+from sewfast import __version__
+from sewfast.control import Controller
+from sewfast.errors import SettingError
+from sewfast.models import Model
+
 from . import c99
 from .precision import at_rest, embedded_members
 
