@@ -1,8 +1,8 @@
 """Plug-ins: what installed packages add by entry points, and what is said where one cannot be used.
 
 A group of entry points is a list in the metadata of the installed packages: `sewfast.readers`
-(formats of files), `sewfast.commands` (commands), `sewfast.names` (names of `sewfast`). Nothing is
-registered, and nothing is imported before it is asked for.
+(formats of files), `sewfast.commands` (commands), `sewfast.names` (names of `sewfast`, and of its
+unit `link`). Nothing is registered, and nothing is imported before it is asked for.
 """
 
 from __future__ import annotations
@@ -123,8 +123,8 @@ NAMES = "sewfast.names"
 
 
 def public_names() -> list[str]:
-    """Names of `sewfast` that plug-ins add."""
-    return [point.name for point in points(NAMES)]
+    """Names of `sewfast` that plug-ins add, without those of its units (`link.NAME`)."""
+    return [point.name for point in points(NAMES) if "." not in point.name]
 
 
 def public_name(name: str) -> Any:

@@ -11,9 +11,10 @@ import re
 import time
 from contextlib import suppress
 
-from ..errors import LinkError, SettingError
-from .boards import QUIET_WITHIN, Clock, PolledBoard
-from .ports import Port
+from sewfast.errors import LinkError, SettingError
+from sewfast.link.ports import Port
+
+from .polled import QUIET_WITHIN, Clock, PolledBoard
 
 IDLE, CLOSED_LOOP = 1, 8
 """States of an axis."""

@@ -18,13 +18,13 @@ from typing import Protocol
 
 import numpy as np
 
-from ..arrays import FloatArray
-from ..control.controller import SampledController
-from ..control.machine import WATCHED, RecordedRun, Watch
-from ..errors import Interrupted, LinkError, SettingError
-from ..gains import real
-from ..recording import Recording, require_finite
-from .ports import Port, Unique, open_port
+from sewfast.arrays import FloatArray
+from sewfast.control.controller import SampledController
+from sewfast.control.machine import WATCHED, RecordedRun, Watch
+from sewfast.errors import Interrupted, LinkError, SettingError
+from sewfast.gains import real
+from sewfast.link.ports import Port, Unique, open_port
+from sewfast.recording import Recording, require_finite
 
 SHORTEST_TS, LONGEST_TS = 0.002, 0.5
 """Sample times [s] that a host without a real-time system can keep."""
