@@ -28,8 +28,6 @@ ALIKE, UNSURE = 0.05, 0.1
 and on one that shows what the machine always was."""
 LOST = 0.1
 """Shares of motion, and of the largest command, that count as none."""
-TIES = 1.05
-"""Changes with an error of up to this multiple of the least are equal: the likelier is taken."""
 
 
 @dataclass(frozen=True)
@@ -265,6 +263,8 @@ class _Look:
 
     def explanation(self, explained: float = EXPLAINED) -> tuple[float, Cause] | None:
         """The error that such a change leaves [RPM], and the change."""
+        # changes with an error of up to this multiple of the least are equal: the likelier is taken
+        ties = 1.05
         if (early := turns_at_rest(self.recording)) is not None:
             return 0.0, early
         found = self.found
@@ -272,13 +272,13 @@ class _Look:
         least = NOTED if is_alone else max(NOTED, TIMES * found["unsure"])
         least = max(least * found["size"], found["rounding"])
         if found["error"] > least and found["findings"]:
-            most = min(explained * found["error"], TIES * found["findings"][0][3])
+            most = min(explained * found["error"], ties * found["findings"][0][3])
             equal = {f[0]: f for f in found["findings"] if f[3] <= most}
             if equal:
                 change = next(name for name in _NAMED if name in equal)
                 _, value, at, error, motor = equal[change]
                 # no change where one motor explains all runs as well
-                if not found["together"] <= TIES * error:
+                if not found["together"] <= ties * error:
                     return error, self.changed(change, value, at, motor)
         return None
 

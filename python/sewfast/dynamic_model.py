@@ -32,7 +32,6 @@ FORMAT = "sewfast.model"
 VERSION = 1
 INIT = 20
 """Default number of samples that determine the initial state."""
-_STEPS_SHOWN = 4
 
 
 class AtRest(NamedTuple):
@@ -459,6 +458,7 @@ class DynamicModel(ABC):
         return html_of("\n".join([first, f"orders: {lines[0]}", *lines[1:]]))
 
     def _story(self) -> list[str]:
+        steps_shown = 4
         t = self.training
         if not t:
             return []
@@ -469,8 +469,8 @@ class DynamicModel(ABC):
             steps = "" if count is None else f"{count} iterations, "
             lines[0] += f"; {steps}{t['termination']}"
         prepared = [f"prepared: {note}" for note in t.get("preparation", [])]
-        if len(prepared) > _STEPS_SHOWN:
-            prepared[_STEPS_SHOWN:] = [f"prepared: and {len(prepared) - _STEPS_SHOWN} more"]
+        if len(prepared) > steps_shown:
+            prepared[steps_shown:] = [f"prepared: and {len(prepared) - steps_shown} more"]
         lines += prepared
         lines += choice_lines(t, self.output_unit)
         lines += [str(note) for note in t.get("notes", [])]

@@ -16,7 +16,6 @@ from .gains import real, vector
 __all__ = ["MachineRun", "VirtualMachine"]
 
 _NAME = re.compile(r"virtual(?::(\d+))?(?:\?(.*))?")
-_LARGEST_SEED = 2**64 - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,8 +231,9 @@ def _parameters(query: str, name: str) -> dict[str, float]:
 
 
 def _checked_seed(seed: int) -> int:
+    largest_seed = 2**64 - 1
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
         raise SettingError(name="seed", expected="a whole number or None", received=repr(seed))
-    if not 0 <= seed <= _LARGEST_SEED:
-        raise SettingError(name="seed", expected=f"0 to {_LARGEST_SEED}", received=str(seed))
+    if not 0 <= seed <= largest_seed:
+        raise SettingError(name="seed", expected=f"0 to {largest_seed}", received=str(seed))
     return int(seed)

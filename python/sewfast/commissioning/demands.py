@@ -45,10 +45,6 @@ def require(met: bool, message: str, cause: Cause | None = None) -> None:
 # --- `Demands` ------------------------------------------------------------------------------------
 
 
-LONGEST_NAME = 100
-"""Longest name of a reference's file [bytes]; file systems allow 255, including the endings."""
-
-MOST_MEMBERS = 100
 OVER = 1.25
 """Training covers this multiple of the top of the working range, as the loop overshoots it."""
 ROOM = 1.1
@@ -179,14 +175,16 @@ def _load(load: float | None, volt: float) -> float | None:
 
 def _fixed(references: Mapping[str, FloatArray] | None) -> Mapping[str, FloatArray] | None:
     """The references, whose names must also be distinct file names."""
+    # longest name of a reference's file [bytes]; file systems allow 255, including the endings
+    longest_name = 100
     if references is None:
         return None
     files: dict[str, str] = {}
     for name in references:
         file = file_name(name)
-        if len(file.encode()) > LONGEST_NAME:
+        if len(file.encode()) > longest_name:
             raise SettingError(
-                name="references", expected=f"names of up to {LONGEST_NAME} bytes",
+                name="references", expected=f"names of up to {longest_name} bytes",
                 received=f"{name[:40]!r}.. of {len(file.encode())}", remedy="shorten it",
             )  # fmt: skip
         if file in files:
@@ -200,10 +198,11 @@ def _fixed(references: Mapping[str, FloatArray] | None) -> Mapping[str, FloatArr
 
 
 def _members(value: int) -> int:
+    most_members = 100
     number = _at_least(1, "members", value)
-    if number > MOST_MEMBERS:
+    if number > most_members:
         raise SettingError(
-            name="members", expected=f"up to {MOST_MEMBERS}", received=f"{number}",
+            name="members", expected=f"up to {most_members}", received=f"{number}",
             remedy="4 are usual, and each is trained for seconds",
         )  # fmt: skip
     return number

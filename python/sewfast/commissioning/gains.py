@@ -36,17 +36,8 @@ from .small_signal import SHAKEN_AT, Resonance, SmallSignal
 # --- Gains: by rule from the step response, then by search on the ensemble ------------------------
 
 
-LOWER, STEPS = 0.85, 29
-"""Factor from one trial of lower gains to the next, and the number of trials."""
 SEARCHED = ("Kp", "Ti", "Td", "alpha", "beta", "N", "filter_samples", "filter_time")
 """Variables of the search: the feedback's filter matters as much as the gains."""
-NOTCH_DEPTHS, NOTCH_WIDTHS = (0.05, 0.2), (0.6, 1.2, 2.0)
-"""Depths and widths to try for the first notch; the search starts from the best. A narrower one
-does not hold a resonance that moves by a tenth."""
-ALPHAS, BETAS = (0.0, 0.1, 0.2, 0.4), (-1.0, 0.0, 0.5)
-"""Values to try for the start of the search."""
-RATIOS = (0.01, 2.0)
-"""Range of L/T in which Eq. 12 is solved."""
 
 
 def first_gains(
@@ -83,8 +74,11 @@ def notched(controller: Controller, plant: Model, resonance: Resonance, Ms: floa
     They are compared by the integral gain, which rejects disturbances. A search can flatten a notch
     that gains nothing, but cannot add one.
     """
+    # depths and widths to try for the first notch; the search starts from the best. A narrower one
+    # does not hold a resonance that moves by a tenth
+    notch_depths, notch_widths = (0.05, 0.2), (0.6, 1.2, 2.0)
     found: list[Controller] = []
-    for depth, width in product(NOTCH_DEPTHS, NOTCH_WIDTHS):
+    for depth, width in product(notch_depths, notch_widths):
         notch = Biquad.notch(resonance.frequency, depth, width)
         with suppress(Refusal):
             found.append(lowered(replace(controller, biquads=(notch,)), plant, Ms))
@@ -100,7 +94,9 @@ def lowered(controller: Controller, plant: Model, Ms: float) -> Controller:
     It lowers Kp alone first; if that is not enough, it also lengthens Ti by the same factor. Raises
     `Refusal` if no gains reach this Ms.
     """
-    shares = LOWER ** np.arange(STEPS)
+    # factor from one trial of lower gains to the next, and the number of trials
+    lower, steps = 0.85, 29
+    shares = lower ** np.arange(steps)
     # at the same Ti, a lower Kp costs phase on a plant slower than Ti; at the same Kp Ti not
     tried = [scaled(controller, s) for s in shares] + [stretched(controller, s) for s in shares]
     for found in tried:
@@ -146,8 +142,10 @@ def _rule(fopdt: Fopdt, late: float, Ms: float) -> Rule:
     Below the smallest L/T of Eq. 12 that ratio is used, a longer dead time than the plant's:
     conservative.
     """
-    L = max(fopdt.L + late, min(RATIOS) * fopdt.T)
-    if max(RATIOS) < L / fopdt.T:
+    # range of L/T in which Eq. 12 is solved
+    ratios = (0.01, 2.0)
+    L = max(fopdt.L + late, min(ratios) * fopdt.T)
+    if max(ratios) < L / fopdt.T:
         return simc(replace(fopdt, L=L))
     return eq_12(replace(fopdt, L=L), Ms=Ms)
 
@@ -160,7 +158,9 @@ def start_of(
     threads: int,
 ) -> Controller:
     """The rule's gains, with alpha and beta of least cost on a grid: the rule's suit steps only."""
-    tried = [replace(rule, alpha=a, beta=b) for a, b in product(ALPHAS, BETAS)]
+    # values to try for the start of the search
+    alphas, betas = (0.0, 0.1, 0.2, 0.4), (-1.0, 0.0, 0.5)
+    tried = [replace(rule, alpha=a, beta=b) for a, b in product(alphas, betas)]
     found = costs([rule, *tried], models, list(references.values()), cost=cost, threads=threads)
     return [rule, *tried][int(np.argmin(found))]
 
@@ -393,10 +393,6 @@ def _linear(members: Sequence[Model], demands: Demands, Ts: float) -> list[Model
 # --- Caution: new gains are tried in steps on a short hold before anything longer -----------------
 
 
-SHARES = (0.25, 0.5, 1.0)
-"""Shares of the gains to try, one hold after the other."""
-PERIODS = 100
-"""Least samples of the hold."""
 EXPECTED = 2.0
 """Deviation of a quiet loop's command as a multiple of the models', which is due to the encoder."""
 
@@ -416,14 +412,16 @@ class Swing:
 
 def held(demands: Demands, fastest: float, Ts: float) -> tuple[FloatArray, int]:
     """A ramp to a working speed and a hold [RPM], and the sample at which the hold begins."""
+    # least samples of the hold
+    periods = 100
     level = SHAKEN_AT * demands.speed
     # the ramp takes this many times as long as at the acceleration of the step response. A current
     # limit can allow only a fifth of that, and a loop that comes off a limit swings back anyway
     rise = max(round(12.0 * level / fastest / Ts), 20)
     # least time between the ramp and the hold [s]
-    settle = rise + max(round(0.5 * rise), round(0.2 / Ts), PERIODS // 2)
+    settle = rise + max(round(0.5 * rise), round(0.2 / Ts), periods // 2)
     # the hold in which an oscillation is looked for lasts .4 s or 100 samples
-    hold = max(round(0.4 / Ts), PERIODS)
+    hold = max(round(0.4 / Ts), periods)
     return level * np.minimum(1.0, np.arange(settle + hold) / rise), settle
 
 
@@ -470,8 +468,10 @@ def cautious(
     samples that `thinning` leaves. Raises `Refusal` if the loop oscillates even with a quarter of
     the gains.
     """
+    # shares of the gains to try, one hold after the other
+    shares = (0.25, 0.5, 1.0)
     r, settled = held(demands, fastest, machine.Ts)
-    for share in SHARES:
+    for share in shares:
         tried = scaled(controller, share)
         expected = 0.0
         if models is not None:
@@ -488,7 +488,7 @@ def cautious(
             continue
         # share that is kept of gains that oscillated
         kept = 0.5 * share
-        if kept < SHARES[0]:
+        if kept < shares[0]:
             raise Refusal(
                 f"expected a quiet loop at {r[-1]:.4g} RPM under a quarter of the gains, it swings "
                 f"at {swing.frequency:.3g} Hz ({swing.command:.3g} V rms): {cause(swing, small)}"

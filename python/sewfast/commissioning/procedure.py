@@ -68,8 +68,6 @@ __all__ = ["STAGES", "commission"]
 
 MEMBERS = 4
 EVALUATIONS = 3000
-SHORTEST = 2 * WATCHED
-"""Least samples of a reference: fewer cannot be judged."""
 
 References = Mapping[str, ArrayLike] | Sequence[str]
 Between = Callable[[str, Commissioning], object]
@@ -579,14 +577,16 @@ def _samples(
 
 def _whole(name: str, reference: ArrayLike) -> FloatArray:
     """The samples of a reference, checked."""
+    # least samples of a reference: fewer cannot be judged
+    shortest = 2 * WATCHED
     samples = vector(name, reference).copy()
     if not np.all(np.isfinite(samples)):
         raise DataError(
             name=name, expected="finite samples of a reference", received="NaN or infinity"
         )
-    if len(samples) < SHORTEST:
+    if len(samples) < shortest:
         raise DataError(
-            name=name, expected=f"{SHORTEST} samples of a reference or more",
+            name=name, expected=f"{shortest} samples of a reference or more",
             received=f"{len(samples)}", remedy="hold its end for longer",
         )  # fmt: skip
     if not samples.any():

@@ -30,8 +30,6 @@ from .bench import bench_of
 
 STEPS = 0.05
 """Default amplitude of the reference under a controller, as a share of the working speed."""
-HARMONICS, APART = 8, 1.0
-"""Multiples of the turn that lines avoid, and the least distance from them [Hz]."""
 HOLD, LONGEST = 2.0, 32.0
 """First and longest hold of a command for measuring its speed [s]."""
 NEAR, SETTLED = 0.03, 0.02
@@ -220,8 +218,6 @@ def _shaken(
 # --- Margins, predicted and measured --------------------------------------------------------------
 
 
-AGAIN, LEAST_SHAKEN = 0.5, 0.2
-"""Factor for the amplitude if the command reached a limit; the least share of it to try."""
 MARGINS = ("Ms", "phase_margin_deg", "gain_margin")
 
 
@@ -233,14 +229,16 @@ def margins_at_work(
     response is too small, the command reaches its limits even at a small amplitude, or the machine
     cannot be excited at that speed.
     """
+    # factor for the amplitude if the command reached a limit; the least share of it to try
+    again, least_shaken = 0.5, 0.2
     share = 1.0
-    while share >= LEAST_SHAKEN:
+    while share >= least_shaken:
         try:
             plan = _Plan.of(machine, speed, 2.0, 2, 4, 1.0, None, seed)
             response = _shaken(machine, plan, share * STEPS * abs(speed), controller, is_whole=True)
             measured = response.margins(controller, speed=speed)
         except DataError:
-            share *= AGAIN
+            share *= again
             continue
         except SettingError:
             # this machine or sample time cannot be excited so
@@ -284,6 +282,8 @@ class _Plan:
         f_max: float | None,
         seed: int,
     ) -> _Plan:
+        # multiples of the turn that lines avoid, and the least distance from them [Hz]
+        harmonics, apart = 8, 1.0
         Ts = machine.Ts
         if speed == 0.0 or not abs(speed) < machine.speed:
             raise SettingError(
@@ -321,7 +321,7 @@ class _Plan:
         hertz = k / (samples * Ts)
         turn = abs(speed) / 60.0
         harmonic = np.round(hertz / turn)
-        off = (np.abs(hertz - harmonic * turn) > APART) | (harmonic < 1) | (harmonic > HARMONICS)
+        off = (np.abs(hertz - harmonic * turn) > apart) | (harmonic < 1) | (harmonic > harmonics)
         k = k[off & (hertz >= f_min) & (hertz <= highest)]
         if len(k) < 3:
             raise SettingError(

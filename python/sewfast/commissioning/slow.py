@@ -29,14 +29,6 @@ from .small_signal import SmallSignal
 
 HARMONICS = 6
 """Harmonics of a turn that are fitted."""
-SLOW = 0.5
-"""Span of the moving mean removed before the fit [s], for a load on the encoder's shaft."""
-LEAST_TURNS = 8.0
-"""Least turns of a load in the recordings: fewer cannot be distinguished from friction."""
-GEARED = 0.95
-"""Largest ratio (turns of the load per turn of the encoder) of a load behind a gear."""
-BIWEIGHT, REWEIGHTED = 4.685, 5
-"""Cut-off of the biweight in standard deviations, the usual value; rounds of reweighting."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +116,11 @@ class _Unexplained:
 
     def span(self, ratio: float) -> float:
         """Span of the mean to remove [s]: it takes warming friction, and leaves a slow load."""
+        # span of the moving mean removed before the fit [s], for a load on the encoder's shaft
+        slow = 0.5
         rate = float(self.turns[-1]) / (len(self.rest) * self.Ts)
         # behind a gear, two turns of the load
-        return max(SLOW, 2.0 / max(ratio * rate, 1e-9)) if ratio < 1.0 else SLOW
+        return max(slow, 2.0 / max(ratio * rate, 1e-9)) if ratio < 1.0 else slow
 
     def parts(
         self, plant: Model, ratio: float, span: float, harmonics: int = HARMONICS
@@ -148,11 +142,13 @@ def _robust(rows: FloatArray, rest: FloatArray) -> FloatArray:
     of .12; with the biweight it gives .18. On nine drives, the residual on the random levels falls
     to .82 (median; .69 to 1.15) of that with equal weights.
     """
+    # cut-off of the biweight in standard deviations, the usual value; rounds of reweighting
+    biweight, reweighted = 4.685, 5
     weight: FloatArray = np.ones(len(rest))
-    for _ in range(1 + REWEIGHTED):
+    for _ in range(1 + reweighted):
         found, *_ = np.linalg.lstsq(weight[:, None] * rows, weight * rest, rcond=1e-6)
         error = rest - rows @ found
-        reach = BIWEIGHT * float(np.median(np.abs(error))) / 0.6745
+        reach = biweight * float(np.median(np.abs(error))) / 0.6745
         weight = np.maximum(1.0 - (error / max(reach, 1e-12)) ** 2, 0.0)
     return np.asarray(found, np.float64)
 
@@ -163,14 +159,18 @@ def _behind_a_gear(plant: Model, known: Sequence[_Unexplained]) -> list[float]:
     refined by the residual that the load would leave: over hundreds of turns, a ratio that is off
     by a thousandth gets out of phase.
     """
+    # least turns of a load in the recordings: fewer cannot be distinguished from friction
+    least_turns = 8.0
+    # largest ratio (turns of the load per turn of the encoder) of a load behind a gear
+    geared = 0.95
     longest = max(known, key=lambda u: len(u.rest))
     total = float(longest.turns[-1])
-    if total * GEARED <= LEAST_TURNS:
+    if total * geared <= least_turns:
         return []
     step = 0.5 / total
     turns = longest.turns[:: longest.thinning.k][: len(longest.rest)]
-    rest = _fast(longest.rest, max(3, round(longest.span(LEAST_TURNS / total) / longest.Ts)))
-    lowest, end = math.ceil(2.0 * LEAST_TURNS), math.ceil(2.0 * GEARED * total)
+    rest = _fast(longest.rest, max(3, round(longest.span(least_turns / total) / longest.Ts)))
+    lowest, end = math.ceil(2.0 * least_turns), math.ceil(2.0 * geared * total)
     first = step * (lowest + int(np.argmax(_lines(turns, rest, total)[lowest:end])))
     # ratios tried within the resolution of the record
     near = first + np.linspace(-step, step, 15)

@@ -38,8 +38,6 @@ NEAR = 0.1
 frequencies and those that move with the speed stay separate."""
 TWICE = 2.0
 """Least number of periods in a record: fewer cannot be distinguished from drift."""
-SHARE, MOST = 0.1, 60.0
-"""Least share of a spectral line in the residual for a second look; its largest frequency [Hz]."""
 BESIDE = (0.4, 0.8), (1.25, 1.8)
 """Surroundings of a line, as shares of its frequency."""
 SIZE = 0.1
@@ -50,8 +48,6 @@ HOLD = 2
 """Samples that each random value is held: power up to a quarter of the sample rate."""
 ITERATIONS = 60
 ORDERS = (1, 2, 3, 4, 5)
-MANY = 20
-"""Order of the model that smooths the record."""
 LEAST_GAIN = math.log(1.005)
 """A smaller difference in (log) error does not count, however significant."""
 SWINGS = 0.3
@@ -227,11 +223,13 @@ def _smooth(shaken: Shaken) -> Dataset | None:
     """The record with a high-order model's free run, almost noiseless, as speed (Wahlberg 1989,
     IEEE Trans. Automatic Control 34).
     """
+    # order of the model that smooths the record
+    many = 20
     try:
-        core = _core.fit_arx(arrays(shaken.dataset()), na=MANY, nb=MANY, nk=1, offset=True)
+        core = _core.fit_arx(arrays(shaken.dataset()), na=many, nb=many, nk=1, offset=True)
     except (DataError, FitError):
         return None
-    speed = core.simulate(shaken.u[:, None], shaken.speed[:MANY])
+    speed = core.simulate(shaken.u[:, None], shaken.speed[:many])
     # an unstable one of the many poles
     return replace(shaken, speed=speed).dataset() if np.isfinite(speed).all() else None
 
@@ -270,14 +268,16 @@ def _suspects(model: Model, shaken: Shaken) -> list[float]:
 
 def _line(shaken: Shaken) -> float | None:
     """The frequency with the most power in the residual, if it is a spectral line [Hz]."""
+    # least share of a spectral line in the residual for a second look; its largest frequency [Hz]
+    share, most = 0.1, 60.0
     rest = _unexplained(shaken)
     if rest is None:
         return None
     # over the angle, a load is a line even while the command varies the speed
-    per_turn = np.arange(TWICE, MOST * shaken.seconds, 0.25) / (shaken.seconds * shaken.rate)
+    per_turn = np.arange(TWICE, most * shaken.seconds, 0.25) / (shaken.seconds * shaken.rate)
     powers = np.array([_power(ratio * shaken.turns, rest) for ratio in per_turn])
     best = int(np.argmax(powers))
-    is_line = 2.0 * powers[best] > SHARE * float(np.mean(rest**2))
+    is_line = 2.0 * powers[best] > share * float(np.mean(rest**2))
     return float(per_turn[best] * shaken.rate) if is_line else None
 
 

@@ -31,15 +31,8 @@ NAMES = ("trapezoid", "trapezoids", "random")
 _STEP_SHARES = (0.25, 0.5, 0.1)
 """Sizes of the step response to try, as shares of the larger limit."""
 _STEP_SAMPLES = (4_000, 16_000)
-_TRAVEL, _TRAVEL_SAMPLES = 10.0, 500
-"""Longest travel of a position: that at the limit in so many time constants, or in so many samples
-for a drive with hardly a time constant."""
-_REACHED = 0.7
-"""Top of the references as a share of the steady output at the limit: the rest accelerates."""
 _RECORDED = 0.9
 """Top of the references as a share of the recorded output, beyond which the model extrapolates."""
-_MARGIN = 0.1
-"""Share of the output at the limit that the ramps leave to the controller."""
 _EDGES = 8
 """Edges of a shortened random reference."""
 
@@ -337,6 +330,10 @@ def drive_references(
 
 
 def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span:
+    # top of the references as a share of the steady output at the limit: the rest accelerates
+    reached = 0.7
+    # share of the output at the limit that the ramps leave to the controller
+    margin = 0.1
     u_min, u_max = _finite_limits(model, u_min, u_max)
     low, high = _output_range(model) or (-math.inf, math.inf)
     moving = rate_step(model, u_min, u_max)
@@ -353,8 +350,8 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
         return _Span(rest, rest, rest + _RECORDED * way, rest, 4.0 * pace)
     fopdt, rest = step.fopdt, step.rest
     reach = [fopdt.K * u + fopdt.offset - rest for u in (u_min, u_max)]
-    up = max(0.0, min(_RECORDED * (high - rest), _REACHED * max(reach)))
-    down = max(0.0, min(_RECORDED * (rest - low), _REACHED * -min(reach)))
+    up = max(0.0, min(_RECORDED * (high - rest), reached * max(reach)))
+    down = max(0.0, min(_RECORDED * (rest - low), reached * -min(reach)))
     sign, x, other = (1.0, up, down) if up >= down else (-1.0, down, up)
     if x == 0.0:
         raise SettingError(
@@ -370,8 +367,8 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
     # for a record that never came near rest: not below its lowest output
     floor = (low - rest if sign > 0 else rest - high) + 0.1 * (high - low)
     slow = min(max(slow, floor), 0.6 * x) if math.isfinite(floor) else slow
-    upward = max(strong - x - _MARGIN * strong, 0.05 * strong)
-    downward = max(slow + weak - _MARGIN * strong, 0.05 * strong)
+    upward = max(strong - x - margin * strong, 0.05 * strong)
+    downward = max(slow + weak - margin * strong, 0.05 * strong)
     average = max(1, filter_length(model.Ts, step.slowest)) * model.Ts
     edge = max(
         step.slowest * (x - slow) / min(upward, downward),
@@ -398,6 +395,9 @@ def _lowest_held(model: Model, fopdt: Fopdt, rest: float, sign: float) -> float:
 
 def _way(step: DriveStep, u_min: float, u_max: float, low: float, high: float, Ts: float) -> _Span:
     """Levels of a position: within the record, and within the travel of a few time constants."""
+    # longest travel of a position: that at the limit in so many time constants, or in so many
+    # samples for a drive with hardly a time constant
+    travel, travel_samples = 10.0, 500
     fopdt, rest = step.fopdt, step.rest
     rates = [fopdt.K * u + fopdt.offset for u in (u_min, u_max)]
     slower = min(max(rates), -min(rates))
@@ -411,7 +411,7 @@ def _way(step: DriveStep, u_min: float, u_max: float, low: float, high: float, T
     up, down = (high - rest, rest - low) if inside else (high - low, 0.0)
     sign, x = (1.0, up) if up >= down else (-1.0, down)
     lag = step.slowest + fopdt.L + Ts
-    x = min(_RECORDED * x, max(_TRAVEL * lag, _TRAVEL_SAMPLES * Ts) * slower)
+    x = min(_RECORDED * x, max(travel * lag, travel_samples * Ts) * slower)
     average = max(1, filter_length(Ts, step.slowest)) * Ts
     # rate of a position's ramps as a share of its rate at the limit: the rest starts and stops it
     edge = max(x / (0.4 * slower), 10.0 * (fopdt.L + Ts) + 4.0 * average)

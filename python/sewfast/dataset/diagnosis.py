@@ -21,8 +21,6 @@ from .pieces import LARGEST, require_dataset
 if TYPE_CHECKING:
     from .dataset import Dataset
 
-SURE = 5.0
-"""Standard errors by which the slowest pole must be known before a record is called short."""
 _REFERENCE = re.compile(
     r"((y_?)?(r|ref|reference|set_?point|sp|target|soll|sollwert|demand)"
     # a `voltage_ref` can be the plant's input, a `speed_ref` cannot
@@ -209,10 +207,12 @@ def _integrator(data: Dataset, found: Integration | None) -> Iterator[Finding]:
 
 
 def _short(data: Dataset, found: Integration | None) -> Iterator[Finding]:
-    if found is None or found.is_integral or found.restoring < SURE:
+    # standard errors by which the slowest pole must be known before a record is called short
+    sure = 5.0
+    if found is None or found.is_integral or found.restoring < sure:
         return
     # three time constants of the slowest pole
-    if 0.0 < found.lengths < 3.0 and found.driving > SURE:
+    if 0.0 < found.lengths < 3.0 and found.driving > sure:
         yield Finding(
             "short_record",
             f"the record is {found.lengths:.2g} times as long as the slowest time constant of "

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 REACH = 10
 """Half width of the filter, in samples of the slower rate."""
-MOST_SAMPLES = 100_000_000
 
 
 def resample(
@@ -72,6 +71,7 @@ def resample(
     DataError
         If an experiment is shorter than one new period.
     """
+    most_samples = 100_000_000
     if isinstance(Ts, bool) or not isinstance(Ts, (int, float, np.number)):
         raise SettingError(f"resample: expected a sample time in seconds, received {Ts!r}")
     if not (math.isfinite(Ts) and Ts > 0.0):
@@ -82,10 +82,10 @@ def resample(
     ratio = _rounded(float(Ts) / data.Ts)
     if ratio == 1.0:
         return data
-    if len(data) / ratio > MOST_SAMPLES:
+    if len(data) / ratio > most_samples:
         raise SettingError(
             f"resample: Ts = {Ts:g} s makes {len(data) / ratio:.3g} samples, expected at most "
-            f"{MOST_SAMPLES:,}; give a longer sample time"
+            f"{most_samples:,}; give a longer sample time"
         )
     experiments = tuple(_resampled(e, ratio, inputs, antialias) for e in data.experiments)
     note = f"resampled from Ts = {data.Ts:g} s to {Ts:g} s, inputs {inputs}"

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 SIGMAS = 3.0
 """Standard errors beyond which a drift, or a level, is not noise."""
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -38,6 +37,7 @@ def standing(experiment: Experiment) -> Standing | None:
     The inputs keep their first values, and the output has at least three measured samples whose
     drift is explained by noise.
     """
+    rounding = 1e-9
     e = without_weightless(experiment)
     moved = (e.u != e.u[0]).any(axis=1)
     if not moved.any():
@@ -53,13 +53,13 @@ def standing(experiment: Experiment) -> Standing | None:
     # the noise of the whole record: that of a few samples is known too badly to see a drift
     white = white_noise(e.y)
     error = white / math.sqrt(float(about @ about))
-    if abs(slope) > SIGMAS * error + _ROUNDING * spread / n:
+    if abs(slope) > SIGMAS * error + rounding * spread / n:
         return None
     level = float(y.mean())
     u = tuple(float(v) for v in e.u[0])
     deviation = float(y.std(ddof=1))
     noise = deviation / math.sqrt(len(y))
-    if not any(u) and abs(level) <= _student(len(y) - 1) * noise + _ROUNDING * spread:
+    if not any(u) and abs(level) <= _student(len(y) - 1) * noise + rounding * spread:
         level = 0.0
     return Standing(n, u, level, max(deviation, white))
 

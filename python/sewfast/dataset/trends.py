@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from .dataset import Dataset
     from .experiment import Experiment
 
-LEAST_REST = 20
-"""Least samples at rest at the beginning for `steady`."""
-
 
 @dataclass(frozen=True, eq=False)
 class Trend:
@@ -176,12 +173,14 @@ def _line(index: FloatArray, column: FloatArray, what: str) -> tuple[float, floa
 
 
 def _rest(e: Experiment, data: Dataset) -> Trend:
+    # least samples at rest at the beginning for `steady`
+    least_rest = 20
     n = _samples_at_rest(e)
     half = slice(n // 2, n)
     y = e.y[half][np.isfinite(e.y[half])]
-    if n < LEAST_REST or len(y) < LEAST_REST // 4:
+    if n < least_rest or len(y) < least_rest // 4:
         raise DataError(
-            f"{e.name} [{e.range_text}]: expected at least {LEAST_REST} samples at rest before an "
+            f"{e.name} [{e.range_text}]: expected at least {least_rest} samples at rest before an "
             f"input moves, received {n} with {len(y)} measured in their second half; record with a "
             "rest before the excitation, or use order 0"
         )

@@ -46,14 +46,10 @@ Signals: TypeAlias = tuple[FloatArray, FloatArray]
 FORM = 2
 """Version of the stored values; version 1 whitened the model's own regressor or state."""
 CENTRES = 300
-_BLOCK = 4096
-_TENTHS = 10
 _FARTHEST = 1000.0
 """Largest distance; squares of larger ones would swamp later values by rounding."""
 
 
-_INPUT_LEVEL, _FEW_WINDOWS = 1.2, 0.2
-"""Factor on the largest training level of an input, and an addition for few windows."""
 _INPUT_PEAK, _OUTPUT = 1.3, 1.7
 """Factors on the largest peak of an input, and on the largest level and peak of the output."""
 _SMALLEST = 1e-6
@@ -320,23 +316,25 @@ def _spread_out(points: FloatArray) -> tuple[FloatArray, float]:
 
 def _between_tenths(points: FloatArray) -> float:
     """Distance of 98 % of a tenth of the points from the other nine, for the worst tenth."""
-    if len(points) < 2 * _TENTHS:
+    tenths = 10
+    if len(points) < 2 * tenths:
         return 0.0
-    tenth = np.arange(len(points)) * _TENTHS // len(points)
-    found = [_nearest(points[tenth == i], points[tenth != i]) for i in range(_TENTHS)]
+    tenth = np.arange(len(points)) * tenths // len(points)
+    found = [_nearest(points[tenth == i], points[tenth != i]) for i in range(tenths)]
     # share of the points of a tenth that lie within its distance from the other tenths
     return float(max(np.quantile(d, 0.98) for d in found))
 
 
 def _nearest(points: FloatArray, centres: FloatArray) -> FloatArray:
     """Distance of every point (N, d) to the nearest centre (c, d), shape (N,)."""
+    block = 4096
     bounded = np.clip(np.nan_to_num(points), -_FARTHEST, _FARTHEST)
     square = np.square(centres).sum(axis=1)
     found = np.empty(len(points))
-    for a in range(0, len(points), _BLOCK):
-        part = bounded[a : a + _BLOCK]
+    for a in range(0, len(points), block):
+        part = bounded[a : a + block]
         cross = (square - 2.0 * part @ centres.T).min(axis=1)
-        found[a : a + _BLOCK] = np.square(part).sum(axis=1) + cross
+        found[a : a + block] = np.square(part).sum(axis=1) + cross
     return np.sqrt(np.maximum(found, 0.0))
 
 
@@ -347,6 +345,8 @@ def _window(
     signals: Sequence[FloatArray], centre: FloatArray, peak: FloatArray, lag: int
 ) -> tuple[int, FloatArray]:
     """The shortest window, with the level's bounds, that has doubled inputs outside."""
+    # factor on the largest training level of an input, and an addition for few windows
+    input_level, few_windows = 1.2, 0.2
     n = sum(map(len, signals))
     whole = np.sqrt(sum(np.square(x - centre).sum(axis=0) for x in signals) / n)
     # least number of windows in the record
@@ -354,7 +354,7 @@ def _window(
     best: tuple[float, int, FloatArray] | None = None
     while True:
         rms = np.max([_rms(x - centre, window).max(axis=0) for x in signals], axis=0)
-        factors = np.full(len(centre), _INPUT_LEVEL + _FEW_WINDOWS * np.sqrt(window / n))
+        factors = np.full(len(centre), input_level + few_windows * np.sqrt(window / n))
         factors[-1] = _OUTPUT
         # factor on the level of the whole record, if that gives more: half way to the double, in dB
         level = np.maximum(np.maximum(factors * rms, 1.4 * whole), _SMALLEST * peak)

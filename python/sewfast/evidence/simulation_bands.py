@@ -33,7 +33,6 @@ from .residuals import Residuals
 
 LEVEL = 0.95
 BLOCKS = 10
-_TAILS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.35, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +205,7 @@ def uncertainty_of(
     model: DynamicModel, data: Dataset, residuals: Residuals, found: Parameters | None
 ) -> Uncertainty:
     """Uncertainty from free runs on the training data and the estimated parameters."""
+    tails = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.35, 0.5)
     factor = np.zeros((0, 0)) if found is None else _factor(found, residuals)
     errors = _left_out(model, residuals)
     power = sum(
@@ -220,7 +220,7 @@ def uncertainty_of(
             for e, s, r in zip(errors, spreads, residuals.runs, strict=True)
         ]
     )
-    probabilities = np.array([*_TAILS, *(1.0 - t for t in _TAILS[-2::-1])])
+    probabilities = np.array([*tails, *(1.0 - t for t in tails[-2::-1])])
     return Uncertainty(
         spread, factor, probabilities, np.quantile(scores, probabilities), residuals.n
     )

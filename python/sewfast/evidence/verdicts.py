@@ -26,9 +26,6 @@ from .simulation_bands import Bands
 SMALL = 0.1
 """Part of the rms error above which a detected dependence is a failure, not a warning."""
 OUTSIDE, FAR_OUTSIDE = 0.05, 0.2
-CONDITION = 1e8
-SAMPLES_PER_PARAMETER = 10.0
-GROWTH, LARGE_GROWTH = 1.5, 3.0
 
 _FOUND = {
     "parameters": (
@@ -148,8 +145,9 @@ def _worst(scores: HorizonScores, unit: str) -> list[Line]:
 
 def generalisation(here: Scores, training: Scores) -> Line:
     """Line on the free-run error on new data compared with that on the training data."""
+    growth, large_growth = 1.5, 3.0
     ratio = here.rmse / training.rmse if training.rmse > 0.0 else math.inf
-    verdict: Verdict = "ok" if ratio <= GROWTH else "warn" if ratio <= LARGE_GROWTH else "fail"
+    verdict: Verdict = "ok" if ratio <= growth else "warn" if ratio <= large_growth else "fail"
     meaning = {
         "ok": "the error is about as large as on the training data",
         "warn": "the error is larger than on the training data: these data hold something "
@@ -157,7 +155,7 @@ def generalisation(here: Scores, training: Scores) -> Line:
         "fail": "the error is several times that on the training data: do not use the model here; "
         "train on data like these as well",
     }[verdict]
-    return Line("error over training", ratio, f"{ratio:.3g}", f"<= {GROWTH:g}", verdict, meaning)
+    return Line("error over training", ratio, f"{ratio:.3g}", f"<= {growth:g}", verdict, meaning)
 
 
 _NO_OFFSET: tuple[Verdict, str] = "ok", "no offset between model and data"
@@ -226,18 +224,20 @@ _INFORMS = {
 
 def parameters(p: StoredInformation) -> list[Line]:
     """Lines on samples per parameter and conditioning."""
+    condition = 1e8
+    samples_per_parameter = 10.0
     ratio = p.samples / max(p.effective, 1e-12)
-    enough = ratio >= SAMPLES_PER_PARAMETER
+    enough = ratio >= samples_per_parameter
     size = Line(
         "samples per parameter", ratio,
         f"{p.samples} / {p.effective:.1f} effective of {p.number}",
-        f">= {SAMPLES_PER_PARAMETER:g}", "ok" if enough else "warn",
+        f">= {samples_per_parameter:g}", "ok" if enough else "warn",
         "enough data for a model of this size"
         if enough
         else "too few samples for a model of this size: it learns noise; record longer or take a "
         "smaller model",
     )  # fmt: skip
-    sound = p.condition <= CONDITION
+    sound = p.condition <= condition
     if sound:
         text = "the data determine the parameters"
     elif p.undetermined:
@@ -255,7 +255,7 @@ def parameters(p: StoredInformation) -> list[Line]:
             "conditioning",
             p.condition,
             shown,
-            f"<= {CONDITION:.0e}",
+            f"<= {condition:.0e}",
             "ok" if sound else "info",
             text,
         ),

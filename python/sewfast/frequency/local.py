@@ -22,9 +22,6 @@ from ..speed import speed_from_counts
 from .estimate import record_of, spectral
 from .response import FrequencyResponse
 
-SAMPLES = 52
-"""Least samples: lines for two intervals."""
-
 
 def local_polynomial(
     u: ArrayLike, y: ArrayLike, *, Ts: float, r: ArrayLike | None = None, **labels: Any
@@ -54,11 +51,13 @@ def local_polynomial(
         For other shapes, values that are not finite, fewer than 52 samples, an input that does not
         move, or a reference that is unrelated to it.
     """
+    # least samples: lines for two intervals
+    samples = 52
     signals = record_of(u, y, r)
     n = len(signals[0])
-    if n < SAMPLES:
+    if n < samples:
         raise DataError(
-            name="u", expected=f"at least {SAMPLES} samples", received=str(n),
+            name="u", expected=f"at least {samples} samples", received=str(n),
             remedy="record longer",
         )  # fmt: skip
     found = _core.record_response(*signals, *([None] if r is None else []))

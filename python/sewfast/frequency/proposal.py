@@ -27,8 +27,6 @@ from .shaft import ShaftFit
 
 MS = 1.7
 """Default largest sensitivity."""
-GRID = 100
-"""Number of frequencies above the measured lines at which the loop's gain is looked at."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -161,6 +159,8 @@ class _Search:
     """The search on one machine, in Rust (`sewfast_core::proposal`)."""
 
     def __init__(self, fit: ShaftFit, like: Controller, Ms: float) -> None:
+        # number of frequencies above the measured lines at which the loop's gain is looked at
+        grid = 100
         of = fit.response
         of.loop(like)  # raises for another sample time or other units
         per_unit, reach = like.counts_per_unit, 0.5 * (like.u_max - like.u_min)
@@ -170,14 +170,14 @@ class _Search:
         quiet = 0.05 * reach * math.sqrt(6.0) * per_unit * of.Ts if known else math.inf
         seen = of.coherence > 0.5
         last = of.hertz[seen][-1]
-        above = np.geomspace(last, max(last, 0.499 / of.Ts), GRID)
+        above = np.geomspace(last, max(last, 0.499 / of.Ts), grid)
         tau = 2.0 * np.pi
         self.fit = fit
         self.like = like
         self._task = _core.ProposalTask(
             loop_path(like), *sampled(fit.to_model(), of.Ts), Ms=Ms, quiet=quiet,
             lines=(tau * of.hertz[seen], of.value[seen], of.radius()[seen], of.from_counts),
-            above=(tau * above, fit.at(above), np.zeros(GRID), of.from_counts),
+            above=(tau * above, fit.at(above), np.zeros(grid), of.from_counts),
         )  # fmt: skip
 
     def best(self, starts: list[FloatArray]) -> _Found:

@@ -32,9 +32,6 @@ Equations: TypeAlias = Callable[[Any, Any, Mapping[str, Any]], Any]
 FORMAT, VERSION = "sewfast-equations", 1
 MOST = 1000
 """Most states, and most substeps of a sample."""
-EVALUATIONS = 60
-MIXED = 0.02
-"""Least share of a parameter in a direction without effect to belong to it."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -323,6 +320,7 @@ def fit_equations(
     substeps: int,
 ) -> EquationFit:
     """Output error of the function's free run; see `physics`."""
+    evaluations = 60
     if not callable(equations):
         raise _not_callable(equations)
     for name, count in (("states", states), ("substeps", substeps)):
@@ -361,7 +359,7 @@ def fit_equations(
             f"{substeps} a sample: substeps={2 * substeps}",
         )  # fmt: skip
     found = least_squares(
-        residuals, start, jacobian, bounds=(low, high), max_nfev=EVALUATIONS, ftol=1e-6, xtol=1e-6
+        residuals, start, jacobian, bounds=(low, high), max_nfev=evaluations, ftol=1e-6, xtol=1e-6
     )
     records = _restarted(records, simulation, found.x)
     over = [y[:, 0] - p.y for p, y in zip(records.pieces, runs(found.x[:, None]), strict=True)]
@@ -369,7 +367,7 @@ def fit_equations(
     filter_ = whitener(
         [np.where(p.used, e, 0.0) for p, e in zip(records.pieces, over, strict=True)], 12
     )
-    found = least_squares(residuals, found.x, jacobian, bounds=(low, high), max_nfev=EVALUATIONS)
+    found = least_squares(residuals, found.x, jacobian, bounds=(low, high), max_nfev=evaluations)
     return _result(records, simulation, found, (start, low, high), runs(found.x[:, None]))
 
 
@@ -436,6 +434,8 @@ def _stacked(
 
 def _merged(jacobian: FloatArray, names: Sequence[str]) -> dict[str, list[str]]:
     """Parameters that others can replace, and which: directions without effect on the run."""
+    # least share of a parameter in a direction without effect to belong to it
+    mixed = 0.02
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0.0] = 1.0
     size, along = np.linalg.eigh(jacobian.T @ jacobian / np.outer(scale, scale))
@@ -444,8 +444,8 @@ def _merged(jacobian: FloatArray, names: Sequence[str]) -> dict[str, list[str]]:
     shares = np.abs(blind @ blind.T)
     found: dict[str, list[str]] = {}
     for j, name in enumerate(names):
-        others = [n for i, n in enumerate(names) if i != j and shares[i, j] > MIXED]
-        if shares[j, j] > MIXED and others:
+        others = [n for i, n in enumerate(names) if i != j and shares[i, j] > mixed]
+        if shares[j, j] > mixed and others:
             found[name] = others
     return found
 

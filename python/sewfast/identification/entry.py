@@ -47,8 +47,6 @@ SHARE_OF_FIT = 0.9
 """Share of a time budget for the fits; the rest is for the evidence stored with the model."""
 _FIT = "iterations of the fit"
 NETWORKS = ("neural_oe", "neural_ss")
-EVIDENCE_RATE, LEAST_EVIDENCE = 2.5e5, 2_000
-"""Samples times parameters whose evidence takes a second of a slow processor."""
 _SEARCHED = ("auto", "neural_ss")
 """Kinds without given lags: their structure is searched."""
 _LAGS = 2
@@ -311,13 +309,15 @@ def _with_losses(model: Model, clock: Clock) -> Model:
 
 def _excerpt(model: Model, data: Dataset, clock: Clock) -> Dataset:
     """The data for the evidence stored with a model; fewer of them if time is short."""
+    # samples times parameters whose evidence takes a second of a slow processor
+    evidence_rate, least_evidence = 2.5e5, 2_000
     if clock.budget is None:
         return data
     left = max(0.0, clock.left(clock.budget))
     width = max(
         (len(m.core.theta) for m in model.members or (model,) if m.kind[:2] == "ne"), default=10
     )
-    return thinned(data, max(LEAST_EVIDENCE, round(left * EVIDENCE_RATE / width)))
+    return thinned(data, max(least_evidence, round(left * evidence_rate / width)))
 
 
 _JUDGED = ("unstable", "late_input", "changes")

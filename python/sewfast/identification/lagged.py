@@ -30,9 +30,6 @@ from .task import (
     wrap,
 )
 
-BLOCKS = 8
-HELD_OUT = (2, 5)
-"""Blocks held out for selection: inside the record, away from both ends of a chirp."""
 LEAST_BLOCK = 2 * INIT
 DECAYS = (1e-2, 1e-4)
 """Weight decays of the default network, the strongest first."""
@@ -269,14 +266,17 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
 
 def _with_blocks_held_out(data: Dataset, lag: int) -> tuple[Dataset, Dataset | None]:
     """The data without two of eight blocks of every experiment, and these, unless too short."""
+    blocks = 8
+    # blocks held out for selection: inside the record, away from both ends of a chirp
+    held_out = (2, 5)
     kept: list[Experiment] = []
     held: list[Experiment] = []
     for e in data.experiments:
-        edges = [round(i * len(e) / BLOCKS) for i in range(BLOCKS + 1)]
+        edges = [round(i * len(e) / blocks) for i in range(blocks + 1)]
         if edges[1] < LEAST_BLOCK + lag:
             return data, None
-        held += [e.cut(edges[i], edges[i + 1]) for i in HELD_OUT]
-        starts, stops = (0, *(i + 1 for i in HELD_OUT)), (*HELD_OUT, BLOCKS)
+        held += [e.cut(edges[i], edges[i + 1]) for i in held_out]
+        starts, stops = (0, *(i + 1 for i in held_out)), (*held_out, blocks)
         kept += [e.cut(edges[i], edges[j]) for i, j in zip(starts, stops, strict=True)]
     # pieces in which enough outputs were measured
     able = [[e for e in some if len(e) - e.unmeasured > LEAST_BLOCK] for some in (kept, held)]

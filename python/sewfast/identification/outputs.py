@@ -13,10 +13,6 @@ from ..errors import FitError
 from .task import Look, Pairs
 
 OUTPUTS = ("linear", "saturation", "abs")
-CORNER = 0.03
-"""Width of a corner, relative to the output's scale."""
-FIRST_ROUNDS, ROUNDS = 2, 12
-"""Iterations of all first guesses; of the better two."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +25,14 @@ class Output:
 
     def parameters(self, mean: float, scale: float) -> FloatArray:
         """As the core takes them, in scaled units."""
+        # width of a corner, relative to the output's scale
+        corner = 0.03
         if self.name == "abs":
-            return np.array([CORNER])
+            return np.array([corner])
         if self.name == "saturation":
             # a part of the data can be constant, without a scale of its own
             low, high = ((v - mean) / (scale or 1.0) for v in (self.low, self.high))
-            return np.array([low, high, CORNER])
+            return np.array([low, high, corner])
         return np.zeros(0)
 
 
@@ -121,6 +119,8 @@ def rectified_start(
     and output error is fitted to the result. The first signs are those of the input through
     low-pass filters with several time constants.
     """
+    # iterations of all first guesses; of the better two
+    first_rounds, rounds = 2, 12
     # most samples of all experiments together: every round of the search for signs is a fit
     share = min(1.0, 2_000 / len(data))
     lengths = [max(2 * INIT, round(share * len(e))) for e in data.experiments]
@@ -130,9 +130,9 @@ def rectified_start(
         [_sign(_low_pass(u, memory)) for u, _ in pairs]
         for memory in (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)
     ]
-    tried = [_restored(pairs, g, order, nk, FIRST_ROUNDS, look) for g in guesses]
+    tried = [_restored(pairs, g, order, nk, first_rounds, look) for g in guesses]
     likely = sorted(tried, key=lambda t: t.error)[:2]
-    tried = [_restored(pairs, t.signs, order, nk, ROUNDS - FIRST_ROUNDS, look, t) for t in likely]
+    tried = [_restored(pairs, t.signs, order, nk, rounds - first_rounds, look, t) for t in likely]
     return min(tried, key=lambda t: t.error).model
 
 

@@ -29,8 +29,6 @@ R = TypeVar("R")
 
 PERIOD = 0.02
 """Interval at which the calling thread checks for Ctrl-C and shows progress [s]."""
-STEPS = 1000
-"""Total of the progress count."""
 CLOSING = 0.3
 """Processor time that is kept for verdict and evidence [s]; the evidence takes .25 s or more."""
 
@@ -205,12 +203,14 @@ class Pool:
 
     def show(self, share: float) -> None:
         """Call the progress function, if any, with the larger share of work or time done."""
+        # total of the progress count
+        steps = 1000
         if self.progress is None:
             return
         clock = self.clock
         if clock.budget is not None:
             share = max(share, clock.spent / clock.budget)
-        self.progress(min(STEPS, round(STEPS * share)), STEPS, self.best)
+        self.progress(min(steps, round(steps * share)), steps, self.best)
 
 
 # --- One identification ---------------------------------------------------------------------------

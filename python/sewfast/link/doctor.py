@@ -101,8 +101,6 @@ SHORT, LONG = 0, 200
 """Bytes of the two kinds of echoes; the difference of their times is the cost of the bytes."""
 SPARE = 0.4
 """Share of the link that a recording at full rate should leave free."""
-BATCH = 10
-DRIFT_PPM = 500.0
 
 
 class Metered(Port):
@@ -247,11 +245,12 @@ def _round_trip(times: dict[int, list[float]]) -> Finding:
 
 def _throughput(times: dict[int, list[float]], drive: Drive, port: Port) -> Finding:
     """Bytes a second that the link carries, compared with the need of samples at full rate."""
+    batch = 10
     # the fastest echo of each size is the one that nothing else delayed
     cost = min(times[LONG]) - min(times[SHORT])
     encodings = [c.encoding for c in drive.channels[:2]]
-    size = wire.wire_size(wire.body_size(encodings, BATCH))
-    needed = size / (BATCH * drive.identity.Ts)
+    size = wire.wire_size(wire.body_size(encodings, batch))
+    needed = size / (batch * drive.identity.Ts)
     values = {"needed_bytes_per_s": needed, "stated_baud": port.baud}
     # least difference of times from which a rate can be computed [s]
     if cost < 20e-6:
@@ -307,6 +306,7 @@ def _loss(
 
 
 def _clock(drive: Drive) -> Finding:
+    drift_ppm = 500.0
     if drive.identity.on_credit:
         return Finding("clock", "ok", "advances only by what the host grants")
     bounds = drive.clock
@@ -321,7 +321,7 @@ def _clock(drive: Drive) -> Finding:
         "uncertainty_s": bounds.offset_s[1] - bounds.offset_s[0],
         "drift_ppm_least": low, "drift_ppm_most": high,
     }  # fmt: skip
-    if low > DRIFT_PPM or high < -DRIFT_PPM:
+    if low > drift_ppm or high < -drift_ppm:
         return Finding(
             "clock",
             "warn",

@@ -27,7 +27,6 @@ DEFAULTS: dict[str, tuple[str, ...]] = {
     "direct": ("speed_true",),
 }
 """Streamed besides `counts` and `u` if the device has them; a low baud rate drops the last."""
-BATCH = 10
 _CAPABILITIES = {"commands": wire.PROFILE, "controller": wire.PID, "direct": wire.DIRECT}
 
 
@@ -210,12 +209,13 @@ def layout(plan: Plan, channels: Sequence[Channel], identity: Identity, baud: fl
 
 def _batch(plan: Plan, chosen: Sequence[Channel], identity: Identity, baud: float) -> int | None:
     """The smallest batch that fits, or the one asked for if it fits."""
+    batch = 10
     encodings = [c.encoding for c in chosen]
-    tries = range(BATCH, 101) if plan.batch is None else (plan.batch,)
+    tries = range(batch, 101) if plan.batch is None else (plan.batch,)
     fits = (b for b in tries if _fits(encodings, b, identity, baud))
     found = next(fits, None)
     if found is None and plan.batch is None:
-        found = next((b for b in range(BATCH, 0, -1) if _fits(encodings, b, identity, baud)), None)
+        found = next((b for b in range(batch, 0, -1) if _fits(encodings, b, identity, baud)), None)
     return found
 
 

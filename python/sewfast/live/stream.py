@@ -26,8 +26,6 @@ from .feed import Feed
 # neither header, so the gate checks them and forwards the requests that pass.
 
 
-PATIENCE = 5.0
-"""Longest wait for the head [s]."""
 _REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 _END = b"\r\n\r\n"
 
@@ -119,7 +117,9 @@ class Gate:
             self._room.release()
 
     def _admit(self, client: socket.socket) -> None:
-        client.settimeout(PATIENCE)
+        # longest wait for the head [s]
+        patience = 5.0
+        client.settimeout(patience)
         head = b""
         # bytes of a request's head
         while _END not in head and len(head) < 16_384:
@@ -130,7 +130,7 @@ class Gate:
         if _END not in head or not admits(head.partition(_END)[0]):
             client.sendall(_REFUSAL)
             return
-        with socket.create_connection(self._behind, timeout=PATIENCE) as server:
+        with socket.create_connection(self._behind, timeout=patience) as server:
             for connection in (client, server):
                 connection.settimeout(None)
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

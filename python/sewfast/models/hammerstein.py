@@ -12,9 +12,6 @@ from ..dataset import FloatArray
 from ..storage import Fields
 from .base import StructuredModel
 
-_SAMPLES = 5
-"""Points of a drawn curve for each piece."""
-
 
 class Characteristic(NamedTuple):
     """A static curve through `x` and `y`, knots included, of an input or the output by `name`."""
@@ -67,13 +64,15 @@ class HammersteinWiener(StructuredModel):
 
     def characteristics(self) -> tuple[Characteristic, ...]:
         """The curve of each input, then that of the output, over their training ranges."""
+        # points of a drawn curve for each piece
+        samples = 5
         s = self.settings
         ends = zip(self.input_names, s["input_low"], s["input_high"], strict=True)
         found = []
         for j, (name, low, high) in enumerate(ends):
-            u = np.linspace(low, high, _SAMPLES * s["input_pieces"] + 1)
+            u = np.linspace(low, high, samples * s["input_pieces"] + 1)
             found.append(Characteristic(name, u, self.core.input_curve(j, u)))
-        x = np.linspace(s["x_low"], s["x_high"], _SAMPLES * s["output_pieces"] + 1)
+        x = np.linspace(s["x_low"], s["x_high"], samples * s["output_pieces"] + 1)
         return (*found, Characteristic(self.output_name, x, self.core.output_curve(x)))
 
     def parameters(self) -> dict[str, Any]:

@@ -138,8 +138,6 @@ def freeze(values: np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> FloatAr
 
 
 _MAX_DEPTH = 16
-MAX_UNPACKED = 1 << 30
-"""Bytes: 64 columns of two million samples."""
 Value: TypeAlias = Any
 """An array, a mapping of field to value (a struct) or a list of values (struct array, cell)."""
 
@@ -149,12 +147,14 @@ def read_npz(path: Path, raw: bytes) -> Table:
     An archive can unpack to a thousand times its size. The claimed sizes of its members are
     therefore checked before any is unpacked, and a member never yields more than it claims.
     """
+    # bytes: 64 columns of two million samples
+    max_unpacked = 1 << 30
     try:
         with np.load(io.BytesIO(raw), allow_pickle=False) as archive:
             claimed = sum(member.file_size for member in archive.zip.infolist())
-            if claimed > MAX_UNPACKED:
+            if claimed > max_unpacked:
                 raise DataError(
-                    f"{path}: expected arrays of at most {MAX_UNPACKED >> 20} MB in all, received "
+                    f"{path}: expected arrays of at most {max_unpacked >> 20} MB in all, received "
                     f"{claimed >> 20} MB; save the columns that are needed, or a part of the time"
                 )
             return _table(path, {name: _npz_member(archive, name) for name in archive.files})

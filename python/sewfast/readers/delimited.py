@@ -28,8 +28,6 @@ _WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
 _MARKED = re.compile(r"[+-]?\d[\d.,]*(?:e[+-]?\d+)?", re.IGNORECASE)
 _APART = re.compile(r"[+-]?\d{1,3}(?:['’\u00a0\u2009\u202f ]\d{3})+(?=[.,]\d|$)")
 """Digits in groups of three, separated by marks with no other meaning."""
-_COMPARED = 1000
-"""Lines with which the last one is compared."""
 CORRUPT = 0.01
 """Part of the lines that can be corrupt, as serial ports lose characters: they are skipped."""
 
@@ -325,8 +323,10 @@ def _whole(layout: _Layout) -> _Layout:
     """The layout without a last line that was cut off: it has no line end, and fewer cells or, in
     its last cell, fewer decimals than all the lines above it.
     """
+    # lines with which the last one is compared
+    compared = 1000
     body, _, last = layout.body.rpartition("\n")
-    above = body.rsplit("\n", _COMPARED)[-_COMPARED:]
+    above = body.rsplit("\n", compared)[-compared:]
     # as of corrupt lines, at most a hundredth
     if len(above) < 1.0 / CORRUPT or not last.strip():
         return layout

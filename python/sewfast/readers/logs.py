@@ -31,13 +31,8 @@ from ..storage import file_bytes
 from .blackbox import BLACKBOX, SALEAE, blackbox_series, saleae_series
 from .containers import MAX_COLUMNS, Table, freeze
 
-LARGEST = 50_000_000
-"""Most rows of a table."""
 PATIENCE, PATIENCE_PER_MB = 20.0, 5.0
 """Time limit of a reader, and addition per megabyte of the file [s]."""
-MEMORY, MEMORY_PER_BYTE = 2_000_000_000, 50
-"""Memory limit of a reader, and addition per byte of the file [B]: a damaged length field can make
-it request any amount."""
 _DEPTH = 8
 """Deepest nesting of messages that is read."""
 _ELEMENTS = 64
@@ -106,10 +101,13 @@ def _from_a_process(path: Path, raw: bytes, name: str) -> list[Signal]:
 
 def send(name: str) -> None:
     """The program of a reader's process: the signals of the file in argv to stdout, as `.npz`."""
+    # memory limit of a reader, and addition per byte of the file [B]: a damaged length field can
+    # make it request any amount
+    memory, memory_per_byte = 2_000_000_000, 50
     out, sys.stdout = sys.stdout.buffer, sys.stderr
     path = Path(sys.argv[1])
     raw = file_bytes(path)
-    _bound_memory(MEMORY + MEMORY_PER_BYTE * len(raw))
+    _bound_memory(memory + memory_per_byte * len(raw))
     arrays: dict[str, Any] = {}
     texts: list[str] = []
     for k, signal in enumerate(_KINDS[name].signals(path, raw)):
@@ -137,6 +135,8 @@ def _bound_memory(most: int) -> None:
 
 def joined(path: Path, signals: Sequence[Signal], kind: str) -> Table:
     """One table of all signals; time is its column `t`, from the first sample of any."""
+    # most rows of a table
+    largest = 50_000_000
     names = _unique([printable(s.name) for s in signals])
     usable: dict[str, Signal] = {}
     unusable: dict[str, str] = {}
@@ -158,8 +158,8 @@ def joined(path: Path, signals: Sequence[Signal], kind: str) -> Table:
         return Table(path, columns, units, unusable)
     main = max(timed.values(), key=lambda s: len(s.values))
     assert main.t is not None
-    if len(main.t) > LARGEST:
-        raise DataError(f"{path}: expected at most {LARGEST} rows, received {len(main.t)}")
+    if len(main.t) > largest:
+        raise DataError(f"{path}: expected at most {largest} rows, received {len(main.t)}")
     columns, held = {}, 0
     for name, signal in timed.items():
         assert signal.t is not None

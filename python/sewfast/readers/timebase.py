@@ -44,7 +44,6 @@ _NUMBER = re.compile(
     r"idx|no|nr|seq(uence)?|counter|n|k"
 )
 """Names of a column that numbers the rows, if its numbers do (`numbers_rows`)."""
-_SMALLER = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
 LONG, ABSURD, SHORT = 0.5, 900.0, 1e-5
 """Sample times [s] of a time column without a unit, read as seconds. From `LONG` on, a warning says
 that the unit can be another one: drives are sampled every 20 us to 200 ms, so a column that counts
@@ -347,7 +346,8 @@ def _guessed(
     seconds, unless the caller's sample time fits a smaller one. Steps that are long for a drive
     cause a warning, since the column then probably counts milliseconds.
     """
-    for unit, scale in _SMALLER if given is not None and given < 0.01 * step else ():
+    smaller = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
+    for unit, scale in smaller if given is not None and given < 0.01 * step else ():
         # not for a grid far finer than the rows
         if given is not None and 0.5 * given < step * scale < 2.0 * given:
             return scale, (f"{table.path.name}: column {name!r} counts {unit}, according to Ts",)
@@ -355,7 +355,7 @@ def _guessed(
         return 1.0, ()
     ways = " or ".join(
         f"--ts {step * scale:.3g} if it counts {unit}"
-        for unit, scale in _SMALLER
+        for unit, scale in smaller
         if SHORT <= step * scale < LONG
     )
     if step >= ABSURD:

@@ -347,10 +347,6 @@ def save_columns(
 # --- A recording with one message per sample, as plotting programs need it ------------------------
 
 
-CHUNK_SAMPLES, CHUNK_BYTES = 500, 1 << 20
-"""Limits of a chunk, whichever comes first: a reader accepts chunks of at most 4 MiB."""
-
-
 def save_curves(
     path: str | os.PathLike[str], recording: RecordedFile, *, compress: bool = False
 ) -> None:
@@ -372,6 +368,8 @@ def save_curves(
 
 
 def _groups(recording: RecordedFile) -> Iterator[list[Message]]:
+    # limits of a chunk, whichever comes first: a reader accepts chunks of at most 4 MiB
+    chunk_samples, chunk_bytes = 500, 1 << 20
     header = recording.header
     start = header.start_ns()
     first = Message(Topic.HEADER, start, start, header.encode())
@@ -385,7 +383,7 @@ def _groups(recording: RecordedFile) -> Iterator[list[Message]]:
     for message in _samples(recording):
         group.append(message)
         size += len(message.data)
-        if len(group) == CHUNK_SAMPLES or size >= CHUNK_BYTES:
+        if len(group) == chunk_samples or size >= chunk_bytes:
             yield group
             group, size = [], 0
     if group:

@@ -41,9 +41,6 @@ FURTHER, FEW = (0, 2, 4, 6, 8, 12), (4, 8)
 LEADING, PART = 0.15, 0.6
 """Part of a time budget that the search leaves to the feedforward, and part of what is left
 then that this may take."""
-SHARES = (1.0, 0.95, 0.9, 0.8)
-"""Shares of the best feedforward, of which the first that no plant loses by is taken: a drive whose
-gain is a quarter too large needs less of it."""
 PARTS = (0.25, 0.5, 1.0)
 """The other levels, as shares of the way from rest to the ends of the range."""
 
@@ -230,6 +227,9 @@ def with_lead(
     work of alpha and beta, which become 0 if they are `searched`. The gains stay: what they owe to
     loads, noise and other plants, margins included, they keep. Raises `TimeUp` at a deadline.
     """
+    # shares of the best feedforward, of which the first that no plant loses by is taken: a drive
+    # whose gain is a quarter too large needs less of it
+    shares = (1.0, 0.95, 0.9, 0.8)
     effort = effort or Effort()
     among = choices(task, lead, effort)
     weights: dict[str, Any] = {name: 0.0 for name in WEIGHTS if name in searched}
@@ -241,7 +241,7 @@ def with_lead(
     best = min(range(len(tried)), key=lambda k: judged[k][::-1])
     led = Led(alone, judged[best][0], alone_cost)
     objection = ""
-    for share in SHARES if effort.is_whole else SHARES[:1]:
+    for share in shares if effort.is_whole else shares[:1]:
         part = _part(among.feedforwards[best], share, task.rest)
         controller = replace(tried[best], feedforward=part)
         said = (_objection(one, controller, alone, effort) for one in (task, *others))

@@ -290,8 +290,6 @@ def _checked(variations: Sequence[tuple[float, int]]) -> list[tuple[float, int]]
 
 Wanted: TypeAlias = str | tuple[str, float, float]
 
-_EDGE = 1e-3
-
 
 @dataclass(frozen=True)
 class Variable:
@@ -308,8 +306,9 @@ class Variable:
     @property
     def at_bound(self) -> bool:
         """Whether it is at a bound: the best value may be beyond."""
-        room = _EDGE * (self.high - self.low)
-        near_low = self.value <= self.low + min(room, _EDGE * abs(self.low) or room)
+        edge = 1e-3
+        room = edge * (self.high - self.low)
+        near_low = self.value <= self.low + min(room, edge * abs(self.low) or room)
         return near_low or self.value >= self.high - room
 
     def __str__(self) -> str:
