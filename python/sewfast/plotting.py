@@ -355,6 +355,8 @@ def lettered(text: str) -> str:
 
 CYCLE = ("measured", "model", "oe", "arx_raw", "arx", "truth")
 """Looks of series of the same kind, in this order; each has its own line style."""
+STYLES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1, 2)))
+"""Line styles that are distinct in grey print."""
 FINE = 1.2
 """Line width where lines do not cover each other."""
 

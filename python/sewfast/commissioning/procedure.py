@@ -66,8 +66,6 @@ from .verification import (
 
 __all__ = ["STAGES", "commission"]
 
-MEMBERS = 4
-EVALUATIONS = 3000
 
 References = Mapping[str, ArrayLike] | Sequence[str]
 Between = Callable[[str, Commissioning], object]
@@ -82,8 +80,8 @@ def commission(
     references: References | None = None,
     practice: References | None = None,
     cost: Cost | None = None,
-    members: int = MEMBERS,
-    evaluations: int = EVALUATIONS,
+    members: int = 4,
+    evaluations: int = 3000,
     load: float | None = None,
     Ms: float | None = LARGEST_MS,
     time_budget: float | None = None,

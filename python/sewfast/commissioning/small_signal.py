@@ -44,8 +44,6 @@ SIZE = 0.1
 """Amplitude as a share of the largest command: small enough for linear dynamics."""
 SAMPLES, LONGEST = 4_000, 12.0
 """Samples of the random command, and its longest duration [s]."""
-HOLD = 2
-"""Samples that each random value is held: power up to a quarter of the sample rate."""
 ITERATIONS = 60
 ORDERS = (1, 2, 3, 4, 5)
 LEAST_GAIN = math.log(1.005)
@@ -166,8 +164,9 @@ def shaking(
     settle = max(1, round(min(4.0 * fopdt.T, LONGEST) / Ts))
     samples = int(min(SAMPLES, max(500, LONGEST / Ts)))
     size = SIZE * demands.u_max
+    # samples that each random value is held: power up to a quarter of the sample rate
     random = _core.prbs(
-        duration=samples * Ts, Ts=Ts, low=held - size, high=held + size, hold=HOLD * Ts,
+        duration=samples * Ts, Ts=Ts, low=held - size, high=held + size, hold=2 * Ts,
         seed=demands.seed,
     )  # fmt: skip
     return np.concatenate([np.full(settle, held), random]), settle

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..dataset import FloatArray, labelled
 from ..errors import SettingError
-from ..plotting import DPI, Drawing, Panel, lettered, stacked, style, thin
+from ..plotting import DPI, STYLES, Drawing, Panel, lettered, stacked, style, thin
 from ..storage import making, replace_files
 from .card import ReportCard
 from .portmanteau import ResidualTest
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Colours of Okabe and Ito, distinct for readers with a colour deficiency, too."""
-_STYLES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1, 2)))
 _MARKERS = "osD^vP"
 _MOST_PANELS = 6
 _BUCKETS = 1200
@@ -168,7 +167,7 @@ def _bode(ax: Axes, card: ReportCard, i: int, phase: bool) -> None:
         look = {
             "color": shade(n, len(shown)),
             "lw": 4.2 - 3.2 * n / max(1, len(shown) - 1),
-            "ls": _STYLES[n % len(_STYLES)],
+            "ls": STYLES[n % len(STYLES)],
         }
         g = o.points[k].response(hertz)[:, i]
         if not np.abs(g).any():

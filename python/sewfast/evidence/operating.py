@@ -39,9 +39,6 @@ def integrating_pole(model: DynamicModel) -> float | None:
 # --- Linearisation over the operating range: equilibria, poles, gains, frequency responses --------
 
 
-POINTS = 9
-
-
 @dataclass(frozen=True, eq=False)
 class OperatingPoint:
     """A linear model about one constant input.
@@ -231,7 +228,7 @@ class OperatingRange:
 
 
 def operating_range(
-    model: DynamicModel, inputs: Sequence[FloatArray] | None = None, points: int = POINTS
+    model: DynamicModel, inputs: Sequence[FloatArray] | None = None, points: int = 9
 ) -> OperatingRange:
     """Linearise a model over the range of its training inputs.
 

@@ -235,9 +235,6 @@ def _orthonormal(columns: FloatArray) -> FloatArray:
 # --- `HorizonScores`: errors one step, k steps ahead and in free run, per experiment and pooled ---
 
 
-STEPS = (1, 5, 20)
-
-
 @dataclass(frozen=True)
 class HorizonScores:
     """Scores by horizon: `free run` and `1 step`, `5 steps`, .. In `experiments` they are None if
@@ -262,7 +259,7 @@ class HorizonScores:
 
 
 def horizon_scores(
-    model: DynamicModel, data: Dataset, residuals: Residuals, steps: tuple[int, ...] = STEPS
+    model: DynamicModel, data: Dataset, residuals: Residuals, steps: tuple[int, ...] = (1, 5, 20)
 ) -> HorizonScores:
     """Errors of the free run, and some steps ahead if the outputs are complete."""
     series: dict[str, list[FloatArray]] = {"free run": [r.yhat for r in residuals.runs]}

@@ -25,9 +25,6 @@ from ..gains import Gains, real
 from ..tables import html_of
 from .shaft import ShaftFit
 
-MS = 1.7
-"""Default largest sensitivity."""
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Proposal:
@@ -58,7 +55,7 @@ class Proposal:
 def propose(
     fit: ShaftFit,
     *,
-    Ms: float = MS,
+    Ms: float = 1.7,
     notch: bool = True,
     like: Controller | None = None,
     counts_per_rev: float | None = None,

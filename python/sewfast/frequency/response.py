@@ -33,8 +33,6 @@ VERSION, VERSIONS = 2, (1, 2)
 PROVENANCE = {"properties": {"cautions": {"type": "array", "items": {"type": "string"}}}}
 """Schema of the provenance that is printed."""
 
-LEVEL = 0.95
-"""Confidence level of the bands."""
 LEAST_LINES = 3
 """For margins."""
 
@@ -99,7 +97,7 @@ class FrequencyResponse:
             return None
         return np.sqrt(np.maximum(self.variance - self.noise, 0.0) * self.blocks)
 
-    def radius(self, level: float = LEVEL) -> FloatArray:
+    def radius(self, level: float = 0.95) -> FloatArray:
         """Radius of the circle about `value` in which the response lies [y/u], shape (n,).
 
         With nu = blocks - 1 complex degrees of freedom the squared error over the estimated

@@ -20,8 +20,6 @@ from . import wire
 from .ports import Port, Unique
 from .wire import Event, Identity, Kind, Reply
 
-WATCHDOG = 0.1
-WATCHDOG_ON_CREDIT = 0.25
 RETRY = 0.05
 """Time between two attempts to open a port that vanished [s]."""
 SILENCE = 0.02
@@ -70,7 +68,7 @@ class Connection(Unique):
         self._bytes = 0
         self._is_closed = self._is_lent = False
         self.identity = self._greet(patience)
-        usual = WATCHDOG_ON_CREDIT if self.identity.on_credit else WATCHDOG
+        usual = 0.25 if self.identity.on_credit else 0.1
         self.watchdog = usual if watchdog is None else watchdog
         self.watchdog_us = round(self.watchdog * 1e6)
         self._client.set_watchdog(self.watchdog_us)

@@ -24,8 +24,6 @@ __all__ = ["VirtualDevice"]
 
 Faults: TypeAlias = "str | Mapping[str, float | tuple[float, float]]"
 
-_LARGEST_SEED = 2**64 - 1
-
 
 class VirtualDevice(Unique):
     """The virtual sewing machine served on a port, with the state machine of a real device.
@@ -99,7 +97,7 @@ class VirtualDevice(Unique):
     ) -> None:
         plant = VirtualMachine.from_name(machine)
         pty = _checked_endpoint(endpoint, link) == "pty"
-        _check_range("seed", seed, 0, _LARGEST_SEED)
+        _check_range("seed", seed, 0, 2**64 - 1)
         if baud is not None:
             _check_range("baud", baud, *(300, 100_000_000))
         if duration is not None and not 0.0 < real("duration", duration) < 1e9:

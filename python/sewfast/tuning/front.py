@@ -41,8 +41,6 @@ from .verdict import Verdict, verdict_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-EVALUATIONS = 3000
-SIZE = 40
 _TUNED = 0.25
 """Share of the evaluations for the tuned controller from which the front starts."""
 
@@ -187,8 +185,8 @@ def pareto(
     constraints: Constraints | None = None,
     variations: Sequence[tuple[float, int]] | None = None,
     loads: Sequence[LoadStep] = (),
-    size: int = SIZE,
-    evaluations: int = EVALUATIONS,
+    size: int = 40,
+    evaluations: int = 3000,
     time_budget: float | None = None,
     seed: int = 0,
     threads: int | None = None,
@@ -236,9 +234,7 @@ def pareto(
     time = Budget(None if time_budget is None else budget(time_budget))
     total, names = whole("evaluations", evaluations), _checked(objectives)
     if total < 2:
-        raise SettingError(
-            f"expected 2 evaluations or more, got {total}; {EVALUATIONS:,} are usual"
-        )
+        raise SettingError(f"expected 2 evaluations or more, got {total}; 3,000 are usual")
     settings: dict[str, Any] = {
         "cost": cost,
         "aggregate": aggregate,

@@ -41,8 +41,6 @@ from .verdict import Verdict, out_of_reach, verdict_of
 
 Method: TypeAlias = Literal["genetic", "cma-es"]
 
-EVALUATIONS = 3000
-"""Controllers tried by default."""
 _ENDED_BY = {
     "evaluations": "their number",
     "converged": "convergence",
@@ -230,7 +228,7 @@ def tune(
     rival: Plants | None = None,
     feedforward: Lead = "preview",
     method: Method = "genetic",
-    evaluations: int = EVALUATIONS,
+    evaluations: int = 3000,
     time_budget: float | None = None,
     seed: int = 0,
     threads: int | None = None,
