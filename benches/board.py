@@ -22,7 +22,7 @@ import numpy as np
 import sewfast
 from sewfast.commissioning import SteppedBench
 from sewfast.link import connect
-from sewfast.link.emulated import EmulatedBoard
+from sewfast_deploy.emulated import EmulatedBoard
 
 F = np.float32
 COUNTS_PER_REV, GAIN, LAG, FRICTION = F(1572.0), F(490.0), F(0.15), F(0.25)

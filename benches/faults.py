@@ -32,7 +32,7 @@ from drives import FAMILY, Drive, Simulator, drawn
 from sewfast.commissioning import SteppedBench
 from sewfast.errors import SewfastError
 from sewfast.link import connect
-from sewfast.link.emulated import EmulatedBoard
+from sewfast_deploy.emulated import EmulatedBoard
 
 VOLT, SPEED = 20.0, 1500.0
 """Largest command [V] and top of the working range [RPM] of a drive."""

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from .control.margins import Margins, margins, operating_point
     from .control.state_feedback import StateFeedback
     from .dataset import Dataset, Diagnosis, Experiment, diagnose
-    from .deployment import Deployment, deploy
     from .errors import (
         DataError,
         FitError,
@@ -75,7 +74,6 @@ __all__ = [
     "DataError",
     "Dataset",
     "DelayEstimate",
-    "Deployment",
     "Diagnosis",
     "Ensemble",
     "Experiment",
@@ -115,7 +113,6 @@ __all__ = [
     "commission",
     "compare",
     "delay",
-    "deploy",
     "diagnose",
     "fit_fopdt",
     "fit_shaft",
@@ -159,7 +156,6 @@ _HOMES = {
     "tuning": "Constraints Cost LoadStep ParetoFront TuningResult pareto tune",
     "dataset": "Dataset Diagnosis Experiment diagnose",
     "identification.delays": "DelayEstimate delay",
-    "deployment": "Deployment deploy",
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
     "evidence": "ReportCard check",
     "frequency": "FrequencyResponse ResponsesOverSpeed ShaftFit fit_shaft load_response "

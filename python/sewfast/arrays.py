@@ -145,10 +145,6 @@ def runs(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
 # --- Products of tall matrices --------------------------------------------------------------------
 
 
-_AT_ONCE = 2**17
-"""Multiplications in one product: half of what OpenBLAS leaves to one thread."""
-
-
 def gram(a: FloatArray, b: FloatArray | None = None) -> FloatArray:
     """a'b, or a'a, of tall matrices (N, p) and (N, q): a sum over blocks of rows.
     A block is so small that BLAS takes one thread for it. The bits are then the same with any
@@ -172,6 +168,7 @@ def product(a: FloatArray, x: FloatArray) -> FloatArray:
 
 def _blocks(n: int, per_row: int) -> Iterator[slice]:
     """Blocks of n rows, each with so many multiplications per row."""
-    rows = max(1, _AT_ONCE // max(1, per_row))
+    # multiplications in one product: half of what OpenBLAS leaves to one thread
+    rows = max(1, 2**17 // max(1, per_row))
     for at in range(0, n, rows):
         yield slice(at, at + rows)

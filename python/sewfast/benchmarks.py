@@ -24,7 +24,6 @@ _NAMES = {
     "parallel_wiener_hammerstein": "ParWH",
     "f16": "F16",
 }
-_DEFAULT_WINDOW = 50
 
 
 class Benchmark(NamedTuple):
@@ -42,16 +41,14 @@ class Benchmark(NamedTuple):
 
 
 def names() -> tuple[str, ...]:
-    """Names of the benchmarks that `load` reads."""
     return tuple(_NAMES)
 
 
 def load(name: str, folder: str | os.PathLike[str] | None = None) -> Benchmark:
-    """Read a benchmark with the windows of the package `nonlinear_benchmarks`.
-    The package downloads a record the first time, from its authors' page, and keeps it in `folder`,
-    by default its own cache. Raises `DataError` if the record can be neither found nor downloaded.
-    Source: M. Schoukens and others, https://www.nonlinearbenchmark.org; windows as in Champneys et
-    al. 2024, arXiv 2405.10779.
+    """Read a benchmark with the windows of the package `nonlinear_benchmarks`. The package
+    downloads a record the first time, from its authors' page, and keeps it in `folder`, by default
+    its own cache. Source: M. Schoukens and others, https://www.nonlinearbenchmark.org; windows as
+    in Champneys et al. 2024, arXiv 2405.10779.
     """
     if name not in _NAMES:
         raise SettingError(f"benchmark: expected one of {', '.join(_NAMES)}, received {name!r}")
@@ -109,4 +106,4 @@ def _dataset(records: list[Any]) -> Dataset:
 
 def _window(records: list[Any]) -> int:
     found = [r.state_initialization_window_length for r in records]
-    return max((int(n) for n in found if n is not None), default=_DEFAULT_WINDOW)
+    return max((int(n) for n in found if n is not None), default=50)

@@ -20,24 +20,14 @@ ABORTED = "_aborted"
 EXPLAINED = 0.5
 """A change is believed if no more than this share of the error is left with it: on runs of healthy
 drives, each fitted up to its change, .68 and more were left (docs/guards.md)."""
-UNSEEN = 0.25
-"""The same on a run that did not end the series."""
 NOTED, TIMES = 0.02, 3.0
-"""Without it the error must be larger than this share of the speed, and larger by this factor than
-on the earlier runs to which the motor was fitted."""
+"""Without the change the error must be larger than this share of the speed, and larger by this
+factor than on the earlier runs to which the motor was fitted."""
 ALIKE, UNSURE = 0.05, 0.1
 """Shares of the speed by which a motor of its own errs at most on a run that can be an earlier one,
 and on one that shows what the machine always was."""
 LOST = 0.1
 """Shares of motion, and of the largest command, that count as none."""
-TURNS = 5
-"""Counts without a command that are a motion, and no trembling at an edge of the encoder."""
-TIES = 1.05
-"""Changes with an error of up to this multiple of the least are equal: the likelier is taken."""
-MOST = 12
-"""Runs that are looked at, the last ones of a series: each takes some tenths of a second."""
-STRONG = 3.0
-"""Gain is too large if the largest command reaches this many times the machine's own limit."""
 
 
 @dataclass(frozen=True)
@@ -122,11 +112,9 @@ def cause_of(
 def cause_among(
     runs: Sequence[Recording], *, volt: float = math.inf, speed: float = math.inf
 ) -> Cause | None:
-    """The cause that ended a series of runs.
-
-    The last run is looked at alone, compared with those before it that a motor explains, and with
-    all of them; the change that leaves the smallest error is the cause. If that shows nothing, a
-    fault may have come unseen in an earlier run.
+    """The cause that ended a series of runs. The last run is looked at alone, compared with those
+    before it that a motor explains, and with all of them; the change that leaves the smallest error
+    is the cause. If that shows nothing, a fault may have come unseen in an earlier run.
     """
     if not runs:
         return None
@@ -137,12 +125,14 @@ def cause_among(
     recent: list[Recording] = []
     known: list[_Look] = []
     unseen: list[Cause] = []
-    for recording in moved[-MOST:]:
+    # runs that are looked at, the last ones of a series: each takes some tenths of a second
+    for recording in moved[-12:]:
         earlier = _look(recording, volt, speed)
         if earlier is None:
             continue
         recent.append(recording)
-        if cause := earlier.change(UNSEEN):
+        # less may be left on a run that did not end the series
+        if cause := earlier.change(0.25):
             unseen.append(cause)
         elif earlier.found["error"] <= ALIKE * earlier.found["size"]:
             known.append(earlier)
@@ -210,7 +200,8 @@ def turns_at_rest(r: Recording) -> Cause | None:
     moves = np.flatnonzero(r.u)
     end = int(moves[0]) if len(moves) else len(r)
     counted = float(r.counts[max(0, end - 1)] - r.counts[0])
-    if not abs(counted) >= TURNS:
+    # counts without a command that are a motion, and no trembling at an edge of the encoder
+    if not abs(counted) >= 5:
         return None
     return turning(60.0 * counted / (r.counts_per_rev * (end - 1) * r.Ts), r.name)
 
@@ -272,6 +263,8 @@ class _Look:
 
     def explanation(self, explained: float = EXPLAINED) -> tuple[float, Cause] | None:
         """The error that such a change leaves [RPM], and the change."""
+        # changes with an error of up to this multiple of the least are equal: the likelier is taken
+        ties = 1.05
         if (early := turns_at_rest(self.recording)) is not None:
             return 0.0, early
         found = self.found
@@ -279,13 +272,13 @@ class _Look:
         least = NOTED if is_alone else max(NOTED, TIMES * found["unsure"])
         least = max(least * found["size"], found["rounding"])
         if found["error"] > least and found["findings"]:
-            most = min(explained * found["error"], TIES * found["findings"][0][3])
+            most = min(explained * found["error"], ties * found["findings"][0][3])
             equal = {f[0]: f for f in found["findings"] if f[3] <= most}
             if equal:
                 change = next(name for name in _NAMED if name in equal)
                 _, value, at, error, motor = equal[change]
                 # no change where one motor explains all runs as well
-                if not found["together"] <= TIES * error:
+                if not found["together"] <= ties * error:
                     return error, self.changed(change, value, at, motor)
         return None
 
@@ -325,7 +318,8 @@ class _Look:
             return None
         elif self.is_unsettled():
             return self.integrates()
-        elif self.is_too_fast() and gain * self.volt > STRONG * self.speed:
+        # gain is too large if the largest command reaches this many times the machine's own limit
+        elif self.is_too_fast() and gain * self.volt > 3.0 * self.speed:
             value = gain * self.volt / self.speed
             name = "gain too large"
             text = (

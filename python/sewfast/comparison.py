@@ -47,13 +47,7 @@ class Comparison(Plotted):
         return len(self.names)
 
     def __getitem__(self, name: str) -> Validation:
-        """The validation of one model.
-
-        Raises
-        ------
-        KeyError
-            For another name, or a model that diverges.
-        """
+        """The validation of one model; `KeyError` for another name, or a model that diverges."""
         found = dict(zip(self.names, self.validations, strict=True)).get(name)
         if found is None:
             raise KeyError(f"no scores of {name!r}; there are those of {', '.join(self._scored)}")
@@ -117,7 +111,6 @@ class Comparison(Plotted):
         return "\n".join([self._caption(), *lines, *self._notes()])
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         header, rows = self._table()
         return Table(self._caption(), header, rows).to_html(self._notes())
 

@@ -32,7 +32,6 @@ FORMAT = "sewfast.model"
 VERSION = 1
 INIT = 20
 """Default number of samples that determine the initial state."""
-_STEPS_SHOWN = 4
 
 
 class AtRest(NamedTuple):
@@ -348,7 +347,6 @@ class DynamicModel(ABC):
         return rest
 
     def _inputs(self, values: ArrayLike) -> FloatArray:
-        """Inputs as (N, n_inputs)."""
         n = len(self.input_names)
         expected = "(N,) or (N, 1)" if n == 1 else f"(N, {n})"
         if values is None or isinstance(values, (str, os.PathLike)):
@@ -456,11 +454,11 @@ class DynamicModel(ABC):
         return "\n".join([*lines, *self.describe(), *self._story()])
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         first, *lines = str(self).splitlines()
         return html_of("\n".join([first, f"orders: {lines[0]}", *lines[1:]]))
 
     def _story(self) -> list[str]:
+        steps_shown = 4
         t = self.training
         if not t:
             return []
@@ -471,8 +469,8 @@ class DynamicModel(ABC):
             steps = "" if count is None else f"{count} iterations, "
             lines[0] += f"; {steps}{t['termination']}"
         prepared = [f"prepared: {note}" for note in t.get("preparation", [])]
-        if len(prepared) > _STEPS_SHOWN:
-            prepared[_STEPS_SHOWN:] = [f"prepared: and {len(prepared) - _STEPS_SHOWN} more"]
+        if len(prepared) > steps_shown:
+            prepared[steps_shown:] = [f"prepared: and {len(prepared) - steps_shown} more"]
         lines += prepared
         lines += choice_lines(t, self.output_unit)
         lines += [str(note) for note in t.get("notes", [])]
@@ -490,10 +488,6 @@ def _require_no_state(initial_state: ArrayLike | None) -> None:
 # --- The choice of `identify` as a table for `print` ----------------------------------------------
 
 
-_COLUMNS = 5
-_MOST_ROWS = 40
-
-
 def choice_lines(training: Mapping[str, Any], unit: str) -> list[str]:
     """The candidates with their free-run errors on data not trained on, and the reason."""
     choice = training.get("choice")
@@ -501,7 +495,7 @@ def choice_lines(training: Mapping[str, Any], unit: str) -> list[str]:
         return []
     listed = choice.get("candidates")
     listed = listed if isinstance(listed, Sequence) else ()
-    candidates = [c for c in listed if isinstance(c, Mapping)][:_MOST_ROWS]
+    candidates = [c for c in listed if isinstance(c, Mapping)][:40]
     lines = _table(candidates, choice, unit) if candidates else []
     return [*lines, f"chosen: {choice.get('chosen')}; {choice.get('reason')}"]
 
@@ -519,7 +513,7 @@ def _table(
 ) -> list[str]:
     heading = f"free-run rmse{f' [{unit}]' if unit else ''} on data not trained on:"
     rows = [_row(c, choice) for c in candidates]
-    widths = [max(len(r[i]) for r in rows) for i in range(_COLUMNS)]
+    widths = [max(len(r[i]) for r in rows) for i in range(5)]
     padded = (["  ", *(t.ljust(w + 2) for t, w in zip(r, widths, strict=True))] for r in rows)
     return [heading, *("".join(p).rstrip() for p in padded)]
 

@@ -37,10 +37,9 @@ class Linearised:
 def linearise(
     core: Any, u: FloatArray, state: FloatArray | None = None, level: float | None = None
 ) -> Linearised:
-    """Linearise about the equilibrium at a constant input, searched from `state` (None: rest).
-    `u` has shape (nu,). `level` is the output level for an integrator, which rests at any level or
-    at none. Raises `SettingError` for an object that is no compiled model, linear, lagged or state
-    space.
+    """Linearise about the equilibrium at a constant input, searched from `state` (None: rest). `u`
+    has shape (nu,). `level` is the output level for an integrator, which rests at any level or at
+    none.
     """
     u = np.ascontiguousarray(u, dtype=np.float64)
     if hasattr(core, "a") and hasattr(core, "offset"):
@@ -154,9 +153,7 @@ def _state_space(
 
 
 def _moved_to(core: Any, u: FloatArray, x: FloatArray, level: float) -> FloatArray:
-    """The integrator's state, the last one, at which the output is `level`, by Newton's method.
-    If the output function does not reach that level, the state is returned unchanged.
-    """
+    """The integrator's state, the last one, with the output `level` (Newton); else unchanged."""
     moved = x.copy()
     for _ in range(_NEWTON):
         left = level - float(np.ravel(core.simulate(u[None, :], moved))[0])

@@ -16,7 +16,6 @@ from .gains import real, vector
 __all__ = ["MachineRun", "VirtualMachine"]
 
 _NAME = re.compile(r"virtual(?::(\d+))?(?:\?(.*))?")
-_LARGEST_SEED = 2**64 - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +217,6 @@ def _name(seed: int | None, parameters: Mapping[str, float]) -> str:
 
 
 def _parameters(query: str, name: str) -> dict[str, float]:
-    """Parameters by name, from ``a=1&b=2``."""
     found = {}
     for part in query.split("&") if query else ():
         key, _, value = part.partition("=")
@@ -233,8 +231,9 @@ def _parameters(query: str, name: str) -> dict[str, float]:
 
 
 def _checked_seed(seed: int) -> int:
+    largest_seed = 2**64 - 1
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
         raise SettingError(name="seed", expected="a whole number or None", received=repr(seed))
-    if not 0 <= seed <= _LARGEST_SEED:
-        raise SettingError(name="seed", expected=f"0 to {_LARGEST_SEED}", received=str(seed))
+    if not 0 <= seed <= largest_seed:
+        raise SettingError(name="seed", expected=f"0 to {largest_seed}", received=str(seed))
     return int(seed)

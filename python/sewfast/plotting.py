@@ -124,9 +124,7 @@ def panels(
     share_x: bool = True,
     width: float = PAGE_WIDTH,
 ) -> tuple[Figure, NDArray[Any]]:
-    """A figure of panels for a page, `width` inch wide, each row `heights` inch high; axes as an
-    array (rows, columns).
-    """
+    """A figure of a page, `width` inch wide, rows `heights` high; axes (rows, columns)."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, sum(heights)), layout="constrained")
@@ -192,21 +190,10 @@ DPI = 150
 
 @dataclass(frozen=True)
 class Drawing:
-    """The picture of a result.
-
-    Attributes
-    ----------
-    rows : tuple of tuple of Panel or None
-        Functions that draw into axes, row by row; None leaves a place empty.
-    heights, widths : tuple of float
-        Heights of the rows [inch]; widths of the columns, relative to each other.
-    share_x : bool
-        Whether the panels of a column share their x axis.
-    main : int
-        The panel, counted row by row, to draw if there are axes for only one.
-    legend : int
-        Columns of a legend above the figure for the labels of the first panel; 0: the panels have
-        their own legends.
+    """The picture of a result: `rows` of panels, functions that draw into axes (None leaves a place
+    empty), with `heights` [inch] and relative `widths`. `main` is the panel, counted row by row,
+    for a single pair of axes; `legend` counts the columns of a legend above the figure, 0 if the
+    panels have their own.
     """
 
     rows: tuple[tuple[Panel | None, ...], ...]
@@ -218,7 +205,6 @@ class Drawing:
 
     @property
     def panels(self) -> list[Panel]:
-        """All panels in reading order."""
         return [panel for row in self.rows for panel in row if panel is not None]
 
     def figure(self, width: float = WIDTH) -> Figure:
@@ -232,9 +218,7 @@ class Drawing:
         return figure
 
     def beside(self) -> Figure:
-        """A figure to stand beside another one on a page: narrow, so that its letters stay legible;
-        one of several columns needs the whole width for its titles.
-        """
+        """A figure beside another one on a page: narrow, so that its letters stay legible."""
         return self.figure(PAGE_WIDTH if len(self.widths) == 1 else WIDTH)
 
     def plot(self, ax: Any = None, file: str | os.PathLike[str] | None = None) -> Any:
@@ -371,6 +355,8 @@ def lettered(text: str) -> str:
 
 CYCLE = ("measured", "model", "oe", "arx_raw", "arx", "truth")
 """Looks of series of the same kind, in this order; each has its own line style."""
+STYLES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1, 2)))
+"""Line styles that are distinct in grey print."""
 FINE = 1.2
 """Line width where lines do not cover each other."""
 

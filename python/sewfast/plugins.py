@@ -1,8 +1,8 @@
 """Plug-ins: what installed packages add by entry points, and what is said where one cannot be used.
 
 A group of entry points is a list in the metadata of the installed packages: `sewfast.readers`
-(formats of files), `sewfast.commands` (commands), `sewfast.names` (names of `sewfast`). Nothing is
-registered, and nothing is imported before it is asked for.
+(formats of files), `sewfast.commands` (commands), `sewfast.names` (names of `sewfast`, and of its
+unit `link`). Nothing is registered, and nothing is imported before it is asked for.
 """
 
 from __future__ import annotations
@@ -67,9 +67,7 @@ UNREGISTERED = (
 def only(
     found: tuple[EntryPoint, ...], place: str, task: str, remedy: str = "uninstall one"
 ) -> EntryPoint:
-    """The entry point for a task such as `that reads .dlog`, at a place named in the error.
-    Raises `SettingError` if there are several. Those of the wheel cannot be taken over.
-    """
+    """The entry point for a task such as `that reads .dlog`; the wheel's cannot be taken over."""
     found = tuple(point for point in found if package(point) == OWN) or found
     if len(found) > 1:
         raise SettingError(
@@ -80,9 +78,7 @@ def only(
 
 
 def load(point: EntryPoint, place: str, task: str) -> Any:
-    """What an entry point names.
-    Raises `SettingError` if it cannot be imported.
-    """
+    """What an entry point names; `SettingError` if it cannot be imported."""
     try:
         return point.load()
     except SewfastError:
@@ -93,9 +89,7 @@ def load(point: EntryPoint, place: str, task: str) -> Any:
 
 
 def function(point: EntryPoint, place: str, task: str) -> Callable[..., Any]:
-    """The function that an entry point names.
-    Raises `SettingError` if it cannot be imported or is no function.
-    """
+    """The function that an entry point names; `SettingError` if there is none."""
     found = load(point, place, task)
     if not callable(found):
         raise unusable(point, place, task, f"{point.value}, a {type(found).__name__}")
@@ -129,14 +123,12 @@ NAMES = "sewfast.names"
 
 
 def public_names() -> list[str]:
-    """Names of `sewfast` that plug-ins add."""
-    return [point.name for point in points(NAMES)]
+    """Names of `sewfast` that plug-ins add, without those of its units (`link.NAME`)."""
+    return [point.name for point in points(NAMES) if "." not in point.name]
 
 
 def public_name(name: str) -> Any:
-    """What a plug-in has for a name of `sewfast`.
-    Raises `AttributeError`, as `hasattr` and `help` expect, if there is none or it cannot be used.
-    """
+    """What a plug-in has for a name of `sewfast`, or `AttributeError`, as `hasattr` expects."""
     found = points(NAMES, name)
     if not found:
         hint = "" if are_registered(NAMES) else f"; {UNREGISTERED}"

@@ -20,7 +20,6 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 LOG = logging.getLogger(__package__)
-_WIDTH = 24
 _FIRST_LINE, _LATER = 10.0, 1.5
 """Without a terminal: time of the first line [s], and the factor from each line to the next."""
 _FIRST_BAR, _BETWEEN = 0.5, 0.2
@@ -74,6 +73,7 @@ class Progress:
         self._show(None, "", text)
 
     def _show(self, share: float | None, count: str, text: str) -> None:
+        width = 24
         seconds = time.monotonic() - self._began
         if self._bar is not None:
             self._bar.draw(self._title, share, "  ".join(filter(None, (count, text))), seconds)
@@ -81,8 +81,8 @@ class Progress:
             if share is None:
                 self._draw(f"{self._title}: {text}  {seconds:.0f} s")
             else:
-                filled = min(int(_WIDTH * share), _WIDTH)
-                bar = "=" * filled + " " * (_WIDTH - filled)
+                filled = min(int(width * share), width)
+                bar = "=" * filled + " " * (width - filled)
                 parts = (f"{self._title} [{bar}] {count}", text, f"{seconds:.0f} s")
                 self._draw("  ".join(filter(None, parts)))
         elif seconds >= self._next:

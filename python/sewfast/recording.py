@@ -182,7 +182,6 @@ class Recording:
         return self.dataset().plot(ax, file=file)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         return self.dataset()._repr_html_()
 
     def __repr__(self) -> str:

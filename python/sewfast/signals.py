@@ -166,9 +166,6 @@ def _saturating_2(seed: int) -> FloatArray:
     )
 
 
-_SLOW_RPM = 400.0
-"""Speed between the trapezoids of the training reference."""
-
 #: Height [RPM], rise, hold, fall and pause after it [s] of the reference `trapezoids`.
 TRAPEZOIDS = (
     (1500.0, 0.25, 0.40, 0.25, 0.3),
@@ -198,9 +195,11 @@ def _trapezoid(
 
 
 def _trapezoids(seed: int) -> FloatArray:
+    # speed between the trapezoids of the training reference
+    slow_rpm = 400.0
     # Down to a low speed, not to rest: a crank held by friction shows nothing about the drive.
-    rise = np.linspace(0.0, _SLOW_RPM, round(0.1 / TS))
-    return np.concatenate([rise, *(_trapezoid(*shape, low=_SLOW_RPM) for shape in TRAPEZOIDS)])
+    rise = np.linspace(0.0, slow_rpm, round(0.1 / TS))
+    return np.concatenate([rise, *(_trapezoid(*shape, low=slow_rpm) for shape in TRAPEZOIDS)])
 
 
 def _table(*signals: Signal) -> Mapping[str, Signal]:

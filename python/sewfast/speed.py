@@ -17,7 +17,6 @@ from .units import counts_per_unit
 Method: TypeAlias = Literal["difference", "savgol", "kalman"]
 
 #: Whole numbers above this are not exact in double precision.
-_EXACT = 2**53
 
 
 def speed_from_counts(
@@ -111,20 +110,16 @@ def speed_from_counts(
     )
 
 
-SHORTEST = 5
-"""Least consecutive counts for the Kalman smoother."""
-
-
 def speed_between_gaps(
     counts: FloatArray, Ts: float, counts_per_rev: float, *, method: Method = "kalman"
 ) -> FloatArray:
-    """As `speed_from_counts`, separately for each piece between gaps (NaN); shape (N,).
-    The speed is NaN in gaps and in pieces too short for the method. Raises `DataError` if no piece
-    is long enough.
+    """As `speed_from_counts`, separately for each piece between gaps (NaN); shape (N,). The speed
+    is NaN in gaps and in pieces too short for the method.
     """
     if not np.isnan(counts).any():
         return speed_from_counts(counts, Ts, counts_per_rev, method=method)
-    shortest = {"kalman": SHORTEST, "savgol": 41, "difference": 2}[method]
+    # least consecutive counts for the Kalman smoother
+    shortest = {"kalman": 5, "savgol": 41, "difference": 2}[method]
     pieces = [(a, n) for a, n in runs(~np.isnan(counts)) if n >= shortest]
     if not pieces:
         raise DataError(
@@ -183,7 +178,7 @@ def _column(values: ArrayLike, name: str = "counts") -> FloatArray:
     if (
         array.dtype.kind in "iu"
         and array.size
-        and max(-int(array.min()), int(array.max())) > _EXACT
+        and max(-int(array.min()), int(array.max())) > (2**53)
     ):
         raise DataError(
             f"expected {name} of at most 2^53, got {array.min()} to {array.max()}; "

@@ -68,9 +68,7 @@ def require_writable(path: str | os.PathLike[str], kind: type[SewfastError] = Se
 
 @contextmanager
 def making(folder: Path) -> Iterator[None]:
-    """Make a folder and those above it; if the block fails, remove those that are still empty.
-    Raises `OSError` if it cannot be made.
-    """
+    """Make a folder and those above it; if the block fails, remove those that are still empty."""
     new = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -105,9 +103,7 @@ def _staged(contents: Mapping[Any, bytes]) -> Iterator[list[tuple[Path, Path]]]:
 
 
 def names(path: str | os.PathLike[str]) -> tuple[Path, Path]:
-    """A free temporary name in the folder of a file, and the file's final name.
-    Raises `OSError` if `path` is a folder, a device or a pipe, which must not be replaced.
-    """
+    """A free temporary name beside a file, and its final name; `OSError` for a folder or device."""
     if "\0" in os.fspath(path):
         raise OSError(errno.EINVAL, "a name cannot hold the character 0")
     try:
@@ -172,9 +168,7 @@ def write(
     path: str | os.PathLike[str], format: str, version: int, payload: Mapping[str, Any]
 ) -> None:
     """Write ``payload`` (JSON values) under its ``format`` and ``version``, which :func:`read`
-    checks; the file is either complete or absent. An existing file is replaced in one step. Raises
-    `ModelFileError` if a number is not finite or a value is no JSON value, or the folder is not
-    writable.
+    checks; the file is either complete or absent. An existing file is replaced in one step.
     """
     try:
         document = {"format": format, "version": version, **payload}
@@ -196,9 +190,7 @@ def replace(path: str | os.PathLike[str], content: str | bytes) -> None:
 
 def read(path: str | os.PathLike[str], format: str, versions: Collection[int]) -> dict[str, Any]:
     """Read a document of a known format and version, without its ``format``; nothing in it is
-    executed. Raises `ModelFileError` if the file is missing, larger than 16 MB or not JSON,
-    contains a number that is not finite or a key twice, or has another format or an unknown
-    version.
+    executed.
     """
     document = _parse(path, _text(path))
     if not isinstance(document, dict):
@@ -494,9 +486,7 @@ def write_table(
 
 
 def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write `content` to a file: under a temporary name beside it, renamed once it is complete.
-    Raises `DataError` if the folder does not exist or cannot be written to.
-    """
+    """Write `content` to a file: under a temporary name beside it, renamed once it is complete."""
     try:
         replace_file(path, content)
     except OSError as e:

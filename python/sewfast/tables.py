@@ -79,9 +79,7 @@ class Table:
     words: bool = False
 
     def to_html(self, notes: Sequence[str] = ()) -> str:
-        """As HTML for a notebook, with everything escaped, without style or script; `notes` are
-        lines below the table.
-        """
+        """As HTML for a notebook, escaped, without style or script; `notes` are lines below."""
         heads = "".join(f'<th scope="col">{escape(h)}</th>' for h in self.header)
         head = f"<thead><tr>{heads}</tr></thead>\n" if self.header else ""
         rows = "\n".join(

@@ -13,9 +13,7 @@ VARIABLE = "SEWFAST_THREADS"
 
 
 def available() -> int:
-    """The processors available to this process, at most as many as `SEWFAST_THREADS` allows.
-    Raises `SettingError` if the variable is not a whole number of 1 or more.
-    """
+    """The processors available to this process, at most as many as `SEWFAST_THREADS` allows."""
     affinity = getattr(os, "sched_getaffinity", None)
     processors = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
     limit = os.environ.get(VARIABLE, "").strip()

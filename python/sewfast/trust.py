@@ -98,14 +98,8 @@ def _of(group: list[ClosedLoopRun]) -> Disagreement:
 
 SETTLING = 0.4
 """Share of a constant stretch that counts as settling after the change before it."""
-LEAST_SAMPLES = 100
-"""Least samples of the rest of a stretch."""
 LEAST_PERIODS = 5.0
-LASTING = 0.5
-"""Least rms of the second half relative to the first for an oscillation that does not decay."""
 SHAFT_ORDERS = (1, 2, 3, 4)
-LEAST_TURNS = 3.0
-"""Least periods of an order within a stretch: fewer cannot be distinguished from a trend."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +156,8 @@ def _constant(run: ClosedLoopRun) -> Iterator[slice]:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
     for start, stop in edges.reshape(-1, 2).tolist():
         first = start + math.ceil(SETTLING * (stop - start))
-        if stop - first >= LEAST_SAMPLES:
+        # least samples of the rest of a stretch
+        if stop - first >= 100:
             yield slice(first, stop)
 
 
@@ -175,7 +170,8 @@ def _oscillation_of(run: ClosedLoopRun, part: slice) -> Oscillation:
     main = u if swing >= ripple else y
     periods = 0.5 * np.count_nonzero(np.diff(np.signbit(main)))
     half = len(main) // 2
-    lasts = periods >= LEAST_PERIODS and _rms(main[half:]) >= LASTING * _rms(main[:half])
+    # least rms of the second half relative to the first for an oscillation that does not decay
+    lasts = periods >= LEAST_PERIODS and _rms(main[half:]) >= 0.5 * _rms(main[:half])
     hertz = periods / (len(main) * run.Ts)
     return Oscillation(
         command, output, swing, ripple, float(run.r[part][0]), float(hertz), bool(lasts)
@@ -191,7 +187,8 @@ def _forced(run: ClosedLoopRun, part: slice) -> FloatArray:
         turns = np.cumsum(run.y[part]) * per_unit * run.Ts
         travelled = abs(float(turns[-1] - turns[0]))
         for order in SHAFT_ORDERS:
-            if order * travelled >= LEAST_TURNS:
+            # least periods of an order within a stretch: fewer cannot be distinguished from a trend
+            if order * travelled >= 3.0:
                 angle = 2.0 * np.pi * order * turns
                 columns += [np.cos(angle), np.sin(angle)]
     return np.column_stack(columns)

@@ -39,9 +39,7 @@ SPEEDS = ANGULAR_SPEEDS | frozenset(["m/s", "cm/s", "mm/s", "m/min", "km/h"])
 
 
 def spelled(unit: str) -> str:
-    """A unit in lower case and in the package's spelling, so that equal units compare equal:
-    "U/min" becomes "rpm".
-    """
+    """A unit in lower case and in the package's spelling: "U/min" becomes "rpm"."""
     key = unit.strip().lower()
     return _SPELLINGS.get(key, key)
 
@@ -125,7 +123,6 @@ def split_unit(header: str) -> tuple[str, str]:
 
 
 def is_unit(text: str) -> bool:
-    """Whether a text is a unit of measurement."""
     return text.strip().lower() in _UNITS
 
 

@@ -21,19 +21,14 @@ from .tables import Table, percent, significant
 
 GOOD, FAIR, POOR = 90.0, 70.0, 30.0
 """Least fit of the free run [%] for a model to be good, fair, poor; below, it is useless."""
-FEW = 100
-"""Scored samples below which a verdict has little evidence."""
-AT_THE_NOISE = 1.5
-"""An error below this multiple of the measurement noise cannot be improved."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of an error series.
-    The fit is 100 (1 - |y - yhat| / |y - mean(y)|) in Euclidean norms, NaN for constant y; `rmse`
-    and the largest magnitude `max_abs` are in the unit of the output. With weights, rmse is
-    sqrt(sum w e^2 / sum w), means are weighted, and norms are of sqrt(w) times their argument; the
-    largest magnitude is not weighted.
+    """Scores of an error series. The fit is 100 (1 - |y - yhat| / |y - mean(y)|) in Euclidean
+    norms, NaN for constant y; `rmse` and the largest magnitude `max_abs` are in the unit of the
+    output. With weights, rmse is sqrt(sum w e^2 / sum w), means are weighted, and norms are of
+    sqrt(w) times their argument; the largest magnitude is not weighted.
     """
 
     rmse: float
@@ -78,7 +73,6 @@ class ExperimentErrors:
 
     @property
     def one_step_error(self) -> FloatArray:
-        """One-step error, shape (N,)."""
         return self.y - self.one_step
 
     @property
@@ -88,7 +82,6 @@ class ExperimentErrors:
 
     @property
     def n(self) -> int:
-        """Samples scored."""
         return len(self.y) - self.init - self.unmeasured
 
     def scored(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -175,7 +168,8 @@ class Validation(Plotted):
     @property
     def verdict(self) -> str:
         """The grade in a sentence."""
-        few = f"; {self.n} samples are few to judge by" if self.n < FEW else ""
+        # scored samples below which a verdict has little evidence
+        few = f"; {self.n} samples are few to judge by" if self.n < 100 else ""
         return self._judged() + few
 
     def _judged(self) -> str:
@@ -238,7 +232,6 @@ class Validation(Plotted):
         return stacked(panels, (2.6, 1.7))
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         unit = f" [{self.unit}]" if self.unit else ""
         rows = [("free run", self.simulation), ("one step ahead", self.one_step)]
         if len(self.experiments) > 1:
@@ -296,7 +289,8 @@ def grade_of(fit: float, rmse: float, noise: float) -> str:
     """
     if not math.isfinite(fit):
         return ""
-    explained = fit >= POOR and rmse <= AT_THE_NOISE * noise
+    # an error below this multiple of the measurement noise cannot be improved
+    explained = fit >= POOR and rmse <= 1.5 * noise
     if fit >= GOOD or explained:
         return "good"
     return "fair" if fit >= FAIR else "poor" if fit >= POOR else "useless"
@@ -389,9 +383,7 @@ def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
 
 
 def free_run_error(model: DynamicModel, data: Dataset, init: int) -> float:
-    """Root mean square error of the free run [output unit]; infinite if the run diverges.
-    It is weighted, over the known outputs after the initial samples.
-    """
+    """Weighted rms error of the free run [output unit]; infinite if the run diverges."""
     return _error(lambda: scored_runs(model, data, init), data, init)
 
 

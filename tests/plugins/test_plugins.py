@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import sewfast
+import sewfast.link
+import sewfast_boards
 from cli import called
 from installed import installed
 from sewfast import plugins
@@ -221,7 +223,20 @@ def test_the_core_works_without_plugins(tmp_path: Path) -> None:
     assert "identify" in dir(sewfast)
 
 
-@pytest.mark.parametrize("name", ["Fleet", "fleet", "studio"])
+@pytest.mark.parametrize("name", ["Deployment", "Fleet", "deploy", "fleet", "studio"])
 def test_the_wheel_s_plugins_have_their_public_names(name: str) -> None:
     assert getattr(sewfast, name) is not None
     assert name in dir(sewfast)
+
+
+@pytest.mark.parametrize("name", ["ODrive", "PolledBoard", "SimpleFOC"])
+def test_the_link_has_the_boards_of_a_plugin(name: str) -> None:
+    assert getattr(sewfast.link, name) is getattr(sewfast_boards, name)
+    assert f"link.{name}" not in dir(sewfast)
+
+
+def test_the_link_has_no_other_names() -> None:
+    with pytest.raises(AttributeError, match=r"no attribute 'link\.Board'"):
+        _ = sewfast.link.Board
+    with pytest.raises(AttributeError, match="no attribute 'boards'"):
+        _ = sewfast.link.boards

@@ -16,7 +16,7 @@ for name in sewfast.__all__:
     getattr(sewfast, name)
 
 plugins = entry_points(group="sewfast.commands")
-assert {point.name for point in plugins} >= {"demo", "fleet", "studio"}
+assert {point.name for point in plugins} >= {"demo", "deploy", "fleet", "pil", "studio"}
 for point in plugins:
     point.load()
 assert callable(sewfast.fleet)

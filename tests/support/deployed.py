@@ -23,7 +23,7 @@ import numpy as np
 
 from portions import portion
 from sewfast import Biquad, Controller, Feedforward, Gains, Model, deploy
-from sewfast.deployment.precision import combined_run, embedded_members
+from sewfast_deploy.precision import combined_run, embedded_members
 
 EMULATED = Path(__file__).parent / "emulated"
 WARNINGS = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]

@@ -19,7 +19,7 @@ import sewfast
 from sewfast.cli import main
 from sewfast.errors import LinkError, SettingError
 from sewfast.link import connect, examine
-from sewfast.link.emulated import BOARDS, EmulatedBoard, build_firmware
+from sewfast_deploy.emulated import BOARDS, EmulatedBoard, build_firmware
 
 ROOT = Path(__file__).resolve().parents[2]
 FIRMWARE = ROOT / "target" / "bare" / "mps2-an386.elf"

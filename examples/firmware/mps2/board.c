@@ -27,7 +27,7 @@ static timer_registers *const TIMER = (timer_registers *)0x40000000u;
 static volatile uint32_t *const ENABLE_INTERRUPTS = (volatile uint32_t *)0xE000E100u;
 static volatile uint32_t *const COPROCESSORS = (volatile uint32_t *)0xE000ED88u;
 
-/* Memory that the computer reads and writes as a file; python/sewfast/link/emulated.py has the same layout. The stack is
+/* Memory that the computer reads and writes as a file; python/sewfast_deploy/emulated.py has the same layout. The stack is
  * next to it, so that its depth can be read from there too. All zeros if no file is given. */
 typedef struct {
     uint32_t boot_id, entropy;

@@ -53,8 +53,6 @@ if TYPE_CHECKING:
 FORMAT = "sewfast.analysis"
 VERSION = 1
 REFERENCES = ("trapezoid", "random")
-MOST = 8
-"""Most members on which gains and plants are varied; an ensemble is sorted, best first."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -275,6 +273,8 @@ def analyse(
     DataError
         For a reference that cannot be used.
     """
+    # most members on which gains and plants are varied; an ensemble is sorted, best first
+    most = 8
     require_controller(controller, on, "analyse(controller, plants)")
     cost = required("cost", cost, Cost)
     limits = required("limits", limits, Limits)
@@ -295,7 +295,7 @@ def analyse(
     )  # fmt: skip
     wanted = each_reference(references, _default_references(controller, plants[0], steps))
     task = Task(
-        tuple(plants[:MOST]), tuple(names[:MOST]), points[main][:MOST], tuple(wanted),
+        tuple(plants[:most]), tuple(names[:most]), points[main][:most], tuple(wanted),
         cost, seed,
     )  # fmt: skip
     loops = loop_bodes(controller, points, slowest)
@@ -489,9 +489,7 @@ ALT = {
 
 
 def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> list[Path]:
-    """Write everything, the PNGs optionally (the report does not use them); return the files.
-    Raises `SettingError` if matplotlib is not installed or the folder cannot be written to.
-    """
+    """Write everything, the PNGs optionally (the report does not use them); return the files."""
     from ..plotting import style, svg
     from .figures import figures
 

@@ -147,7 +147,6 @@ def _changed(model: Model, **parameters: Any) -> Model:
 
 
 def with_gain(model: Model, factor: float) -> Model:
-    """The model with its output multiplied by a factor."""
     if not isinstance(model, SingleModel):
         raise SettingError("gain: expected a single model, received an ensemble; take its members")
     scaled = _changed(model, **model.with_output_scaled(factor))
@@ -159,23 +158,16 @@ def with_gain(model: Model, factor: float) -> Model:
 
 
 def with_delay(model: Model, samples: int) -> Model:
-    """The model with its input delayed by some samples."""
     if not isinstance(model, SingleModel):
         raise SettingError("delay: expected a single model, received an ensemble; take its members")
     return _changed(model, **model.with_input_delayed(samples))
 
 
 def with_time_constants(model: Model, factor: float) -> Model:
-    """The model with the same steady states, reached more slowly by a factor.
-
-    Linear: every pole p becomes p^(1/factor); the steady gain is kept, an integrator's rate is
-    divided by the factor. State space: every step is 1/factor as large. Grey box: inertia and lag
-    are multiplied. A lagged network has no explicit time constants to change.
-
-    Raises
-    ------
-    SettingError
-        For a lagged network.
+    """The model with the same steady states, reached more slowly by a factor. Linear: every pole p
+    becomes p^(1/factor); the steady gain is kept, an integrator's rate is divided by the factor.
+    State space: every step is 1/factor as large. Grey box: inertia and lag are multiplied. A lagged
+    network has no time constants to change: `SettingError`.
     """
     if isinstance(model, LinearDifference):
         return _slower_linear(model, factor)

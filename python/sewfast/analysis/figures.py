@@ -13,7 +13,7 @@ from ..arrays import in_unit, labelled
 from ..dataset import FloatArray
 from ..errors import SettingError
 from ..evidence.figures import shade
-from ..plotting import Drawing, Float, Panel, lettered, thin
+from ..plotting import STYLES, Drawing, Float, Panel, lettered, thin
 from .points import LoopBode
 from .responses import Responses
 from .sensitivity import Score
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 BLUE, ORANGE, GREY, BLACK = "#0072B2", "#D55E00", "#9a9a9a", "#000000"
 """Colours of Okabe and Ito, distinct for everyone; line styles distinguish them in grey print."""
-_STYLES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1, 2)))
 LARGE_MS = 2.0
 
 
@@ -147,7 +146,7 @@ def _bode(ax: Axes, a: Analysis, curve: str) -> None:
     for n, loop in enumerate(a.loops):
         look = {
             "color": shade(n, len(a.loops)),
-            "ls": _STYLES[n % len(_STYLES)],
+            "ls": STYLES[n % len(STYLES)],
             # thinner lines on top, so that a curve below stays visible
             "lw": 1.4 + 1.8 * (1.0 - (n + 1) / len(a.loops)),
         }
@@ -215,7 +214,7 @@ def _sensitivity(
         scores = [*s.scores, a.score]
         ax.plot(
             100.0 * (factors[order] - 1.0), _finite([value(scores[i]) for i in order]),
-            label=s.name, color=shade(n, len(a.sensitivity)), ls=_STYLES[n % len(_STYLES)],
+            label=s.name, color=shade(n, len(a.sensitivity)), ls=STYLES[n % len(STYLES)],
             marker="osD^vP<>"[n % 8], ms=4.5, lw=1.3,
         )  # fmt: skip
     if is_peak:

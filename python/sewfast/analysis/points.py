@@ -27,9 +27,6 @@ from ..models.linear import LinearDifference
 
 SHARES = (0.1, 0.5, 0.9)
 """Positions within the outputs near the training data at which plants are linearised."""
-BOTH = 0.25
-"""Least way in one direction as a share of that in the other, as of references over both."""
-_MACHINE_SPEEDS = (300.0, 1000.0, 2000.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +86,7 @@ def plant_points(
     plants: Sequence[Plant], names: Sequence[str], speeds: Sequence[float] | None
 ) -> tuple[tuple[PlantPoint, ...], ...]:
     """The plants at each of the operating points, without those that cannot rest there. `speeds`
-    are steady outputs [y], by default spread over the training data of the first model. Raises
-    `SettingError` for a model with several inputs, or if no plant can rest at any of the outputs.
+    are steady outputs [y], by default spread over the training data of the first model.
     """
     for plant in plants:
         if isinstance(plant, Model) and len(plant.input_names) != 1:
@@ -117,7 +113,7 @@ def plant_points(
 def _speeds(plants: Sequence[Plant]) -> list[float]:
     first = next((p for p in plants if isinstance(p, Model)), None)
     if first is None:
-        return list(_MACHINE_SPEEDS)
+        return [300.0, 1000.0, 2000.0]
     low, high = first.training.get("output_range", (0.0, 0.0))
     shares: Sequence[float] = SHARES
     if isinstance(first, LinearDifference) or not first.training.get("input_range"):
@@ -129,7 +125,8 @@ def _speeds(plants: Sequence[Plant]) -> list[float]:
         shares = SHARES if known else (0.5,)
     rest = first.rest.y
     ways = sorted((end - rest for end in (low, high)), key=abs)
-    if ways[0] * ways[1] < 0.0 and abs(ways[0]) > BOTH * abs(ways[1]):
+    # least way in one direction as a share of that in the other, as of references over both
+    if ways[0] * ways[1] < 0.0 and abs(ways[0]) > 0.25 * abs(ways[1]):
         # a motor in the middle of both directions stands in its dry friction
         levels = [rest + share * ways[1] for share in shares[-2:]]
         levels = [rest + 0.5 * ways[0], *levels] if len(shares) > 1 else levels
@@ -188,7 +185,6 @@ def two_lags(gain: float, T1: float, T2: float, Ts: float) -> StateSpace:
 
 
 def to_json(point: PlantPoint) -> dict[str, Any]:
-    """As JSON values."""
     return {
         "plant": point.plant,
         "u": point.u,
@@ -199,11 +195,6 @@ def to_json(point: PlantPoint) -> dict[str, Any]:
 
 
 # --- LoopBode: L, S and T of every plant at one operating point, with margins ---------------------
-
-
-FREQUENCIES = 240
-_BELOW = 0.02
-"""Lowest frequency relative to that of the slowest closed-loop pole."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,8 +269,9 @@ def loop_bodes(
     """The loop at every operating point. Each of `points` has its plants; `slowest` is the time
     constant of the slowest closed-loop pole [s], from which the frequencies begin.
     """
-    low = min(_BELOW / (2.0 * math.pi * slowest), 0.01 / controller.Ts)
-    hertz = np.geomspace(low, 0.5 / controller.Ts, FREQUENCIES)
+    # lowest frequency relative to that of the slowest closed-loop pole
+    low = min(0.02 / (2.0 * math.pi * slowest), 0.01 / controller.Ts)
+    hertz = np.geomspace(low, 0.5 / controller.Ts, 240)
     return tuple(_lines_of(controller, tuple(row), hertz) for row in points)
 
 

@@ -165,7 +165,6 @@ SETTLED = 0.02
 """Part of the step within which a response is settled, unless the output itself varies more."""
 RECOVERED = 0.01
 """Part of the disturbance's effect without control within which it is rejected, likewise."""
-RISE = (0.1, 0.9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +240,8 @@ def _reference_metrics(of: Responses, y: FloatArray) -> dict[str, float | None]:
     t, share = of.t[after], (y[after] - of.level) / of.size
     # a controller with feedforward begins before the step
     early = ~_quiet(of)
-    low, high = (_first(of.t[early], (y[early] - of.level) / of.size >= s) for s in RISE)
+    # from 10 to 90 %
+    low, high = (_first(of.t[early], (y[early] - of.level) / of.size >= s) for s in (0.1, 0.9))
     rise = None if low is None or high is None else 1e3 * (high - low)
     return {
         "rise_ms": rise,

@@ -60,9 +60,7 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """The plants, references and cost that score a controller; `points` are the plants at the
-    operating point for Ms.
-    """
+    """What scores a controller; `points` are the plants at the operating point, for Ms."""
 
     plants: tuple[Plant, ...]
     names: tuple[str, ...]
@@ -142,9 +140,7 @@ class GainSensitivity:
 def gain_sensitivity(
     controller: Controller, task: Task, *, threads: int | None = None
 ) -> tuple[GainSensitivity, ...]:
-    """Vary every setting that is neither 0 nor infinite by each of `FACTORS`.
-    The result is the same at any number of threads (by default all processors).
-    """
+    """Vary every setting that is neither 0 nor infinite by each of `FACTORS`, on `threads`."""
     values = {n: v for n in NAMES if (v := _value(controller, n)) and math.isfinite(v)}
     jobs = [(n, f) for n in values for f in FACTORS]
     scores = each(lambda job: task.score(scaled(controller, *job)), jobs, threads)

@@ -125,9 +125,7 @@ _WRITTEN = {
 
 
 def require_apart(args: argparse.Namespace) -> None:
-    """Refuse to write over a file that the same command reads, or over its own other output.
-    Raises `SettingError` if two of its files are the same.
-    """
+    """Refuse to write over a file that the same command reads, or over its own other output."""
     others = [place for place in _read(args) if _is_file(place)]
     for option, path in _written(args):
         for other in others:

@@ -157,10 +157,7 @@ def require_plot(path: Path | None) -> None:
 
 
 def require_place(path: Path | None, suffixes: tuple[str, ...], *, option: str = "-o") -> None:
-    """Refuse an output file that cannot be written, before the work.
-    Raises `SettingError` for an extension without a format, a folder that does not exist or cannot
-    be written to, and for what is no file.
-    """
+    """Refuse an output file that cannot be written, before the work."""
     if path is None:
         return
     if path.suffix.lower() not in suffixes:

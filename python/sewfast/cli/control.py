@@ -204,9 +204,7 @@ def _wanted(args: argparse.Namespace, controller: SampledController) -> Any:
 
 
 def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
-    """The name of a reference, or the samples of a file with columns t, r. Raises `SettingError` or
-    `DataError` for any other text, and a file without r or with another sample time or unit.
-    """
+    """The name of a reference, or the samples of a file with columns t, r."""
     from ..readers import read_columns
     from ..signals import REFERENCES
     from ..units import ANGULAR_SPEEDS, spelled
@@ -259,9 +257,7 @@ def add_host_loop(parser: argparse.ArgumentParser) -> None:
 
 
 def at_loops_period(args: argparse.Namespace, controller: Controller) -> Controller:
-    """The controller at the requested sample time; other arguments are checked too.
-    Raises `SettingError`, before anything moves, for options that do not go together.
-    """
+    """The controller at the requested sample time; other arguments are checked too."""
     from ..link import at_period
     from ..recordfile.writer import require_free
 
@@ -283,9 +279,7 @@ def at_loops_period(args: argparse.Namespace, controller: Controller) -> Control
 def run_host_loop(
     args: argparse.Namespace, controller: Controller, reference: str | FloatArray
 ) -> int | None:
-    """Run the loop, write its files, and print its outcome. Return 2 if the run did not complete,
-    130 if it was interrupted; the files are written even then.
-    """
+    """Run the loop and write its files: 0, 2 if it did not complete, 130 if interrupted."""
     from ..link import run_on_host
 
     code = None

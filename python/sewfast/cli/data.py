@@ -157,10 +157,7 @@ def _sample_time(given: float | None, table: Table, model: Model) -> float | Non
 
 
 def split(data: Dataset, train: str | None, held_out: str | None) -> tuple[Dataset, Dataset | None]:
-    """Training data and held-out data; without `train` the former is all but the latter.
-    Raises `SettingError` or `DataError` for a range that is invalid or outside a file, and for two
-    that overlap.
-    """
+    """Training data and held-out data; without `train` the former is all but the latter."""
     held = None if held_out is None else data.slice(held_out)
     if train is None:
         return (data, None) if held is None else (_without(data, held), held)

@@ -184,9 +184,7 @@ def is_port(text: str) -> bool:
 
 
 def machine_of(text: str) -> VirtualMachine | Machine:
-    """The machine that `--on` names: `virtual[:SEED]`, a motor's twin, or an FMU. Raises
-    `SettingError` or `ModelFileError` for any other text, and for a file that cannot be used.
-    """
+    """The machine that `--on` names: `virtual[:SEED]`, a motor's twin, or an FMU."""
     from ..commissioning.fmu import fmu_of, is_fmu
     from ..machine import VirtualMachine
 
@@ -210,9 +208,7 @@ def _named(machine: str) -> str:
 
 
 def require_no_drive_options(args: argparse.Namespace) -> None:
-    """Refuse (`SettingError`) a drive's options for another machine: a user could rely on limits
-    that do not apply.
-    """
+    """Refuse a drive's options elsewhere: a user could rely on limits that do not apply."""
     given = {
         "--limits": args.limits is not None,
         "--watchdog": args.watchdog is not None,
@@ -262,9 +258,7 @@ def _require_untripped(port: str, drive: Drive) -> None:
 
 
 def _limits(text: str) -> dict[str, float]:
-    """Parse `volt=10,speed=3500,...`.
-    Raises `SettingError` if a limit is missing, unknown, repeated or not a number.
-    """
+    """Parse `volt=10,speed=3500,...`."""
     parts = [part.partition("=") for part in text.split(",")]
     names = [name.strip() for name, _, _ in parts]
     if sorted(names) != sorted(LIMITS):
@@ -351,9 +345,6 @@ drop, flip (a bit), duplicate, reorder, delay (.02 s), stall (both directions, .
 device reboots), unplug (the port vanishes, .3 s)
 """
 
-_LOOK = 0.05
-"""Longest delay of a signal [s]."""
-
 
 def add_device(commands: Commands) -> None:
     parser = add_command(
@@ -436,7 +427,8 @@ def device_command(args: argparse.Namespace) -> int | None:
 
 def _serve(device: VirtualDevice, *, as_json: bool) -> None:
     _say(json.dumps({"port": device.port}) if as_json else f"port {device.port}")
-    while not device.wait(_LOOK):
+    # longest delay of a signal [s]
+    while not device.wait(0.05):
         pass
 
 

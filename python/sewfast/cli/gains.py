@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from ..rules import Fopdt, Rule
 
 RULES = ("eq-12", "table-1", "simc", "simc-pid", "amigo")
-FILTER = 8
 N = 10.0
 
 TEXT = """\
@@ -59,7 +58,7 @@ def add(commands: Commands) -> None:
         "--nearest", action="store_true", help="table-1: use the end row for L/T outside .1 to 1"
     )
     parser.add_argument(
-        "--filter", type=int, default=FILTER, metavar="N",
+        "--filter", type=int, default=8, metavar="N",
         help="moving average over N samples of the feedback (8); 1: none",
     )  # fmt: skip
     parser.add_argument(

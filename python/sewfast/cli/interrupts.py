@@ -20,17 +20,14 @@ SIGNALS = tuple(getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if h
 """Ctrl-C, the end of a session or a shutdown, a closed terminal: each acts as Ctrl-C."""
 GRACE = 0.7
 """Time for a command to end by itself [s]; Ctrl-C is to take no longer than a second."""
-STOPPING = 10.0
-"""The same while a drive is open, whose motor is to stop first [s]."""
 
 _pressed = _is_patient = False
 _end_at = 0.0
 
 
 def listen() -> None:
-    """Interrupt the command at the first signal, and end the process `GRACE` later.
-    Further signals are ignored, so that they cannot interrupt what the first one made the command
-    do. A signal that is ignored, as in a job in the background, stays ignored.
+    """Interrupt the command at the first signal, end the process `GRACE` later, ignore further
+    ones; a signal that a background job ignores stays ignored.
     """
     for number in SIGNALS:
         if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL):
@@ -66,7 +63,8 @@ def _press(number: int, frame: FrameType | None) -> None:
     global _end_at, _pressed
     deaf()
     _pressed = True
-    _end_at = time.monotonic() + (STOPPING if _is_patient else GRACE)
+    # while a drive is open, its motor is to stop first
+    _end_at = time.monotonic() + (10.0 if _is_patient else GRACE)
     # no threading.Thread: the interrupted code can hold the locks that starting one needs
     _thread.start_new_thread(_end, ())
     raise KeyboardInterrupt

@@ -140,9 +140,8 @@ def _speeds(text: str) -> float | list[float]:
 
 
 def _require_place_of_model(path: Path | None) -> None:
-    """Refuse to replace an identified model, or a file that is no model.
-    In other commands `--model`, or the first argument, names a model to read: given here by
-    mistake, it would be lost. Raises `SettingError` as `require_place`, and for such a file.
+    """Refuse to replace an identified model, or a file that is no model: other commands read
+    `--model`, so a slip here would lose it.
     """
     from ..models import load_model
 

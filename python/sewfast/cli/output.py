@@ -90,7 +90,6 @@ def print_result(result: Any, args: Any, *, plot: Path | None = None) -> None:
 
 
 def print_rows(rows: Sequence[Sequence[str]]) -> None:
-    """Print rows as aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = (cell.ljust(w) for cell, w in zip(row, widths, strict=True))

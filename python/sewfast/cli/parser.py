@@ -17,7 +17,6 @@ from . import (
     commission,
     control,
     data,
-    deploy,
     drive,
     gains,
     identify,
@@ -64,9 +63,7 @@ exit codes:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest name for a typo; without a command it shows its help.
-    argparse uses the same class for the parsers of the commands.
-    """
+    """A parser that suggests the nearest name for a typo; without a command it shows its help."""
 
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: Any = None
@@ -142,8 +139,6 @@ def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
         check.add_analyse,
         machine.add,
         machine.add_physics,
-        deploy.add,
-        deploy.add_pil,
         drive.add_ports,
         drive.add_doctor,
         drive.add,

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from ..readers import Table
 
 NAME = "sewfast.toml"
-_LARGEST = 1 << 20
 _RANGE = ("u_min", "u_max")
 _KEYS: dict[str, tuple[str, ...]] = {
     "columns": ("input", "output", "time", "counts", "counts_per_rev", "ts", "weights"),
@@ -104,9 +103,7 @@ class Project:
 
 
 def find(folder: Path | None = None) -> Project:
-    """The project that a folder belongs to: its own file's, or that of the next folder above.
-    Raises `SettingError` if the file cannot be read or has invalid content.
-    """
+    """The project that a folder belongs to: its own file's, or that of the next folder above."""
     try:
         folder = Path.cwd() if folder is None else folder
         places = (place / NAME for place in (folder, *folder.parents))
@@ -130,9 +127,7 @@ def _is_trusted(path: Path) -> bool:
 
 
 def load(path: Path) -> Project:
-    """The project that a file describes.
-    Raises `SettingError` if the file cannot be read or has invalid content.
-    """
+    """The project that a file describes."""
     found = _parsed(path)
     _require_known(path, "", found, _TOP)
     tables = {name: _table(path, found, name) for name in ("columns", "units", "limits")}
@@ -178,7 +173,7 @@ def _parsed(path: Path) -> dict[str, Any]:
         raise not_installed("tomli", f"{path} on Python 3.10") from None
     from ..storage import file_bytes  # loads NumPy
 
-    raw = file_bytes(path, SettingError, largest=_LARGEST)
+    raw = file_bytes(path, SettingError, largest=1 << 20)
     try:
         found: dict[str, Any] = toml.loads(raw.decode("utf-8-sig"))
     except (UnicodeDecodeError, ValueError, RecursionError) as e:
@@ -238,9 +233,7 @@ def _number(path: Path, where: str, value: Any) -> float:
 
 
 def with_units(table: Table, args: argparse.Namespace) -> Table:
-    """A table with the project's units for columns whose file states none.
-    Raises `SettingError` if the file states another unit: one of the two is wrong.
-    """
+    """A table with the project's units where its file states none; another is refused."""
     units: dict[str, str] = getattr(args, "units", {})
     known = {name: unit for name, unit in units.items() if name in table}
     if not known:
@@ -375,9 +368,7 @@ def init_command(args: argparse.Namespace) -> None:
 
 
 def _described(recording: str) -> tuple[str, str]:
-    """The lines on columns and units of a recording.
-    Raises `SettingError` if its columns do not show which is the input and which the output.
-    """
+    """The lines on columns and units of a recording."""
     from ..readers import read_table, roles
 
     table = read_table(recording)

@@ -121,9 +121,7 @@ def _settings(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _excitation(args: argparse.Namespace) -> tuple[FloatArray, float]:
-    """The samples of the signal [V] and their sample time [s]. Raises `SettingError` or `DataError`
-    for a text that is neither a name nor a file, a file without u, or an invalid factor.
-    """
+    """The samples of the signal [V] and their sample time [s]."""
     from ..readers import read_columns
     from ..signals import EXCITATIONS, TS, excitation
 

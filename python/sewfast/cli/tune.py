@@ -287,9 +287,7 @@ def _settings(args: argparse.Namespace) -> dict[str, Any]:
 def _on_response(
     args: argparse.Namespace, constraints: Constraints, models: list[Any]
 ) -> Constraints:
-    """Ms about a speed, and on the bands of a response.
-    Raises `SettingError` for a response without a linear model.
-    """
+    """Ms about a speed, and on the bands of a response."""
     if args.speed is not None:
         constraints = replace(constraints, speed=args.speed)
     if args.response is None:
@@ -319,9 +317,7 @@ def _started(args: argparse.Namespace, models: list[Any]) -> dict[str, Any]:
 
 
 def _pid(start: SampledController, option: str) -> Controller:
-    """The start as a PID, for an option that needs one.
-    Raises `SettingError` for another kind of controller.
-    """
+    """The start as a PID, for an option that needs one."""
     from ..control.controller import Controller
 
     if isinstance(start, Controller):
@@ -333,9 +329,7 @@ def _pid(start: SampledController, option: str) -> Controller:
 
 
 def _first(args: argparse.Namespace) -> dict[str, Any]:
-    """The controller to start with, or limits, encoder and filter of the first one.
-    Raises `SettingError` for both.
-    """
+    """The controller to start with, or limits, encoder and filter of the first one."""
     if args.start is None:
         return _loop(args)
     from ..control.files import load_controller
@@ -533,14 +527,12 @@ def _pairs(given: list[str] | None, option: str) -> dict[str, float]:
 
 
 def cost(given: list[str] | None) -> Cost:
-    """Weights of every --cost."""
     from ..tuning.objective import Cost
 
     return Cost(**_known(_pairs(given, "--cost"), "--cost", tuple(Cost.__dataclass_fields__)))
 
 
 def constraints(given: list[str] | None) -> Constraints:
-    """Limits of every --constraint."""
     from ..tuning.objective import Constraints
 
     pairs = _pairs(given, "--constraint")
@@ -550,7 +542,6 @@ def constraints(given: list[str] | None) -> Constraints:
 
 
 def loads(given: list[str] | None) -> list[LoadStep]:
-    """Disturbances of every --load."""
     from ..tuning.objective import LoadStep
 
     steps = []
@@ -566,7 +557,6 @@ def loads(given: list[str] | None) -> list[LoadStep]:
 
 
 def _known(pairs: dict[str, float], option: str, names: tuple[str, ...]) -> dict[str, Any]:
-    """The pairs, if all names are known."""
     for name in pairs:
         if name not in names:
             raise SettingError(f"{option} {name}: expected one of {', '.join(names)}")
@@ -574,9 +564,7 @@ def _known(pairs: dict[str, float], option: str, names: tuple[str, ...]) -> dict
 
 
 def variables(text: str | None) -> list[Wanted] | None:
-    """`Kp,Ti=0.02:0.5` as names and (name, low, high).
-    Raises `SettingError` for bounds that are not two numbers.
-    """
+    """`Kp,Ti=0.02:0.5` as names and (name, low, high)."""
     if text is None:
         return None
     found: list[Wanted] = []
@@ -596,9 +584,7 @@ def variables(text: str | None) -> list[Wanted] | None:
 
 
 def command_limits(args: argparse.Namespace) -> tuple[float | None, float | None]:
-    """Least and largest command [V]: as given, else a recording's volt limit, else None. Raises
-    `SettingError` or `DataError` for a recording without a volt limit, or one that cannot be read.
-    """
+    """Least and largest command [V]: as given, else a recording's volt limit, else None."""
     if args.limits_of is None:
         return args.u_min, args.u_max
     volt = _volt_limit(args.limits_of)

@@ -48,9 +48,7 @@ Bench = Machine
 
 
 class Aborted(Refusal):
-    """A run that was ended early. `recording` is what was recorded until then; `frequency` [Hz] is
-    that of a command that swung from limit to limit.
-    """
+    """A run ended early: its `recording`, and the `frequency` of a swinging command [Hz]."""
 
     def __init__(
         self, reason: str, recording: Recording, *, frequency: float | None = None
@@ -308,9 +306,7 @@ class RecordedBench(MachineWrapper):
 
 
 def require_record(machine: Machine, name: str, samples: int, found: object) -> None:
-    """Refuse an unusable recording of a user's own machine. Raises `SettingError` for anything but
-    a recording, `DataError` for a wrong number of samples or values that are not finite.
-    """
+    """Refuse an unusable recording of a user's own machine."""
     if not isinstance(found, Recording):
         raise SettingError(
             name=f"{machine.name}, {name}", expected="a Recording", received=type(found).__name__,
@@ -370,9 +366,7 @@ def description_of(bench: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
 def bench_of(
     on: object, u_max: float | None, cancel: threading.Event | None = None
 ) -> Iterator[Machine]:
-    """The machine to commission; for a drive, with a limit of at most `u_max` [V] meanwhile.
-    Raises `SettingError` for anything but a machine.
-    """
+    """The machine to commission; for a drive, with a limit of at most `u_max` [V] meanwhile."""
     machine = machine_of(on)
     if not is_streaming(machine):
         yield machine

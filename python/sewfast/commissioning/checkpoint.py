@@ -54,9 +54,7 @@ class Checkpoint:
     _has_warned: bool = field(default=False, init=False)
 
     def begin(self) -> None:
-        """Create the folder, and delete the files of an earlier commissioning unless it resumes.
-        Raises `DataError` if either fails.
-        """
+        """Create the folder, and delete the files of an earlier commissioning unless it resumes."""
         try:
             if not self.resume:
                 clear(self.folder)
@@ -71,9 +69,7 @@ class Checkpoint:
     def keep(
         self, stage: str, name: str, key: str, recording: Recording, run: ClosedLoopRun | None
     ) -> None:
-        """Write a recording; it replaces an earlier one of that name, which was not good enough.
-        If a file cannot be written, there is one warning: the recordings are also in memory.
-        """
+        """Write or replace a recording. If that fails, warn once: it is also in memory."""
         columns = recording.columns()
         del columns["t"]
         own: dict[str, Any] = {}
@@ -139,9 +135,7 @@ class Checkpoint:
 
 
 def prepare(folder: Path) -> None:
-    """Create the folder, before the machine moves. Raises `DataError` if it cannot be created, or
-    nothing can be written into it.
-    """
+    """Create the folder, before the machine moves."""
     try:
         with making(folder):
             require_writable(folder / "report.html", DataError)

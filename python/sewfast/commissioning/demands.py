@@ -45,10 +45,6 @@ def require(met: bool, message: str, cause: Cause | None = None) -> None:
 # --- `Demands` ------------------------------------------------------------------------------------
 
 
-LONGEST_NAME = 100
-"""Longest name of a reference's file [bytes]; file systems allow 255, including the endings."""
-
-MOST_MEMBERS = 100
 OVER = 1.25
 """Training covers this multiple of the top of the working range, as the loop overshoots it."""
 ROOM = 1.1
@@ -56,36 +52,14 @@ ROOM = 1.1
 1.25 times the working range, where it was their limit."""
 
 
-SAMPLE_TIMES = (1e-5, 0.1)
-"""Shortest and longest sample time of a machine [s]: the signals are planned in seconds."""
-
-
 @dataclass(frozen=True)
 class Demands:
-    """Limits, working range and effort.
-
-    Attributes
-    ----------
-    u_max : float
-        Largest command in either direction [V].
-    speed : float
-        Top of the working range [RPM].
-    references : mapping of name to array, or None
-        References for the verification [RPM]; None for those of `excitations.standard`.
-    practice : mapping of name to array, or None
-        References for tuning [RPM]; None for the same, or for shorter versions of the standard
-        ones.
-    members, evaluations : int
-        Models in the ensemble; controllers that the search tries.
-    load : float or None
-        Size of the load step in command [V]; None for a share of `u_max`, 0 for no such
-        requirement.
-    Ms : float or None
-        Largest sensitivity on the small signals; None for no such requirement.
-    time_budget : float or None
-        Longest time of the search [s].
-    stated : float
-        Speed above which the machine ends a run [RPM].
+    """Limits, working range and effort. `u_max` [V] and `speed` [RPM] bound command and working
+    range; `references` are those of the verification [RPM] and `practice` those of tuning, None for
+    those of `excitations.standard`. `members` models make the ensemble, and the search tries
+    `evaluations` controllers for `time_budget` [s]. `load` is a step of command [V] (None: a share
+    of `u_max`; 0: not required), `Ms` the largest sensitivity on the small signals; above `stated`
+    [RPM] the machine ends a run.
     """
 
     u_max: float
@@ -122,9 +96,7 @@ def demands(
     Ms: float | None = LARGEST_MS,
     time_budget: float | None = None,
 ) -> Demands:
-    """The demands, checked against the machine's limits.
-    Raises `SettingError` for a value outside its range or beyond a limit.
-    """
+    """The demands, checked against the machine's limits."""
     _require_machine(machine)
     volt = machine.volt if u_max is None else real("u_max", u_max)
     if not 0.0 < volt < math.inf:
@@ -172,7 +144,8 @@ def demands(
 
 def _require_machine(machine: Machine) -> None:
     """Refuse a machine with impossible figures before it moves."""
-    for name, low, high in (("Ts", *SAMPLE_TIMES), ("counts_per_rev", 1.0, 1e9)):
+    # shortest and longest sample time of a machine [s]: the signals are planned in seconds
+    for name, low, high in (("Ts", 1e-5, 0.1), ("counts_per_rev", 1.0, 1e9)):
         value = real(name, getattr(machine, name))
         if not low <= value <= high:
             raise SettingError(
@@ -202,14 +175,16 @@ def _load(load: float | None, volt: float) -> float | None:
 
 def _fixed(references: Mapping[str, FloatArray] | None) -> Mapping[str, FloatArray] | None:
     """The references, whose names must also be distinct file names."""
+    # longest name of a reference's file [bytes]; file systems allow 255, including the endings
+    longest_name = 100
     if references is None:
         return None
     files: dict[str, str] = {}
     for name in references:
         file = file_name(name)
-        if len(file.encode()) > LONGEST_NAME:
+        if len(file.encode()) > longest_name:
             raise SettingError(
-                name="references", expected=f"names of up to {LONGEST_NAME} bytes",
+                name="references", expected=f"names of up to {longest_name} bytes",
                 received=f"{name[:40]!r}.. of {len(file.encode())}", remedy="shorten it",
             )  # fmt: skip
         if file in files:
@@ -223,10 +198,11 @@ def _fixed(references: Mapping[str, FloatArray] | None) -> Mapping[str, FloatArr
 
 
 def _members(value: int) -> int:
+    most_members = 100
     number = _at_least(1, "members", value)
-    if number > MOST_MEMBERS:
+    if number > most_members:
         raise SettingError(
-            name="members", expected=f"up to {MOST_MEMBERS}", received=f"{number}",
+            name="members", expected=f"up to {most_members}", received=f"{number}",
             remedy="4 are usual, and each is trained for seconds",
         )  # fmt: skip
     return number

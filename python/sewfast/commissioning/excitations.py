@@ -19,25 +19,17 @@ from .demands import Demands, Refusal, require
 # --- First motion: the command that moves the machine, its direction, and a rough speed -----------
 
 
-SHARES = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.0)
-"""Commands to try, as shares of the largest, the smallest first."""
 HOLD = 0.8
 """Duration of each [s]."""
 MOVED = 0.02
 """Turns that count as motion."""
-ENOUGH = 0.2
-"""Share of the top speed at which the trials end."""
-LEAST_TURNS = 1.0
-"""Travel within which a load over the turn can stop the machine."""
 STALLS, STALLING = 3, 0.2
-"""Number of such stalls that are allowed, and the largest share of the command for them."""
+"""Stalls under a load that are allowed, and the largest share of the command for them."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Speed is about `gain (u - threshold)`.
-    `gain` is in [RPM/V]; `threshold` is the command that friction uses up [V].
-    """
+    """Speed is about `gain (u - threshold)` [RPM], gain in [RPM/V], threshold in [V]."""
 
     gain: float
     threshold: float
@@ -52,9 +44,13 @@ def first_motion(machine: Machine, demands: Demands) -> Motion:
     Raises `Refusal` if nothing moves, the machine turns the wrong way or gets stuck, or its largest
     command does not reach a fair speed.
     """
+    # commands to try, as shares of the largest, the smallest first
+    shares = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.0)
+    # share of the top speed at which the trials end
+    enough = 0.2
     levels: list[tuple[float, float]] = []
     stood, stalls = 0.0, 0
-    for share in SHARES:
+    for share in shares:
         u = share * demands.u_max
         recording = machine.excite(_pulse(u, machine.Ts), f"motion_{100 * share:g}")
         speed = _judged(recording, u, may_stall=stalls < STALLS and share < STALLING)
@@ -64,7 +60,7 @@ def first_motion(machine: Machine, demands: Demands) -> Motion:
             stood = stood if has_moved else u
             continue
         levels.append((u, speed))
-        if speed >= ENOUGH * demands.speed:
+        if speed >= enough * demands.speed:
             return _motion(levels, stood)
     require(
         bool(levels),
@@ -75,13 +71,13 @@ def first_motion(machine: Machine, demands: Demands) -> Motion:
     )
     u, speed = levels[-1]
     raise Refusal(
-        f"expected {ENOUGH * demands.speed:.4g} RPM within {HOLD:g} s at {u:g} V, a fifth of the "
+        f"expected {enough * demands.speed:.4g} RPM within {HOLD:g} s at {u:g} V, a fifth of the "
         f"top speed of {demands.speed:g} RPM, the machine reached {speed:.4g}",
         cause=Cause(
             "out of reach",
             f"{u:g} V reach {speed:.4g} RPM; see what brakes the machine, and whether motor and "
             "supply are made for this speed, or lower speed",
-            f"motion_{100 * SHARES[-1]:g}", None, speed,
+            f"motion_{100 * shares[-1]:g}", None, speed,
         ),
     )  # fmt: skip
 
@@ -113,7 +109,8 @@ def _judged(recording: Recording, u: float, *, may_stall: bool) -> float | None:
     speed = 60.0 * (turns[-1] - turns[-tail]) / ((tail - 1) * recording.Ts)
     first = turns[: len(turns) // 2]
     stopped = turns[-1] == turns[-tail] and np.ptp(first) > MOVED
-    if stopped and may_stall and np.max(np.abs(turns)) < LEAST_TURNS:
+    # travel within which a load over the turn can stop the machine
+    if stopped and may_stall and np.max(np.abs(turns)) < 1.0:
         # a load that varies over the turn stops a small command at its hardest angle
         return None
     require(
@@ -136,45 +133,42 @@ def _motion(levels: list[tuple[float, float]], stood: float) -> Motion:
 # --- The step response: gain, time constant and dead time -----------------------------------------
 
 
-SHARE = 0.6
-"""Target of the step as a share of the top speed."""
-DURATIONS = (2.0, 6.0, 20.0)
-"""Durations to try until the response settles [s]."""
-LEAST_FIT = 80.0
-"""Least fit [%]; below it the machine is not of first order with dead time."""
-
-
 def step_response(machine: Machine, demands: Demands, motion: Motion) -> Fopdt:
     """Record steps until one settles, and fit it.
     Each longer step is so small that even a machine that integrates stays below the top speed.
     Raises `Refusal` if none settles, the fit is poor, or the command cannot reach the top speed.
     """
-    u = min(motion.command(SHARE * demands.speed), demands.u_max)
+    # durations to try until the response settles [s]
+    durations = (2.0, 6.0, 20.0)
+    # target of the step as a share of the top speed
+    u = min(motion.command(0.6 * demands.speed), demands.u_max)
     reason: Exception | None = None
-    for k, seconds in enumerate(DURATIONS):
+    for k, seconds in enumerate(durations):
         recording = machine.excite(step(u, seconds, machine.Ts), "step")
         try:
             fopdt = fit_fopdt(recording.u, recording.y, Ts=recording.Ts)
         except (DataError, FitError) as error:
             reason = error
-            if seconds < DURATIONS[-1]:
-                at_worst = float(np.max(recording.y)) * DURATIONS[k + 1] / seconds
+            if seconds < durations[-1]:
+                at_worst = float(np.max(recording.y)) * durations[k + 1] / seconds
                 room = min(1.0, demands.top / max(at_worst, 1e-3 * demands.top))
                 u = motion.threshold + room * (u - motion.threshold)
             continue
         _checked(fopdt, demands, motion.threshold, u)
         return fopdt
     raise Refusal(
-        f"expected a speed that settles within {DURATIONS[-1]:g} s at {u:.3g} V, it did not "
+        f"expected a speed that settles within {durations[-1]:g} s at {u:.3g} V, it did not "
         f"({reason}); see what varies: a changing load, a controller inside the drive, a "
         "machine that integrates", cause=unsettled(recording),
     ) from reason  # fmt: skip
 
 
 def _checked(fopdt: Fopdt, demands: Demands, threshold: float, u: float) -> None:
+    # least fit [%]; below it the machine is not of first order with dead time
+    least_fit = 80.0
     require(
-        fopdt.K > 0.0 and fopdt.fit_percent >= LEAST_FIT,
-        f"expected a step response of first order with dead time (fit of {LEAST_FIT:g} % or more, "
+        fopdt.K > 0.0 and fopdt.fit_percent >= least_fit,
+        f"expected a step response of first order with dead time (fit of {least_fit:g} % or more, "
         f"gain above 0), got {fopdt}; see the recording: the load must not change, nor a limit "
         "be reached",
     )
@@ -197,21 +191,8 @@ def _checked(fopdt: Fopdt, demands: Demands, threshold: float, u: float) -> None
 # --- Signals for a machine of which only a first order with dead time is known --------------------
 
 
-SPANS = 0.02, 0.01, 0.005
-"""Spans for differences of speed, long enough to average the encoder's noise [s]; the shorter ones
-are for fast machines, whose pulses are shorter."""
-FIRST_SHARE, FAIR_SHARE = 0.2, 0.35
-"""Shares of the top speed: aim of the first single pulse, and speed that ends the series."""
-LONGEST_PULSE = 1.0
-"""Longest pulse of the series [s]."""
-LEAST_HARD = 50
-"""Samples near the largest command needed for an estimate of the acceleration."""
 LONGEST = 60.0
 """Longest excitation [s]."""
-PULSES = 20.0
-"""Length of the pulses in time constants."""
-HARD = 0.25
-"""Least size of a pulse as a share of the largest command; a current limit takes about half."""
 SLOW = 0.15
 """Speed between the trapezoids as a share of the top: a shaft held by friction shows nothing."""
 TRAPEZOIDS = (
@@ -237,10 +218,13 @@ def acceleration_shown(recording: Recording, demands: Demands) -> float:
     much as it hinders here.
     """
     hard = recording.u >= 0.7 * demands.u_max
-    for span in (max(1, round(seconds / recording.Ts)) for seconds in SPANS):
+    # spans for differences of speed, long enough to average the encoder's noise [s]; the shorter
+    # ones are for fast machines, whose pulses are shorter
+    for span in (max(1, round(seconds / recording.Ts)) for seconds in (0.02, 0.01, 0.005)):
         whole = np.convolve(hard, np.ones(span), "valid")[:-1] >= span
         change = (recording.y[span:] - recording.y[:-span])[: len(whole)][whole]
-        if len(change) >= LEAST_HARD and np.quantile(change, 0.9) > 0.0:
+        # samples near the largest command needed for an estimate of the acceleration
+        if len(change) >= 50 and np.quantile(change, 0.9) > 0.0:
             return float(np.quantile(change, 0.9)) / (span * recording.Ts)
     return float("inf")
 
@@ -250,13 +234,16 @@ def acceleration_from_rest(machine: Machine, fastest: float, demands: Demands) -
     Each is twice as long as the one before. Pulses between speeds do not help if they are planned
     with far more acceleration than a drive's current limit allows: they last only milliseconds.
     """
-    samples = max(1, round(FIRST_SHARE * demands.top / (fastest * machine.Ts)))
+    # shares of the top speed: aim of the first single pulse, and speed that ends the series
+    first_share, fair_share = 0.2, 0.35
+    samples = max(1, round(first_share * demands.top / (fastest * machine.Ts)))
     while True:
         seconds = samples * machine.Ts
         recording = machine.excite(_single(demands.u_max, samples, machine.Ts), f"limit_{samples}")
         reached = float(np.max(recording.y))
         # a pulse of twice the length reaches at most about twice the speed
-        if reached >= FAIR_SHARE * demands.top or seconds >= LONGEST_PULSE:
+        # longest pulse of the series [s]
+        if reached >= fair_share * demands.top or seconds >= 1.0:
             return max(reached, 1e-3 * demands.top) / seconds
         samples *= 2
 
@@ -319,12 +306,14 @@ def pulses(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int)
     """
     T = fopdt.T
     return _core.jumps(
-        duration=min(PULSES * T, LONGEST),
+        # length of the pulses in time constants
+        duration=min(20.0 * T, LONGEST),
         Ts=Ts,
         speed_low=SLOW * demands.top,
         speed_high=demands.top,
         change_min=0.25 * demands.top,
-        level_min=HARD * demands.u_max,
+        # least size of a pulse as a share of the largest command; a current limit takes about half
+        level_min=0.25 * demands.u_max,
         level_max=demands.u_max,
         hold_min=0.4 * T,
         hold_max=2.0 * T,
@@ -340,10 +329,6 @@ def pulses(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int)
 
 GENTLE = 0.75
 """Largest acceleration of the standard references as a share of the machine's."""
-BRIEF = 2.5
-"""Largest pace at which the references for tuning still get longer; beyond it they cover less."""
-SHORT = 0.35
-"""Length of the sweeps for tuning as a share of those for the verification."""
 
 
 def pace_of(fastest: float, demands: Demands) -> float:
@@ -360,9 +345,11 @@ def standard(fastest: float, demands: Demands, Ts: float, *, short: bool) -> dic
     """
     pace = pace_of(fastest, demands)
     size = demands.speed / 2000.0
-    share = SHORT if short else 1.0
+    # length of the sweeps for tuning as a share of those for the verification
+    share = 0.35 if short else 1.0
     # the complete sweeps of a slow machine would take minutes in every loop that a search simulates
-    brief = min(pace, BRIEF) if short else pace
+    # largest pace at which the references for tuning still get longer; beyond it they cover less
+    brief = min(pace, 2.5) if short else pace
     # the change of random levels is half a cosine, steepest in its middle
     change = max(0.2 * pace, 0.5 * math.pi * 1800.0 * size / (GENTLE * fastest))
     return {

@@ -20,11 +20,6 @@ from ..control.machine import SteppedBench
 from ..errors import ModelFileError, SettingError, not_installed
 from .fmu_process import FmuProcess
 
-MOST_BYTES = 2 * 1024**3
-"""Most bytes of all files of an FMU, unpacked."""
-MOST_FILES = 20_000
-MOST_XML = 64 * 1024**2
-"""Most bytes of a model description."""
 _TURNS = {"rad": 1.0 / (2.0 * math.pi), "deg": 1.0 / 360.0, "turn": 1.0, "rev": 1.0}
 _RPM = {
     "RPM": 1.0, "rpm": 1.0, "1/min": 1.0, "rev/min": 1.0, "rad/s": 30.0 / math.pi,
@@ -295,9 +290,7 @@ def is_fmu(text: str) -> bool:
 
 
 def fmu_of(text: str) -> SteppedBench:
-    """The machine of `FILE.fmu?volt=24&input=u&speed=w`, the arguments of `fmu_bench` by name.
-    Raises as `fmu_bench`, and `SettingError` for unknown arguments.
-    """
+    """The machine of `FILE.fmu?volt=24&input=u&speed=w`, the arguments of `fmu_bench` by name."""
     path, _, query = text.partition("?")
     given: dict[str, Any] = {}
     for part in filter(None, query.split("&")):
@@ -331,6 +324,11 @@ def _library() -> Any:
 
 def _require_fmu(path: Path) -> None:
     """Refuse a file that is not an FMU or would do harm when unpacked; nothing is executed."""
+    # most bytes of all files of an FMU, unpacked
+    most_bytes = 2 * 1024**3
+    most_files = 20_000
+    # most bytes of a model description
+    most_xml = 64 * 1024**2
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
@@ -340,14 +338,14 @@ def _require_fmu(path: Path) -> None:
                     name=str(path), expected="an FMU with one modelDescription.xml",
                     received=str(len(described)), remedy="export it again",
                 )  # fmt: skip
-            if described[0].file_size > MOST_XML:
+            if described[0].file_size > most_xml:
                 raise ModelFileError(
-                    name=str(path), expected=f"a modelDescription.xml of at most {MOST_XML} bytes",
+                    name=str(path), expected=f"a modelDescription.xml of at most {most_xml} bytes",
                     received=str(described[0].file_size),
                     remedy="export it without what is not needed",
                 )  # fmt: skip
             with archive.open(described[0]) as file:
-                text = file.read(MOST_XML)
+                text = file.read(most_xml)
     except ModelFileError:
         raise
     except OSError as error:
@@ -374,9 +372,9 @@ def _require_fmu(path: Path) -> None:
             remedy="export it as 2.0 or 3.0",
         )  # fmt: skip
     size = sum(e.file_size for e in entries)
-    if size > MOST_BYTES or len(entries) > MOST_FILES:
+    if size > most_bytes or len(entries) > most_files:
         raise ModelFileError(
-            name=str(path), expected=f"at most {MOST_FILES} files of {MOST_BYTES} bytes",
+            name=str(path), expected=f"at most {most_files} files of {most_bytes} bytes",
             received=f"{len(entries)} of {size}", remedy="export it without what is not needed",
         )  # fmt: skip
     for entry in entries:

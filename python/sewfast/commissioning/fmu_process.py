@@ -26,8 +26,6 @@ _REQUEST = struct.Struct("<cd")
 _ANSWER = struct.Struct("<?3d")
 """Whether it succeeded, and the measured variables; after a failure, the first is the size of the
 message that follows."""
-_FAREWELL = 5.0
-"""Time for an FMU to end by itself [s]."""
 
 
 class FmuProcess:
@@ -64,9 +62,7 @@ class FmuProcess:
         self._ended: BaseException | None = None
 
     def begin(self) -> tuple[float, ...]:
-        """Begin a run; return the variables at its beginning.
-        Raises `SettingError` if the FMU refuses, crashes, or does not answer in time.
-        """
+        """Begin a run; return the variables at its beginning."""
         return self._ask(b"r", 0.0, "an instance that begins")
 
     def step(self, u: float, sample: int) -> tuple[float, ...]:
@@ -74,11 +70,11 @@ class FmuProcess:
         return self._ask(b"s", u, f"a step of {self.Ts:g} s from {sample * self.Ts:g} s")
 
     def close(self) -> None:
-        """End the process."""
         with contextlib.suppress(OSError):
             self._requests.close()
         try:
-            self._process.wait(0.0 if self._ended else _FAREWELL)
+            # time for an FMU to end by itself [s]
+            self._process.wait(0.0 if self._ended else 5.0)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

@@ -36,20 +36,8 @@ from .small_signal import SHAKEN_AT, Resonance, SmallSignal
 # --- Gains: by rule from the step response, then by search on the ensemble ------------------------
 
 
-FILTER = 8e-3
-"""Length of the feedback's moving average [s]: one count of 1,572 per ms is 38 RPM."""
-DERIVATIVE_FILTER = 10.0
-LOWER, STEPS = 0.85, 29
-"""Factor from one trial of lower gains to the next, and the number of trials."""
 SEARCHED = ("Kp", "Ti", "Td", "alpha", "beta", "N", "filter_samples", "filter_time")
 """Variables of the search: the feedback's filter matters as much as the gains."""
-NOTCH_DEPTHS, NOTCH_WIDTHS = (0.05, 0.2), (0.6, 1.2, 2.0)
-"""Depths and widths to try for the first notch; the search starts from the best. A narrower one
-does not hold a resonance that moves by a tenth."""
-ALPHAS, BETAS = (0.0, 0.1, 0.2, 0.4), (-1.0, 0.0, 0.5)
-"""Values to try for the start of the search."""
-RATIOS = (0.01, 2.0)
-"""Range of L/T in which Eq. 12 is solved."""
 
 
 def first_gains(
@@ -59,14 +47,15 @@ def first_gains(
     With a model of the small signals, the gains are lowered until its Ms is within the limit, too;
     if it has a resonance, with a notch there.
     """
-    samples = max(1, min(64, round(FILTER / machine.Ts)))
+    # length of the feedback's moving average [s]: one count of 1,572 per ms is 38 RPM
+    samples = max(1, min(64, round(8e-3 / machine.Ts)))
     rule = _rule(fopdt, (samples - 1) / 2 * machine.Ts, LARGEST_MS)
     found = Controller(
         gains=rule.gains,
         Ts=machine.Ts,
         alpha=rule.alpha,
         beta=rule.beta,
-        N=DERIVATIVE_FILTER,
+        N=10.0,
         u_min=-demands.u_max,
         u_max=demands.u_max,
         filter_samples=samples,
@@ -85,8 +74,11 @@ def notched(controller: Controller, plant: Model, resonance: Resonance, Ms: floa
     They are compared by the integral gain, which rejects disturbances. A search can flatten a notch
     that gains nothing, but cannot add one.
     """
+    # depths and widths to try for the first notch; the search starts from the best. A narrower one
+    # does not hold a resonance that moves by a tenth
+    notch_depths, notch_widths = (0.05, 0.2), (0.6, 1.2, 2.0)
     found: list[Controller] = []
-    for depth, width in product(NOTCH_DEPTHS, NOTCH_WIDTHS):
+    for depth, width in product(notch_depths, notch_widths):
         notch = Biquad.notch(resonance.frequency, depth, width)
         with suppress(Refusal):
             found.append(lowered(replace(controller, biquads=(notch,)), plant, Ms))
@@ -102,7 +94,9 @@ def lowered(controller: Controller, plant: Model, Ms: float) -> Controller:
     It lowers Kp alone first; if that is not enough, it also lengthens Ti by the same factor. Raises
     `Refusal` if no gains reach this Ms.
     """
-    shares = LOWER ** np.arange(STEPS)
+    # factor from one trial of lower gains to the next, and the number of trials
+    lower, steps = 0.85, 29
+    shares = lower ** np.arange(steps)
     # at the same Ti, a lower Kp costs phase on a plant slower than Ti; at the same Kp Ti not
     tried = [scaled(controller, s) for s in shares] + [stretched(controller, s) for s in shares]
     for found in tried:
@@ -148,8 +142,10 @@ def _rule(fopdt: Fopdt, late: float, Ms: float) -> Rule:
     Below the smallest L/T of Eq. 12 that ratio is used, a longer dead time than the plant's:
     conservative.
     """
-    L = max(fopdt.L + late, min(RATIOS) * fopdt.T)
-    if max(RATIOS) < L / fopdt.T:
+    # range of L/T in which Eq. 12 is solved
+    ratios = (0.01, 2.0)
+    L = max(fopdt.L + late, min(ratios) * fopdt.T)
+    if max(ratios) < L / fopdt.T:
         return simc(replace(fopdt, L=L))
     return eq_12(replace(fopdt, L=L), Ms=Ms)
 
@@ -161,10 +157,10 @@ def start_of(
     cost: Cost,
     threads: int,
 ) -> Controller:
-    """The start of the search: the rule's gains, with alpha and beta of least cost on a grid.
-    The rule's own alpha and beta are for a step of the reference; slow references need others.
-    """
-    tried = [replace(rule, alpha=a, beta=b) for a, b in product(ALPHAS, BETAS)]
+    """The rule's gains, with alpha and beta of least cost on a grid: the rule's suit steps only."""
+    # values to try for the start of the search
+    alphas, betas = (0.0, 0.1, 0.2, 0.4), (-1.0, 0.0, 0.5)
+    tried = [replace(rule, alpha=a, beta=b) for a, b in product(alphas, betas)]
     found = costs([rule, *tried], models, list(references.values()), cost=cost, threads=threads)
     return [rule, *tried][int(np.argmin(found))]
 
@@ -258,14 +254,8 @@ def led(
 # --- Requirements of tuned gains besides their cost -----------------------------------------------
 
 
-LOAD = 0.1
-"""Default of the load step as a share of the largest command."""
 LEVEL = 0.75
 """Speed of the load step, and of the linearisation of networks, as a share of the top speed."""
-RECOVERED = 0.01
-"""Band of recovery as a share of the load's effect on the speed without control."""
-SLOWER = 30
-"""Times that the rule's gains are lowered by a tenth; .04 of them are left after all."""
 SENSITIVE = 2.0
 """Largest Ms of a network under the rule's gains, as a multiple of that of the small signals'
 model: above it the network is wrong about small signals. Of 44 networks of eleven commissionings 41
@@ -341,7 +331,8 @@ class Requirements:
 
 def _within(rule: Controller, plants: Sequence[Model], speed: float, limit: float) -> Controller:
     """The rule's gains, slowed down until they keep the limit of Ms on every plant."""
-    for k in range(SLOWER):
+    # times that the rule's gains are lowered by a tenth; .04 of them are left after all
+    for k in range(30):
         slowed = stretched(rule, 0.9**k)
         if all(margins(slowed, m, speed=speed).Ms_robust <= limit for m in plants):
             return slowed
@@ -350,13 +341,15 @@ def _within(rule: Controller, plants: Sequence[Model], speed: float, limit: floa
 
 def _load_steps(fopdt: Fopdt, fastest: float, demands: Demands) -> tuple[LoadStep, ...]:
     """A braking load step at three quarters of the top speed."""
-    volt = LOAD * demands.u_max if demands.load is None else demands.load
+    # default of the load step as a share of the largest command
+    volt = 0.1 * demands.u_max if demands.load is None else demands.load
     if volt == 0.0:
         return ()
     pace = pace_of(fastest, demands)
     return (
         LoadStep(
-            LEVEL * demands.speed, -volt, band=RECOVERED * volt * fopdt.K,
+            # band of recovery as a share of the load's effect on the speed without control
+            LEVEL * demands.speed, -volt, band=0.01 * volt * fopdt.K,
             ramp=0.3 * pace, settle=0.5 * pace, look=0.5 * pace,
         ),
     )  # fmt: skip
@@ -400,25 +393,8 @@ def _linear(members: Sequence[Model], demands: Demands, Ts: float) -> list[Model
 # --- Caution: new gains are tried in steps on a short hold before anything longer -----------------
 
 
-SHARES = (0.25, 0.5, 1.0)
-"""Shares of the gains to try, one hold after the other."""
-HOLD = 0.4
-"""Least duration of the hold in which an oscillation is looked for [s]."""
-GENTLY = 12.0
-"""The ramp takes this many times as long as at the acceleration of the step response. A current
-limit can allow only a fifth of that, and a loop that comes off a limit swings back anyway."""
-SETTLE = 0.2
-"""Least time between the ramp and the hold [s]."""
-PERIODS = 100
-"""Least samples of the hold."""
-CHATTER = 0.12
-"""Largest standard deviation of a quiet loop's command, as a share of the largest command."""
 EXPECTED = 2.0
-"""The same as a multiple of the models' own, due to the encoder; the larger one counts."""
-RAILED = 0.05
-"""Largest share of the held samples at a limit."""
-BACK = 0.5
-"""Share that is kept of gains that oscillated."""
+"""Deviation of a quiet loop's command as a multiple of the models', which is due to the encoder."""
 
 
 @dataclass(frozen=True)
@@ -436,25 +412,31 @@ class Swing:
 
 def held(demands: Demands, fastest: float, Ts: float) -> tuple[FloatArray, int]:
     """A ramp to a working speed and a hold [RPM], and the sample at which the hold begins."""
+    # least samples of the hold
+    periods = 100
     level = SHAKEN_AT * demands.speed
-    rise = max(round(GENTLY * level / fastest / Ts), 20)
-    settle = rise + max(round(0.5 * rise), round(SETTLE / Ts), PERIODS // 2)
-    hold = max(round(HOLD / Ts), PERIODS)
+    # the ramp takes this many times as long as at the acceleration of the step response. A current
+    # limit can allow only a fifth of that, and a loop that comes off a limit swings back anyway
+    rise = max(round(12.0 * level / fastest / Ts), 20)
+    # least time between the ramp and the hold [s]
+    settle = rise + max(round(0.5 * rise), round(0.2 / Ts), periods // 2)
+    # the hold in which an oscillation is looked for lasts .4 s or 100 samples
+    hold = max(round(0.4 / Ts), periods)
     return level * np.minimum(1.0, np.arange(settle + hold) / rise), settle
 
 
 def swing_of(
     found: ClosedLoopRun, settled: int, share: float = 1.0, expected: float = 0.0
 ) -> Swing | None:
-    """The oscillation of the command at a held speed; None for a quiet loop.
-    `expected` is its standard deviation according to the models [V].
-    """
+    """The oscillation of a command at a held speed beyond the `expected` rms [V]; None if quiet."""
     u, limits = found.u[settled:], found.controller
     u = u[np.isfinite(u)]
     reach = 0.5 * (limits.u_max - limits.u_min)
     railed = float(np.mean((u >= limits.u_max - 1e-9) | (u <= limits.u_min + 1e-9)))
     rest = unsettled(u)
-    if rest.std() <= max(CHATTER * reach, EXPECTED * expected) and railed <= RAILED:
+    # a quiet loop's command deviates little, as a share of the largest one or of what the models
+    # expect, and few of the held samples are at a limit
+    if rest.std() <= max(0.12 * reach, EXPECTED * expected) and railed <= 0.05:
         return None
     return Swing(share, frequency_of(rest, found.Ts), float(rest.std()), railed)
 
@@ -467,7 +449,6 @@ def unsettled(u: FloatArray) -> FloatArray:
 
 
 def frequency_of(rest: FloatArray, Ts: float) -> float:
-    """The frequency of an oscillation [Hz]."""
     power = np.abs(np.fft.rfft(rest * np.hanning(len(rest)))) ** 2
     return (1 + int(np.argmax(power[1:]))) / (len(rest) * Ts)
 
@@ -487,8 +468,10 @@ def cautious(
     samples that `thinning` leaves. Raises `Refusal` if the loop oscillates even with a quarter of
     the gains.
     """
+    # shares of the gains to try, one hold after the other
+    shares = (0.25, 0.5, 1.0)
     r, settled = held(demands, fastest, machine.Ts)
-    for share in SHARES:
+    for share in shares:
         tried = scaled(controller, share)
         expected = 0.0
         if models is not None:
@@ -503,8 +486,9 @@ def cautious(
             swing = Swing(share, stop.frequency, float(u.std()), 1.0)
         if swing is None:
             continue
-        kept = BACK * share
-        if kept < SHARES[0]:
+        # share that is kept of gains that oscillated
+        kept = 0.5 * share
+        if kept < shares[0]:
             raise Refusal(
                 f"expected a quiet loop at {r[-1]:.4g} RPM under a quarter of the gains, it swings "
                 f"at {swing.frequency:.3g} Hz ({swing.command:.3g} V rms): {cause(swing, small)}"

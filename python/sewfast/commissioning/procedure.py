@@ -66,16 +66,6 @@ from .verification import (
 
 __all__ = ["STAGES", "commission"]
 
-MEMBERS = 4
-EVALUATIONS = 3000
-SHORTEST = 2 * WATCHED
-"""Least samples of a reference: fewer cannot be judged."""
-FALLS_SHORT = 0.7
-"""Share of the planned acceleration; a drive that reaches less limits its current."""
-TWICE = 2.0
-"""Multiple of the largest planned speed at which a machine that states no limit is too fast."""
-LEAST_OF_STEP = 0.1
-"""Share of the step's acceleration that a larger command must reach."""
 
 References = Mapping[str, ArrayLike] | Sequence[str]
 Between = Callable[[str, Commissioning], object]
@@ -90,8 +80,8 @@ def commission(
     references: References | None = None,
     practice: References | None = None,
     cost: Cost | None = None,
-    members: int = MEMBERS,
-    evaluations: int = EVALUATIONS,
+    members: int = 4,
+    evaluations: int = 3000,
     load: float | None = None,
     Ms: float | None = LARGEST_MS,
     time_budget: float | None = None,
@@ -237,7 +227,8 @@ def commission(
                 return None
             return checkpoint.found_run(journal.stage, name, key, controller, machine.name)
 
-        recorded = RecordedBench(machine, note, kept, kept_run, most=TWICE * asked.top)
+        # multiple of the largest planned speed at which a machine that states no limit is too fast
+        recorded = RecordedBench(machine, note, kept, kept_run, most=2.0 * asked.top)
         try:
             return _carry_out(recorded, asked, cost, journal)
         except (Refusal, LinkError) as stop:
@@ -306,7 +297,6 @@ def _place(
 def _carry_out(
     machine: RecordedBench, asked: Demands, cost: Cost | None, journal: Journal
 ) -> Commissioning:
-    """Run the stages."""
     journal.enter("first motion")
     motion = first_motion(machine, asked)
     journal.keep(motion=motion)
@@ -424,13 +414,12 @@ def _compared(
     plan: _Plan,
     journal: Journal,
 ) -> Controller:
-    """Predict and measure every reference; the controller with its gains lowered until it is calm.
-    Raises `Refusal` if it is restless even with half of them.
-    """
+    """Predict and measure every reference with gains lowered until it is calm, or `Refusal`."""
     thinning = plan.thinning
     pushes = thinning.pushes(load, verify, machine.Ts)
     swings = ""
-    for share in CALMER:
+    # shares of Kp under which the references run, one after the other until the loop is calm
+    for share in (1.0, 0.7, 0.5):
         tried = scaled(controller, share)
         if share < 1.0:
             note = f"gains lowered to {100 * share:.0f} %, as the machine {swings}"
@@ -453,9 +442,7 @@ def _compared(
 
 
 def _instead(rival: Rival | None, judge: Recording, refusal: Refusal, journal: Journal) -> Trained:
-    """The linear rival in place of networks that failed.
-    Raises the networks' `refusal` if the rival does not predict well enough either.
-    """
+    """The linear rival in place of networks that failed; their `refusal` if it fails, too."""
     if rival is None or not rival.is_fit:
         raise refusal
     journal.say(f"tuned on the linear model alone, as the networks failed: {refusal}")
@@ -473,9 +460,11 @@ def _pulses(machine: Machine, fopdt: Fopdt, asked: Demands) -> tuple[float, list
     shown = excitations.acceleration_shown(found[0], asked)
     if math.isinf(shown):
         shown = excitations.acceleration_from_rest(machine, fastest, asked)
-    if shown > FALLS_SHORT * fastest:
+    # share of the planned acceleration; a drive that reaches less limits its current
+    if shown > 0.7 * fastest:
         return min(shown, fastest), found
-    slowest = LEAST_OF_STEP * fopdt.K * fopdt.u_high / fopdt.T
+    # share of the step's acceleration that a larger command must reach
+    slowest = 0.1 * fopdt.K * fopdt.u_high / fopdt.T
     require(
         shown > slowest,
         f"expected the largest command to accelerate the machine by at least {slowest:.3g} RPM/s, "
@@ -485,10 +474,6 @@ def _pulses(machine: Machine, fopdt: Fopdt, asked: Demands) -> tuple[float, list
     found.append(machine.excite(u, "pulses_limited"))
     again = excitations.acceleration_shown(found[1], asked)
     return shown if math.isinf(again) else again, found
-
-
-CALMER = (1.0, 0.7, 0.5)
-"""Shares of Kp under which the references run, one after the other until the loop is calm."""
 
 
 @dataclass(frozen=True)
@@ -590,14 +575,16 @@ def _samples(
 
 def _whole(name: str, reference: ArrayLike) -> FloatArray:
     """The samples of a reference, checked."""
+    # least samples of a reference: fewer cannot be judged
+    shortest = 2 * WATCHED
     samples = vector(name, reference).copy()
     if not np.all(np.isfinite(samples)):
         raise DataError(
             name=name, expected="finite samples of a reference", received="NaN or infinity"
         )
-    if len(samples) < SHORTEST:
+    if len(samples) < shortest:
         raise DataError(
-            name=name, expected=f"{SHORTEST} samples of a reference or more",
+            name=name, expected=f"{shortest} samples of a reference or more",
             received=f"{len(samples)}", remedy="hold its end for longer",
         )  # fmt: skip
     if not samples.any():
@@ -616,9 +603,7 @@ Progress: TypeAlias = Callable[[int, int, str], object]
 
 
 class Journal:
-    """Collects the results; `result` makes a `Commissioning` of them at any time.
-    The callbacks and `cancel` are those of `commission`.
-    """
+    """Collects the results; `result` makes a `Commissioning` of them at any time."""
 
     def __init__(
         self,
@@ -640,22 +625,18 @@ class Journal:
 
     @property
     def first(self) -> Controller:
-        """The first gains."""
         found: Controller = self._values["first"]
         return found
 
     def recording(self, name: str) -> Recording:
-        """A recording by its name."""
         found: Recording = self._values["recordings"][name]
         return found
 
     @property
     def stage(self) -> str:
-        """The present stage."""
         return self._began[-1][0] if self._began else STAGES[0]
 
     def enter(self, stage: str) -> None:
-        """Begin a stage."""
         # register it first: the callbacks can raise to stop
         self._began.append((stage, time.perf_counter()))
         self._report(STAGES.index(stage), stage)
@@ -688,7 +669,6 @@ class Journal:
             self._progress(done, len(STAGES), text)
 
     def keep(self, **values: Any) -> None:
-        """Store results."""
         self._values |= values
 
     def say(self, note: str) -> None:
@@ -707,7 +687,6 @@ class Journal:
         return found
 
     def result(self, verdict: str, reason: str = "") -> Commissioning:
-        """The results so far."""
         ends = [t for _, t in self._began[1:]] + [time.perf_counter()]
         seconds = {s: end - t for (s, t), end in zip(self._began, ends, strict=True)}
         return Commissioning(

@@ -239,7 +239,6 @@ class Commissioning:
         return loop_drawing(traces, units["y"], units["u"]).plot(ax, file)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         return html_of(str(self))
 
     def __str__(self) -> str:
@@ -331,14 +330,10 @@ def _comparison(c: Comparison) -> str:
 
 
 _FOLDERS = ("recordings", "models", "controllers", "runs", "analysis")
-_SHORT = 5.0
-"""Longest reference for the analysis [s]."""
 
 
 def require_own(folder: Path, *, overwrite: bool) -> None:
-    """Refuse (`SettingError`) a folder with files that a commissioning of a virtual machine cannot
-    repeat.
-    """
+    """Refuse a folder with files that a commissioning of a virtual machine cannot repeat."""
     if not overwrite:
         require_repeatable(folder)
         _require_own_artefacts(folder)
@@ -453,7 +448,8 @@ def _analysis(found: Commissioning, folder: Path) -> None:
     if found.controller is None or found.models is None:
         return
     runs = [c.predicted for c in found.comparisons]
-    references = [r.r for r in runs if r.t[-1] <= _SHORT] or [r.r for r in runs[:1]] or None
+    # longest reference for the analysis [s]
+    references = [r.r for r in runs if r.t[-1] <= 5.0] or [r.r for r in runs[:1]] or None
     coarse = Thinning.between(found.models.members[0].Ts, found.controller.Ts)
     with suppress(SettingError):
         analyse(

@@ -28,22 +28,12 @@ from ..recording import Recording
 from ..speed import speed_from_counts
 from .bench import bench_of
 
-SHARE = 0.6
-"""Default amplitude of the multisine as a share of the command left at the working point."""
 STEPS = 0.05
 """Default amplitude of the reference under a controller, as a share of the working speed."""
-HIGHEST = 0.4
-"""Highest excited frequency as a share of the sample rate."""
-HARMONICS, APART = 8, 1.0
-"""Multiples of the turn that lines avoid, and the least distance from them [Hz]."""
 HOLD, LONGEST = 2.0, 32.0
 """First and longest hold of a command for measuring its speed [s]."""
 NEAR, SETTLED = 0.03, 0.02
 """Tolerance of the working point, and of a settled speed, as shares of the speed."""
-TRIES = 8
-CLIPPING = 0.8
-"""Share of its peak at which a multisine is repeatedly clipped to lower its crest factor."""
-ROUNDS = 100
 SWING, MOST = 0.5, 0.8
 """Largest predicted swing as a share of the working speed: by default, and on request. Nearer to
 standstill, friction would act like a step."""
@@ -228,10 +218,7 @@ def _shaken(
 # --- Margins, predicted and measured --------------------------------------------------------------
 
 
-AGAIN, LEAST_SHAKEN = 0.5, 0.2
-"""Factor for the amplitude if the command reached a limit; the least share of it to try."""
 MARGINS = ("Ms", "phase_margin_deg", "gain_margin")
-UNBOUNDED = 1e6
 
 
 def margins_at_work(
@@ -242,14 +229,16 @@ def margins_at_work(
     response is too small, the command reaches its limits even at a small amplitude, or the machine
     cannot be excited at that speed.
     """
+    # factor for the amplitude if the command reached a limit; the least share of it to try
+    again, least_shaken = 0.5, 0.2
     share = 1.0
-    while share >= LEAST_SHAKEN:
+    while share >= least_shaken:
         try:
             plan = _Plan.of(machine, speed, 2.0, 2, 4, 1.0, None, seed)
             response = _shaken(machine, plan, share * STEPS * abs(speed), controller, is_whole=True)
             measured = response.margins(controller, speed=speed)
         except DataError:
-            share *= AGAIN
+            share *= again
             continue
         except SettingError:
             # this machine or sample time cannot be excited so
@@ -260,7 +249,7 @@ def margins_at_work(
             "predicted": {name: getattr(predicted, name) for name in MARGINS},
             "measured": {name: getattr(measured, name) for name in MARGINS}
             # a confidence circle that contains -1 gives no bound
-            | {"Ms_band": [x if x < UNBOUNDED else math.inf for x in measured.Ms_band]},
+            | {"Ms_band": [x if x < 1e6 else math.inf for x in measured.Ms_band]},
         }
         return found, response
     return None
@@ -293,6 +282,8 @@ class _Plan:
         f_max: float | None,
         seed: int,
     ) -> _Plan:
+        # multiples of the turn that lines avoid, and the least distance from them [Hz]
+        harmonics, apart = 8, 1.0
         Ts = machine.Ts
         if speed == 0.0 or not abs(speed) < machine.speed:
             raise SettingError(
@@ -310,7 +301,8 @@ class _Plan:
                 name="periods", expected="at least two in all", received="one",
                 remedy="use periods=2 or more: noise is estimated from repetitions",
             )  # fmt: skip
-        highest = HIGHEST / Ts if f_max is None else real("f_max", f_max)
+        # highest excited frequency as a share of the sample rate
+        highest = 0.4 / Ts if f_max is None else real("f_max", f_max)
         if not 0.0 < real("f_min", f_min) < highest <= 0.5 / Ts:
             raise SettingError(
                 name="f_min, f_max",
@@ -329,7 +321,7 @@ class _Plan:
         hertz = k / (samples * Ts)
         turn = abs(speed) / 60.0
         harmonic = np.round(hertz / turn)
-        off = (np.abs(hertz - harmonic * turn) > APART) | (harmonic < 1) | (harmonic > HARMONICS)
+        off = (np.abs(hertz - harmonic * turn) > apart) | (harmonic < 1) | (harmonic > harmonics)
         k = k[off & (hertz >= f_min) & (hertz <= highest)]
         if len(k) < 3:
             raise SettingError(
@@ -343,10 +335,11 @@ class _Plan:
         random = np.random.default_rng([self.seed, realisation])
         phases = random.uniform(0.0, 2.0 * math.pi, len(self.lines))
         spectrum = np.zeros(self.samples // 2 + 1, dtype=np.complex128)
-        for _ in range(ROUNDS):
+        for _ in range(100):
             spectrum[self.lines] = np.exp(1j * phases)
             x = np.fft.irfft(spectrum, self.samples)
-            bound = CLIPPING * np.abs(x).max()
+            # share of its peak at which a multisine is repeatedly clipped to lower its crest factor
+            bound = 0.8 * np.abs(x).max()
             phases = np.angle(np.fft.rfft(np.clip(x, -bound, bound))[self.lines])
         found: FloatArray = x / np.abs(x).max()
         return found
@@ -378,7 +371,8 @@ def _in_open_loop(
     left = machine.volt - abs(level)
     swing = _swing(plan, plan.speed / level, time)
     room = min(abs(plan.speed), machine.speed - abs(plan.speed))
-    peak = min(SHARE * left, SWING * room / swing)
+    # default amplitude of the multisine as a share of the command left at the working point
+    peak = min(0.6 * left, SWING * room / swing)
     if amplitude is not None:
         peak = real("amplitude", amplitude)
         most = min(left, MOST * room / swing)
@@ -401,9 +395,7 @@ def _in_open_loop(
 
 
 def _kept(error: LinkError, lead: int, plan: _Plan, *, is_whole: bool) -> Recording:
-    """The recording of an aborted run up to its first gap.
-    Raises the given `error` if that is less than a period.
-    """
+    """The recording of an aborted run up to its first gap; its `error` if below a period."""
     found = getattr(error.recording, "recording", error.recording)
     if is_whole or not isinstance(found, Recording):
         raise error
@@ -521,12 +513,10 @@ def _response(
 
 
 def _working_point(machine: Machine, speed: float) -> tuple[float, int, float]:
-    """The command that holds the speed [V], the samples until it does, the time constant [s].
-    It is found by the secant method, as a machine is not linear.
-    """
+    """The command that holds the speed [V], by secants; the samples until then, the lag [s]."""
     tried: list[tuple[float, float]] = [(0.0, 0.0)]
     u, hold = math.copysign(0.15 * machine.volt, speed), HOLD
-    for _ in range(TRIES):
+    for _ in range(8):
         held = _held(machine, u, hold)
         while not held.settled and hold < LONGEST:
             hold *= 2.0

@@ -29,22 +29,6 @@ from .small_signal import SmallSignal
 
 HARMONICS = 6
 """Harmonics of a turn that are fitted."""
-WORTH_IT = 0.97
-"""Largest ratio of the residuals with and without the load, on a recording not used for the fit."""
-SLOW = 0.5
-"""Span of the moving mean removed before the fit [s], for a load on the encoder's shaft."""
-SLOW_TURNS = 2.0
-"""The same for a load behind a gear, in turns of the load."""
-LEAST_TURNS = 8.0
-"""Least turns of a load in the recordings: fewer cannot be distinguished from friction."""
-GEARED = 0.95
-"""Largest ratio (turns of the load per turn of the encoder) of a load behind a gear."""
-BIWEIGHT, REWEIGHTED = 4.685, 5
-"""Cut-off of the biweight in standard deviations, the usual value; rounds of reweighting."""
-CELLS = 32
-"""Cells per turn of the encoder's shaft in the search for a line; a load turns less often."""
-REFINED = 15
-"""Ratios tried within the resolution of the record."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +88,9 @@ def turn_load(
         solution = _robust(rows, rest)
         row, rest = other.parts(plant, ratio, span)
         before, after = float(np.mean(rest**2)), float(np.mean((rest - row @ solution) ** 2))
-        if after < WORTH_IT**2 * before and before - after > gained:
+        # largest ratio of the residuals with and without the load, on a recording not used for the
+        # fit
+        if after < 0.97**2 * before and before - after > gained:
             best = TurnLoad(solution[:HARMONICS], solution[HARMONICS:], ratio)
             gained = before - after
     return best
@@ -121,9 +107,7 @@ class _Unexplained:
 
     @classmethod
     def of(cls, ensemble: Ensemble, whole: Recording, k: int) -> _Unexplained:
-        """The residual of the median of the members' free runs.
-        Raises `FitError` if a member diverges.
-        """
+        """The residual of the median of the members' free runs; `FitError` if a member diverges."""
         thinning = Thinning(k)
         recording = thinning.recording(whole)
         runs = [m.simulate(recording.dataset(), init=0)[0] for m in ensemble.members]
@@ -131,11 +115,12 @@ class _Unexplained:
         return cls(recording.y - np.median(runs, axis=0), turns, recording.Ts, thinning)
 
     def span(self, ratio: float) -> float:
-        """Span of the moving mean to remove [s]. It removes slow changes such as friction that
-        varies with temperature, but keeps the load of a slow output shaft.
-        """
+        """Span of the mean to remove [s]: it takes warming friction, and leaves a slow load."""
+        # span of the moving mean removed before the fit [s], for a load on the encoder's shaft
+        slow = 0.5
         rate = float(self.turns[-1]) / (len(self.rest) * self.Ts)
-        return max(SLOW, SLOW_TURNS / max(ratio * rate, 1e-9)) if ratio < 1.0 else SLOW
+        # behind a gear, two turns of the load
+        return max(slow, 2.0 / max(ratio * rate, 1e-9)) if ratio < 1.0 else slow
 
     def parts(
         self, plant: Model, ratio: float, span: float, harmonics: int = HARMONICS
@@ -157,11 +142,13 @@ def _robust(rows: FloatArray, rest: FloatArray) -> FloatArray:
     of .12; with the biweight it gives .18. On nine drives, the residual on the random levels falls
     to .82 (median; .69 to 1.15) of that with equal weights.
     """
+    # cut-off of the biweight in standard deviations, the usual value; rounds of reweighting
+    biweight, reweighted = 4.685, 5
     weight: FloatArray = np.ones(len(rest))
-    for _ in range(1 + REWEIGHTED):
+    for _ in range(1 + reweighted):
         found, *_ = np.linalg.lstsq(weight[:, None] * rows, weight * rest, rcond=1e-6)
         error = rest - rows @ found
-        reach = BIWEIGHT * float(np.median(np.abs(error))) / 0.6745
+        reach = biweight * float(np.median(np.abs(error))) / 0.6745
         weight = np.maximum(1.0 - (error / max(reach, 1e-12)) ** 2, 0.0)
     return np.asarray(found, np.float64)
 
@@ -172,16 +159,21 @@ def _behind_a_gear(plant: Model, known: Sequence[_Unexplained]) -> list[float]:
     refined by the residual that the load would leave: over hundreds of turns, a ratio that is off
     by a thousandth gets out of phase.
     """
+    # least turns of a load in the recordings: fewer cannot be distinguished from friction
+    least_turns = 8.0
+    # largest ratio (turns of the load per turn of the encoder) of a load behind a gear
+    geared = 0.95
     longest = max(known, key=lambda u: len(u.rest))
     total = float(longest.turns[-1])
-    if total * GEARED <= LEAST_TURNS:
+    if total * geared <= least_turns:
         return []
     step = 0.5 / total
     turns = longest.turns[:: longest.thinning.k][: len(longest.rest)]
-    rest = _fast(longest.rest, max(3, round(longest.span(LEAST_TURNS / total) / longest.Ts)))
-    lowest, end = math.ceil(2.0 * LEAST_TURNS), math.ceil(2.0 * GEARED * total)
+    rest = _fast(longest.rest, max(3, round(longest.span(least_turns / total) / longest.Ts)))
+    lowest, end = math.ceil(2.0 * least_turns), math.ceil(2.0 * geared * total)
     first = step * (lowest + int(np.argmax(_lines(turns, rest, total)[lowest:end])))
-    near = first + np.linspace(-step, step, REFINED)
+    # ratios tried within the resolution of the record
+    near = first + np.linspace(-step, step, 15)
     return [float(near[int(np.argmin([_left(plant, longest, ratio) for ratio in near]))])]
 
 
@@ -190,7 +182,8 @@ def _lines(turns: FloatArray, rest: FloatArray, total: float) -> FloatArray:
     This is one Fourier transform of sums over cells of angle; sums over all samples for each of
     thousands of ratios took four seconds of a slow drive's commissioning.
     """
-    cells = math.ceil(CELLS * total)
+    # cells per turn of the encoder's shaft in the search for a line; a load turns less often
+    cells = math.ceil(32 * total)
     at = np.rint(turns * (cells / total)).astype(int) % (2 * cells)
     powers: FloatArray = np.abs(np.fft.rfft(np.bincount(at, rest, 2 * cells))) ** 2
     return powers
@@ -223,8 +216,6 @@ PER_CONSTANT = 200
 """Samples kept per time constant: as many as the nominal machine has at 1 ms."""
 MOST = 10
 """Largest k."""
-LONGEST_FILTER = 64
-"""Longest moving average of the feedback [samples]."""
 SHARPEST = 50.0
 """Largest derivative filter N of the search; a coarse controller gets it if its sample time alone
 filters more than its N."""
@@ -249,8 +240,8 @@ class Thinning:
         return cls(max(1, round(coarse / fine)))
 
     def recording(self, r: Recording) -> Recording:
-        """The mean command over k samples, and the speed from every k-th count.
-        The command is averaged and not picked, as in a closed loop it changes at every sample.
+        """The mean command over k samples (it may change at each), and the speed from every k-th
+        count.
         """
         if self.k == 1:
             return r
@@ -266,9 +257,7 @@ class Thinning:
     def pushes(
         self, load: TurnLoad | None, references: Mapping[str, FloatArray], Ts: float
     ) -> list[FloatArray] | None:
-        """The load's command along references at the machine's sample time, thinned. At high speeds
-        its harmonics lie above half the coarse sample rate: averaging keeps them from aliasing.
-        """
+        """The load's command along references, averaged and not picked: harmonics would alias."""
         if load is None:
             return None
         return [self.mean(load.along(r, Ts)) for r in references.values()]
@@ -283,9 +272,7 @@ class Thinning:
         return means
 
     def coarse(self, c: Controller) -> Controller:
-        """The controller for simulations at the coarse sample time. Its moving average is k times
-        shorter, as a difference of counts over k samples is already the mean of k speeds.
-        """
+        """The controller at coarse samples; their counts are already means of k speeds."""
         if self.k == 1:
             return c
         return replace(
@@ -307,7 +294,8 @@ class Thinning:
         return replace(
             c,
             Ts=Ts,
-            filter_samples=min(LONGEST_FILTER, self.k * c.filter_samples),
+            # longest moving average of the feedback [samples]
+            filter_samples=min(64, self.k * c.filter_samples),
             N=_derivative_filter(c, c.Ts - Ts),
         )
 
@@ -319,9 +307,7 @@ class Thinning:
         return fopdt if self.k == 1 else replace(fopdt, L=fopdt.L + (self.k - 1) * Ts)
 
     def variations(self) -> Sequence[tuple[float, int]] | None:
-        """Gain and delay of the plants for tuning; None for the usual ones.
-        The coarse sample time alone is more delay than the usual ones add.
-        """
+        """Gain and delay of the plants for tuning; None if the samples are not coarse."""
         return None if self.k == 1 else ((1.0, 0), (0.8, 0), (1.25, 0))
 
     def cost(self, cost: Cost) -> Cost:

@@ -33,46 +33,30 @@ from .excitations import Motion
 
 SHAKEN_AT = 0.5
 """Working speed as a share of the top speed."""
-FASTER = 0.8
-"""Second working speed, used if something oscillates, as a share of the top speed."""
 NEAR = 0.1
 """Search range about a frequency, as a share of it. The two speeds lie further apart, so that fixed
 frequencies and those that move with the speed stay separate."""
-CLEAR = 4.0
-"""Least power of a load over the power at the place of a resonance, and over its surroundings."""
 TWICE = 2.0
 """Least number of periods in a record: fewer cannot be distinguished from drift."""
-SHARE, MOST = 0.1, 60.0
-"""Least share of a spectral line in the residual for a second look; its largest frequency [Hz]."""
 BESIDE = (0.4, 0.8), (1.25, 1.8)
 """Surroundings of a line, as shares of its frequency."""
-LOADS = 4
-"""Most rounds of removing loads over the turn."""
 SIZE = 0.1
 """Amplitude as a share of the largest command: small enough for linear dynamics."""
 SAMPLES, LONGEST = 4_000, 12.0
 """Samples of the random command, and its longest duration [s]."""
-HOLD = 2
-"""Samples that each random value is held: power up to a quarter of the sample rate."""
 ITERATIONS = 60
 ORDERS = (1, 2, 3, 4, 5)
-MANY = 20
-"""Order of the model that smooths the record."""
 LEAST_GAIN = math.log(1.005)
 """A smaller difference in (log) error does not count, however significant."""
 SWINGS = 0.3
 """Damping ratio below which a pair of poles is a resonance."""
 LOWEST, HIGHEST = 2.0, 0.4
 """Range of resonances: least frequency [Hz], largest as a share of the sample rate."""
-LEAST_FIT = 90.0
-"""Least fit of first order with dead time to the model's own step response [%]."""
 
 
 @dataclass(frozen=True)
 class Resonance:
-    """A pair of lightly damped poles; `frequency` is the undamped one [Hz], `damping` their damping
-    ratio.
-    """
+    """Lightly damped poles: the undamped `frequency` [Hz] and the `damping` ratio."""
 
     frequency: float
     damping: float
@@ -106,9 +90,11 @@ def small_signal(
     found = explained(slow, fopdt)
     if found is None or not _suspects(found.model, slow):
         return found
-    u, settled = shaking(demands, motion, fopdt, machine.Ts, FASTER)
+    # second working speed, used if something oscillates, as a share of the top speed
+    u, settled = shaking(demands, motion, fopdt, machine.Ts, 0.8)
     fast = Shaken.of(machine.excite(u, "small_signals_faster"), settled)
-    for _ in range(LOADS):
+    # most rounds of removing loads over the turn
+    for _ in range(4):
         loads = [turns_of(f, slow, fast) for f in _suspects(found.model, slow)]
         taken = [ratio for ratio in loads if ratio is not None]
         if not taken:
@@ -151,7 +137,6 @@ class Shaken:
         return float(self.turns[-1] - self.turns[0]) / self.seconds
 
     def dataset(self) -> Dataset:
-        """Command and speed as a data set."""
         return Dataset.from_arrays(
             self.u, self.speed, self.Ts, input_units="V", output_unit="RPM", name=self.name
         )
@@ -179,8 +164,9 @@ def shaking(
     settle = max(1, round(min(4.0 * fopdt.T, LONGEST) / Ts))
     samples = int(min(SAMPLES, max(500, LONGEST / Ts)))
     size = SIZE * demands.u_max
+    # samples that each random value is held: power up to a quarter of the sample rate
     random = _core.prbs(
-        duration=samples * Ts, Ts=Ts, low=held - size, high=held + size, hold=HOLD * Ts,
+        duration=samples * Ts, Ts=Ts, low=held - size, high=held + size, hold=2 * Ts,
         seed=demands.seed,
     )  # fmt: skip
     return np.concatenate([np.full(settle, held), random]), settle
@@ -233,14 +219,16 @@ def fitted(
 
 
 def _smooth(shaken: Shaken) -> Dataset | None:
-    """The record with the free run of a model of high order in place of the speed.
-    It has the dynamics and hardly any noise (B. Wahlberg, IEEE Trans. Automatic Control 34, 1989).
+    """The record with a high-order model's free run, almost noiseless, as speed (Wahlberg 1989,
+    IEEE Trans. Automatic Control 34).
     """
+    # order of the model that smooths the record
+    many = 20
     try:
-        core = _core.fit_arx(arrays(shaken.dataset()), na=MANY, nb=MANY, nk=1, offset=True)
+        core = _core.fit_arx(arrays(shaken.dataset()), na=many, nb=many, nk=1, offset=True)
     except (DataError, FitError):
         return None
-    speed = core.simulate(shaken.u[:, None], shaken.speed[:MANY])
+    speed = core.simulate(shaken.u[:, None], shaken.speed[:many])
     # an unstable one of the many poles
     return replace(shaken, speed=speed).dataset() if np.isfinite(speed).all() else None
 
@@ -279,14 +267,16 @@ def _suspects(model: Model, shaken: Shaken) -> list[float]:
 
 def _line(shaken: Shaken) -> float | None:
     """The frequency with the most power in the residual, if it is a spectral line [Hz]."""
+    # least share of a spectral line in the residual for a second look; its largest frequency [Hz]
+    share, most = 0.1, 60.0
     rest = _unexplained(shaken)
     if rest is None:
         return None
     # over the angle, a load is a line even while the command varies the speed
-    per_turn = np.arange(TWICE, MOST * shaken.seconds, 0.25) / (shaken.seconds * shaken.rate)
+    per_turn = np.arange(TWICE, most * shaken.seconds, 0.25) / (shaken.seconds * shaken.rate)
     powers = np.array([_power(ratio * shaken.turns, rest) for ratio in per_turn])
     best = int(np.argmax(powers))
-    is_line = 2.0 * powers[best] > SHARE * float(np.mean(rest**2))
+    is_line = 2.0 * powers[best] > share * float(np.mean(rest**2))
     return float(per_turn[best] * shaken.rate) if is_line else None
 
 
@@ -316,7 +306,8 @@ def turns_of(frequency: float, slow: Shaken, fast: Shaken) -> float | None:
     stayed = max(_power(f * t, rest) for f in near)
     shares = np.concatenate([np.linspace(*BESIDE[0], 21), np.linspace(*BESIDE[1], 21)])
     beside = np.median([_power(ratio * share * fast.turns, rest) for share in shares])
-    is_load = _power(ratio * fast.turns, rest) > CLEAR * max(stayed, float(beside))
+    # least power of a load over the power at the place of a resonance, and over its surroundings
+    is_load = _power(ratio * fast.turns, rest) > 4.0 * max(stayed, float(beside))
     return ratio if is_load else None
 
 
@@ -353,4 +344,5 @@ def _first_order(core: _core.LinearModel, Ts: float, recorded: Fopdt) -> Fopdt |
         found = fit_fopdt(u, y, Ts=Ts)
     except (DataError, FitError):
         return None
-    return found if found.K > 0.0 and found.fit_percent >= LEAST_FIT else None
+    # least fit of first order with dead time to the model's own step response [%]
+    return found if found.K > 0.0 and found.fit_percent >= 90.0 else None

@@ -23,16 +23,10 @@ from ..validation import validate
 from .demands import Demands, require
 from .small_signal import SIZE, fitted, simplest
 
-WORST = 2.0
-"""Members with a larger multiple of the best one's error on held-out data are left out."""
 LEAST_FIT = 85.0
 """Least fit of the best member in free run on held-out data [%]."""
 MOST_SAMPLES = 80_000
 """Most training samples; from longer recordings, blocks spread over them are used."""
-CLOSE = 0.02
-"""Members with an error within this share of the recording's span stay in any case."""
-DRAWN = 2
-"""Networks trained for each member."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +68,9 @@ def train(
     held_out = judge.dataset()
     scores = [validate_member(m, held_out) for m in members]
     best = min(rmse for rmse, _ in scores)
-    bound = max(WORST * best, CLOSE * float(np.ptp(judge.y)))
+    # who errs by twice as much as the best on held-out data is left out, but not within .02 of the
+    # recording's span
+    bound = max(2.0 * best, 0.02 * float(np.ptp(judge.y)))
     ranked = sorted(range(len(scores)), key=lambda i: scores[i][0])
     kept = [i for i in ranked if scores[i][0] <= bound][: demands.members]
     fit = max(fit for _, fit in scores)
@@ -110,7 +106,8 @@ def _members(
     needed, as some end in a poor minimum; the better half by the error on the training data stays.
     """
     stopped = threading.Event()
-    seeds = [demands.seed + i for i in range(DRAWN * demands.members)]
+    # networks trained for each member
+    seeds = [demands.seed + i for i in range(2 * demands.members)]
 
     def look(*_: object) -> None:
         if stopped.is_set():
@@ -163,8 +160,6 @@ command. The small signals reach `SIZE`; beyond it a drive that limits its curre
 With stretches beyond it, the free-run fit on the random levels is 1 % instead of 97 % (drive `weak`
 of benches/drives.py), with the pulses 18 to 38 % instead of 98.5 % (`lash`, `shaft60`); on drives
 that reach no limit (`nominal`, `heavy`) the cut makes no difference."""
-LEAST_RUN = 200
-"""Least samples of a stretch: in shorter ones the initial state dominates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,4 +229,5 @@ def _stretches(recording: Recording, fopdt: Fopdt, reach: float) -> list[Experim
     begins, ends = np.flatnonzero(np.diff(near)).reshape(-1, 2).T
     (experiment,) = recording.dataset().experiments
     runs = zip(begins, ends, strict=True)
-    return [experiment.cut(int(a), int(b)) for a, b in runs if b - a >= LEAST_RUN]
+    # least samples of a stretch: in shorter ones the initial state dominates
+    return [experiment.cut(int(a), int(b)) for a, b in runs if b - a >= 200]

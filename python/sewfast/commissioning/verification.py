@@ -38,9 +38,7 @@ def span(reference: FloatArray) -> float:
 def agreeing(
     controller: Controller, ensemble: Ensemble, references: Mapping[str, FloatArray]
 ) -> Ensemble:
-    """The ensemble without members that deviate from the others, for instance in a false rest.
-    Raises `Disagreement` if less than half of the members agree.
-    """
+    """The ensemble without members that deviate; `Disagreement` if fewer than half agree."""
     members = list(ensemble.members)
     apart = np.zeros(len(members))
     for r in references.values():
@@ -172,10 +170,9 @@ def measure(
     keep: Callable[[tuple[Comparison, ...]], object],
     cost: Cost,
 ) -> Swing | None:
-    """Run the references on the machine, the shortest first, and compare each as it ends.
-    If the machine allows it, a run is also watched on the way. A loop that is `restless` ends it.
-    Raises `Refusal` as `require_alike`, before the next reference runs, and if `Watching` ends a
-    run.
+    """Run the references on the machine, the shortest first, and compare each as it ends. If the
+    machine allows it, a run is also watched on the way. A loop that is `restless` ends it. Raises
+    `Refusal` as `require_alike`, before the next reference runs, and if `Watching` ends a run.
     """
     found = dict(enumerate(predicted))
     for i in sorted(found, key=lambda i: len(found[i].predicted.r)):
@@ -216,8 +213,6 @@ WINDOW = 0.25
 TIMES, FLOOR = 4.0, 0.05
 """Chatter that ends a run: a multiple of the largest predicted one, but at least this share of the
 largest command, rms from sample to sample."""
-SURE = 1.1
-"""Multiple of the allowed distance at which a run is hopeless, whatever its rest."""
 
 
 class Watching:
@@ -237,7 +232,8 @@ class Watching:
         n = self._k * len(predicted.r)
         self._u, self._counts = np.full(n, np.nan), np.full(n, np.nan)
         self._judged, self._squares, self._railed = 0, 0.0, 0
-        self._allowed = n * (SURE * APART * span(predicted.r)) ** 2
+        # multiple of the allowed distance at which a run is hopeless, whatever its rest
+        self._allowed = n * (1.1 * APART * span(predicted.r)) ** 2
         self._window = max(10, round(WINDOW / self._Ts))
         self._most = max(
             TIMES * self._chatter_predicted(), FLOOR * max(abs(controller.u_min), controller.u_max)
@@ -271,9 +267,7 @@ class Watching:
             )  # fmt: skip
 
     def _parts(self, end: int) -> None:
-        """End a run too far off or too long at a limit.
-        Speeds are means over blocks of samples, to average the encoder's noise.
-        """
+        """End a run too far off, in means of blocks of samples, or too long at a limit."""
         p, c = self._predicted, self._controller
         block = WATCHED * self._k
         for begin in range(self._judged, end - block, block):
@@ -326,12 +320,11 @@ def out_of_reach(
 
 
 def unreached(comparisons: Sequence[Comparison]) -> str:
-    """What the machine did not reach although it did what was predicted; empty if nothing.
-
-    A level that a reference holds for a tenth of its length, or at its end, must be met, in the
-    mean over the last quarter of the hold, within `APART` of the reference's span. The command must
-    be at a limit no longer than predicted, and a reference without an edge must not be farther off
-    than that while it is, for more than `APART` of its length.
+    """What the machine did not reach although it did what was predicted; empty if nothing. A level
+    that a reference holds for a tenth of its length, or at its end, must be met, in the mean over
+    the last quarter of the hold, within `APART` of the reference's span. The command must be at a
+    limit no longer than predicted, and a reference without an edge must not be farther off than
+    that while it is, for more than `APART` of its length.
     """
     said = []
     for c in comparisons:
@@ -374,9 +367,7 @@ def _at_limit(found: ClosedLoopRun) -> float:
 
 
 def judged(predicted: tuple[Comparison, ...], ensemble: Ensemble) -> Judgement:
-    """Verdicts on the loops: of the first member on every reference, of all on the shortest.
-    That all members agree on all references has been checked before.
-    """
+    """Verdicts of the first member on every reference, of all on the shortest."""
     shortest = min(predicted, key=lambda c: len(c.predicted.r))
     runs = [m for c in predicted for m in (c.members if c is shortest else c.members[:1])]
     return judge(runs, ensemble, refuse=False)

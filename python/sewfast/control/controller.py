@@ -176,7 +176,6 @@ class SampledController:
         storage.write(path, FORMAT, self.VERSION, self.to_dict())
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         return html_of(str(self))
 
 

@@ -29,43 +29,16 @@ from .controller import SampledController
 
 NAMES = ("trapezoid", "trapezoids", "random")
 """Default references for tuning."""
-FILTER_TIME = 0.008
-"""Length of the moving average in the feedback for a slow drive [s]."""
-_FILTER_SHARE = 0.1
-"""Its longest length as a share of the time constant."""
-_MOST_FILTERED = 64
-"""Longest moving average of a controller [samples]."""
 _STEP_SHARES = (0.25, 0.5, 0.1)
 """Sizes of the step response to try, as shares of the larger limit."""
 _STEP_SAMPLES = (4_000, 16_000)
-_MOVES_ON = 0.15
-"""Share of a step's response in the second half of the longest one, above which the output
-integrates: a lag that settles in time has less there, so every model is one or the other."""
-_TRAVEL, _TRAVEL_SAMPLES = 10.0, 500
-"""Longest travel of a position: that at the limit in so many time constants, or in so many samples
-for a drive with hardly a time constant."""
-_RATE_USED = 0.4
-"""Rate of a position's ramps as a share of its rate at the limit: the rest starts and stops it."""
-_REACHED = 0.7
-"""Top of the references as a share of the steady output at the limit: the rest accelerates."""
 _RECORDED = 0.9
 """Top of the references as a share of the recorded output, beyond which the model extrapolates."""
-_SLOW_RUN = 0.3
-"""Lowest level as a share of the top for a drive that cannot brake: it coasts down to that."""
-_HELD = 0.95
-"""Largest distance of a held level from the record's mean, as a share of the region's bound."""
 _HELD_UNSTABLE = 0.3
 """Top of the references as a share of the output that an unstable plant can be held at with the
 least of the commands' limits: beyond it nothing brings the plant back."""
-_MARGIN = 0.1
-"""Share of the output at the limit that the ramps leave to the controller."""
 _EDGES = 8
 """Edges of a shortened random reference."""
-_MOST_SAMPLES = 20_000
-"""A random reference with more samples is shortened to `_EDGES`: tuning runs it thousands of
-times."""
-_MOST_TUNED = 60_000
-"""A reference with more samples is not used for tuning."""
 
 
 def recorded_limits(models: Sequence[Any]) -> tuple[float, float] | None:
@@ -135,11 +108,11 @@ def beyond_record(models: Sequence[Any], u_min: float, u_max: float) -> str:
 
 
 def filter_length(Ts: float, time_constant: float) -> int:
-    """Samples of the feedback's moving average: 8 ms, at most a tenth of the time constant.
-    It is 1, no filter, if the sample time is longer than that.
-    """
-    wanted = min(FILTER_TIME, _FILTER_SHARE * time_constant) / Ts
-    return int(min(max(1, round(wanted)), _MOST_FILTERED))
+    """Samples of the feedback's mean: 8 ms, at most a tenth of the time constant, at least one."""
+    # 8 ms for a slow drive, at most a tenth of the time constant
+    wanted = min(0.008, 0.1 * time_constant) / Ts
+    # of at most 64 samples, as the core has them
+    return int(min(max(1, round(wanted)), 64))
 
 
 @dataclass(frozen=True)
@@ -290,15 +263,15 @@ def moves_on(model: Model, u_min: float, u_max: float) -> bool:
 
 
 def _moves_on(model: Model, size: float) -> bool:
-    """Whether the response still changes in the second half of a long step.
-    A pole at 1 that a zero nearly cancels does not integrate.
-    """
+    """Whether a long step moves on: a pole at 1 that a zero nearly cancels does not."""
     samples = _STEP_SAMPLES[-1]
     u = np.zeros(samples)
     # after some samples, as the model's rest state assumes the first command before the start
     u[samples // 20 :] = size
     y = _from_rest(model, u)
-    return bool(abs(y[-1] - y[samples // 2]) > _MOVES_ON * abs(y[-1] - y[0]))
+    # share of a step's response in the second half of the longest one, above which the output
+    # integrates: a lag that settles in time has less there, so every model is one or the other
+    return bool(abs(y[-1] - y[samples // 2]) > 0.15 * abs(y[-1] - y[0]))
 
 
 @dataclass(frozen=True)
@@ -313,9 +286,7 @@ class _Span:
 
 
 def catalogue_fits(model: Any, u_min: float, u_max: float, unit: str) -> bool:
-    """Whether the references of `sewfast.signals` suit a drive's unit, sample time and range.
-    A plant without a stored range is assumed to suit them.
-    """
+    """Whether `sewfast.signals` suit a drive's unit, sample time and range, if that is known."""
     if spelled(unit) != "rpm" or not math.isclose(model.Ts, signals.TS, rel_tol=1e-9):
         return False
     known = _output_range(model) if isinstance(model, Model) else None
@@ -370,6 +341,10 @@ def drive_references(
 
 
 def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span:
+    # top of the references as a share of the steady output at the limit: the rest accelerates
+    reached = 0.7
+    # share of the output at the limit that the ramps leave to the controller
+    margin = 0.1
     u_min, u_max = _finite_limits(model, u_min, u_max)
     low, high = _output_range(model) or (-math.inf, math.inf)
     moving = rate_step(model, u_min, u_max)
@@ -391,8 +366,8 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
         return _Span(rest, rest, rest + top, rest, 4.0 * pace)
     fopdt, rest = step.fopdt, step.rest
     reach = [fopdt.K * u + fopdt.offset - rest for u in (u_min, u_max)]
-    up = max(0.0, min(_RECORDED * (high - rest), _REACHED * max(reach)))
-    down = max(0.0, min(_RECORDED * (rest - low), _REACHED * -min(reach)))
+    up = max(0.0, min(_RECORDED * (high - rest), reached * max(reach)))
+    down = max(0.0, min(_RECORDED * (rest - low), reached * -min(reach)))
     sign, x, other = (1.0, up, down) if up >= down else (-1.0, down, up)
     if x == 0.0:
         raise SettingError(
@@ -403,12 +378,13 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
     strong, weak = (max(reach), -min(reach)) if sign > 0 else (-min(reach), max(reach))
     slow = 0.0
     if weak <= 0.25 * x:
-        slow = max(_SLOW_RUN * x, _lowest_held(model, fopdt, rest, sign))
+        # lowest level as a share of the top for a drive that cannot brake: it coasts down to that
+        slow = max(0.3 * x, _lowest_held(model, fopdt, rest, sign))
     # for a record that never came near rest: not below its lowest output
     floor = (low - rest if sign > 0 else rest - high) + 0.1 * (high - low)
     slow = min(max(slow, floor), 0.6 * x) if math.isfinite(floor) else slow
-    upward = max(strong - x - _MARGIN * strong, 0.05 * strong)
-    downward = max(slow + weak - _MARGIN * strong, 0.05 * strong)
+    upward = max(strong - x - margin * strong, 0.05 * strong)
+    downward = max(slow + weak - margin * strong, 0.05 * strong)
     average = max(1, filter_length(model.Ts, step.slowest)) * model.Ts
     edge = max(
         step.slowest * (x - slow) / min(upward, downward),
@@ -427,13 +403,17 @@ def _lowest_held(model: Model, fopdt: Fopdt, rest: float, sign: float) -> float:
     region = stored_region(model)
     if region is None:
         return 0.0
-    (u, y), (far_u, far_y) = region.centre, _HELD * region.level
+    # largest distance of a held level from the record's mean, as a share of the region's bound
+    (u, y), (far_u, far_y) = region.centre, 0.95 * region.level
     levels = (fopdt.K * (u - sign * np.sign(fopdt.K) * far_u) + fopdt.offset, y - sign * far_y)
     return max(sign * (float(level) - rest) for level in levels)
 
 
 def _way(step: DriveStep, u_min: float, u_max: float, low: float, high: float, Ts: float) -> _Span:
     """Levels of a position: within the record, and within the travel of a few time constants."""
+    # longest travel of a position: that at the limit in so many time constants, or in so many
+    # samples for a drive with hardly a time constant
+    travel, travel_samples = 10.0, 500
     fopdt, rest = step.fopdt, step.rest
     rates = [fopdt.K * u + fopdt.offset for u in (u_min, u_max)]
     slower = min(max(rates), -min(rates))
@@ -447,9 +427,10 @@ def _way(step: DriveStep, u_min: float, u_max: float, low: float, high: float, T
     up, down = (high - rest, rest - low) if inside else (high - low, 0.0)
     sign, x = (1.0, up) if up >= down else (-1.0, down)
     lag = step.slowest + fopdt.L + Ts
-    x = min(_RECORDED * x, max(_TRAVEL * lag, _TRAVEL_SAMPLES * Ts) * slower)
+    x = min(_RECORDED * x, max(travel * lag, travel_samples * Ts) * slower)
     average = max(1, filter_length(Ts, step.slowest)) * Ts
-    edge = max(x / (_RATE_USED * slower), 10.0 * (fopdt.L + Ts) + 4.0 * average)
+    # rate of a position's ramps as a share of its rate at the limit: the rest starts and stops it
+    edge = max(x / (0.4 * slower), 10.0 * (fopdt.L + Ts) + 4.0 * average)
     other = min(min(up, down), x)
     return _Span(
         rest, rest, rest + sign * x, rest - sign * (other if other > 0.25 * x else 0.0), edge
@@ -474,7 +455,9 @@ def _finite_limits(model: Model, u_min: float, u_max: float) -> tuple[float, flo
 def _shapes(span: _Span, Ts: float, seed: int) -> dict[str, FloatArray]:
     """The catalogue's shapes; its fastest edge, .15 s of the trapezoid, becomes `span.edge`."""
     pace = span.edge / 0.15
-    most = _MOST_SAMPLES * Ts
+    # a random reference with more samples is shortened to `_EDGES`: tuning runs it thousands of
+    # times
+    most = 20_000 * Ts
     # keep the rates: the rise from rest is longer than that from the slow run
     height = span.top - span.low
     first = span.edge * (span.top - span.rest) / height
@@ -546,4 +529,5 @@ def default_references(
         return list(names)
     made = drive_references(plant, low, high, pace=controller.pace)
     first, *others = (made[name] for name in names)
-    return [first, *(r for r in others if len(r) <= _MOST_TUNED)]
+    # a reference with more samples is not used for tuning
+    return [first, *(r for r in others if len(r) <= 60_000)]

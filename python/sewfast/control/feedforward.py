@@ -119,11 +119,9 @@ class Feedforward:
 def reduced(
     levels: Sequence[tuple[float, float]], most: int = LEVELS, always: float | None = None
 ) -> list[tuple[float, float]]:
-    """The fewest of these levels, at most `most`, that draw the line through all of them.
-
-    The output `always` stays if it is among them.
-    One level after another is added where the line is farthest off, until it is within a thousandth
-    of the commands' range.
+    """The fewest of these levels, at most `most`, that draw the line through all of them. The
+    output `always` stays if it is among them. One level after another is added where the line is
+    farthest off, until it is within a thousandth of the commands' range.
     """
     if len(levels) < 3:
         return list(levels)

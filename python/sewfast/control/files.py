@@ -14,7 +14,6 @@ KINDS: dict[str, type[SampledController]] = {
     kind.KIND: kind for kind in (Controller, StateFeedback)
 }
 """The kinds by name. A file of versions 1 to 3 has no kind and is a PID."""
-_VERSIONS = (1, 2, 3, 4, 5)
 
 
 def load_controller(path: str | os.PathLike[str]) -> SampledController:
@@ -26,7 +25,7 @@ def load_controller(path: str | os.PathLike[str]) -> SampledController:
         If the file is missing, damaged, of another format or of an unknown version, or holds a
         setting outside its range; the message names the file and the field.
     """
-    fields = Fields(os.fspath(path), storage.read(path, FORMAT, _VERSIONS))
+    fields = Fields(os.fspath(path), storage.read(path, FORMAT, (1, 2, 3, 4, 5)))
     kind = fields.text("kind") if fields.integer("version") > 3 else Controller.KIND
     if kind not in KINDS:
         raise fields.refuse("kind", ", ".join(KINDS), kind)

@@ -26,10 +26,6 @@ from .systems import beside, gain, measurement, pid, series
 
 _SAME = 1e-9
 """Relative difference up to which two numbers of an object count as equal."""
-_ROUNDING = 1e-12
-"""Share of a denominator's coefficients below which its value at z = 1 counts as 0."""
-_NOTHING = 1e-13
-"""Share of all gains below which one counts as a rounding error."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +143,8 @@ def _terms(num: FloatArray, den: FloatArray) -> _Terms:
     order = len(den) - 1
     if order > 2:
         raise _other(den)
-    integrates = order > 0 and bool(abs(den.sum()) <= _ROUNDING * np.abs(den).sum())
+    # share of a denominator's coefficients below which its value at z = 1 counts as 0
+    integrates = order > 0 and bool(abs(den.sum()) <= 1e-12 * np.abs(den).sum())
     if order == 2 and not integrates:
         raise _other(den)
     # the product of the poles: if one is 1, it is the other one
@@ -166,7 +163,8 @@ def _terms(num: FloatArray, den: FloatArray) -> _Terms:
     if not math.isnan(pole):
         kd = float(at(pole, rising)) / (one**2 if integrates else -one)
     size = np.abs(num).max(initial=0.0)
-    Ki, kd = (0.0 if abs(x) <= _NOTHING * size else x for x in (Ki, kd))
+    # share of all gains below which one counts as a rounding error
+    Ki, kd = (0.0 if abs(x) <= 1e-13 * size else x for x in (Ki, kd))
     return _Terms(float(num[0]) - Ki - kd, Ki, kd, pole if kd else math.nan)
 
 

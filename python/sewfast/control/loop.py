@@ -137,7 +137,6 @@ class ClosedLoopRun:
         return loop_drawing(traces[::-1], self.units["y"], self.units["u"], limits).plot(ax, file)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         return run_html(self, f"{self.reference} on {self.plant}, {len(self.t) * self.Ts:g} s")
 
     def __str__(self) -> str:
@@ -419,10 +418,9 @@ def _on_machine(
 def reference_samples(
     reference: str | ArrayLike, controller: SampledController, seed: int = 0, *, plant: Any = None
 ) -> FloatArray:
-    """The samples of a reference given by name or as samples, shape (N,), as a copy.
-    A name is the signal of the catalogue for a controller in RPM at 1 ms; otherwise it is the same
-    shape over the recorded range of a model with one input
-    (`sewfast.control.defaults.drive_references`). Raises `SettingError` without such a model.
+    """The samples of a reference given by name or as samples, shape (N,), as a copy. A name is the
+    signal of the catalogue for a controller in RPM at 1 ms; otherwise it is the same shape over the
+    recorded range of a model with one input (`sewfast.control.defaults.drive_references`).
     """
     if not isinstance(reference, str):
         return vector("reference", reference).copy()

@@ -204,9 +204,7 @@ MEMBERS = ("name", "Ts", "counts_per_rev", "volt", "speed", "excite", "follow")
 
 
 def machine_of(on: object) -> Machine:
-    """The argument as a `Machine`: a virtual machine is wrapped, others are returned as they are.
-    Raises `SettingError` with the missing members for anything else.
-    """
+    """The argument as a `Machine`; a virtual machine is wrapped."""
     if isinstance(on, VirtualMachine):
         return MachineBench(on)
     # look properties up in the class: reading a drive's limits would send it a command
@@ -331,8 +329,8 @@ def _command(u: ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True)
 class MachineBench:
-    """A virtual machine as a `Machine` that stops by itself above `speed` [RPM].
-    `method` is that of estimating the speed from the counts: "kalman", "savgol" or "difference".
+    """A virtual machine as a `Machine` that stops above `speed` [RPM]; `method` is that of the
+    speed.
     """
 
     machine: VirtualMachine

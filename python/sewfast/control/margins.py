@@ -331,7 +331,6 @@ class Margins(Plotted):
         legend(ax, columns=3)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         return html_of(f"margins\n{self}")
 
     def __str__(self) -> str:
@@ -433,9 +432,7 @@ def _require_units(gains: Gains, plant: Any) -> None:
 
 
 def loop_path(controller: Controller, *, speed: float | None = None) -> _core.LoopPath:
-    """The part of the controller in the feedback path, with a schedule's gains at `speed`.
-    Raises `SettingError` for a schedule without a speed.
-    """
+    """The part of the controller in the feedback path, with a schedule's gains at `speed`."""
     gains, slope = scheduled_gains(controller, speed)
     return _core.LoopPath(
         Kp=gains.Kp,
@@ -455,7 +452,6 @@ def loop_path(controller: Controller, *, speed: float | None = None) -> _core.Lo
 def scheduled_gains(controller: Controller, speed: float | None) -> tuple[Gains, float]:
     """Gains in standard form at the output `speed`, and the schedule's contribution to Kp there:
     `alpha r dKp/dy` at r = y [u/y], as `-Kp alpha r` varies with the output; 0 without a schedule.
-    Raises `SettingError` for a schedule without a speed.
     """
     schedule = controller.schedule
     if not schedule:

@@ -27,11 +27,6 @@ _REALS = ("Ts", *VARIABLES, *_UNBOUNDED)
 FIELDS = (
     "version", "kind", "num", "den", "u_unit", "y_unit", *_REALS, "counts_per_rev", "notes",
 )  # fmt: skip
-_PACE = 0.05
-"""Frequency [rad/sample] at which the plant's gain scales the first weights: a time constant of 20
-samples, well within what a loop can control."""
-_INTEGRAL = 0.02
-"""First weight of the integral, per sample."""
 
 
 @dataclass(frozen=True)
@@ -150,14 +145,17 @@ class StateFeedback(SampledController):
         num, den = _fraction(plant, Ts, speed)
         if counts_per_rev is not None and len(num) < STATES:
             num = np.convolve(num, [0.5, 0.5])
-        gain = abs(_response(num, den, _PACE))
+        # frequency [rad/sample] at which the plant's gain scales the first weights: a time constant
+        # of 20 samples, well within what a loop can control
+        gain = abs(_response(num, den, 0.05))
         if not 0.0 < gain < math.inf:
             raise SettingError(
                 name="plant", expected="one that responds to its command",
                 received=f"a gain of {gain:g}",
                 remedy="identify it from a recording in which the command moves the output",
             )  # fmt: skip
-        first = {"rho": gain**2, "noise": gain**2, "integral": _INTEGRAL / Ts}
+        # first weight of the integral, per sample
+        first = {"rho": gain**2, "noise": gain**2, "integral": 0.02 / Ts}
         return cls(
             tuple(num),
             tuple(den) or (0.0,),

@@ -119,9 +119,7 @@ def measurement(controller: Controller, encoder: bool) -> StateSpace:
 
 
 def pid(controller: Controller, speed: float = 0.0) -> StateSpace:
-    """From reference and filtered output, in this order, to the command, with the biquads of the
-    reference. A gain schedule is evaluated at the output `speed` [y].
-    """
+    """From (reference, filtered output) to the command, at the output `speed` [y] of a schedule."""
     g, slope = scheduled_gains(controller, speed)
     Ts = controller.Ts
     ki = g.Kp * Ts / g.Ti

@@ -304,7 +304,6 @@ class Dataset:
         return self.to_arrow().__arrow_c_stream__(requested_schema)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         names = [*map(labelled, self.input_names, self.input_units)]
         columns = [
             ("input", name, span) for name, span in zip(names, self.input_range, strict=True)

@@ -21,14 +21,6 @@ from .pieces import LARGEST, require_dataset
 if TYPE_CHECKING:
     from .dataset import Dataset
 
-SHORT = 3.0
-"""Shortest length of a record, in time constants of its slowest pole."""
-SURE = 5.0
-"""Standard errors by which that pole must be known before a record is called short."""
-RESTING = 0.2
-"""Part of a record that can be at rest at its ends without a finding."""
-COARSE = 10.0
-"""Steps of the sensor in a standard deviation of the output, below which it counts as coarse."""
 _REFERENCE = re.compile(
     r"((y_?)?(r|ref|reference|set_?point|sp|target|soll|sollwert|demand)"
     # a `voltage_ref` can be the plant's input, a `speed_ref` cannot
@@ -87,7 +79,6 @@ class Diagnosis:
         return {"findings": [f.to_json() for f in self.findings]}
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         if not self.findings:
             return Table(str(self), (), ()).to_html()
         rows = tuple((f.kind, f.text, f.remedy) for f in self.findings)
@@ -216,9 +207,12 @@ def _integrator(data: Dataset, found: Integration | None) -> Iterator[Finding]:
 
 
 def _short(data: Dataset, found: Integration | None) -> Iterator[Finding]:
-    if found is None or found.is_integral or found.restoring < SURE:
+    # standard errors by which the slowest pole must be known before a record is called short
+    sure = 5.0
+    if found is None or found.is_integral or found.restoring < sure:
         return
-    if 0.0 < found.lengths < SHORT and found.driving > SURE:
+    # three time constants of the slowest pole
+    if 0.0 < found.lengths < 3.0 and found.driving > sure:
         yield Finding(
             "short_record",
             f"the record is {found.lengths:.2g} times as long as the slowest time constant of "
@@ -236,7 +230,8 @@ def _short(data: Dataset, found: Integration | None) -> Iterator[Finding]:
 def _coarse(data: Dataset) -> Iterator[Finding]:
     known = _known(np.concatenate([e.y for e in data.experiments])[:200_000])
     step = quantum(known) if len(known) else None
-    if step is None or not float(known.std()) < COARSE * step:
+    # steps of the sensor in a standard deviation of the output, below which it counts as coarse
+    if step is None or not float(known.std()) < 10.0 * step:
         return
     steps = float(known.std()) / step
     yield Finding(
@@ -359,7 +354,8 @@ def _rests(data: Dataset) -> Iterator[Finding]:
     found = zip(data.experiments, _core.rests(_arrays(data)), strict=True)
     ends = [(e, 0, 0) if a >= len(e) else (e, a, b) for e, (a, b) in found]
     share = sum(a + b for _, a, b in ends) / len(data)
-    if share < RESTING:
+    # part of a record that can be at rest at its ends without a finding
+    if share < 0.2:
         return
     e, before, after = max(ends, key=lambda end: end[1] + end[2])
     # a short rest is useful: it shows the level and helps to estimate the initial state

@@ -67,9 +67,8 @@ def without_weightless(e: Experiment) -> Experiment:
 
 
 def in_effect(data: Dataset) -> Dataset:
-    """The data as fits and scores use them.
-    Samples of weight 0 count as not measured. Only ratios of the other weights matter: equal
-    weights are dropped, others are scaled to a largest one of 1.
+    """The data as fits and scores use them. Samples of weight 0 count as not measured. Only ratios
+    of the other weights matter: equal weights are dropped, others are scaled to a largest one of 1.
     """
     if all(e.weights is None for e in data.experiments):
         return data

@@ -67,8 +67,7 @@ class Fault:
 
 
 def faults(data: Dataset) -> tuple[Fault, ...]:
-    """Dead stretches of the output's sensor, columns that are no input and output of a plant, a
-    record in two parts that do not go together, or a plant that only a closed loop holds."""
+    """What is wrong: dead stretches, columns of no plant, two records in one, an unstable plant."""
     if wrap := tuple(_wraps(data)):
         return wrap
     if apart := spikes(data):

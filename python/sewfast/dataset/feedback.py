@@ -40,10 +40,9 @@ def integration(data: Dataset) -> Integration | None:
 
 @dataclass(frozen=True)
 class Feedback:
-    """How one input follows the output's innovations, `lead` samples later.
-    `correlation` is that of the innovations at this lead, and `significance` the same in standard
-    errors. `misfit` is the largest correlation with the input's past beyond the regression, in
-    standard errors.
+    """How one input follows the output's innovations, `lead` samples later. `correlation` is that
+    of the innovations at this lead, and `significance` the same in standard errors. `misfit` is the
+    largest correlation with the input's past beyond the regression, in standard errors.
     """
 
     input: int
@@ -54,9 +53,7 @@ class Feedback:
 
 
 def feedback(data: Dataset) -> Feedback | None:
-    """The input with the clearest response to noise of the output; None if no input responds.
-    The output of a smoother is not tested (`Dataset.looks_ahead`).
-    """
+    """The input with the clearest response to noise of the output; None if no input responds."""
     if data.looks_ahead:
         return None
     found = _core.feedback([(e.u, e.y) for e in data.experiments])

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 
 MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
-STUCK = 3
-"""Samples in a row at an extreme that count as at a limit."""
-_SAME = 1e-9
 
 
 def white_noise(column: FloatArray) -> float:
@@ -41,10 +38,7 @@ def white_noise(column: FloatArray) -> float:
 
 
 def quantum(column: FloatArray) -> float | None:
-    """The step of a grid on which all values lie; None if there is none.
-    It requires at least three values that occur twice or more on average: a few values always lie
-    on some grid.
-    """
+    """The step of a grid of all values, which occur twice or more on average; None without one."""
     return _core.quantum(np.ascontiguousarray(column))
 
 
@@ -53,18 +47,16 @@ def share_at_limits(column: FloatArray) -> tuple[float, float]:
     known = column[np.isfinite(column)]
     if len(known) == 0 or known.min() == known.max():
         return 0.0, 0.0
-    margin = _SAME * np.ptp(known)
+    margin = 1e-9 * np.ptp(known)
     sides = (known <= known.min() + margin, known >= known.max() - margin)
-    low, high = (sum(n for _, n in runs(side) if n >= STUCK) / len(known) for side in sides)
+    # samples in a row at an extreme that count as at a limit
+    low, high = (sum(n for _, n in runs(side) if n >= 3) / len(known) for side in sides)
     return low, high
 
 
 # --- The spectrum of a signal ---------------------------------------------------------------------
 
 
-LONGEST = 4096
-"""Samples of a segment at most (Welch 1967)."""
-SHORTEST = 32
 LOW, HIGH, TOP = 0.05, 0.95, 0.999
 """Parts of the power below the band's lower end, its upper end, and the top frequency."""
 
@@ -75,10 +67,11 @@ def power_spectrum(columns: Iterable[FloatArray], Ts: float) -> tuple[FloatArray
     frequency [Hz] and power [unit^2/Hz], both (M,), without frequency 0; they are empty where no
     piece has 32 samples.
     """
-    pieces = [c[a : a + n] for c in columns for a, n in runs(np.isfinite(c)) if n >= SHORTEST]
+    pieces = [c[a : a + n] for c in columns for a, n in runs(np.isfinite(c)) if n >= 32]
     if not pieces:
         return np.zeros(0), np.zeros(0)
-    length = min(LONGEST, 2 ** int(np.log2(max(map(len, pieces)))))
+    # samples of a segment at most (Welch 1967)
+    length = min(4096, 2 ** int(np.log2(max(map(len, pieces)))))
     window = np.hanning(length + 1)[:-1]
     total, count = np.zeros(length // 2 + 1), 0
     for piece in pieces:
@@ -122,12 +115,7 @@ class Simulates(Protocol):
 
 BoolArray = NDArray[np.bool_]
 
-_ROUNDING = 1e-12
-"""Part of the range below which a deviation is rounding."""
-_CELLS = 2_000_000
 _SHOWN = 8
-THRESHOLD = 6.0
-"""Robust standard deviations from which on an output of a short record stands out."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -238,7 +226,8 @@ def usual_threshold(data: Dataset) -> float:
     For white noise alone, 6 would suffice for a hundred million samples; in 2,000,000 samples of a
     moving plant, chance reaches 7.3.
     """
-    return THRESHOLD + 0.75 * max(0.0, math.log10(len(data) / 20_000))
+    # robust standard deviations from which on an output of a short record stands out
+    return 6.0 + 0.75 * max(0.0, math.log10(len(data) / 20_000))
 
 
 def _series(data: Dataset, model: Simulates | None) -> list[FloatArray]:
@@ -261,12 +250,14 @@ def distances(y: FloatArray, window: int = 7) -> FloatArray:
     known = y[np.isfinite(y)]
     if len(known) == 0:
         return np.full_like(y, np.nan)
-    least = max(_ROUNDING * float(np.ptp(known)), np.finfo(np.float64).tiny)
+    # part of the range below which a deviation is rounding
+    least = max(1e-12 * float(np.ptp(known)), np.finfo(np.float64).tiny)
     level = max(float(np.nan_to_num(white_noise(y))), 0.5 * (quantum(y) or 0.0), least)
     padded = np.pad(y, window // 2, constant_values=np.nan)
     rows = np.lib.stride_tricks.sliding_window_view(padded, window)
     distance = np.empty_like(y)
-    count = max(1, _CELLS // window)
+    # numbers at once, for the memory
+    count = max(1, 2_000_000 // window)
     for first in range(0, len(y), count):
         part = slice(first, first + count)
         levelled = _levelled(rows[part], level)

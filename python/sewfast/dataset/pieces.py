@@ -134,9 +134,7 @@ def require_excited(data: Dataset) -> None:
 
 
 def require_fittable(data: Dataset) -> None:
-    """Raise `DataError` if values are so large, or move so little, that their squares overflow.
-    Call it after `require_measured`, which reports infinite values.
-    """
+    """Raise `DataError` if squares overflow; `require_measured` comes first."""
     require_sane(data, LARGEST_FITTED)
     columns = [*np.concatenate([e.u for e in data.experiments]).T]
     columns.append(np.concatenate([e.y for e in data.experiments]))
@@ -171,10 +169,7 @@ SHORTEST_PIECE = 100
 
 
 def take(data: Dataset, text: str) -> Dataset:
-    """`"A:B"` of every experiment, 0-based, end excluded; A or B can be left out.
-    Raises `SettingError` if the text is not a range, and `DataError` if the range leaves an
-    experiment or is empty.
-    """
+    """`"A:B"` of every experiment, 0-based, end excluded; A or B can be left out."""
     pieces = (e.cut(*range_of_text(text, e)) for e in data.experiments)
     return replace(data, experiments=tuple(pieces))
 

@@ -28,10 +28,6 @@ if TYPE_CHECKING:
 
 REACH = 10
 """Half width of the filter, in samples of the slower rate."""
-KAISER = 5.653
-"""Its window's beta: 60 dB (Kaiser 1974); passband to .8, stopband from 1.2 of the Nyquist rate."""
-MOST_SAMPLES = 100_000_000
-_CHUNK = 2_000_000
 
 
 def resample(
@@ -75,6 +71,7 @@ def resample(
     DataError
         If an experiment is shorter than one new period.
     """
+    most_samples = 100_000_000
     if isinstance(Ts, bool) or not isinstance(Ts, (int, float, np.number)):
         raise SettingError(f"resample: expected a sample time in seconds, received {Ts!r}")
     if not (math.isfinite(Ts) and Ts > 0.0):
@@ -85,10 +82,10 @@ def resample(
     ratio = _rounded(float(Ts) / data.Ts)
     if ratio == 1.0:
         return data
-    if len(data) / ratio > MOST_SAMPLES:
+    if len(data) / ratio > most_samples:
         raise SettingError(
             f"resample: Ts = {Ts:g} s makes {len(data) / ratio:.3g} samples, expected at most "
-            f"{MOST_SAMPLES:,}; give a longer sample time"
+            f"{most_samples:,}; give a longer sample time"
         )
     experiments = tuple(_resampled(e, ratio, inputs, antialias) for e in data.experiments)
     note = f"resampled from Ts = {data.Ts:g} s to {Ts:g} s, inputs {inputs}"
@@ -210,7 +207,8 @@ def _low_passed(column: FloatArray, times: FloatArray, scale: float) -> FloatArr
     padded = _extended(column, reach + 1)
     offsets = np.arange(-reach, reach + 2)
     found = np.empty(len(times))
-    rows = max(1, _CHUNK // len(offsets))
+    # numbers at once, for the memory
+    rows = max(1, 2_000_000 // len(offsets))
     for first in range(0, len(times), rows):
         t = times[first : first + rows]
         whole = np.floor(t).astype(np.int64)
@@ -225,7 +223,8 @@ def _low_passed(column: FloatArray, times: FloatArray, scale: float) -> FloatArr
 def _weights(x: FloatArray) -> FloatArray:
     """Sinc under a Kaiser window; each row has the sum 1, so that a constant stays one."""
     inside = np.clip(1.0 - (x / REACH) ** 2, 0.0, None)
-    weights = np.where(np.abs(x) < REACH, np.sinc(x) * np.i0(KAISER * np.sqrt(inside)), 0.0)
+    # the window's beta: 60 dB (Kaiser 1974); passband to .8, stopband from 1.2 of the Nyquist rate
+    weights = np.where(np.abs(x) < REACH, np.sinc(x) * np.i0(5.653 * np.sqrt(inside)), 0.0)
     scaled: FloatArray = weights / weights.sum(axis=1, keepdims=True)
     return scaled
 
@@ -243,8 +242,6 @@ def _extended(column: FloatArray, reach: int) -> FloatArray:
 
 SHORTEST = {"kalman": 5, "savgol": 41, "difference": 2}
 """Samples in a row that each method needs."""
-BRIDGED = 5
-"""Most missing samples that the smoother bridges."""
 _HOW = {
     "kalman": "by a Kalman smoother, without delay",
     "savgol": "by the slope of a cubic over 41 samples, without delay",
@@ -329,7 +326,8 @@ def _differentiated(e: Experiment, data: Dataset, method: Method) -> Experiment:
     bridged = known.copy()
     for first, count in runs(~known):
         inside = first > 0 and first + count < len(e)
-        bridged[first : first + count] = inside and count <= BRIDGED and method != "difference"
+        # most missing samples that the smoother bridges
+        bridged[first : first + count] = inside and count <= 5 and method != "difference"
     pieces = [(a, n) for a, n in runs(bridged) if n >= SHORTEST[method]]
     if not pieces:
         raise DataError(

@@ -14,11 +14,8 @@ from .outliers import white_noise
 if TYPE_CHECKING:
     from .experiment import Experiment
 
-LEAST = 3
-"""Fewest measured outputs by which a drift can be told from noise."""
 SIGMAS = 3.0
 """Standard errors beyond which a drift, or a level, is not noise."""
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -40,13 +37,15 @@ def standing(experiment: Experiment) -> Standing | None:
     The inputs keep their first values, and the output has at least three measured samples whose
     drift is explained by noise.
     """
+    rounding = 1e-9
     e = without_weightless(experiment)
     moved = (e.u != e.u[0]).any(axis=1)
     if not moved.any():
         return None
     n = int(np.argmax(moved))
     k = np.flatnonzero(np.isfinite(e.y[:n]))
-    if len(k) < LEAST:
+    # fewest measured outputs by which a drift can be told from noise
+    if len(k) < 3:
         return None
     y, spread = e.y[k], float(np.nanmax(e.y) - np.nanmin(e.y))
     about = k - k.mean()
@@ -54,13 +53,13 @@ def standing(experiment: Experiment) -> Standing | None:
     # the noise of the whole record: that of a few samples is known too badly to see a drift
     white = white_noise(e.y)
     error = white / math.sqrt(float(about @ about))
-    if abs(slope) > SIGMAS * error + _ROUNDING * spread / n:
+    if abs(slope) > SIGMAS * error + rounding * spread / n:
         return None
     level = float(y.mean())
     u = tuple(float(v) for v in e.u[0])
     deviation = float(y.std(ddof=1))
     noise = deviation / math.sqrt(len(y))
-    if not any(u) and abs(level) <= _student(len(y) - 1) * noise + _ROUNDING * spread:
+    if not any(u) and abs(level) <= _student(len(y) - 1) * noise + rounding * spread:
         level = 0.0
     return Standing(n, u, level, max(deviation, white))
 

@@ -327,20 +327,8 @@ def _plain(value: Any) -> Any:
 # --- Advice on the figures of a summary -----------------------------------------------------------
 
 
-LIMITED = 0.02
-"""Least part of the samples at one limit for the output to count as limited."""
-NOISY = 0.2
-"""Least ratio of white noise to standard deviation for the output to count as noisy."""
-FINE = 50.0
-"""Samples per period of the highest frequency above which the sample time is very short."""
-ENOUGH = 10.0
-"""Samples per such period that are enough."""
-NYQUIST = 0.25
-"""Upper end of the band, as a part of the sampling rate, that is close to the limit."""
 SHOWN = 8
 """Outliers whose places are named."""
-FEW = 500
-"""Samples below which an identification has little evidence."""
 
 
 def advice(found: Summary) -> Iterator[str]:
@@ -356,7 +344,8 @@ def advice(found: Summary) -> Iterator[str]:
     # nearly all power of a position is slow, however fast its speed changes
     if found.diagnosis.find("integrator") is None and found.diagnosis.find("wraps") is None:
         yield from _rate(output, found.Ts)
-    if found.n < FEW:
+    # samples below which an identification has little evidence
+    if found.n < 500:
         yield (
             f"{found.n} samples are few: a network needs about ten for each of its parameters; "
             "record longer, or identify a linear model (model='oe')"
@@ -410,7 +399,8 @@ def _outliers(found: Summary, name: str) -> str:
 
 def _limits(output: ColumnSummary) -> Iterator[str]:
     for part, value in ((output.at_low, output.low), (output.at_high, output.high)):
-        if part > LIMITED:
+        # least part of the samples at one limit for the output to count as limited
+        if part > 0.02:
             yield (
                 f"{output.name} stays at {value:g} for {part:.1%} of the samples: a limit of the "
                 "sensor or of the plant. A network can learn it, a linear model cannot; of a "
@@ -421,7 +411,8 @@ def _limits(output: ColumnSummary) -> Iterator[str]:
 def _noise_advice(output: ColumnSummary) -> Iterator[str]:
     # the square of a tiny output can be 0
     known = output.moves and output.std > 0.0 and math.isfinite(output.noise)
-    if known and output.noise > NOISY * output.std:
+    # least ratio of white noise to standard deviation for the output to count as noisy
+    if known and output.noise > 0.2 * output.std:
         yield (
             f"white noise is {output.noise / output.std:.0%} of what {output.name} does: excite "
             "more strongly or record longer; prefer output error to arx, which noise biases"
@@ -431,15 +422,18 @@ def _noise_advice(output: ColumnSummary) -> Iterator[str]:
 def _rate(output: ColumnSummary, Ts: float) -> Iterator[str]:
     if output.band is None or output.top is None or not output.moves:
         return
-    if 1.0 / (output.top * Ts) > FINE:
-        wanted = nice(1.0 / (ENOUGH * output.top))
+    # samples per period of the highest frequency above which the sample time is very short
+    if 1.0 / (output.top * Ts) > 50.0:
+        # ten samples of such a period are enough
+        wanted = nice(1.0 / (10.0 * output.top))
         yield (
             f"99.9 % of the power of {output.name} lies below {output.top:.3g} Hz, "
             f"{1.0 / (output.top * Ts):.0f} samples in a period: where no controller is to run at "
             f"this rate, fits are faster at a longer sample time, data.resample({wanted:g}) "
             f"(--resample {wanted:g})"
         )
-    elif output.band[1] * Ts > NYQUIST:
+    # upper end of the band, as a part of the sampling rate, that is close to the limit
+    elif output.band[1] * Ts > 0.25:
         yield (
             f"{output.name} moves up to {output.band[1]:.3g} Hz, close to half the sampling rate: "
             "either most of it is noise, or the sample time is too long to see what the plant does"
@@ -456,10 +450,6 @@ def nice(value: float) -> float:
 
 
 INPUT, OUTPUT, MISSING, OUTLIER = "#333333", "#0072B2", "#D55E00", "#CC0000"
-MOST_PANELS = 8
-_BUCKETS = 1200
-_MOST_GAPS = 1000
-"""Most gaps that are shaded, the longest first; more would only slow the figure down."""
 
 
 def plot(data: Dataset, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
@@ -478,7 +468,7 @@ def plot(data: Dataset, ax: Any = None, *, file: str | os.PathLike[str] | None =
 def drawing(data: Dataset) -> Drawing:
     """One row per column, time on the left, spectrum on the right; experiments side by side."""
     names = [*map(labelled, data.input_names, data.input_units)]
-    names = [*names[: MOST_PANELS - 1], labelled(data.output_name, data.output_unit)]
+    names = [*names[:7], labelled(data.output_name, data.output_unit)]
     rows = []
     units = [*data.input_units[: len(names) - 1], data.output_unit]
     for i, (name, unit) in enumerate(zip(map(lettered, names), map(lettered, units), strict=True)):
@@ -507,8 +497,9 @@ def _over_time(
     look |= {"drawstyle": "default" if is_output else "steps-post"}
     for column in columns:
         index = np.arange(offset, offset + len(column), dtype=np.float64)
-        ax.plot(*thin(index * Ts, column, _BUCKETS), **look)
-        gaps = sorted(runs(np.isnan(column)), key=lambda gap: -gap[1])[:_MOST_GAPS]
+        ax.plot(*thin(index * Ts, column, 1200), **look)
+        # most gaps that are shaded, the longest first; more would only slow the figure down
+        gaps = sorted(runs(np.isnan(column)), key=lambda gap: -gap[1])[:1000]
         if gaps:
             places = [((offset + start - 0.5) * Ts, length * Ts) for start, length in gaps]
             missing: dict[str, Any] = {"color": MISSING, "alpha": 0.25, "lw": 0, "snap": False}

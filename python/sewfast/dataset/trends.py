@@ -17,13 +17,6 @@ if TYPE_CHECKING:
     from .dataset import Dataset
     from .experiment import Experiment
 
-LEAST_REST = 20
-"""Least samples at rest at the beginning for `steady`."""
-MOVED = 0.02
-"""Part of its range by which an input at rest can differ from its first value."""
-SETTLED = 0.05
-"""Part of its range by which the output can drift over the second half of the rest."""
-
 
 @dataclass(frozen=True, eq=False)
 class Trend:
@@ -180,18 +173,21 @@ def _line(index: FloatArray, column: FloatArray, what: str) -> tuple[float, floa
 
 
 def _rest(e: Experiment, data: Dataset) -> Trend:
+    # least samples at rest at the beginning for `steady`
+    least_rest = 20
     n = _samples_at_rest(e)
     half = slice(n // 2, n)
     y = e.y[half][np.isfinite(e.y[half])]
-    if n < LEAST_REST or len(y) < LEAST_REST // 4:
+    if n < least_rest or len(y) < least_rest // 4:
         raise DataError(
-            f"{e.name} [{e.range_text}]: expected at least {LEAST_REST} samples at rest before an "
+            f"{e.name} [{e.range_text}]: expected at least {least_rest} samples at rest before an "
             f"input moves, received {n} with {len(y)} measured in their second half; record with a "
             "rest before the excitation, or use order 0"
         )
     spread = np.ptp(e.y[np.isfinite(e.y)])
     drift = abs(y[: len(y) // 2].mean() - y[len(y) // 2 :].mean())
-    if drift > SETTLED * spread > 0.0:
+    # part of its range by which the output can drift over the second half of the rest
+    if drift > 0.05 * spread > 0.0:
         raise DataError(
             f"{e.name} [{e.range_text}]: expected an output that has settled before the input "
             f"moves, but it still moves by {drift:g} of a range of {spread:g}; wait longer before "
@@ -209,7 +205,8 @@ def _samples_at_rest(e: Experiment) -> int:
         if len(known) == 0:
             return 0
         off = np.abs(column - np.median(known[:10]))
-        moved |= ~(off <= MOVED * np.ptp(known))
+        # part of its range by which an input at rest can differ from its first value
+        moved |= ~(off <= 0.02 * np.ptp(known))
     return int(np.argmax(moved)) if moved.any() else len(e)
 
 

@@ -26,7 +26,6 @@ __all__ = ["Line", "ReportCard", "Verdict"]
 
 Verdict: TypeAlias = Literal["ok", "warn", "fail", "info"]
 _ORDER: dict[Verdict, int] = {"info": 0, "ok": 1, "warn": 2, "fail": 3}
-_WIDTH = 100
 
 
 @dataclass(frozen=True)
@@ -131,6 +130,7 @@ class VerdictTable:
         return f"{type(self).__name__}({self.verdict}: {text})"
 
     def __str__(self) -> str:
+        width = 100
         wide = [
             max((len(getattr(x, k)) for x in self.lines), default=0)
             for k in ("name", "shown", "limit")
@@ -142,19 +142,17 @@ class VerdictTable:
             found.append(f"{x.verdict:4}  " + "  ".join(c.ljust(w) for c, w in cells).rstrip())
             if x.meaning != before:
                 found += textwrap.wrap(
-                    x.meaning, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6
+                    x.meaning, width, initial_indent=" " * 6, subsequent_indent=" " * 6
                 )
             before = x.meaning
         if self.summary:
-            found += ["", *textwrap.wrap(f"in short: {self.summary}", _WIDTH)]
+            found += ["", *textwrap.wrap(f"in short: {self.summary}", width)]
         return "\n".join(found)
 
 
 # --- The conclusion of a report card: good enough or not, why, what to do first -------------------
 
 
-_NAMED = 3
-"""Most lines listed by name; of the others only the number is given."""
 _STEPS = (
     # most important first: mending a later line does not help a model that fails an earlier one
     ("record", "mend the record: its line says how"),
@@ -214,8 +212,10 @@ def summary(lines: Sequence[Line]) -> str:
 
 
 def _counted(lines: Sequence[Line], verb: str) -> str:
-    names = ", ".join(x.name for x in lines[:_NAMED])
-    more = len(lines) - _NAMED
+    # most lines listed by name; of the others only the number is given
+    named = 3
+    names = ", ".join(x.name for x in lines[:named])
+    more = len(lines) - named
     count = f"one line {verb}s" if len(lines) == 1 else f"{len(lines)} lines {verb}"
     return f"{count} ({names}{f' and {more} more' if more > 0 else ''})"
 

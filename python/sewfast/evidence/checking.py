@@ -31,9 +31,6 @@ from .simulation_bands import (
     uncertainty_of,
 )
 
-_FORGOTTEN = 0.05
-TESTED = 200_000
-"""Most samples that the tests of the residual use, in blocks: of more all are significant."""
 _M = TypeVar("_M", bound=DynamicModel)
 
 
@@ -92,7 +89,8 @@ def check(
     free = Residuals.of(model, data, init, "free run")
     has_gaps = not all(np.isfinite(e.y).all() for e in data.experiments)
     horizon: Horizon = "one step" if model.kind == "arx" and not has_gaps else "free run"
-    tested, part = free, thinned(data, TESTED)
+    # most samples that the tests of the residual use, in blocks: of more all are significant
+    tested, part = free, thinned(data, 200_000)
     if part is not data or horizon != "free run":
         tested = Residuals.of(model, part, init, horizon)
     scores = horizon_scores(model, data, free)
@@ -156,7 +154,7 @@ def fading_samples(model: DynamicModel, data: Dataset, init: int = INIT) -> int:
     except (FitError, ValueError):
         return LAGS
     gap = np.abs(other - one)
-    kept = np.flatnonzero(gap > _FORGOTTEN * gap.max(initial=0.0))
+    kept = np.flatnonzero(gap > 0.05 * gap.max(initial=0.0))
     return int(kept[-1]) + 1 if len(kept) else LAGS
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..dataset import FloatArray, labelled
 from ..errors import SettingError
-from ..plotting import DPI, Drawing, Panel, lettered, stacked, style, thin
+from ..plotting import DPI, STYLES, Drawing, Panel, lettered, stacked, style, thin
 from ..storage import making, replace_files
 from .card import ReportCard
 from .portmanteau import ResidualTest
@@ -24,17 +24,13 @@ if TYPE_CHECKING:
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Colours of Okabe and Ito, distinct for readers with a colour deficiency, too."""
-_STYLES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1, 2)))
 _MARKERS = "osD^vP"
 _MOST_PANELS = 6
 _BUCKETS = 1200
-_FARTHEST = 20.0
 
 
 def figures(card: ReportCard, *, page: bool = False) -> dict[str, Figure]:
-    """All figures of a card by name, as far as it has the evidence: `residuals`, `bands`, `bode`,
-    `poles`, `region`. Raises `SettingError` if matplotlib is not installed.
-    """
+    """All figures of a card for which it has the evidence, by name."""
     drawn = {name: drawing(card, name) for name in names(card)}
     return {name: d.beside() if page else d.figure() for name, d in drawn.items()}
 
@@ -50,9 +46,7 @@ def names(card: ReportCard) -> list[str]:
 
 
 def drawing(card: ReportCard, name: str | None = None) -> Drawing:
-    """One figure of a card; by default `bands`, else the first for which it has evidence.
-    Raises `SettingError` for a figure for which the card has no evidence.
-    """
+    """One figure of a card; by default `bands`, else the first for which it has evidence."""
     there = names(card)
     if name is None and there:
         name = "bands" if "bands" in there else there[0]
@@ -64,9 +58,7 @@ def drawing(card: ReportCard, name: str | None = None) -> Drawing:
 
 
 def save(card: ReportCard, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write every figure as a PNG into a folder, which is created if needed.
-    Raises `SettingError` if matplotlib is not installed or the folder cannot be written to.
-    """
+    """Write every figure as a PNG into a folder, which is created if needed."""
     contents: dict[Path, bytes] = {}
     for name, figure in figures(card).items():
         content = io.BytesIO()
@@ -175,7 +167,7 @@ def _bode(ax: Axes, card: ReportCard, i: int, phase: bool) -> None:
         look = {
             "color": shade(n, len(shown)),
             "lw": 4.2 - 3.2 * n / max(1, len(shown) - 1),
-            "ls": _STYLES[n % len(_STYLES)],
+            "ls": STYLES[n % len(STYLES)],
         }
         g = o.points[k].response(hertz)[:, i]
         if not np.abs(g).any():
@@ -283,7 +275,7 @@ def _region(ax: Axes, card: ReportCard, i: int) -> None:
     ax.set_ylabel("distance / radius")
     ax.set_xlabel("time [s]")
     ax.margins(x=0.01)
-    ax.set_ylim(0.0, min(max(1.2, 1.05 * float(d.max())), _FARTHEST))
+    ax.set_ylim(0.0, min(max(1.2, 1.05 * float(d.max())), 20.0))
 
 
 _DRAWINGS: dict[str, Callable[[ReportCard], Drawing]] = {

@@ -22,8 +22,8 @@ INTEGRATES = 2.5e-4
 
 
 def integrating_pole(model: DynamicModel) -> float | None:
-    """The pole at 1, or so close that no practical step settles; None if there is none.
-    A record of a position determines it up to noise and friction.
+    """The pole at 1, or so close, given noise and friction, that no practical step settles; or
+    None.
     """
     try:
         small = linearise(representative(model).core, np.zeros(len(model.input_names)))
@@ -37,12 +37,6 @@ def integrating_pole(model: DynamicModel) -> float | None:
 
 
 # --- Linearisation over the operating range: equilibria, poles, gains, frequency responses --------
-
-
-POINTS = 9
-FREQUENCIES = 120
-_CLOSING = 3
-"""Rounds that narrow the range of an input to the values near the training data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +211,7 @@ class OperatingRange:
             for p in self.points
         ]
         low = 0.05 / (2.0 * math.pi * max(*slowest, self.Ts))
-        return np.geomspace(min(low, 0.05 / self.Ts), 0.5 / self.Ts, FREQUENCIES)
+        return np.geomspace(min(low, 0.05 / self.Ts), 0.5 / self.Ts, 120)
 
     def __str__(self) -> str:
         header = [*self.input_names, self.output_name, "gain", "slowest [s]", "bandwidth [Hz]", ""]
@@ -234,7 +228,7 @@ class OperatingRange:
 
 
 def operating_range(
-    model: DynamicModel, inputs: Sequence[FloatArray] | None = None, points: int = POINTS
+    model: DynamicModel, inputs: Sequence[FloatArray] | None = None, points: int = 9
 ) -> OperatingRange:
     """Linearise a model over the range of its training inputs.
 
@@ -290,7 +284,8 @@ def _closed_in(
 ) -> list[FloatArray]:
     """Values of input i near the training data: the height of a pulse, say, was never held."""
     low, high = limits[i]
-    for _ in range(_CLOSING):
+    # rounds that narrow the range of an input to the values near the training data
+    for _ in range(3):
         line = _line(limits, i, low, high, points)
         known = [k for k, p in enumerate(_points(model, line, region)) if p.known]
         if not known or len(known) > 0.7 * points:

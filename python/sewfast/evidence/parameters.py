@@ -18,20 +18,11 @@ from .residuals import Residuals, representative
 
 @dataclass(frozen=True)
 class Criteria:
-    """Criteria of a model on its training data; smaller is better, only differences matter.
+    """Criteria of a model on its training data; smaller is better, only differences matter. `aic`,
+    `aicc` and `bic` are n ln(RSS/n) + 2 p, + 2 p (p + 1)/(n - p - 1), and n ln(RSS/n) + p ln n for
+    the effective number of `parameters`; `fpe` is RSS/n (1 + p/n)/(1 - p/n) [output unit squared].
     They assume a white residual; with a coloured one they favour too many parameters. Sources:
     Akaike (1974), Hurvich and Tsai (1989), Schwarz (1978), Akaike (1969); Ljung 1999, section 16.4.
-
-    Attributes
-    ----------
-    parameters : float
-        Effective number of parameters.
-    n : int
-        Samples.
-    aic, aicc, bic : float
-        n ln(RSS/n) + 2 p; + 2 p (p + 1)/(n - p - 1); n ln(RSS/n) + p ln n. NaN without a residual.
-    fpe : float
-        RSS/n (1 + p/n)/(1 - p/n) [output unit squared].
     """
 
     parameters: float
@@ -65,8 +56,6 @@ class Criteria:
 
 DETERMINED = 1e-10
 """Least information of a direction, relative to the largest; double precision ends there."""
-NOTHING = 1e-60
-"""Least length of a sensitivity's column, relative to the longest, to carry information."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +99,7 @@ class Parameters:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """The normal matrix of a residual, with its inverse over the determined directions.
-    `gram` (p, p) is Psi'Psi and `penalty` (p,) the weight decay's diagonal.
-    """
+    """The normal matrix Psi'Psi (p, p) and its inverse over the determined directions."""
 
     gram: FloatArray
     penalty: FloatArray
@@ -156,14 +143,13 @@ def _unit_scale(squares: FloatArray) -> FloatArray:
     """
     lengths = np.sqrt(squares)
     largest = lengths.max(initial=0.0) or 1.0
-    return np.where(lengths > NOTHING * largest, lengths, largest)
+    # least length of a sensitivity's column, relative to the longest, to carry information
+    return np.where(lengths > 1e-60 * largest, lengths, largest)
 
 
 @dataclass(frozen=True)
 class StoredInformation:
-    """Stored with a model: how well its training data determine the parameters. `number` counts the
-    parameters; `effective`, `condition` and `undetermined` are as for `Parameters`.
-    """
+    """How well a model's training data determine its `number` of parameters, as `Parameters`."""
 
     number: int
     samples: int
@@ -218,9 +204,7 @@ def estimate(model: DynamicModel, residuals: Residuals) -> Parameters | None:
 
 
 def penalty(model: DynamicModel, residuals: Residuals) -> FloatArray:
-    """The weight decay as a diagonal added to Psi'Psi, in the data's units; zero without decay.
-    The training cost is 1/(2N) sum (e/y_scale)^2 + decay/2 |w|^2 (docs/CONVENTIONS.md).
-    """
+    """Weight decay as a diagonal added to Psi'Psi in the data's units (docs/CONVENTIONS.md, J)."""
     single = representative(model)
     decay = single.training.get("weight_decay", 0.0)
     decay = decay if isinstance(decay, float) and np.isfinite(decay) else 0.0

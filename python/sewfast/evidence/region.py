@@ -46,30 +46,12 @@ Signals: TypeAlias = tuple[FloatArray, FloatArray]
 FORM = 2
 """Version of the stored values; version 1 whitened the model's own regressor or state."""
 CENTRES = 300
-_SUBSAMPLE = 4000
-_BLOCK = 4096
-_TENTHS = 10
 _FARTHEST = 1000.0
 """Largest distance; squares of larger ones would swamp later values by rounding."""
 
-_LEAST_RADIUS = 0.1
-"""Least radius, as a part of half a range: a twentieth of the range is no new region."""
-_LEFT_OUT = 0.98
-"""Share of the points of a tenth that lie within its distance from the other tenths."""
-_MOVED = 0.5
-"""Mean square change over the lag, relative to the variance: a correlation of three quarters."""
 
-_INPUT_LEVEL, _FEW_WINDOWS = 1.2, 0.2
-"""Factor on the largest training level of an input, and an addition for few windows."""
-_WHOLE_LEVEL = 1.4
-"""Factor on the level of the whole record, if that gives more: half way to the double, in dB."""
 _INPUT_PEAK, _OUTPUT = 1.3, 1.7
 """Factors on the largest peak of an input, and on the largest level and peak of the output."""
-_SEEN = 0.85
-"""Share of the training record, doubled in amplitude, that must lie outside with the window."""
-_LARGEST_WINDOW = 6
-"""Least number of windows in the record."""
-_PEAK_LAGS = 3
 _SMALLEST = 1e-6
 """Least level, relative to the signal: an input that never moved is outside once it moves."""
 
@@ -107,9 +89,10 @@ class Region:
         if least_scale is not None:
             scale = np.maximum(scale, least_scale)
         scale = np.maximum(scale, 1e-12)
-        kept = ((points - mean) / scale)[:: max(1, len(points) // _SUBSAMPLE)]
+        kept = ((points - mean) / scale)[:: max(1, len(points) // 4000)]
         centres, covered = _spread_out(kept)
-        radius = max(_LEAST_RADIUS, _between_tenths(kept)) + covered
+        # least radius, as a part of half a range: a twentieth of the range is no new region
+        radius = max(0.1, _between_tenths(kept)) + covered
         return cls(mean, scale, centres, radius)
 
     @np.errstate(over="ignore")
@@ -208,11 +191,9 @@ class TrainingRegion:
 
     @property
     def n_inputs(self) -> int:
-        """Inputs of the model."""
         return len(self.centre) - 1
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values."""
         return {
             "form": FORM,
             "lag": self.lag,
@@ -241,7 +222,6 @@ class TrainingRegion:
 
 
 def training_region(model: DynamicModel, data: Dataset) -> dict[str, Any]:
-    """The region of a model on its training data, for its `training["region"]`."""
     return _region(model, data).to_json()
 
 
@@ -314,16 +294,15 @@ def _lag(y: FloatArray) -> int:
     variance = float(y.var())
     lag = 1
     while lag < len(y) // 20:
-        if np.mean(np.square(y[lag:] - y[:-lag])) > _MOVED * variance:
+        # mean square change over the lag, relative to the variance: a correlation of three quarters
+        if np.mean(np.square(y[lag:] - y[:-lag])) > 0.5 * variance:
             break
         lag = max(lag + 1, int(1.3 * lag))
     return lag
 
 
 def _spread_out(points: FloatArray) -> tuple[FloatArray, float]:
-    """Up to `CENTRES` points, each farthest from those before, and the largest distance left.
-    The greedy k-centre of Gonzalez (1985): extremes are among the first.
-    """
+    """Up to `CENTRES` points by greedy k-centre (Gonzalez 1985), and the largest distance left."""
     chosen = [int(np.argmin(np.square(points).sum(axis=1)))]
     nearest = np.square(points - points[chosen[0]]).sum(axis=1)
     while len(chosen) < CENTRES:
@@ -337,22 +316,25 @@ def _spread_out(points: FloatArray) -> tuple[FloatArray, float]:
 
 def _between_tenths(points: FloatArray) -> float:
     """Distance of 98 % of a tenth of the points from the other nine, for the worst tenth."""
-    if len(points) < 2 * _TENTHS:
+    tenths = 10
+    if len(points) < 2 * tenths:
         return 0.0
-    tenth = np.arange(len(points)) * _TENTHS // len(points)
-    found = [_nearest(points[tenth == i], points[tenth != i]) for i in range(_TENTHS)]
-    return float(max(np.quantile(d, _LEFT_OUT) for d in found))
+    tenth = np.arange(len(points)) * tenths // len(points)
+    found = [_nearest(points[tenth == i], points[tenth != i]) for i in range(tenths)]
+    # share of the points of a tenth that lie within its distance from the other tenths
+    return float(max(np.quantile(d, 0.98) for d in found))
 
 
 def _nearest(points: FloatArray, centres: FloatArray) -> FloatArray:
     """Distance of every point (N, d) to the nearest centre (c, d), shape (N,)."""
+    block = 4096
     bounded = np.clip(np.nan_to_num(points), -_FARTHEST, _FARTHEST)
     square = np.square(centres).sum(axis=1)
     found = np.empty(len(points))
-    for a in range(0, len(points), _BLOCK):
-        part = bounded[a : a + _BLOCK]
+    for a in range(0, len(points), block):
+        part = bounded[a : a + block]
         cross = (square - 2.0 * part @ centres.T).min(axis=1)
-        found[a : a + _BLOCK] = np.square(part).sum(axis=1) + cross
+        found[a : a + block] = np.square(part).sum(axis=1) + cross
     return np.sqrt(np.maximum(found, 0.0))
 
 
@@ -362,18 +344,20 @@ def _nearest(points: FloatArray, centres: FloatArray) -> FloatArray:
 def _window(
     signals: Sequence[FloatArray], centre: FloatArray, peak: FloatArray, lag: int
 ) -> tuple[int, FloatArray]:
-    """The window and the bounds of the level: the shortest with the doubled inputs outside.
-    Inputs are doubled about their mean and about zero. If no window suffices, the best one.
-    """
+    """The shortest window, with the level's bounds, that has doubled inputs outside."""
+    # factor on the largest training level of an input, and an addition for few windows
+    input_level, few_windows = 1.2, 0.2
     n = sum(map(len, signals))
     whole = np.sqrt(sum(np.square(x - centre).sum(axis=0) for x in signals) / n)
-    window, largest = max(4, 2 * lag), max(4, 2 * lag, n // _LARGEST_WINDOW)
+    # least number of windows in the record
+    window, largest = max(4, 2 * lag), max(4, 2 * lag, n // 6)
     best: tuple[float, int, FloatArray] | None = None
     while True:
         rms = np.max([_rms(x - centre, window).max(axis=0) for x in signals], axis=0)
-        factors = np.full(len(centre), _INPUT_LEVEL + _FEW_WINDOWS * np.sqrt(window / n))
+        factors = np.full(len(centre), input_level + few_windows * np.sqrt(window / n))
         factors[-1] = _OUTPUT
-        level = np.maximum(np.maximum(factors * rms, _WHOLE_LEVEL * whole), _SMALLEST * peak)
+        # factor on the level of the whole record, if that gives more: half way to the double, in dB
+        level = np.maximum(np.maximum(factors * rms, 1.4 * whole), _SMALLEST * peak)
         doubled = (
             np.concatenate(
                 [_size(d[:, :-1], level[:-1], peak[:-1], lag, window) > 1.0 for d in bigger]
@@ -386,7 +370,8 @@ def _window(
         seen = min(float(d.mean()) for d in doubled)
         if best is None or seen > best[0]:
             best = seen, window, level
-        if seen >= _SEEN or window >= largest:
+        # share of the training record, doubled in amplitude, that must lie outside with the window
+        if seen >= 0.85 or window >= largest:
             return best[1], best[2]
         window = min(int(1.4 * window) + 1, largest)
 
@@ -398,7 +383,7 @@ def _size(
     bound = _FARTHEST * np.minimum(level, peak)
     signals = np.clip(signals, -bound, bound)
     rms = (_rms(signals, window) / level).max(axis=1)
-    peaks = _largest((np.abs(signals) / peak).max(axis=1), min(window, max(4, _PEAK_LAGS * lag)))
+    peaks = _largest((np.abs(signals) / peak).max(axis=1), min(window, max(4, 3 * lag)))
     size: FloatArray = np.maximum(rms, peaks)
     return size
 

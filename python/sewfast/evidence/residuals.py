@@ -27,19 +27,10 @@ Horizon: TypeAlias = Literal["free run", "one step"]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One experiment.
-
-    Attributes
-    ----------
-    y, yhat : array, shape (N,)
-        Measured (NaN where it is not) and computed output [output unit].
-    counts : array of bool, shape (N,)
-        Measured samples after the initial ones.
-    psi : array, shape (N, p)
-        Sensitivity of yhat to the parameters.
-    state : array, shape (N, s)
-        Orthonormal basis of the changes of yhat due to the initial state, zero where a sample does
-        not count.
+    """One experiment: `y` (N,), NaN where not measured, `yhat` [output unit], and `counts`, the
+    measured samples after the initial ones. `psi` (N, p) is the sensitivity of yhat to the
+    parameters, `state` (N, s) an orthonormal basis of its changes due to the initial state, zero
+    where a sample does not count.
     """
 
     name: str
@@ -244,9 +235,6 @@ def _orthonormal(columns: FloatArray) -> FloatArray:
 # --- `HorizonScores`: errors one step, k steps ahead and in free run, per experiment and pooled ---
 
 
-STEPS = (1, 5, 20)
-
-
 @dataclass(frozen=True)
 class HorizonScores:
     """Scores by horizon: `free run` and `1 step`, `5 steps`, .. In `experiments` they are None if
@@ -258,7 +246,6 @@ class HorizonScores:
     names: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values."""
         return {
             horizon: {
                 **scores.to_json(),
@@ -272,11 +259,9 @@ class HorizonScores:
 
 
 def horizon_scores(
-    model: DynamicModel, data: Dataset, residuals: Residuals, steps: tuple[int, ...] = STEPS
+    model: DynamicModel, data: Dataset, residuals: Residuals, steps: tuple[int, ...] = (1, 5, 20)
 ) -> HorizonScores:
-    """Errors at every horizon; those some steps ahead only if the outputs are complete.
-    `residuals` are those of the free run.
-    """
+    """Errors of the free run, and some steps ahead if the outputs are complete."""
     series: dict[str, list[FloatArray]] = {"free run": [r.yhat for r in residuals.runs]}
     if all(np.isfinite(e.y).all() for e in data.experiments):
         for k in steps:

@@ -33,16 +33,6 @@ from .residuals import Residuals
 
 LEVEL = 0.95
 BLOCKS = 10
-_TAILS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.35, 0.5)
-_KEPT_VARIANCE = 0.999
-_FOLLOWED = 1e-4
-"""Least relative information of a direction in which parameters move when a block is left out.
-
-In weaker directions a network is nonlinear long before the first-order step is reached.
-"""
-_WIDEST = 10.0
-_LARGEST_GROWTH = 3.0
-"""Largest growth of a residual when its block is left out: the limit of the first order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +56,6 @@ class Uncertainty:
         return float(np.interp(normal(probability), at, self.quantiles))
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values."""
         return {
             "spread": self.spread,
             "factor": [[float(f"{v:.6e}") for v in row] for row in self.factor],
@@ -187,9 +176,7 @@ def bands_of(
     low, high = known.quantile(tail), known.quantile(1.0 - tail)
     spreads = _spreads(model, data, residuals, known)
     if place is not None:
-        spreads = [
-            s * np.clip(d, 1.0, _WIDEST) for s, d in zip(spreads, place.distances, strict=True)
-        ]
+        spreads = [s * np.clip(d, 1.0, 10.0) for s, d in zip(spreads, place.distances, strict=True)]
     lower = tuple(r.yhat + low * s for r, s in zip(residuals.runs, spreads, strict=True))
     upper = tuple(r.yhat + high * s for r, s in zip(residuals.runs, spreads, strict=True))
     hits = [
@@ -209,7 +196,6 @@ def bands_of(
 
 
 def uncertainty(model: DynamicModel, data: Dataset, init: int = INIT) -> Uncertainty:
-    """Uncertainty of a model from its training data."""
     residuals = Residuals.of(model, data, init, "free run")
     found = None if model.members else estimate(model, residuals)
     return uncertainty_of(model, data, residuals, found)
@@ -219,6 +205,7 @@ def uncertainty_of(
     model: DynamicModel, data: Dataset, residuals: Residuals, found: Parameters | None
 ) -> Uncertainty:
     """Uncertainty from free runs on the training data and the estimated parameters."""
+    tails = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.35, 0.5)
     factor = np.zeros((0, 0)) if found is None else _factor(found, residuals)
     errors = _left_out(model, residuals)
     power = sum(
@@ -233,7 +220,7 @@ def uncertainty_of(
             for e, s, r in zip(errors, spreads, residuals.runs, strict=True)
         ]
     )
-    probabilities = np.array([*_TAILS, *(1.0 - t for t in _TAILS[-2::-1])])
+    probabilities = np.array([*tails, *(1.0 - t for t in tails[-2::-1])])
     return Uncertainty(
         spread, factor, probabilities, np.quantile(scores, probabilities), residuals.n
     )
@@ -258,7 +245,7 @@ def _factor(found: Parameters, residuals: Residuals) -> FloatArray:
     moved, turn = np.linalg.eigh(root.T @ residuals.gram @ root)
     order = np.argsort(moved)[::-1]
     share = np.cumsum(moved[order]) / max(moved.sum(), 1e-300)
-    kept = order[: int(np.searchsorted(share, _KEPT_VARIANCE)) + 1]
+    kept = order[: int(np.searchsorted(share, 0.999)) + 1]
     factor: FloatArray = root @ turn[:, kept]
     return factor
 
@@ -275,7 +262,10 @@ def _left_out(model: DynamicModel, residuals: Residuals) -> list[FloatArray]:
     for run, e, out in zip(residuals.runs, errors, found, strict=True):
         for a, b in _blocks(len(e), residuals.n):
             psi = run.sensitivity[a:b]
-            inverse = information.inverse(gram(psi), _FOLLOWED)
+            # least relative information of a direction in which parameters move when a block is
+            # left out. In weaker directions a network is nonlinear long before the first-order step
+            # is reached
+            inverse = information.inverse(gram(psi), 1e-4)
             change = psi @ (inverse @ (psi.T @ e[a:b]))
             out[a:b] = e[a:b] + _bounded(change, e[a:b])
     return found
@@ -291,7 +281,8 @@ def _blocks(length: int, total: int) -> list[tuple[int, int]]:
 
 
 def _bounded(change: FloatArray, e: FloatArray) -> FloatArray:
-    largest = _LARGEST_GROWTH * float(np.linalg.norm(e))
+    # largest growth of a residual when its block is left out: the limit of the first order
+    largest = 3.0 * float(np.linalg.norm(e))
     size = float(np.linalg.norm(change))
     return change if size <= largest else change * (largest / size)
 

@@ -25,12 +25,7 @@ from .simulation_bands import Bands
 
 SMALL = 0.1
 """Part of the rms error above which a detected dependence is a failure, not a warning."""
-COVERAGE = (0.88, 0.99)
-LEAST_COVERAGE = 0.8
 OUTSIDE, FAR_OUTSIDE = 0.05, 0.2
-CONDITION = 1e8
-SAMPLES_PER_PARAMETER = 10.0
-GROWTH, LARGE_GROWTH = 1.5, 3.0
 
 _FOUND = {
     "parameters": (
@@ -150,8 +145,9 @@ def _worst(scores: HorizonScores, unit: str) -> list[Line]:
 
 def generalisation(here: Scores, training: Scores) -> Line:
     """Line on the free-run error on new data compared with that on the training data."""
+    growth, large_growth = 1.5, 3.0
     ratio = here.rmse / training.rmse if training.rmse > 0.0 else math.inf
-    verdict: Verdict = "ok" if ratio <= GROWTH else "warn" if ratio <= LARGE_GROWTH else "fail"
+    verdict: Verdict = "ok" if ratio <= growth else "warn" if ratio <= large_growth else "fail"
     meaning = {
         "ok": "the error is about as large as on the training data",
         "warn": "the error is larger than on the training data: these data hold something "
@@ -159,7 +155,7 @@ def generalisation(here: Scores, training: Scores) -> Line:
         "fail": "the error is several times that on the training data: do not use the model here; "
         "train on data like these as well",
     }[verdict]
-    return Line("error over training", ratio, f"{ratio:.3g}", f"<= {GROWTH:g}", verdict, meaning)
+    return Line("error over training", ratio, f"{ratio:.3g}", f"<= {growth:g}", verdict, meaning)
 
 
 _NO_OFFSET: tuple[Verdict, str] = "ok", "no offset between model and data"
@@ -195,12 +191,10 @@ def bias(residuals: Residuals) -> Line:
 
 
 def residuals_power(residuals: Residuals) -> float:
-    """Mean square of the residuals."""
     return sum(float(r.error @ r.error) for r in residuals.runs) / residuals.n
 
 
 def correlation(t: ResidualTest) -> Line:
-    """Line with the verdict of one residual test."""
     limit = f"p >= {LEVEL:g}"
     if not math.isfinite(t.p_value):
         text = (
@@ -230,18 +224,20 @@ _INFORMS = {
 
 def parameters(p: StoredInformation) -> list[Line]:
     """Lines on samples per parameter and conditioning."""
+    condition = 1e8
+    samples_per_parameter = 10.0
     ratio = p.samples / max(p.effective, 1e-12)
-    enough = ratio >= SAMPLES_PER_PARAMETER
+    enough = ratio >= samples_per_parameter
     size = Line(
         "samples per parameter", ratio,
         f"{p.samples} / {p.effective:.1f} effective of {p.number}",
-        f">= {SAMPLES_PER_PARAMETER:g}", "ok" if enough else "warn",
+        f">= {samples_per_parameter:g}", "ok" if enough else "warn",
         "enough data for a model of this size"
         if enough
         else "too few samples for a model of this size: it learns noise; record longer or take a "
         "smaller model",
     )  # fmt: skip
-    sound = p.condition <= CONDITION
+    sound = p.condition <= condition
     if sound:
         text = "the data determine the parameters"
     elif p.undetermined:
@@ -259,7 +255,7 @@ def parameters(p: StoredInformation) -> list[Line]:
             "conditioning",
             p.condition,
             shown,
-            f"<= {CONDITION:.0e}",
+            f"<= {condition:.0e}",
             "ok" if sound else "info",
             text,
         ),
@@ -291,7 +287,7 @@ def information(c: Criteria, unit: str) -> Line:
 
 def coverage(b: Bands) -> Line:
     """Line on the measured coverage of the bands; its limits test honesty, not accuracy."""
-    low, high = COVERAGE
+    low, high = (0.88, 0.99)
     value = b.coverage
     limit = f"{100 * low:.0f} to {100 * high:.0f} %"
     name = f"inside {100 * b.level:g} % bands"
@@ -299,9 +295,7 @@ def coverage(b: Bands) -> Line:
         return Line(name, value, "not measured", limit, "info", "no output was measured here")
     if b.level != 0.95:
         low, high, limit = b.level - 0.07, min(1.0, b.level + 0.04), ""
-    verdict: Verdict = (
-        "ok" if low <= value <= high else "fail" if value < LEAST_COVERAGE else "warn"
-    )
+    verdict: Verdict = "ok" if low <= value <= high else "fail" if value < 0.8 else "warn"
     text = "the bands describe the error to expect correctly"
     if value < low:
         text = (

@@ -14,14 +14,8 @@ from ..arrays import FloatArray, is_whole
 from ..errors import DataError, SettingError
 from .response import Complex, FrequencyResponse
 
-SEGMENTS = 16
-"""Default number of segments, which overlap by half: gives bands of a fifth of the gain at a
-coherence of one half."""
 LEAST = 16
 """Least samples of a segment or period."""
-LARGEST, SMALLEST = 1e150, 1e-60
-"""Largest magnitude of a signal, so that sums of squares do not overflow, and smallest range of one
-that moves the plant, so that products of powers do not underflow."""
 
 
 def periodic(
@@ -203,7 +197,9 @@ def _explained(value: Complex, Suu: FloatArray, residual: FloatArray) -> FloatAr
 
 def _segment(segment: int | None, n: int) -> int:
     if segment is None:
-        return max(2 * (n // (SEGMENTS + 1)), LEAST)
+        # default number of segments, which overlap by half: gives bands of a fifth of the gain at a
+        # coherence of one half
+        return max(2 * (n // (16 + 1)), LEAST)
     if not is_whole(segment) or segment < LEAST:
         raise SettingError(
             name="segment", expected=f"at least {LEAST} samples", received=repr(segment)
@@ -212,16 +208,17 @@ def _segment(segment: int | None, n: int) -> int:
 
 
 def record_of(u: ArrayLike, y: ArrayLike, r: ArrayLike | None) -> list[FloatArray]:
-    """Input, output and, if there is one, reference of a record, of one length and finite power.
-    Raises `DataError` for an input or a reference that does not move.
-    """
+    """Input, output and, if there is one, reference of a record, of one length and finite power."""
+    # largest magnitude of a signal, so that sums of squares do not overflow, and smallest range of
+    # one that moves the plant, so that products of powers do not underflow
+    largest, smallest = 1e150, 1e-60
     given = {"u": u, "y": y} if r is None else {"u": u, "y": y, "r": r}
     signals = {name: _signal(name, values) for name, values in given.items()}
     lengths = [len(s) for s in signals.values()]
     if len(set(lengths)) > 1:
         raise DataError(name=", ".join(given), expected="one length", received=str(lengths))
     for name, signal in signals.items():
-        if np.abs(signal).max(initial=0.0) > LARGEST:
+        if np.abs(signal).max(initial=0.0) > largest:
             raise DataError(
                 name=name, expected="values with finite squares", received="larger ones",
                 remedy="change their units",
@@ -236,9 +233,9 @@ def record_of(u: ArrayLike, y: ArrayLike, r: ArrayLike | None) -> list[FloatArra
     for name in [n for n in signals if n != "y"]:
         low, high = signals[name].min(), signals[name].max()
         # the product of two spectra would be 0, and their quotient no number, at every line
-        if high - low < SMALLEST:
+        if high - low < smallest:
             raise DataError(
-                name=name, expected=f"values that differ by {SMALLEST:g} or more",
+                name=name, expected=f"values that differ by {smallest:g} or more",
                 received=f"{low:g} to {high:g}", remedy="change their units",
             )  # fmt: skip
     return list(signals.values())

@@ -22,9 +22,6 @@ from ..speed import speed_from_counts
 from .estimate import record_of, spectral
 from .response import FrequencyResponse
 
-SAMPLES = 52
-"""Least samples: lines for two intervals."""
-
 
 def local_polynomial(
     u: ArrayLike, y: ArrayLike, *, Ts: float, r: ArrayLike | None = None, **labels: Any
@@ -54,11 +51,13 @@ def local_polynomial(
         For other shapes, values that are not finite, fewer than 52 samples, an input that does not
         move, or a reference that is unrelated to it.
     """
+    # least samples: lines for two intervals
+    samples = 52
     signals = record_of(u, y, r)
     n = len(signals[0])
-    if n < SAMPLES:
+    if n < samples:
         raise DataError(
-            name="u", expected=f"at least {SAMPLES} samples", received=str(n),
+            name="u", expected=f"at least {samples} samples", received=str(n),
             remedy="record longer",
         )  # fmt: skip
     found = _core.record_response(*signals, *([None] if r is None else []))
@@ -86,20 +85,11 @@ RecordMethod: TypeAlias = Literal["segments", "local"]
 
 LEAST_RUN = 3
 """Equal samples in a row at the largest or smallest value that count as a command at a limit."""
-MOVES = 0.9
-"""Least share of the other samples that differ from the one before; a staircase has fewer."""
-REVERSED = 0.02
-"""A mean speed over 20 ms in the opposite direction counts as a reversal from this share of the
-largest speed on."""
-MEAN = 0.02
-OUTSIDE = 1.0, 99.0
-"""Percentiles of the second half of a record; one that begins outside them has a run-up."""
 
 
 def of_record(
     on: Recording | Dataset, reference: str | None, method: str | None, segment: int | None
 ) -> FrequencyResponse:
-    """`bode` of a record, with the same arguments."""
     if method not in (None, *get_args(RecordMethod)):
         raise SettingError(
             name="method", expected=" or ".join(get_args(RecordMethod)), received=repr(method)
@@ -165,10 +155,12 @@ def _cautions(u: FloatArray, y: FloatArray, Ts: float, *, is_speed: bool) -> dic
             f"u rests at its largest or smallest value in {len(at)} samples, the first at "
             f"{at[0] * Ts:.4g} s: if it was limited after it was recorded, the response is wrong"
         )
-    k = max(1, round(MEAN / Ts))
+    k = max(1, round(0.02 / Ts))
     if is_speed and len(y) >= k and np.isfinite(y).all():
         means = np.convolve(y, np.ones(k) / k, "valid")
-        back = np.flatnonzero(means * np.sign(means.sum()) < -REVERSED * np.abs(means).max())
+        # a mean speed over 20 ms in the opposite direction counts as a reversal from this share of
+        # the largest speed on
+        back = np.flatnonzero(means * np.sign(means.sum()) < -0.02 * np.abs(means).max())
         if len(back):
             found.append(
                 f"the speed changes its sign, first at {back[0] * Ts:.4g} s: there friction acts "
@@ -176,7 +168,8 @@ def _cautions(u: FloatArray, y: FloatArray, Ts: float, *, is_speed: bool) -> dic
             )
     if len(y) >= LEAST_RUN and np.isfinite(y).all():
         later = y[len(y) // 2 :]
-        low, high = np.percentile(later, OUTSIDE)
+        # percentiles of the second half of a record; one that begins outside them has a run-up
+        low, high = np.percentile(later, (1.0, 99.0))
         ends = np.flatnonzero((y >= low) & (y <= high))
         if not low <= y[: k + 1].mean() <= high and len(ends):
             found.append(
@@ -195,7 +188,8 @@ def _limited(u: FloatArray) -> Any:
     starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
     long = stops - starts >= LEAST_RUN
     moves = np.mean(np.diff(u)[~extreme[1:]] != 0.0) if not extreme[1:].all() else 0.0
-    if not long.any() or moves < MOVES:
+    # least share of the other samples that differ from the one before; a staircase has fewer
+    if not long.any() or moves < 0.9:
         return np.zeros(0, dtype=np.intp)
     return np.concatenate([np.arange(a, b) for a, b in zip(starts[long], stops[long], strict=True)])
 

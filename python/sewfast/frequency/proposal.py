@@ -25,19 +25,6 @@ from ..gains import Gains, real
 from ..tables import html_of
 from .shaft import ShaftFit
 
-MS = 1.7
-"""Default largest sensitivity."""
-WORTH = 1.05
-"""Least bandwidth with a filter, relative to the one without it."""
-BESIDE = (0.6, 1.5)
-"""Start of a second filter, relative to the first one's frequency; it begins without effect."""
-GRID = 100
-"""Number of frequencies above the measured lines at which the loop's gain is looked at."""
-QUIET = 0.05
-"""Largest motion of the command due to the encoder's rounding (rms), relative to its limit."""
-INVERSE = 0.3
-"""Initial damping of the poles that the inverse of a shaft puts on its antiresonance."""
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Proposal:
@@ -68,7 +55,7 @@ class Proposal:
 def propose(
     fit: ShaftFit,
     *,
-    Ms: float = MS,
+    Ms: float = 1.7,
     notch: bool = True,
     like: Controller | None = None,
     counts_per_rev: float | None = None,
@@ -119,17 +106,20 @@ def _filtered(search: _Search, plain: _Found) -> _Found:
     gains, own = notch.x[:4], np.exp(notch.x[4:])
     # the same notch, and the inverse of the shaft
     same = _freed(*own)
+    # initial damping of the poles that the inverse of a shaft puts on its antiresonance
     inverse = np.log([
-        p["resonance_hertz"], 2.0 * p["resonance_damping"], p["antiresonance_hertz"], INVERSE,
+        p["resonance_hertz"], 2.0 * p["resonance_damping"], p["antiresonance_hertz"], 0.3,
     ])  # fmt: skip
     one = search.best([np.concatenate([gains, x]) for x in (same, inverse)])
-    more = [np.log([own[0] * beside, 0.7, own[0] * beside, 0.7]) for beside in BESIDE]
+    # start of a second filter, relative to the first one's frequency; it begins without effect
+    more = [np.log([own[0] * beside, 0.7, own[0] * beside, 0.7]) for beside in (0.6, 1.5)]
     if fit.resonances > 1:
         more.append(_freed(*fit.notch(2).numbers))
     two = search.best([np.concatenate([one.x, x]) for x in more])
     best = plain
     for found in (notch, one, two):
-        if found.log_bandwidth - best.log_bandwidth > math.log(WORTH):
+        # least bandwidth with a filter, relative to the one without it
+        if found.log_bandwidth - best.log_bandwidth > math.log(1.05):
             best = found
     return best
 
@@ -166,22 +156,25 @@ class _Search:
     """The search on one machine, in Rust (`sewfast_core::proposal`)."""
 
     def __init__(self, fit: ShaftFit, like: Controller, Ms: float) -> None:
+        # number of frequencies above the measured lines at which the loop's gain is looked at
+        grid = 100
         of = fit.response
         of.loop(like)  # raises for another sample time or other units
         per_unit, reach = like.counts_per_unit, 0.5 * (like.u_max - like.u_min)
         known = per_unit > 0.0 and math.isfinite(reach)
         # a speed is the difference of two roundings of variance 1/12
-        quiet = QUIET * reach * math.sqrt(6.0) * per_unit * of.Ts if known else math.inf
+        # largest motion of the command due to the encoder's rounding (rms), relative to its limit
+        quiet = 0.05 * reach * math.sqrt(6.0) * per_unit * of.Ts if known else math.inf
         seen = of.coherence > 0.5
         last = of.hertz[seen][-1]
-        above = np.geomspace(last, max(last, 0.499 / of.Ts), GRID)
+        above = np.geomspace(last, max(last, 0.499 / of.Ts), grid)
         tau = 2.0 * np.pi
         self.fit = fit
         self.like = like
         self._task = _core.ProposalTask(
             loop_path(like), *sampled(fit.to_model(), of.Ts), Ms=Ms, quiet=quiet,
             lines=(tau * of.hertz[seen], of.value[seen], of.radius()[seen], of.from_counts),
-            above=(tau * above, fit.at(above), np.zeros(GRID), of.from_counts),
+            above=(tau * above, fit.at(above), np.zeros(grid), of.from_counts),
         )  # fmt: skip
 
     def best(self, starts: list[FloatArray]) -> _Found:

@@ -33,12 +33,8 @@ VERSION, VERSIONS = 2, (1, 2)
 PROVENANCE = {"properties": {"cautions": {"type": "array", "items": {"type": "string"}}}}
 """Schema of the provenance that is printed."""
 
-LEVEL = 0.95
-"""Confidence level of the bands."""
 LEAST_LINES = 3
 """For margins."""
-BETWEEN = 4
-"""Points per measured line at which a search evaluates the sensitivity."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -101,7 +97,7 @@ class FrequencyResponse:
             return None
         return np.sqrt(np.maximum(self.variance - self.noise, 0.0) * self.blocks)
 
-    def radius(self, level: float = LEVEL) -> FloatArray:
+    def radius(self, level: float = 0.95) -> FloatArray:
         """Radius of the circle about `value` in which the response lies [y/u], shape (n,).
 
         With nu = blocks - 1 complex degrees of freedom the squared error over the estimated
@@ -191,7 +187,8 @@ class FrequencyResponse:
             )  # fmt: skip
         hertz, value, radius = self.hertz[seen], self.value[seen], self.radius()[seen]
         n = len(hertz)
-        fine = np.interp(np.arange(0, n - 1 + 1e-9, 1.0 / BETWEEN), np.arange(n), hertz)
+        # points per measured line at which a search evaluates the sensitivity
+        fine = np.interp(np.arange(0, n - 1 + 1e-9, 1.0 / 4), np.arange(n), hertz)
         size = np.interp(fine, hertz, np.log(np.maximum(np.abs(value), 1e-300)))
         turn = np.interp(fine, hertz, np.unwrap(np.angle(value)))
         found: Complex = np.exp(size + 1j * turn)
@@ -344,9 +341,7 @@ def load_response(path: str | os.PathLike[str]) -> FrequencyResponse:
 
 
 def response_of(fields: storage.Fields) -> FrequencyResponse:
-    """The response of the values of `FrequencyResponse.to_dict`; anything else is a
-    `ModelFileError`.
-    """
+    """The response of the values of `FrequencyResponse.to_dict`, or a `ModelFileError`."""
     hertz = fields.vector("hertz")
     noise = None if fields.any("noise") is None else fields.vector("noise")
     arrays = {name: fields.vector(name) for name in ("real", "imaginary", "variance", "coherence")}

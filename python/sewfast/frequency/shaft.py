@@ -31,16 +31,7 @@ from .response import Complex, FrequencyResponse
 
 RIGID, SHAFT = 4, 4
 """Number of parameters of a rigid machine, and of each shaft."""
-LEAST, LEAST_GAIN = 20, 1e-300
-"""Least number of frequencies for a fit, and least magnitude of a usable one."""
-NEIGHBOURS = 10
-"""Lines to either side over which the uncertainty is smoothed: few blocks estimate it poorly."""
-FLOOR = 0.005
-"""Part of the gain that no fit has to explain: friction and dead time distort every response a
-little, which could otherwise outweigh a less visible resonance."""
 CONFIDENCE = 1.96
-DEPTHS, WIDTHS = (0.02, 0.7), (0.1, 2.0)
-"""Limits of depth and width of a proposed notch."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +107,8 @@ class ShaftFit:
         FitError
             For a resonance that the machine does not have, or one beyond half the sample rate.
         """
+        # limits of depth and width of a proposed notch
+        depths, widths = (0.02, 0.7), (0.1, 2.0)
         if not 1 <= number <= self.resonances:
             kind = f"one of {self.resonances}" if self.resonances else "a rigid one"
             raise FitError(
@@ -133,8 +126,8 @@ class ShaftFit:
         ratio = fa / fr
         rises = abs(ratio**2 - 1.0 + 2j * za * ratio) / (2.0 * zr * ratio**2)
         depth, width = 1.0 / max(rises, 1.0), 2.0 * zr * max(rises, 1.0)
-        low, high = DEPTHS
-        return Biquad.notch(fr, min(max(depth, low), high), min(max(width, WIDTHS[0]), WIDTHS[1]))
+        low, high = depths
+        return Biquad.notch(fr, min(max(depth, low), high), min(max(width, widths[0]), widths[1]))
 
     def to_dict(self) -> dict[str, Any]:
         """Parameters with their intervals, as JSON values."""
@@ -217,16 +210,16 @@ def sampled_model(theta: FloatArray, Ts: float, u_unit: str, y_unit: str) -> Lin
 
 
 def _usable(response: FrequencyResponse) -> tuple[FloatArray, Complex, FloatArray, float]:
-    """Frequencies, values and deviations of the usable lines, in units of their median magnitude,
-    and that.
-    """
+    """Frequencies, values and deviations of usable lines over their median magnitude, and that."""
+    # least number of frequencies for a fit, and least magnitude of a usable one
+    least, least_gain = 20, 1e-300
     hertz, value = np.asarray(response.hertz), np.asarray(response.value)
     variance = np.asarray(response.variance)
-    usable = (response.coherence > 0.5) & (hertz > 0.0) & (np.abs(value) > LEAST_GAIN)
+    usable = (response.coherence > 0.5) & (hertz > 0.0) & (np.abs(value) > least_gain)
     usable &= np.isfinite(value) & np.isfinite(variance)
-    if usable.sum() < LEAST:
+    if usable.sum() < least:
         raise DataError(
-            name="response", expected=f"at least {LEAST} frequencies with a coherence above .5",
+            name="response", expected=f"at least {least} frequencies with a coherence above .5",
             received=str(usable.sum()), remedy="excite more, or longer",
         )  # fmt: skip
     f, Ts = hertz[usable], response.Ts
@@ -243,15 +236,19 @@ def _usable(response: FrequencyResponse) -> tuple[FloatArray, Complex, FloatArra
         )  # fmt: skip
     g = value[usable] / level
     spread = np.minimum(np.sqrt(np.maximum(variance[usable], 0.0)) / level, 1e100)
-    sigma = np.sqrt(0.5 * _smoothed(spread**2) + (FLOOR * np.abs(g)) ** 2)
+    # part of the gain that no fit has to explain: friction and dead time distort every response a
+    # little, which could otherwise outweigh a less visible resonance
+    sigma = np.sqrt(0.5 * _smoothed(spread**2) + (0.005 * np.abs(g)) ** 2)
     return f, g, sigma, level
 
 
 def _smoothed(variance: FloatArray) -> FloatArray:
+    # lines to either side over which the uncertainty is smoothed: few blocks estimate it poorly
+    neighbours = 10
     logs = np.log(np.maximum(variance, 1e-300))  # a simulation without noise has none
     n = len(logs)
     around = [
-        np.median(logs[max(0, k - NEIGHBOURS) : min(n, k + NEIGHBOURS + 1)]) for k in range(n)
+        np.median(logs[max(0, k - neighbours) : min(n, k + neighbours + 1)]) for k in range(n)
     ]
     return np.exp(around)
 

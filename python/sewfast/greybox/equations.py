@@ -32,19 +32,6 @@ Equations: TypeAlias = Callable[[Any, Any, Mapping[str, Any]], Any]
 FORMAT, VERSION = "sewfast-equations", 1
 MOST = 1000
 """Most states, and most substeps of a sample."""
-EVALUATIONS = 60
-DIFFERENCE = 1e-4
-"""Half the step of a central difference, relative to the parameter."""
-VAGUE = 1.0
-"""Half-width of an interval, relative to the value, above which a parameter is not determined."""
-NOTHING = 1e-9
-"""Least effect of a parameter on the free run, relative to the speed's spread."""
-BLIND = 1e-9
-"""Eigenvalue, relative to the largest of the scaled matrix, of a direction without effect."""
-MIXED = 0.02
-"""Least share of a parameter in such a direction to belong to it."""
-WHITE = 12
-"""Order of the autoregression that models the residual's colour."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -232,10 +219,7 @@ class Simulation:
     """Whether the function takes all columns at once."""
 
     def derivative(self, x: FloatArray, u: float, p: Mapping[str, Any]) -> FloatArray:
-        """Derivative of the state (n,) or (n, columns), with its shape checked.
-        Raises `FitError` if the function raises, and `SettingError` if it returns another shape, or
-        no numbers.
-        """
+        """Derivative of the state (n,) or (n, columns), with its shape checked."""
         try:
             found = self.equations(x, u, p)
         except Exception as e:
@@ -258,9 +242,7 @@ class Simulation:
         return array.reshape(x.shape)
 
     def settle(self, theta: FloatArray, u: float, speed: float) -> None:
-        """Test whether the function accepts all columns at once, with the same results.
-        Raises as `derivative`, at the start; also if it returns no finite number there.
-        """
+        """Find out whether the function accepts all columns at once, with the same results."""
         x = np.zeros(self.states)
         x[0] = speed
         single = self.derivative(x, u, dict(zip(self.names, map(float, theta), strict=True)))
@@ -338,6 +320,7 @@ def fit_equations(
     substeps: int,
 ) -> EquationFit:
     """Output error of the function's free run; see `physics`."""
+    evaluations = 60
     if not callable(equations):
         raise _not_callable(equations)
     for name, count in (("states", states), ("substeps", substeps)):
@@ -358,7 +341,8 @@ def fit_equations(
         return _stacked(records.pieces, runs(x[:, None]), filter_)[:, 0]
 
     def jacobian(x: FloatArray) -> FloatArray:
-        h = DIFFERENCE * np.maximum(np.abs(x), 1e-3 * np.abs(start))
+        # half the step of a central difference, relative to the parameter
+        h = 1e-4 * np.maximum(np.abs(x), 1e-3 * np.abs(start))
         more, less = np.minimum(x + h, high), np.maximum(x - h, low)
         sets = np.repeat(x[:, None], 2 * len(x), axis=1)
         j = np.arange(len(x))
@@ -375,14 +359,15 @@ def fit_equations(
             f"{substeps} a sample: substeps={2 * substeps}",
         )  # fmt: skip
     found = least_squares(
-        residuals, start, jacobian, bounds=(low, high), max_nfev=EVALUATIONS, ftol=1e-6, xtol=1e-6
+        residuals, start, jacobian, bounds=(low, high), max_nfev=evaluations, ftol=1e-6, xtol=1e-6
     )
     records = _restarted(records, simulation, found.x)
     over = [y[:, 0] - p.y for p, y in zip(records.pieces, runs(found.x[:, None]), strict=True)]
+    # order of the autoregression that models the residual's colour
     filter_ = whitener(
-        [np.where(p.used, e, 0.0) for p, e in zip(records.pieces, over, strict=True)], WHITE
+        [np.where(p.used, e, 0.0) for p, e in zip(records.pieces, over, strict=True)], 12
     )
-    found = least_squares(residuals, found.x, jacobian, bounds=(low, high), max_nfev=EVALUATIONS)
+    found = least_squares(residuals, found.x, jacobian, bounds=(low, high), max_nfev=evaluations)
     return _result(records, simulation, found, (start, low, high), runs(found.x[:, None]))
 
 
@@ -449,15 +434,18 @@ def _stacked(
 
 def _merged(jacobian: FloatArray, names: Sequence[str]) -> dict[str, list[str]]:
     """Parameters that others can replace, and which: directions without effect on the run."""
+    # least share of a parameter in a direction without effect to belong to it
+    mixed = 0.02
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0.0] = 1.0
     size, along = np.linalg.eigh(jacobian.T @ jacobian / np.outer(scale, scale))
-    blind = along[:, size < BLIND * size[-1]]
+    # eigenvalue, relative to the largest of the scaled matrix, of a direction without effect
+    blind = along[:, size < 1e-9 * size[-1]]
     shares = np.abs(blind @ blind.T)
     found: dict[str, list[str]] = {}
     for j, name in enumerate(names):
-        others = [n for i, n in enumerate(names) if i != j and shares[i, j] > MIXED]
-        if shares[j, j] > MIXED and others:
+        others = [n for i, n in enumerate(names) if i != j and shares[i, j] > mixed]
+        if shares[j, j] > mixed and others:
             found[name] = others
     return found
 
@@ -491,14 +479,17 @@ def _result(
     for j, name in enumerate(simulation.names):
         value = float(found.x[j])
         half = CONFIDENCE * math.sqrt(max(float(covariance[j, j]), 0.0))
-        if effects[j] <= NOTHING * np.linalg.norm(found.fun):
+        # least effect of a parameter on the free run, relative to the speed's spread
+        if effects[j] <= 1e-9 * np.linalg.norm(found.fun):
             undetermined[name] = "the free run does not depend on it"
         elif name in merged:
             undetermined[name] = (
                 f"the record shows only combinations of it and {', '.join(merged[name])}; give one "
                 "of them a value in the function"
             )
-        elif half >= VAGUE * abs(value):
+        # half-width of an interval, relative to the value, above which a parameter is not
+        # determined
+        elif half >= 1.0 * abs(value):
             undetermined[name] = (
                 f"its interval, {value - half:.3g} to {value + half:.3g}, is as wide as its value"
             )

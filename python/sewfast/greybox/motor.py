@@ -32,13 +32,7 @@ FORMAT = "sewfast-motor"
 VERSION = 3
 """Version 1 has `untold` for `undetermined`, version 2 no `orders`; both are read."""
 NAMES = tuple(_core.GREYBOX_PARAMETERS)
-OLDER = NAMES.index("limit") + 1
-"""First of the parameters that files before version 3 lack."""
-VAGUE = 1.0
-"""Half-width of an interval, relative to the value, above which a parameter is not printed."""
 
-APART = 10.0
-"""Half-width, relative to the value, above which other parameters can replace it."""
 
 _SI = ("resistance", "motor_constant", "inertia", "viscous_friction", "coulomb_torque")
 _NO_CURRENT = (
@@ -419,7 +413,10 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
     if document["version"] < VERSION:  # terms added later
         document.setdefault("orders", [0] * len(WAVES))
         if isinstance(document.get("theta"), dict):
-            document["theta"] = dict.fromkeys(NAMES[OLDER:], 0.0) | document["theta"]
+            # first of the parameters that files before version 3 lack
+            document["theta"] = (
+                dict.fromkeys(NAMES[NAMES.index("limit") + 1 :], 0.0) | document["theta"]
+            )
     fields = storage.Fields(str(path), document)
     fields.require_only(
         [
@@ -476,6 +473,8 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
 
 def motor_of(found: Estimated, volts: float | None, *, profile: bool) -> Motor:
     """The motor of an estimate: each parameter with its interval, or the reason for having none."""
+    # half-width, relative to the value, above which other parameters can replace it
+    apart = 10.0
     estimate, records, reasons = found.state, found.records, found.reasons
     known, names = values_of(estimate), estimate.names()
     spreads = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
@@ -491,14 +490,15 @@ def motor_of(found: Estimated, volts: float | None, *, profile: bool) -> Motor:
         value = of(known)
         slope = slope_of(known, of, names, spreads)
         half = CONFIDENCE * math.sqrt(max(float(slope @ found.covariance @ slope), 0.0))
-        vague = half >= VAGUE * abs(value)
+        # half-width of an interval, relative to the value, above which a parameter is not printed
+        vague = half >= 1.0 * abs(value)
         if name == "delay":  # a delay of zero is a valid result
-            vague = half >= APART * max(value, records.Ts)
+            vague = half >= apart * max(value, records.Ts)
         if not math.isfinite(half) or vague:
             undetermined[name] = (
                 "the record does not part it from the others; add steps to several speeds, in both "
                 "directions"
-                if not half < APART * abs(value) or name == "delay"
+                if not half < apart * abs(value) or name == "delay"
                 else f"its interval, {value - half:.3g} to {value + half:.3g} {unit}, is as wide "
                 "as its value"
             )

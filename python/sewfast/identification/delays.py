@@ -26,27 +26,12 @@ LONGEST = 30
 
 @dataclass(frozen=True, eq=False)
 class InputDelay:
-    """Estimate of one input's delay.
-
-    Attributes
-    ----------
-    nk : int
-        Delay of the model with the lowest cost in free run [samples].
-    low, high : int
-        Range of the plausible delays: their likelihood is at least `1 - confidence` of the best
-        one's, counting only the independent samples of the residual.
-    first_correlated : int or None
-        First lag at which input and output, both filtered to make the input white, correlate beyond
-        chance; None if there is no such lag.
-    cost : array, shape (L,)
-        Mean square free-run error of a model with each delay [output unit squared]; inf if there is
-        no such model.
-    one_step_cost : array, shape (L,)
-        Mean square one-step error of an ARX model with each delay.
-    correlation : array, shape (L,)
-        Prewhitened cross-correlation at each lag.
-    bound : float
-        Bound of |correlation| for independent input and output, for all lags together.
+    """Estimate of one input's delay. `nk` is that of the model with the lowest free-run error,
+    `low` and `high` those with a likelihood of at least `1 - confidence` of its own, by the
+    independent samples of the residual. `cost` and `one_step_cost` (L,) are mean square errors of a
+    model with each delay [output unit squared], inf without one; `correlation` (L,) is that of
+    prewhitened signals, `bound` its bound for independent ones at all lags together, and
+    `first_correlated` the first lag beyond it, or None.
     """
 
     name: str
@@ -61,7 +46,6 @@ class InputDelay:
     bound: float
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values."""
         costs = (self.cost, self.one_step_cost, self.correlation)
         arrays: dict[str, Any] = {"lags": [int(v) for v in self.lags]} | {
             name: [v if math.isfinite(v) else None for v in values.tolist()]
@@ -115,7 +99,6 @@ class DelayEstimate:
         return stacked(panels, (2.0, 1.8) * len(self.inputs)).plot(ax, file)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         return html_of(str(self))
 
     def __str__(self) -> str:

@@ -45,13 +45,10 @@ SHARE_OF_FIT = 0.9
 """Share of a time budget for the fits; the rest is for the evidence stored with the model."""
 _FIT = "iterations of the fit"
 NETWORKS = ("neural_oe", "neural_ss")
-EVIDENCE_RATE, LEAST_EVIDENCE = 2.5e5, 2_000
-"""Samples times parameters whose evidence takes a second of a slow processor."""
 _SEARCHED = ("auto", "neural_ss")
 """Kinds without given lags: their structure is searched."""
 _LAGS = 2
 _PAPER = {"na": 2, "nb": 2, "nk": 1, "hidden": 8}
-_PAPER_STARTS = 8
 
 
 @shown_in_notebooks("identify")
@@ -177,7 +174,7 @@ def identify(
             )
     if preset is not None:
         kind = _preset(preset, kind, {"na": na, "nb": nb, "nk": nk, "hidden": hidden})
-        starts = _PAPER_STARTS if starts is None else starts
+        starts = 8 if starts is None else starts
     _require_settings(
         na=na, nb=nb, nk=nk, nx=nx, hidden=hidden, starts=starts, seed=seed,
         iterations=iterations, threads=threads,
@@ -319,13 +316,15 @@ def _with_losses(model: Model, clock: Clock) -> Model:
 
 def _excerpt(model: Model, data: Dataset, clock: Clock) -> Dataset:
     """The data for the evidence stored with a model; fewer of them if time is short."""
+    # samples times parameters whose evidence takes a second of a slow processor
+    evidence_rate, least_evidence = 2.5e5, 2_000
     if clock.budget is None:
         return data
     left = max(0.0, clock.left(clock.budget))
     width = max(
         (len(m.core.theta) for m in model.members or (model,) if m.kind[:2] == "ne"), default=10
     )
-    return thinned(data, max(LEAST_EVIDENCE, round(left * EVIDENCE_RATE / width)))
+    return thinned(data, max(least_evidence, round(left * evidence_rate / width)))
 
 
 _JUDGED = ("unstable", "late_input", "changes")
@@ -352,9 +351,7 @@ def _judged_by(model: Model, faults: Sequence[Fault]) -> Model:
 
 
 def _verdict(model: Model, data: Dataset, validation: Dataset | None) -> Provenance:
-    """The verdict on a kind requested by name, for which no data were held out.
-    It is judged on the validation data, else on its training data; the text states which.
-    """
+    """The verdict on a kind requested by name, on validation, else on training data."""
     part = Split(data, validation or data, is_given=validation is not None)
     where = UNSEEN_DATA if part.is_given else "its own training data"
     if doubling(model) is not None:

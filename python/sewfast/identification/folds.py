@@ -36,16 +36,13 @@ memorises the record; a later part is the honest test if there are many data.
 FOLDS = 3
 """Number of later parts on which models are judged, each trained on the data before the part."""
 LEAST_HELD_OUT = 2 * INIT
-RUN_UP = 10 * INIT
-"""Fitted samples at the beginning of a held-out part, so that its state is known for scoring."""
 
 
 @dataclass(frozen=True)
 class Split:
-    """Data to fit to and data to choose by.
-    Parts of `held` begin in the fitted data, which give their state. If `is_given`, it is the
-    user's own validation data, which are never trained on. `sources` are the scored ranges, as
-    JSON values.
+    """Data to fit to and data to choose by. Parts of `held` begin in the fitted data, which give
+    their state. If `is_given`, it is the user's own validation data, which are never trained on.
+    `sources` are the scored ranges, as JSON values.
     """
 
     fitted: Dataset
@@ -172,7 +169,8 @@ class HeldOut(Experiment):
 
 
 def with_run_up(e: Experiment, at: int, stop: int) -> HeldOut:
-    begin = max(0, at - RUN_UP)
+    # fitted samples at the beginning of a held-out part, so that its state is known for scoring
+    begin = max(0, at - (10 * INIT))
     part = e.cut(begin, stop)
     return HeldOut(part.u, part.y, {}, e.name, part.start, weights=part.weights, run_up=at - begin)
 
@@ -190,7 +188,6 @@ def _shortened(data: Dataset, samples: int) -> Dataset:
 
 ERROR_BLOCKS = 12
 """Number of blocks of squared errors in a comparison, over all held-out parts together."""
-RESAMPLES = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +249,7 @@ def compared(one: Errors, other: Errors) -> tuple[float, float]:
     one_runs, other_runs = np.isfinite(one.squares).all(), np.isfinite(other.squares).all()
     if not (one_runs and other_runs):
         return 0.0 if one_runs == other_runs else -np.inf if one_runs else np.inf, 0.0
-    picks = np.random.default_rng(0).integers(0, len(one.squares), (RESAMPLES, len(one.squares)))
+    picks = np.random.default_rng(0).integers(0, len(one.squares), (400, len(one.squares)))
     tiny = 1e-300
     drawn = 0.5 * np.log(
         (one.squares[picks].sum(axis=1) + tiny) / (other.squares[picks].sum(axis=1) + tiny)

@@ -17,8 +17,6 @@ from .grey_box import trained_from
 from .linear import arx, iv, linear_provenance
 from .task import Pairs, Task, arrays, completed, fit_provenance, with_provenance
 
-STARTING_SCALE = 1.0
-
 
 def trained(model: Model, task: Task) -> Model:
     """The model after further iterations of its kind of fit on the task's data.
@@ -151,7 +149,7 @@ def _state_space(
         output=s["output"],
         output_parameters=s["output_parameters"],
         integrator=s["integrator"],
-        hidden_scale=STARTING_SCALE,
+        hidden_scale=1.0,
         first_start=0,
         initial=[model.core],
         **options,

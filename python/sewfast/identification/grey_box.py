@@ -121,7 +121,6 @@ class MotorCandidate:
 
     @property
     def hidden(self) -> int:
-        """Units of the network."""
         units: int = self.core.settings["hidden"]
         return units
 
@@ -189,9 +188,8 @@ class Motors:
     def _with_network(
         self, core: _core.GreyBox, data: Dataset, hidden: int, look: Look | None
     ) -> _core.GreyBox:
-        """Motor and network together, at the least-squares solution of the free run.
-        The network begins without effect. Its starts are trained on an excerpt, the best one on all
-        data.
+        """Motor and network together, at the least-squares solution of the free run. The network
+        begins without effect. Its starts are trained on an excerpt, the best one on all data.
         """
         part, asked, begun = thinned(data, EXCERPT), _at_any_time(look), []
         for i in range(STARTS):

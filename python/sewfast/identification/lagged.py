@@ -30,19 +30,9 @@ from .task import (
     wrap,
 )
 
-BLOCKS = 8
-HELD_OUT = (2, 5)
-"""Blocks held out for selection: inside the record, away from both ends of a chirp."""
 LEAST_BLOCK = 2 * INIT
 DECAYS = (1e-2, 1e-4)
 """Weight decays of the default network, the strongest first."""
-ABOUT_AS_WELL = 1.25
-"""Largest ratio to the best held-out error for which a stronger weight decay is chosen."""
-SAME = 1e-6
-"""Relative difference of two errors below which the network is still its linear start."""
-NOTHING_LEFT = 1e-6
-"""J in scaled units below which a linear model explains everything."""
-_USUAL_STARTS = 4
 LINEAR_SHARE = 0.4
 """Share of a time budget for the linear fits, so that some is left for the network."""
 _LINEAR_FITS = "linear fits at which the network begins"
@@ -70,10 +60,9 @@ def paper(task: Task) -> Model:
 
 
 def neural_oe(task: Task) -> Model:
-    """The network, trained in free run from the linear output-error model.
-    The result is always a trained network. If the held-out blocks stop the training before its
-    first step, because no step is better there than the linear model, the network is trained on all
-    data instead, with a note.
+    """The network, trained in free run from the linear output-error model. The result is always a
+    trained network. If the held-out blocks stop the training before its first step, because no step
+    is better there than the linear model, the network is trained on all data instead, with a note.
     """
     networks = Networks.of(task)
     return networks.selected() if task.select else networks.unselected()
@@ -83,7 +72,7 @@ def _options(task: Task) -> dict[str, Any]:
     """Settings of a network's training that every network of a task shares."""
     return {
         **task.fit_options(), "hidden": task.hidden_or_usual, "seed": task.seed,
-        "starts": _USUAL_STARTS if task.starts is None else task.starts, "threads": task.threads,
+        "starts": 4 if task.starts is None else task.starts, "threads": task.threads,
     }  # fmt: skip
 
 
@@ -136,7 +125,8 @@ class Networks:
             # a strong decay would pull the network back to its linear part
             network = self._trained(self.task.data, None, DECAYS[-1])
             # J is in scaled units: a linear model without error needs no step
-            if len(network.trace) < 2 and network.cost > NOTHING_LEFT:
+            # J in scaled units below which a linear model explains everything
+            if len(network.trace) < 2 and network.cost > 1e-6:
                 raise FitError(
                     f"{self.task.data.source}: expected a network that does better than its linear "
                     "start, found none; ask for model oe, or give more iterations or starts"
@@ -185,7 +175,8 @@ class Networks:
         fits = [self._trained(data, held, decay) for decay in decays]
         errors = [math.sqrt(2.0 * (f.validation_cost or 0.0)) for f in fits]
         able = [i for i, f in enumerate(fits) if f.sound] or list(range(len(fits)))
-        bound = ABOUT_AS_WELL * min(errors[i] for i in able)
+        # largest ratio to the best held-out error for which a stronger weight decay is chosen
+        bound = 1.25 * min(errors[i] for i in able)
         chosen = next(i for i in able if errors[i] <= bound)
         tried = [
             {"weight_decay": d, "held_out_error": e or None, "sound": f.sound}
@@ -228,7 +219,8 @@ def _is_still_linear(choice: Provenance) -> bool:
     network, linear = rmse.get("neural_oe"), rmse.get("oe")
     if network is None or linear is None:
         return False
-    return bool(abs(network - linear) <= SAME * linear)
+    # relative difference of two errors below which the network is still its linear start
+    return bool(abs(network - linear) <= 1e-6 * linear)
 
 
 def _linear(task: Task) -> _core.LinearModel:
@@ -245,9 +237,8 @@ def _linear(task: Task) -> _core.LinearModel:
 
 
 def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
-    """The start of the training: the linear model, or a smaller one if that one is misled.
-    Networks that start at a slow pole which the drive does not have (`linear.is_misled`) rarely
-    leave it.
+    """The start of the training: the linear model, or a smaller one if that one is misled. Networks
+    that start at a slow pole which the drive does not have (`linear.is_misled`) rarely leave it.
     """
     orders = task.orders
     na, nb = orders["na"] - 1, orders["nb"] - 1
@@ -274,17 +265,18 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
 
 
 def _with_blocks_held_out(data: Dataset, lag: int) -> tuple[Dataset, Dataset | None]:
-    """The data without two of eight blocks of every experiment, and these blocks.
-    None is held out if the blocks would be too short.
-    """
+    """The data without two of eight blocks of every experiment, and these, unless too short."""
+    blocks = 8
+    # blocks held out for selection: inside the record, away from both ends of a chirp
+    held_out = (2, 5)
     kept: list[Experiment] = []
     held: list[Experiment] = []
     for e in data.experiments:
-        edges = [round(i * len(e) / BLOCKS) for i in range(BLOCKS + 1)]
+        edges = [round(i * len(e) / blocks) for i in range(blocks + 1)]
         if edges[1] < LEAST_BLOCK + lag:
             return data, None
-        held += [e.cut(edges[i], edges[i + 1]) for i in HELD_OUT]
-        starts, stops = (0, *(i + 1 for i in HELD_OUT)), (*HELD_OUT, BLOCKS)
+        held += [e.cut(edges[i], edges[i + 1]) for i in held_out]
+        starts, stops = (0, *(i + 1 for i in held_out)), (*held_out, blocks)
         kept += [e.cut(edges[i], edges[j]) for i, j in zip(starts, stops, strict=True)]
     # pieces in which enough outputs were measured
     able = [[e for e in some if len(e) - e.unmeasured > LEAST_BLOCK] for some in (kept, held)]

@@ -105,13 +105,7 @@ class LeastSquaresResult:
         return (*(f.name for f in fields(self)), "grad")
 
     def __getitem__(self, name: str) -> Any:
-        """The value of a name.
-
-        Raises
-        ------
-        KeyError
-            If there is no value of that name.
-        """
+        """The value of a name; `KeyError` if there is none."""
         if name not in self.keys():
             raise KeyError(name)
         return getattr(self, name)

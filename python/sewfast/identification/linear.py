@@ -256,9 +256,8 @@ class LinearCandidate:
 
 @dataclass
 class LinearTable:
-    """Linear models fitted for a decision.
-    Models are fitted to thinned excerpts of each fold's training data. `given_nk` is None if the
-    delay is not given.
+    """Linear models fitted for a decision. Models are fitted to thinned excerpts of each fold's
+    training data. `given_nk` is None if the delay is not given.
     """
 
     given_nk: int | None
@@ -385,9 +384,8 @@ class LinearTable:
         return Errors(np.concatenate(squares), np.concatenate(counts))
 
     def start(self, order: int, nk: int, fold: int = 0) -> _core.LinearModel | None:
-        """A model of that order as a network's start.
-        If the fit of that order is misled (it has found a spurious slow pole), it is the smaller
-        one with additional fast poles.
+        """A model of that order as a network's start. If the fit of that order is misled (it has
+        found a spurious slow pole), it is the smaller one with additional fast poles.
         """
         fitted_ = self.candidates.get((order, nk))
         own = None if fitted_ is None else fitted_.models[fold]
@@ -412,9 +410,8 @@ class LinearTable:
 
     def integrates(self, data: Dataset, diagnosis: Diagnosis) -> bool:
         """Whether the record shows an integrator, or the best models do: a pole at 1 and an
-        unbounded steady gain.
-        Friction or limits also lead larger orders to a pole near 1, but these do worse on held-out
-        data: only the best models count.
+        unbounded steady gain. Friction or limits also lead larger orders to a pole near 1, but
+        these do worse on held-out data: only the best models count.
         """
         if diagnosis.find("integrator") is not None:
             return True

@@ -47,9 +47,7 @@ _CLASSES: dict[type, type[Model]] = {
 
 
 def searched(task: Task, *, wants_network: bool = False) -> Model:
-    """The structures that describe the data best, as one model.
-    If a network is wanted, it is of state-space networks, even if these are not better.
-    """
+    """The structures that describe the data best, as one model; networks if they are wanted."""
     folds = blocked(task.data, task.validation)
     if not folds:
         reason = (

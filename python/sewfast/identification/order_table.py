@@ -23,31 +23,16 @@ from .delays import DelayEstimate, delay, reach
 
 Progress: TypeAlias = Callable[[int, int, float], object]
 
-ABOUT_AS_WELL = 1.005
-"""Ratio of free-run errors below which they count as equal: a tenth of the noise, if only that."""
-EXACT = 1e-3
-"""Error due to the unknown inputs before the later part, in standard deviations of the output."""
 SHOWN = 12
 
 
 @dataclass(frozen=True)
 class Structure:
-    """One row: a linear model's orders and its errors.
-
-    Attributes
-    ----------
-    parameters : int
-        Number of parameters that the training data determine.
-    one_step : float
-        rms one-step error of the ARX model on later data [output unit].
-    free_run : float
-        rms free-run error on later data of that model, or of its refinement by instrumental
-        variables if that is better; inf if both diverge.
-    aic, aicc, bic, fpe : float
-        Criteria of the ARX model on the training data, the same samples for every structure (Ljung
-        1999, section 16.4). FPE in the output's unit squared.
-    lipschitz : float
-        Index of He and Asada (1993) of a model with these lags, linear or not; relative to others.
+    """One row: a linear model's orders, the number of `parameters` that the data determine, and its
+    errors. `one_step` and `free_run` are rms errors on later data [output unit], the latter also of
+    its refinement by instrumental variables if that is better. The criteria are those of the ARX
+    model on the same training samples (Ljung 1999, section 16.4); `lipschitz` is the index of He
+    and Asada (1993) for these lags, relative to others.
     """
 
     na: int
@@ -271,7 +256,8 @@ def orders(
         )
         for orders, parameters, one_step, blocks, (aic, aicc, bic, fpe), index in tried
     ]
-    exact = EXACT * float(np.nanstd(np.concatenate([e.y for e in later.experiments])))
+    # error due to the unknown inputs before the later part, in standard deviations of the output
+    exact = 1e-3 * float(np.nanstd(np.concatenate([e.y for e in later.experiments])))
     choice, reason = _chosen(rows, errors, exact)
     output = labelled(data.output_name, data.output_unit)
     return OrderTable(tuple(rows), choice, reason, found, output)
@@ -336,7 +322,8 @@ def _chosen(rows: list[Structure], errors: list[FloatArray], exact: float) -> tu
             "expected a structure with a finite free run, found none; check units and signs, or "
             "record with more excitation"
         )
-    good = max(ABOUT_AS_WELL * rows[best].free_run, exact)
+    # ratio of free-run errors below which they count as equal: a tenth of the noise, if only that
+    good = max(1.005 * rows[best].free_run, exact)
     able = [
         i
         for i, row in enumerate(rows)

@@ -13,22 +13,6 @@ from ..errors import FitError
 from .task import Look, Pairs
 
 OUTPUTS = ("linear", "saturation", "abs")
-CORNER = 0.03
-"""Width of a corner, relative to the output's scale."""
-NEAR_ZERO = 0.05
-"""Part of the range within which an output counts as zero."""
-BELOW_ZERO = 0.03
-"""Part of the range by which noise takes a rectified output below zero."""
-PILE = 0.02
-"""Least share of the samples within a hundredth of the range from its end that forms a pile."""
-SHARPNESS = 4.0
-"""Least density of a pile relative to its surroundings."""
-MEMORIES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)
-"""Poles of the low-pass filters whose sign is the first guess of the output's."""
-FIRST_ROUNDS, ROUNDS = 2, 12
-"""Iterations of all first guesses; of the better two."""
-SIGN_SAMPLES = 2_000
-"""Most samples of all experiments together: every round of the search for signs is a fit."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +25,14 @@ class Output:
 
     def parameters(self, mean: float, scale: float) -> FloatArray:
         """As the core takes them, in scaled units."""
+        # width of a corner, relative to the output's scale
+        corner = 0.03
         if self.name == "abs":
-            return np.array([CORNER])
+            return np.array([corner])
         if self.name == "saturation":
             # a part of the data can be constant, without a scale of its own
             low, high = ((v - mean) / (scale or 1.0) for v in (self.low, self.high))
-            return np.array([low, high, CORNER])
+            return np.array([low, high, corner])
         return np.zeros(0)
 
 
@@ -100,7 +86,9 @@ def _piles(distance: FloatArray, width: float) -> bool:
     """Whether samples pile up within a hundredth of the range, but not next to it."""
     at = float(np.mean(distance <= width / 100.0))
     beside = float(np.mean((distance > width / 100.0) & (distance <= width / 20.0))) / 4.0
-    return at >= PILE and at > SHARPNESS * beside
+    # least share of the samples within a hundredth of the range from its end that forms a pile
+    # least density of a pile relative to its surroundings
+    return at >= 0.02 and at > 4.0 * beside
 
 
 def _changes_sign(data: Dataset) -> bool:
@@ -113,9 +101,11 @@ def _changes_sign(data: Dataset) -> bool:
 def _may_be_rectified(y: FloatArray) -> bool:
     """Whether the output is never clearly below zero, and often but not permanently at zero."""
     top = float(y.max())
-    if top <= 0.0 or float(y.min()) < -BELOW_ZERO * top:
+    # part of the range by which noise takes a rectified output below zero
+    if top <= 0.0 or float(y.min()) < -0.03 * top:
         return False
-    return bool(np.mean(y <= NEAR_ZERO * top) > 0.005)
+    # part of the range within which an output counts as zero
+    return bool(np.mean(y <= 0.05 * top) > 0.005)
 
 
 # --- a linear start behind a rectifier ----------------------------------------------------------
@@ -129,13 +119,20 @@ def rectified_start(
     and output error is fitted to the result. The first signs are those of the input through
     low-pass filters with several time constants.
     """
-    share = min(1.0, SIGN_SAMPLES / len(data))
+    # iterations of all first guesses; of the better two
+    first_rounds, rounds = 2, 12
+    # most samples of all experiments together: every round of the search for signs is a fit
+    share = min(1.0, 2_000 / len(data))
     lengths = [max(2 * INIT, round(share * len(e))) for e in data.experiments]
     pairs: Pairs = [(e.u[:n], e.y[:n]) for e, n in zip(data.experiments, lengths, strict=True)]
-    guesses = [[_sign(_low_pass(u, memory)) for u, _ in pairs] for memory in MEMORIES]
-    tried = [_restored(pairs, g, order, nk, FIRST_ROUNDS, look) for g in guesses]
+    # poles of the low-pass filters whose sign is the first guess of the output's
+    guesses = [
+        [_sign(_low_pass(u, memory)) for u, _ in pairs]
+        for memory in (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)
+    ]
+    tried = [_restored(pairs, g, order, nk, first_rounds, look) for g in guesses]
     likely = sorted(tried, key=lambda t: t.error)[:2]
-    tried = [_restored(pairs, t.signs, order, nk, ROUNDS - FIRST_ROUNDS, look, t) for t in likely]
+    tried = [_restored(pairs, t.signs, order, nk, rounds - first_rounds, look, t) for t in likely]
     return min(tried, key=lambda t: t.error).model
 
 

@@ -77,9 +77,7 @@ Models: TypeAlias = Sequence[Sequence[Any]]
 
 @dataclass
 class Table:
-    """The structures of one identification.
-    `rows` are those with a finite free run on every block, by what they were made of.
-    """
+    """The structures of one identification; `rows` are those that are finite on every block."""
 
     task: Task
     blocks: Blocks
@@ -223,9 +221,7 @@ class Table:
 
     @cached_property
     def _behind_rectifier(self) -> _core.LinearModel | None:
-        """The linear model behind a rectifier, of all data: each fold trains from it.
-        A delay that was found without the rectifier says nothing.
-        """
+        """The linear model behind a rectifier of all data, in which each fold trains."""
         order = min(2, self.task.nx or 2)
         until = self.clock.until(self._share)
         (found,) = self.pool.map(
@@ -291,8 +287,7 @@ class Table:
         return diagnose(self.task.data)
 
     def _is_affordable(self, s: Structure) -> bool:
-        """Whether every fold has enough samples for the parameters; if asked for by name, enough
-        for the core."""
+        """Whether every fold has enough samples for the parameters; for the core, if asked for."""
         parameters = s.parameters(self.task.data.n_inputs)
         is_given = None not in (self.task.nx, self.task.hidden)
         each = 1 if is_given else SAMPLES_PER_PARAMETER
@@ -469,5 +464,4 @@ class Table:
 
 
 def is_integrator(row: Row) -> bool:
-    """Whether it is of networks with an integrator."""
     return isinstance(row.found, Structure) and row.found.integrator

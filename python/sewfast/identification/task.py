@@ -29,8 +29,6 @@ R = TypeVar("R")
 
 PERIOD = 0.02
 """Interval at which the calling thread checks for Ctrl-C and shows progress [s]."""
-STEPS = 1000
-"""Total of the progress count."""
 CLOSING = 0.3
 """Processor time that is kept for verdict and evidence [s]; the evidence takes .25 s or more."""
 
@@ -80,8 +78,8 @@ class Clock:
 
     @property
     def for_fits(self) -> float:
-        """The part of the budget for fits [s]: verdict and evidence follow in time (`latest`).
-        They get at most half of it: if they take longer, it is the evidence that is lost.
+        """The part of the budget for fits [s], at least half: verdict and evidence follow
+        (`latest`).
         """
         if self.budget is None:
             return math.inf
@@ -102,9 +100,7 @@ class Clock:
         return None if self.budget is None else self._began + share * self.for_fits
 
     def within(self, share: float, most: float) -> float | None:
-        """Time at which this share of the budget has passed from now on, but `most` of it at most;
-        None without a budget.
-        """
+        """When this share of the budget, `most` of it at most, has passed; None without one."""
         until = self.until(most)
         return until and min(until, time.perf_counter() + share * self.for_fits)
 
@@ -116,8 +112,8 @@ class Clock:
         return is_over
 
     def limited(self, progress: Progress | None, share: float, what: str) -> Progress | None:
-        """`progress` that ends a fit, as Ctrl-C would, when this share of the budget is used up.
-        Then `what` is lost.
+        """`progress` that ends a fit, as Ctrl-C would, after this share of the budget; `what` is
+        lost.
         """
         if self.budget is None:
             return progress
@@ -141,9 +137,7 @@ class Stopped(Exception):
 
 
 class Pool:
-    """Runs compiled work on several threads while the calling one listens.
-    `progress(done, total, best)` is called from the calling thread, at most every `PERIOD`.
-    """
+    """Runs compiled work on threads while the caller listens, at most every `PERIOD`."""
 
     def __init__(self, threads: int, clock: Clock, progress: Progress | None) -> None:
         self.threads = threads
@@ -209,12 +203,14 @@ class Pool:
 
     def show(self, share: float) -> None:
         """Call the progress function, if any, with the larger share of work or time done."""
+        # total of the progress count
+        steps = 1000
         if self.progress is None:
             return
         clock = self.clock
         if clock.budget is not None:
             share = max(share, clock.spent / clock.budget)
-        self.progress(min(STEPS, round(STEPS * share)), STEPS, self.best)
+        self.progress(min(steps, round(steps * share)), steps, self.best)
 
 
 # --- One identification ---------------------------------------------------------------------------

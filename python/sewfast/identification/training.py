@@ -23,14 +23,6 @@ from ..threads import Workers, spread
 from .outputs import LINEAR, Output, scale_of
 from .task import Look, Pairs, Pool, Provenance, Stopped, arrays
 
-HIDDEN_SCALE = 1.0
-WORST = 3.0
-"""Starts whose J exceeds this multiple of the best one's do not count."""
-SHARE_OF_GUARD = 0.95
-"""Part of a time budget by which the guard must be finished."""
-OVERHEAD = 2_000
-"""Cost of a sample apart from its sensitivities, in multiplications."""
-
 Network: TypeAlias = _core.NeuralSS | _core.NeuralOE
 
 
@@ -67,7 +59,8 @@ class Structure:
     def operations(self, inputs: int, samples: int) -> float:
         """Multiplications of one iteration: sensitivities, and the sum of outer products."""
         p = self.parameters(inputs)
-        return samples * (p * p / 2.0 + self.nx * self.nx * p + OVERHEAD)
+        # cost of a sample apart from its sensitivities, in multiplications
+        return samples * (p * p / 2.0 + self.nx * self.nx * p + 2_000)
 
     def to_json(self) -> Provenance:
         """For the table of candidates."""
@@ -79,9 +72,8 @@ class Structure:
 
 @dataclass(frozen=True)
 class Start:
-    """One trained start.
-    `cost` is J on held-out data, else on the training data; `fault` is what the guard found, empty
-    for a sound start.
+    """One trained start. `cost` is J on held-out data, else on the training data; `fault` is what
+    the guard found, empty for a sound start.
     """
 
     model: Network
@@ -96,9 +88,8 @@ class Start:
 
 @dataclass(frozen=True)
 class Request:
-    """Some starts of one structure on some data.
-    `initial` are models to train further, one start each; otherwise `starts` new ones are drawn
-    around `linear`, numbered from `first` on.
+    """Some starts of one structure on some data. `initial` are models to train further, one start
+    each; otherwise `starts` new ones are drawn around `linear`, numbered from `first` on.
     """
 
     structure: Structure
@@ -112,7 +103,6 @@ class Request:
 
     @property
     def count(self) -> int:
-        """Starts."""
         return len(self.initial) or self.starts
 
     @property
@@ -239,16 +229,15 @@ def guarded(
     bounds: list[_core.LinearModel],
     pool: Pool,
 ) -> list[list[Start]]:
-    """The starts with the guard's findings on whole records.
-    `bounds` are linear models whose memory of the initial state bounds that of networks.
-    """
+    """Starts with the guard's findings; the memory of linear `bounds` limits that of networks."""
     flat = [start for starts in found for start in starts]
 
     def fault(start: Start, look: Look) -> str:
         return _core.guard(start.model, data, linear=bounds)
 
     late = "not asked within the time budget"
-    until = pool.clock.until(SHARE_OF_GUARD)
+    # part of a time budget by which the guard must be finished
+    until = pool.clock.until(0.95)
     faults = (
         late if f is None else f
         for f in pool.map(fault, flat, until=until, what="the guard of networks")
@@ -260,7 +249,8 @@ def counting(starts: Iterable[Start]) -> list[Start]:
     """Starts not far worse than the best, sound ones if there are any; best first."""
     starts = list(starts)
     able = sorted([s for s in starts if s.is_sound] or starts, key=lambda s: s.cost)
-    return [s for s in able if s.cost <= WORST * able[0].cost]
+    # starts whose J exceeds this multiple of the best one's do not count
+    return [s for s in able if s.cost <= 3.0 * able[0].cost]
 
 
 def _spread(workers: Workers, jobs: Sequence[Job]) -> list[tuple[Network, float] | None]:
@@ -294,7 +284,7 @@ def _jobs(request: Request, seed: int, until: float | None) -> list[Job]:
     else:
         settings |= {"nx": s.nx, "integrator": s.integrator, "output": s.output.name}
         parameters = s.output.parameters(*scale_of(request.fitted, s.output))
-        settings |= {"output_parameters": parameters, "hidden_scale": HIDDEN_SCALE}
+        settings |= {"output_parameters": parameters, "hidden_scale": 1.0}
     common: dict[str, Any] = {
         "experiments": arrays(request.fitted),
         "held": [] if request.held is None else arrays(request.held),

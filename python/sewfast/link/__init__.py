@@ -4,17 +4,18 @@ Read in this order: `ports` (transports and their failures), `wire` (the frames'
 `connection` (a session: the core's client on a port, and the device's clock), `drive` (`Drive`),
 `plan` (a run's commands, its checks and its outcome), `run` (the loop of a run, and how it ends),
 `record` (into memory, a file and a live view). Then `host_loop` and `host_run` (a controller on
-this computer), `doctor`, `virtual` and `emulated` (devices without a motor), and `boards` with
-`makers` (boards of other makers, polled over text: ODrive, SimpleFOC).
+this computer), `doctor`, and `virtual` (a device without a motor). Plug-ins add classes to this
+unit by entry points `link.NAME` of the group `sewfast.names`.
 """
 
-from .boards import PolledBoard
+from typing import Any
+
+from ..plugins import public_name as _public_name
 from .connection import ClockBounds
 from .doctor import Diagnosis, Finding, examine
 from .drive import Drive, connect
 from .host_loop import at_period, run_on_host
 from .host_run import HostLoopRun, Jitter
-from .makers import ODrive, SimpleFOC
 from .plan import Layout, Outcome, Plan, Sink
 from .ports import Port, PortInfo, list_ports, open_port
 from .virtual import VirtualDevice
@@ -32,13 +33,10 @@ __all__ = [
     "Jitter",
     "Layout",
     "Limits",
-    "ODrive",
     "Outcome",
     "Plan",
-    "PolledBoard",
     "Port",
     "PortInfo",
-    "SimpleFOC",
     "Sink",
     "Status",
     "VirtualDevice",
@@ -49,3 +47,10 @@ __all__ = [
     "open_port",
     "run_on_host",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # a module of this folder is asked for as an attribute first
+    if not name[:1].isupper():
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return _public_name(f"link.{name}")

@@ -20,14 +20,8 @@ from . import wire
 from .ports import Port, Unique
 from .wire import Event, Identity, Kind, Reply
 
-WATCHDOG = 0.1
-WATCHDOG_ON_CREDIT = 0.25
-GREETED_WITHIN = 0.1
-"""Longest wait for the answer to one HELLO on a reopened port [s]."""
 RETRY = 0.05
 """Time between two attempts to open a port that vanished [s]."""
-HALTED_WITHIN = 30.0
-"""Longest wait for another thread's run to end; after its STOP it waits for rest [s]."""
 SILENCE = 0.02
 """Longest wait for bytes in one turn [s]; Ctrl-C and cancelling are checked at least as often."""
 
@@ -74,7 +68,7 @@ class Connection(Unique):
         self._bytes = 0
         self._is_closed = self._is_lent = False
         self.identity = self._greet(patience)
-        usual = WATCHDOG_ON_CREDIT if self.identity.on_credit else WATCHDOG
+        usual = 0.25 if self.identity.on_credit else 0.1
         self.watchdog = usual if watchdog is None else watchdog
         self.watchdog_us = round(self.watchdog * 1e6)
         self._client.set_watchdog(self.watchdog_us)
@@ -171,9 +165,7 @@ class Connection(Unique):
 
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """Use the connection from this thread alone; a second thread is refused, not queued.
-        Raises `SettingError` if another thread uses it: their frames and replies would mix.
-        """
+        """Use the connection from this thread alone; refuse a second one: frames would mix."""
         if not self._owner.acquire(blocking=False):
             raise SettingError(
                 name="drive", expected="one thread that uses it",
@@ -208,13 +200,10 @@ class Connection(Unique):
         return reply
 
     def ask(self, kind: Kind, body: bytes = b"") -> bytes:
-        """The body of a command's reply.
-        Raises `LinkError` as `request`, and if the device refuses.
-        """
+        """The body of a command's reply; `LinkError` as `request`, and if the device refuses."""
         return self.request(kind, body).checked()
 
     def status(self) -> wire.Status:
-        """Ask the device for its status."""
         return wire.status(self.request(Kind.STATUS))
 
     def stop(self) -> None:
@@ -239,7 +228,8 @@ class Connection(Unique):
             return
         self.halted = True
         try:
-            if self._owner.acquire(timeout=HALTED_WITHIN):
+            # longest wait for another thread's run to end; after its STOP it waits for rest [s]
+            if self._owner.acquire(timeout=30.0):
                 self._owner.release()
         finally:
             self.halted = False
@@ -364,7 +354,8 @@ class Connection(Unique):
                 self.port.reopen(max(RETRY, lost + self.resume - time.monotonic()))
                 if self._is_closed:
                     self.port.close()
-                return self._greet(GREETED_WITHIN)
+                # longest wait for the answer to one HELLO on a reopened port [s]
+                return self._greet(0.1)
             except LinkError as failed:
                 if time.monotonic() - lost + RETRY > self.resume:
                     raise LinkError(
@@ -504,9 +495,7 @@ def _slopes(low: _Points, high: _Points) -> tuple[float, float]:
 
 
 def _offsets(low: _Points, high: _Points, slopes: tuple[float, float]) -> tuple[float, float]:
-    """Least and greatest value at 0 of such a line.
-    They are reached at the least or greatest slope, or at the slope of an edge of a hull.
-    """
+    """Least and greatest value at 0 of such a line: at an extreme slope, or an edge of a hull."""
     at = [np.clip(s, *slopes) for s in (*slopes, *_edges(low), *_edges(high))]
     least = min(float(np.max(low[:, 1] - s * low[:, 0])) for s in at)
     greatest = max(float(np.min(high[:, 1] - s * high[:, 0])) for s in at)

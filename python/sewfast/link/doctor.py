@@ -101,13 +101,6 @@ SHORT, LONG = 0, 200
 """Bytes of the two kinds of echoes; the difference of their times is the cost of the bytes."""
 SPARE = 0.4
 """Share of the link that a recording at full rate should leave free."""
-BATCH = 10
-SLOW_TRIP = 0.01
-LOSSY = 0.01
-"""Share of lost frames above which loss is a failure rather than a warning."""
-DRIFT_PPM = 500.0
-MEASURABLE = 20e-6
-"""Least difference of times from which a rate can be computed [s]."""
 
 
 class Metered(Port):
@@ -148,9 +141,7 @@ class Metered(Port):
 
 
 def checkup(port: Metered, echoes: int) -> Iterator[Finding]:
-    """Check the device behind an open port, one finding after the other.
-    Raises `LinkError` if no device answers, or it stops answering.
-    """
+    """Check the device behind an open port, finding by finding; `LinkError` if it is mute."""
     link = Connection(port, watchdog=0.05, patience=PATIENCE, resume=0.0)
     drive = Drive(link)
     yield _identity(drive)
@@ -243,7 +234,7 @@ def _round_trip(times: dict[int, list[float]]) -> Finding:
     median, worst = statistics.median(times[SHORT]), max(times[SHORT])
     values = {"median_s": median, "worst_s": worst}
     detail = f"median {_time(median)}, worst {_time(worst)} of {len(times[SHORT])}"
-    if median <= SLOW_TRIP:
+    if median <= 0.01:
         return Finding("round trip", "ok", detail, values=values)
     return Finding(
         "round trip", "warn", detail,
@@ -254,13 +245,15 @@ def _round_trip(times: dict[int, list[float]]) -> Finding:
 
 def _throughput(times: dict[int, list[float]], drive: Drive, port: Port) -> Finding:
     """Bytes a second that the link carries, compared with the need of samples at full rate."""
+    batch = 10
     # the fastest echo of each size is the one that nothing else delayed
     cost = min(times[LONG]) - min(times[SHORT])
     encodings = [c.encoding for c in drive.channels[:2]]
-    size = wire.wire_size(wire.body_size(encodings, BATCH))
-    needed = size / (BATCH * drive.identity.Ts)
+    size = wire.wire_size(wire.body_size(encodings, batch))
+    needed = size / (batch * drive.identity.Ts)
     values = {"needed_bytes_per_s": needed, "stated_baud": port.baud}
-    if cost < MEASURABLE:
+    # least difference of times from which a rate can be computed [s]
+    if cost < 20e-6:
         detail = f"too fast to be measured; {needed:.0f} B/s are needed for counts and command"
         return Finding("throughput", "ok", detail, values=values)
     rate = 2 * (LONG - SHORT) / cost
@@ -302,7 +295,8 @@ def _loss(
     )
     if not bad and not odd:
         return Finding("loss", "ok", f"none of {echoes} echoes", values=values)
-    verdict: Verdict = "fail" if bad > LOSSY * 2 * echoes else "warn"
+    # share of lost frames above which loss is a failure rather than a warning
+    verdict: Verdict = "fail" if bad > 0.01 * 2 * echoes else "warn"
     return Finding(
         "loss", verdict, detail,
         "shorten or shield the cable, connect the grounds, lower the baud rate, and make sure "
@@ -312,6 +306,7 @@ def _loss(
 
 
 def _clock(drive: Drive) -> Finding:
+    drift_ppm = 500.0
     if drive.identity.on_credit:
         return Finding("clock", "ok", "advances only by what the host grants")
     bounds = drive.clock
@@ -326,7 +321,7 @@ def _clock(drive: Drive) -> Finding:
         "uncertainty_s": bounds.offset_s[1] - bounds.offset_s[0],
         "drift_ppm_least": low, "drift_ppm_most": high,
     }  # fmt: skip
-    if low > DRIFT_PPM or high < -DRIFT_PPM:
+    if low > drift_ppm or high < -drift_ppm:
         return Finding(
             "clock",
             "warn",
@@ -368,7 +363,6 @@ def _time(seconds: float) -> str:
 
 
 ECHOES = 200
-LATENCY_TIMER_MS = 2
 
 
 def examine(url: str, *, baud: int = 115_200, echoes: int = ECHOES) -> Diagnosis:
@@ -484,7 +478,7 @@ def _latency(url: str) -> Iterator[Finding]:
         return
     milliseconds, file = found
     values = {"latency_timer_ms": milliseconds}
-    if milliseconds <= LATENCY_TIMER_MS:
+    if milliseconds <= 2:
         yield Finding("latency timer", "ok", f"{milliseconds} ms", values=values)
         return
     yield Finding(
@@ -580,9 +574,7 @@ def permission_remedy(found: Access, vid: int | None = None, pid: int | None = N
 
 
 def holders(path: str, proc: Path = PROC) -> list[tuple[int, str]]:
-    """Number and name of the other processes that hold a port open, as far as this user can see.
-    Empty on a system without /proc.
-    """
+    """Number and name of other processes that hold a port, as far as /proc shows them."""
     wanted = os.path.realpath(path)
     found = []
     for folder in proc.glob("[0-9]*"):
@@ -615,9 +607,7 @@ def _command(folder: Path) -> str:
 
 
 def latency_timer(path: str, root: Path = SYS) -> tuple[int, Path] | None:
-    """Milliseconds for which an FTDI adapter holds bytes back, and the file to change them in.
-    None for an adapter without such a timer, and on a system that does not show it.
-    """
+    """Milliseconds for which an FTDI adapter holds bytes, and the file to change them in."""
     file = root / Path(os.path.realpath(path)).name / "device" / "latency_timer"
     try:
         return int(file.read_text()), file

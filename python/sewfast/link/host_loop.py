@@ -26,11 +26,6 @@ from .plan import Layout, Plan
 from .run import ARMS_WITHIN, MOVING
 from .wire import refusal
 
-WATCHDOG_PERIODS = 4
-"""Periods that the device runs on without a command, unless its watchdog time is longer."""
-BATCHES = (10, 9, 8, 7, 6, 5)
-"""Samples in a frame: the first that divides a period, so all ticks see equally old samples."""
-PRIORITY = 50
 ORDINARY = "ordinary"
 
 _ENDS = {
@@ -112,7 +107,8 @@ def run_on_host(
     r = _reference(reference, controller, seed)
     plan = Plan("direct", r, columns=columns, batch=batch or _batch(ratio))
     streamed = drive.prepare_direct(plan, controller)
-    wait = max(drive.watchdog, WATCHDOG_PERIODS * controller.Ts) if watchdog is None else watchdog
+    # periods that the device runs on without a command, unless its watchdog time is longer
+    wait = max(drive.watchdog, 4 * controller.Ts) if watchdog is None else watchdog
     until = time.monotonic() + ARMS_WITHIN
     while True:
         with drive.lent() as session, _scheduling(real_time) as scheduling:
@@ -164,7 +160,9 @@ def at_period(controller: Controller, Ts: float) -> Controller:
 
 def _batch(ratio: int) -> int:
     """Samples in a frame; fewer than five would load a serial line too much."""
-    return next((b for b in BATCHES if ratio % b == 0), min(ratio, BATCHES[0]))
+    # samples in a frame: the first that divides a period, so all ticks see equally old samples
+    batches = (10, 9, 8, 7, 6, 5)
+    return next((b for b in batches if ratio % b == 0), min(ratio, batches[0]))
 
 
 def _ratio(drive: Drive, controller: Controller) -> int:
@@ -213,12 +211,13 @@ def _scale(drive: Drive, controller: Controller) -> float:
 @contextmanager
 def _scheduling(wanted: bool) -> Iterator[list[str]]:
     """Real-time scheduling, if wanted, of this thread and those it starts; yields the result."""
+    priority = 50
     if not wanted:
         yield [ORDINARY]
         return
     try:
         before = os.sched_getscheduler(0), os.sched_getparam(0)
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except AttributeError:
         yield [f"{ORDINARY} (real time is not offered on this system)"]
         return
@@ -226,7 +225,7 @@ def _scheduling(wanted: bool) -> Iterator[list[str]]:
         yield [f"{ORDINARY} (real time refused: {refused.strerror}; see limits.conf, rtprio)"]
         return
     try:
-        yield [f"SCHED_FIFO {PRIORITY}"]
+        yield [f"SCHED_FIFO {priority}"]
     finally:
         os.sched_setscheduler(0, *before)
 

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 EDGES = np.array([m * 10.0**d for d in range(7) for m in (1.0, 2.0, 5.0)] + [1e7])
 """Edges of the bins [us], 1 us to 10 s; values beyond count in the first or last bin."""
-PERCENT = (50.0, 99.0, 99.9)
 BAR = 30
 
 
@@ -145,7 +144,7 @@ def _percentiles(values: FloatArray) -> dict[str, float]:
     known = values[np.isfinite(values)]
     if not len(known):
         return dict.fromkeys(("median", "p99", "p999", "worst"), math.nan)
-    found = np.percentile(known, PERCENT, method="higher")
+    found = np.percentile(known, (50.0, 99.0, 99.9), method="higher")
     return dict(zip(("median", "p99", "p999"), map(float, found), strict=True)) | {
         "worst": float(known.max())
     }
@@ -324,7 +323,6 @@ class HostLoopRun(Plotted):
         return stacked((*panels, self.jitter.panel), (2.2, 1.3, 1.3, 2.4), share_x=False)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         caption = f"{self.reference} on {self.plant} from this computer, {self.outcome}"
         return run_html(self, caption)
 

@@ -27,8 +27,6 @@ DEFAULTS: dict[str, tuple[str, ...]] = {
     "direct": ("speed_true",),
 }
 """Streamed besides `counts` and `u` if the device has them; a low baud rate drops the last."""
-BATCH = 10
-SPARE = 0.1
 _CAPABILITIES = {"commands": wire.PROFILE, "controller": wire.PID, "direct": wire.DIRECT}
 
 
@@ -168,9 +166,7 @@ class Layout:
 
 
 def require_capable(plan: Plan, identity: Identity) -> None:
-    """Refuse (`SettingError`) a plan that the device cannot run: a mode that it does not offer, or
-    a controller with another sample time.
-    """
+    """Refuse a mode that the device does not offer, or a controller with another sample time."""
     if not identity.capabilities & _CAPABILITIES[plan.mode]:
         raise SettingError(
             name="mode", expected="one that the device offers",
@@ -213,12 +209,13 @@ def layout(plan: Plan, channels: Sequence[Channel], identity: Identity, baud: fl
 
 def _batch(plan: Plan, chosen: Sequence[Channel], identity: Identity, baud: float) -> int | None:
     """The smallest batch that fits, or the one asked for if it fits."""
+    batch = 10
     encodings = [c.encoding for c in chosen]
-    tries = range(BATCH, 101) if plan.batch is None else (plan.batch,)
+    tries = range(batch, 101) if plan.batch is None else (plan.batch,)
     fits = (b for b in tries if _fits(encodings, b, identity, baud))
     found = next(fits, None)
     if found is None and plan.batch is None:
-        found = next((b for b in range(BATCH, 0, -1) if _fits(encodings, b, identity, baud)), None)
+        found = next((b for b in range(batch, 0, -1) if _fits(encodings, b, identity, baud)), None)
     return found
 
 
@@ -227,7 +224,7 @@ def _fits(encodings: Sequence[int], batch: int, identity: Identity, baud: float)
     if not 1 <= batch <= 255 or body > wire.MAX_BODY:
         return False
     seconds = batch * identity.Ts
-    return wire.wire_size(body) * 10.0 / seconds <= (1.0 - SPARE) * baud
+    return wire.wire_size(body) * 10.0 / seconds <= (1.0 - 0.1) * baud
 
 
 def _too_much(plan: Plan, out: Sequence[Channel], identity: Identity, baud: float) -> SettingError:
@@ -250,9 +247,7 @@ def _too_much(plan: Plan, out: Sequence[Channel], identity: Identity, baud: floa
 
 
 def channels(link: Connection) -> tuple[Channel, ...]:
-    """The device's description of its channels.
-    Raises `LinkError` if it does not match the device's schema hash.
-    """
+    """The device's description of its channels; `LinkError` if it differs from its schema hash."""
     identity = link.identity
     bodies = [link.ask(Kind.DESCRIBE, bytes([k])) for k in range(identity.channels)]
     if wire.schema_hash(identity.version, identity.period_us, bodies) != identity.schema:
@@ -271,9 +266,7 @@ def channels(link: Connection) -> tuple[Channel, ...]:
 
 
 def limit(name: str, value: float | None, present: float, ceiling: float) -> float:
-    """The limit to set: the one asked for, the one in force, or the device's ceiling.
-    Raises `SettingError` for a limit that is not above 0 or is above the ceiling.
-    """
+    """The limit to set: the one asked for, the one in force, or the device's ceiling."""
     if value is None:
         return present if present else ceiling
     if not 0.0 < real(name, value) <= ceiling * (1.0 + 1e-6):
@@ -285,9 +278,7 @@ def limit(name: str, value: float | None, present: float, ceiling: float) -> flo
 
 
 def require_units(controller: SampledController, streamed: Sequence[Channel]) -> None:
-    """Refuse (`SettingError`) a controller whose command or output has another unit than the
-    device's.
-    """
+    """Refuse a controller whose command or output has another unit than the device's."""
     units = {c.name: c.unit for c in streamed}
     _require_units(controller.u_unit, units.get("u", ""), "command")
     _require_units(controller.y_unit, units.get("feedback", "RPM"), "output")
@@ -302,9 +293,7 @@ def fitting(controller: Controller, streamed: Sequence[Channel]) -> Gains:
 def other_kind(
     controller: SampledController, streamed: Sequence[Channel], identity: Identity
 ) -> bytes:
-    """Body of CONTROLLER for any controller but a PID, with the encoder of the device.
-    Raises `SettingError` if it has other units than the device, or the firmware does not know it.
-    """
+    """Body of CONTROLLER for any controller but a PID, with the encoder of the device."""
     require_units(controller, streamed)
     if not identity.capabilities & wire.KINDS:
         raise SettingError(
@@ -320,9 +309,7 @@ def other_kind(
 
 
 def gains(controller: Controller, streamed: Sequence[Channel], identity: Identity) -> bytes:
-    """Body of GAINS for a controller, with the encoder of the device. Raises `SettingError` if its
-    gains have other units than the device, or the firmware does not support its parts.
-    """
+    """Body of GAINS for a controller, with the encoder of the device."""
     g, c = fitting(controller, streamed), controller
     named = ("observer_time", bool(c.observer_time)), ("r_rate", c.r_rate != math.inf)
     further = [name for name, used in (*named, ("schedule", bool(c.schedule))) if used]

@@ -135,15 +135,11 @@ class Port(Unique, ABC):
 
     @abstractmethod
     def write(self, data: bytes) -> None:
-        """Write all of `data`.
-        Raises `LinkError` if the port vanished or takes no bytes for a second.
-        """
+        """Write all of `data`; `LinkError` if the port vanished or takes no bytes for a second."""
 
     @abstractmethod
     def fileno(self) -> int:
-        """Its descriptor, for code that reads and writes outside the interpreter.
-        Raises `LinkError` if the port is closed.
-        """
+        """Its descriptor, for code outside the interpreter; `LinkError` if the port is closed."""
 
     @abstractmethod
     def close(self) -> None:
@@ -155,14 +151,11 @@ class Port(Unique, ABC):
         return self.baud
 
     def describe(self) -> str:
-        """A description of the open port."""
         return "connected"
 
     @staticmethod
     def opening(url: str, number: int | None, error: BaseException) -> Texts:
-        """Expected, received and remedy for a port that does not open.
-        `number` is the operating system's number of the error.
-        """
+        """Expected, received and remedy for a port that does not open, by the system's `number`."""
         return "a port that opens", "one that does not", "`sewfast ports` lists what is connected"
 
     @staticmethod

@@ -59,9 +59,7 @@ class Recorder:
         self._early: list[tuple[str, int | None, dict[str, Any]]] = []
 
     def samples(self, first: int, columns: Mapping[str, FloatArray]) -> None:
-        """Take a batch of samples; called by the thread that owns the link.
-        Raises `DataError` if the file cannot be written.
-        """
+        """Take a batch of samples; called by the thread that owns the link."""
         self._begin()
         if self._file is not None:
             self._file.samples(first, columns)
@@ -348,13 +346,10 @@ def _stream(
     return _result(recorder, writer, outcome)
 
 
-_LONGEST = 10.0
-"""Longest watchdog time of the protocol [s]."""
-
-
 def _more_time(watchdog: float) -> str:
     """The remedy for a busy computer: a longer watchdog time, up to the longest."""
-    longer = min(max(0.25, 2.0 * watchdog), _LONGEST)
+    # the protocol's longest watchdog time is 10 s
+    longer = min(max(0.25, 2.0 * watchdog), 10.0)
     if longer <= watchdog:
         return ""
     return (

@@ -54,24 +54,13 @@ def _take_reply(profile: LinkUpload, reply: Reply) -> None:
 # --- Run ------------------------------------------------------------------------------------------
 
 
-ASK = 0.5
-"""Time between two STATUS in real time [s]; each one tightens the bounds on the clocks."""
-CREDIT_SHARE = 0.8
-"""Share of the watchdog time that a device on credit can run ahead."""
 AGAIN, AT_MOST = 0.002, 0.064
 """Time after which credit is granted again if nothing arrived [s], and its upper bound: it doubles
 each time, as a device that is slow to read would otherwise drown in grants, with its answers stuck
 behind them."""
 ARMED_SILENCE = 0.25
 """Longest silence of an armed device, which sends a frame every .2 s [s]."""
-REST_US = 120_000
-"""Device time without a count after which a motor counts as at rest; ARM requires 100 ms."""
 STEP_US = 20_000
-COASTS = 0.99
-"""A motor that keeps more than this share of its speed over the second half of the wait for its
-rest is driven: one that coasts loses speed."""
-MEASURED_WITHIN = 1.0
-"""Longest wait for a booting device to finish its first measurements [s]."""
 ARMS_WITHIN = 10.0
 """Longest wait for a motor that still moves according to the device [s]."""
 MOVING = 11
@@ -86,13 +75,16 @@ def wait_for_rest(link: Connection, timeout: float) -> None:
     # the host's clock too: the time of a device that takes no credit stands still
     deadline = time.monotonic() + timeout + (5.0 if link.identity.on_credit else 0.0)
     half = math.inf
-    while status.time_us - since < REST_US:
+    # device time without a count after which a motor counts as at rest; ARM requires 100 ms
+    while status.time_us - since < 120_000:
         if status.time_us - began > timeout * 1e6 or time.monotonic() > deadline:
             error = LinkError(
                 name=link.port.url, expected=f"the motor at rest within {timeout:g} s",
                 received=f"{status.speed_rpm:.0f} RPM", remedy="brake it or wait longer",
             )  # fmt: skip
-            if abs(status.speed_rpm) > COASTS * half:
+            # a motor that keeps more than this share of its speed over the second half of the wait
+            # for its rest is driven: one that coasts loses speed
+            if abs(status.speed_rpm) > 0.99 * half:
                 error.remedy = ""  # both are said
                 error.explain(turning(status.speed_rpm, "before a run"))
             raise error
@@ -106,7 +98,8 @@ def wait_for_rest(link: Connection, timeout: float) -> None:
 
 def await_measurement(link: Connection) -> None:
     """Wait for the end of boot, after some good samples; a device on credit is granted time."""
-    deadline = time.monotonic() + MEASURED_WITHIN
+    # longest wait for a booting device to finish its first measurements [s]
+    deadline = time.monotonic() + 1.0
     while link.status().state == "boot" and time.monotonic() < deadline:
         link.let_pass(STEP_US)
 
@@ -134,9 +127,7 @@ def arm_at_rest(link: Connection) -> None:
 
 
 class Run:
-    """One run: `upload`, `begin`, `pump`, `finish` in this order, or `abort` at any time. The
-    `profile` is None in mode "direct".
-    """
+    """One run: `upload`, `begin`, `pump`, `finish` in this order, or `abort` at any time."""
 
     def __init__(
         self, link: Connection, plan: Plan, layout: Layout, profile: LinkUpload | None, sink: Sink
@@ -155,7 +146,8 @@ class Run:
         self.ended = False
         self._sink_works = True
         self._last: Status | None = None
-        self._lead = round(CREDIT_SHARE * link.watchdog_us)
+        # share of the watchdog time that a device on credit can run ahead
+        self._lead = round(0.8 * link.watchdog_us)
         self._granted = self._brought = 0
         self._again = AGAIN
         self._driven = 0.0
@@ -250,8 +242,8 @@ class Run:
             self._beat()
 
     def _is_deaf(self, now: float) -> bool:
-        """Whether the device has been silent for too long.
-        Then heartbeats stop, so that its watchdog stops the motor that nobody sees.
+        """Whether the device is silent for so long that heartbeats end: its watchdog stops the
+        motor.
         """
         after = self._deaf_after
         if self.start_us is None:
@@ -297,7 +289,8 @@ class Run:
     def _ask(self, now: float) -> None:
         """Send the next command if one is due: a piece of the profile, or STATUS."""
         silent = now - max(self._heard, self._asked) >= self._silence
-        if silent or (not self._on_credit and now - self._asked >= ASK):
+        # time between two STATUS in real time [s]; each one tightens the bounds on the clocks
+        if silent or (not self._on_credit and now - self._asked >= 0.5):
             self._asked = now
             self.link.begin(Kind.STATUS)
             return
@@ -420,9 +413,7 @@ class Run:
     # --- the end ----------------------------------------------------------------------------------
 
     def finish(self, reason: str | None = None) -> Outcome:
-        """Ask the device how many samples it took, and list those that did not arrive.
-        `reason` is why the host ended it; None if the device did.
-        """
+        """Ask how many samples were taken, list those that did not arrive."""
         status = self.link.status()
         if self.start_us is not None:
             self.collect(self.start_us)
@@ -437,9 +428,7 @@ class Run:
         return self._outcome(status.state, reason or ended, taken)
 
     def abort(self, error: BaseException | None) -> Outcome:
-        """Stop the motor before anything else, then collect the samples that arrived.
-        `error` is why; None if the run was cancelled.
-        """
+        """Stop the motor first, then collect what arrived; `error` is why, None if cancelled."""
         link, resume = self.link, self.link.resume
         link.each_turn = None
         # wait for a vanished port as long as the motor can still turn, to send it STOP

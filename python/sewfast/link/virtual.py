@@ -24,9 +24,6 @@ __all__ = ["VirtualDevice"]
 
 Faults: TypeAlias = "str | Mapping[str, float | tuple[float, float]]"
 
-_LARGEST_SEED = 2**64 - 1
-_BAUD = (300, 100_000_000)
-
 
 class VirtualDevice(Unique):
     """The virtual sewing machine served on a port, with the state machine of a real device.
@@ -100,9 +97,9 @@ class VirtualDevice(Unique):
     ) -> None:
         plant = VirtualMachine.from_name(machine)
         pty = _checked_endpoint(endpoint, link) == "pty"
-        _check_range("seed", seed, 0, _LARGEST_SEED)
+        _check_range("seed", seed, 0, 2**64 - 1)
         if baud is not None:
-            _check_range("baud", baud, *_BAUD)
+            _check_range("baud", baud, *(300, 100_000_000))
         if duration is not None and not 0.0 < real("duration", duration) < 1e9:
             raise SettingError(name="duration", expected="above 0 s", received=repr(duration))
         _require_switches(fast=fast, once=once, anyone=anyone)
@@ -286,9 +283,7 @@ def _require_place(name: str, place: object, pipes: ExitStack) -> None:
 
 
 def _require_free(link: Path) -> None:
-    """Refuse a link to something that exists: the pty of another device, or a user's file.
-    A dangling link was left over by a killed device, and is replaced.
-    """
+    """Refuse to replace what exists by a link, except a dangling one of a killed device."""
     if link.is_symlink() and link.exists():
         raise LinkError(
             name=str(link), expected="a free name",

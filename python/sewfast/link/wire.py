@@ -215,9 +215,7 @@ class Reply:
     time_us: int
 
     def checked(self) -> bytes:
-        """The body.
-        Raises `LinkError` if the device refused the command; the message says why and what to do.
-        """
+        """The body; `LinkError` with the reason and the remedy if the device refused."""
         if self.result:
             raise refusal(self.kind, self.result, self.detail)
         return self.body

@@ -93,23 +93,12 @@ def speed_over_window(counts: FloatArray, lag: int, Ts: float, counts_per_rev: f
 SPEED = "speed"
 """Name of the column that a feed derives from counts."""
 
-WHOLE_S = 30.0
-"""A record of at most this length [s] is kept whole."""
-
-SCROLL_S = 10.0
-"""The part kept of a longer record, or of one without a planned end [s]."""
 
 _LEAST, _MOST = 4096, 131_072
 """Fewest and most samples kept of a column, at 8 bytes each."""
 
-_SPARE_S = 2.0
-"""Kept in addition to the span of a plot, for a slow view [s]."""
-
 
 _CLAIMED, _END, _RECEIVED, _GAPS = range(4)
-
-_LONGEST = 500
-"""Most characters of a note: a short write to a pipe is never partial (POSIX, PIPE_BUF)."""
 
 
 class Feed:
@@ -300,7 +289,9 @@ class Feed:
         if self._pipe is not None:
             # a view that hangs or has ended misses the line
             with suppress(OSError):
-                os.write(self._pipe, json.dumps(text[:_LONGEST]).encode() + b"\n")
+                # most characters of a note: a short write to a pipe is never partial (POSIX,
+                # PIPE_BUF)
+                os.write(self._pipe, json.dumps(text[:500]).encode() + b"\n")
 
     def notes(self, after: int = 0) -> list[tuple[int, str]]:
         """The lines of status with numbers above `after`: (number, text), oldest first."""
@@ -353,9 +344,12 @@ class Feed:
 
 def _extent(Ts: float, n: int | None) -> tuple[int, int]:
     """Samples in the ring, and the number of them that a plot spans."""
-    whole = n is not None and n * Ts <= WHOLE_S
-    wanted = n if n is not None and whole else math.ceil(SCROLL_S / Ts)
-    size = min(max(wanted + math.ceil(_SPARE_S / Ts), _LEAST), _MOST)
+    # a record of at most this length [s] is kept whole
+    whole = n is not None and n * Ts <= 30.0
+    # the part kept of a longer record, or of one without a planned end [s]
+    wanted = n if n is not None and whole else math.ceil(10.0 / Ts)
+    # kept in addition to the span of a plot, for a slow view [s]
+    size = min(max(wanted + math.ceil(2.0 / Ts), _LEAST), _MOST)
     return size, min(wanted, size - size // 8)
 
 

@@ -26,12 +26,6 @@ from .feed import Feed
 # neither header, so the gate checks them and forwards the requests that pass.
 
 
-LONGEST = 16_384
-"""Bytes of a request's head."""
-PATIENCE = 5.0
-"""Longest wait for the head [s]."""
-CONNECTIONS = 16
-"""Most connections at once; further ones are closed."""
 _REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 _END = b"\r\n\r\n"
 
@@ -72,9 +66,7 @@ def _is_local(address: str) -> bool:
 
 
 class Gate:
-    """Listens, reads the heads of requests and forwards those that pass to the server `behind`.
-    Port 0 takes any free one. Raises `OSError` if the port is taken.
-    """
+    """Forwards requests whose heads pass to the server `behind`; port 0 takes any free one."""
 
     def __init__(self, host: str, port: int, behind: tuple[str, int]) -> None:
         self._behind = behind
@@ -83,7 +75,8 @@ class Gate:
         self.port = int(self._listener.getsockname()[1])
         self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
-        self._room = threading.BoundedSemaphore(CONNECTIONS)
+        # most connections at once; further ones are closed
+        self._room = threading.BoundedSemaphore(16)
         self._closed = False
         self._start(self._accept)
 
@@ -124,9 +117,12 @@ class Gate:
             self._room.release()
 
     def _admit(self, client: socket.socket) -> None:
-        client.settimeout(PATIENCE)
+        # longest wait for the head [s]
+        patience = 5.0
+        client.settimeout(patience)
         head = b""
-        while _END not in head and len(head) < LONGEST:
+        # bytes of a request's head
+        while _END not in head and len(head) < 16_384:
             piece = client.recv(4096)
             if not piece:
                 return
@@ -134,7 +130,7 @@ class Gate:
         if _END not in head or not admits(head.partition(_END)[0]):
             client.sendall(_REFUSAL)
             return
-        with socket.create_connection(self._behind, timeout=PATIENCE) as server:
+        with socket.create_connection(self._behind, timeout=patience) as server:
             for connection in (client, server):
                 connection.settimeout(None)
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -175,9 +171,7 @@ fewer. Samples not sent in one second can be made up for in the next."""
 
 
 class Tail:
-    """The samples of a feed since the last read.
-    Their time stamps start from the wall clock `now` [s].
-    """
+    """The samples of a feed since the last read, with time stamps from the wall clock `now` [s]."""
 
     def __init__(self, feed: Feed, now: Callable[[], float] = time.time) -> None:
         self._feed, self._now = feed, now
@@ -248,14 +242,9 @@ _LOG = {
 }
 """The part used of Foxglove's own schema foxglove.Log, which its log panel shows."""
 
-_INFO = 2
-
 
 class FoxgloveView:
-    """Topics `/drive` (one message a sample) and `/log` (the lines of status).
-    It listens on `host` and `port`; clients see `name`. Raises `SettingError` without the package
-    foxglove-sdk, or for a port that is taken.
-    """
+    """Topics `/drive` (one message a sample) and `/log` (the lines of status)."""
 
     def __init__(self, host: str, port: int, name: str) -> None:
         try:
@@ -284,7 +273,6 @@ class FoxgloveView:
 
     @property
     def port(self) -> int:
-        """Port for clients."""
         return self._gate.port
 
     def run(self, feed: Feed) -> None:
@@ -324,7 +312,7 @@ def _send(tail: Tail, drive: Any, log: Any) -> None:
     for text in tail.notes():
         at = round((stamp or tail.now) * 1e9)
         time = {"sec": at // 10**9, "nsec": at % 10**9}
-        message = {"timestamp": time, "level": _INFO, "message": text, "name": "sewfast"}
+        message = {"timestamp": time, "level": 2, "message": text, "name": "sewfast"}
         log.log(encode(message), log_time=at)
 
 

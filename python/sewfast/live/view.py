@@ -87,17 +87,14 @@ def _refusal(text: str) -> SettingError:
 # --- The process of a view: it reads the feed's memory, and the notes from a pipe -----------------
 
 
-_NICE = 5
-"""Lower priority than the link's when both need the processor."""
-
-
 def main() -> None:
     """Show a feed until the pipe on standard input ends.
     The arguments are the descriptor of the memory, the feed and the kind as JSON. The answer on
     standard output is a line of JSON: the view's port, or why there is none.
     """
     with contextlib.suppress(AttributeError, OSError):
-        os.nice(_NICE)
+        # lower priority than the link's when both need the processor
+        os.nice(5)
     feed = Feed.attached(int(sys.argv[1]), json.loads(sys.argv[2]))
     try:
         view = make(ViewKind(**json.loads(sys.argv[3])), feed)
@@ -126,8 +123,6 @@ def _listen(feed: Feed) -> None:
 CLOSE_S = 0.5
 """Longest wait at the end of a `with` for a view that hangs [s]."""
 
-START_S = 20.0
-"""Longest wait at its beginning for the view to start [s]."""
 
 _PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.live.view import main; main()"
 
@@ -238,7 +233,8 @@ def _stderr() -> int | None:
 def _answer(program: subprocess.Popen[bytes]) -> Shown:
     assert program.stdout is not None
     with program.stdout as pipe:
-        ready, _, _ = select.select([pipe], [], [], START_S)
+        # longest wait at its beginning for the view to start [s]
+        ready, _, _ = select.select([pipe], [], [], 20.0)
         line = pipe.readline() if ready else b""
     refusal = "live: expected a view that starts, received none; use --live none"
     answer: dict[str, Any] = json.loads(line) if line else {"error": refusal}
@@ -289,17 +285,13 @@ def report_failure(e: Exception) -> None:
 
 
 class View(Protocol):
-    """Shows a feed."""
-
     def run(self, feed: Feed) -> None:
         """Show the feed until it is closed; runs in its own thread or process."""
         ...
 
 
 def resolve(kind: ViewKind) -> ViewKind:
-    """Replace `auto` by `terminal` or `none`.
-    Raises `SettingError` for `terminal` if standard error is not a terminal.
-    """
+    """Replace `auto` by `terminal`, if standard error is one, or `none`."""
     terminal = sys.stderr is not None and sys.stderr.isatty()
     if kind.name == "auto":
         return ViewKind("terminal" if terminal else "none")
@@ -312,9 +304,7 @@ def resolve(kind: ViewKind) -> ViewKind:
 
 
 def make(kind: ViewKind, feed: Feed) -> View | None:
-    """The view of a kind; None for `none`. Raises `SettingError` as `resolve`, and for a host
-    without an address, a port that is taken or a missing package.
-    """
+    """The view of a kind; None for `none`."""
     kind = resolve(kind)
     if kind.name == "terminal":
         return TerminalView(sys.stderr)
@@ -333,10 +323,6 @@ def make(kind: ViewKind, feed: Feed) -> View | None:
 
 
 # --- Tty: writing to a terminal without blocking on it --------------------------------------------
-
-
-_SLICE_S = 0.05
-"""Longest wait before it is checked whether to wait on [s]."""
 
 
 class Tty:
@@ -374,7 +360,8 @@ class Tty:
     def _write_some(self, rest: memoryview) -> int:
         """Bytes written; 0 if the terminal took none for a moment."""
         # on Windows, select works for sockets only
-        if os.name != "nt" and not select.select([], [self._fd], [], _SLICE_S)[1]:
+        # longest wait before it is checked whether to wait on [s]
+        if os.name != "nt" and not select.select([], [self._fd], [], 0.05)[1]:
             return 0
         try:
             return os.write(self._fd, rest)
@@ -436,13 +423,6 @@ def _is_one_cell(c: str) -> bool:
 # --- TerminalView: the status line while the feed is open -----------------------------------------
 
 
-PERIOD_S = 0.1
-"""Time between two lines [s]."""
-
-_PATIENCE_S = 0.2
-"""Longest wait for a blocked terminal once the record has ended [s]."""
-
-
 class TerminalView:
     """A status line on a terminal, with the feed's notes written above it.
     It moves the cursor only by carriage returns, which every terminal knows, and changes no mode:
@@ -457,7 +437,8 @@ class TerminalView:
     def run(self, feed: Feed) -> None:
         """Write until the feed is closed, then once more."""
         try:
-            while not feed.closed.wait(PERIOD_S):
+            # time between two lines [s]
+            while not feed.closed.wait(0.1):
                 self._write(feed)
             self._write(feed, end="\r\n")
         finally:
@@ -482,6 +463,7 @@ class TerminalView:
         def wait() -> bool:
             if feed.closed.is_set() and not ended:
                 ended.append(time.monotonic())
-            return not ended or time.monotonic() - ended[0] < _PATIENCE_S
+            # longest wait for a blocked terminal once the record has ended [s]
+            return not ended or time.monotonic() - ended[0] < 0.2
 
         return wait

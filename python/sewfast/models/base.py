@@ -239,8 +239,6 @@ class StructuredModel(SingleModel):
 Combine: TypeAlias = Literal["median", "mean"]
 COMBINATIONS: tuple[Combine, ...] = ("median", "mean")
 MOST_MEMBERS = 1000
-LEAST_SHARE = 0.5
-"""Part of the members that must not diverge for the ensemble to have a run."""
 _OF_ALL_MEMBERS = ("input_range", "output_range", "region", "rest", "noise", "verdict")
 """Entries that a file stores once for all members."""
 
@@ -306,7 +304,8 @@ class EnsembleCore:
                 found.append(run(member, x))
             except FitError as e:
                 reason = e
-        if len(found) < LEAST_SHARE * len(self.members):
+        # part of the members that must not diverge for the ensemble to have a run
+        if len(found) < 0.5 * len(self.members):
             raise FitError(
                 f"expected at least half of {len(self.members)} members to stand this input, "
                 f"received {len(found)} ({reason}); identify from data that cover it"

@@ -15,11 +15,6 @@ from ..errors import SettingError, not_installed
 # --- ContinuousModel: the differential equation behind a zero-order hold --------------------------
 
 
-NODES = 8
-"""Nodes of the quadrature, the [8/8] Pade approximant: exact to rounding within 0.25 of I."""
-NEAR = 0.25
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class ContinuousModel:
     """dx/dt = A x + B u(t - dead_time), y = C x + D u(t - dead_time), in deviations.
@@ -97,10 +92,11 @@ def logarithm(matrix: FloatArray) -> FloatArray:
     11). `log(I + X) = int_0^1 X (I + t X)^-1 dt`, and the logarithm of a square root is half of it.
     """
     eye, roots = np.eye(len(matrix)), 0
-    while np.linalg.norm(matrix - eye, 1) > NEAR and roots < 60:
+    while np.linalg.norm(matrix - eye, 1) > 0.25 and roots < 60:
         matrix, roots = _square_root(matrix), roots + 1
     x = matrix - eye
-    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    # the [8/8] Pade approximant: exact to rounding within .25 of I
+    nodes, weights = np.polynomial.legendre.leggauss(8)
     terms = (
         w / 2 * np.linalg.solve(eye + (t + 1) / 2 * x, x)
         for t, w in zip(nodes, weights, strict=True)
@@ -158,10 +154,7 @@ def transfer_function(core: _core.LinearModel) -> tuple[FloatArray, FloatArray]:
 
 
 def difference_equation(num: ArrayLike, den: ArrayLike, offset: float) -> _core.LinearModel:
-    """The model of a transfer function in powers of z^-1, the inverse of `transfer_function`.
-    Leading zeros common to all numerators become the delay; trailing ones are dropped. Raises
-    `SettingError` if the denominator begins with zero.
-    """
+    """The model of a transfer function in z^-1: common leading zeros are the delay."""
     numerators, denominator = np.atleast_2d(_finite(num, "num")), _finite(den, "den")
     if numerators.ndim != 2 or denominator.ndim != 1 or 0 in (numerators.size, denominator.size):
         raise SettingError(
@@ -224,10 +217,7 @@ def from_state_space(
 def with_common_denominator(
     numerators: list[FloatArray], denominators: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Fractions in descending powers of z, one per input, as rows in z^-1 over one denominator.
-    Raises `SettingError` if a numerator has a higher degree than its denominator, which is not
-    causal.
-    """
+    """Fractions in descending powers of z, one per input, as rows in z^-1 over one denominator."""
     distinct: list[FloatArray] = []
     for den in denominators:
         if not any(np.array_equal(den, other) for other in distinct):
@@ -255,9 +245,7 @@ def in_descending_powers(core: _core.LinearModel) -> tuple[list[FloatArray], Flo
 
 
 def offset_at(core: _core.LinearModel, u0: ArrayLike, y0: float) -> float:
-    """The offset that makes (u0, y0) a steady point: `(1 + sum a) y0 - sum_j u0_j sum_i b_ji`.
-    Raises `SettingError` if `u0` has not one finite value per input.
-    """
+    """The offset that makes (u0, y0) a steady point: `(1 + sum a) y0 - sum_j u0_j sum_i b_ji`."""
     u = np.atleast_1d(_finite(u0, "operating point"))
     if u.shape != (len(core.b),):
         raise SettingError(
@@ -356,9 +344,7 @@ def scipy_system(numerators: list[FloatArray], den: FloatArray, s: StateSpace, T
 
 
 def polynomials_of(system: Any, Ts: float | None) -> tuple[FloatArray, FloatArray, float]:
-    """Numerators and denominator in powers of z^-1, and the sample time [s], of a system's object.
-    Raises `SettingError` for continuous time, several outputs or no sample time.
-    """
+    """Numerators and denominator in powers of z^-1 of a system, and its sample time [s]."""
     dt = _sample_time(getattr(system, "dt", None), Ts)
     if all(hasattr(system, name) for name in "ABCD"):
         num, den = from_state_space(system.A, system.B, system.C, system.D)

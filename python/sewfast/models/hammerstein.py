@@ -12,16 +12,9 @@ from ..dataset import FloatArray
 from ..storage import Fields
 from .base import StructuredModel
 
-PIECES = 8
-"""Pieces of a curve, unless `identify` is given a number."""
-_SAMPLES = 5
-"""Points of a drawn curve for each piece."""
-
 
 class Characteristic(NamedTuple):
-    """A static curve: `name` is that of its input, or of the output; `x` and `y` are points on the
-    curve, including the knots.
-    """
+    """A static curve through `x` and `y`, knots included, of an input or the output by `name`."""
 
     name: str
     x: FloatArray
@@ -71,13 +64,15 @@ class HammersteinWiener(StructuredModel):
 
     def characteristics(self) -> tuple[Characteristic, ...]:
         """The curve of each input, then that of the output, over their training ranges."""
+        # points of a drawn curve for each piece
+        samples = 5
         s = self.settings
         ends = zip(self.input_names, s["input_low"], s["input_high"], strict=True)
         found = []
         for j, (name, low, high) in enumerate(ends):
-            u = np.linspace(low, high, _SAMPLES * s["input_pieces"] + 1)
+            u = np.linspace(low, high, samples * s["input_pieces"] + 1)
             found.append(Characteristic(name, u, self.core.input_curve(j, u)))
-        x = np.linspace(s["x_low"], s["x_high"], _SAMPLES * s["output_pieces"] + 1)
+        x = np.linspace(s["x_low"], s["x_high"], samples * s["output_pieces"] + 1)
         return (*found, Characteristic(self.output_name, x, self.core.output_curve(x)))
 
     def parameters(self) -> dict[str, Any]:
@@ -121,7 +116,8 @@ class HammersteinWiener(StructuredModel):
     @staticmethod
     def structures(size: int | None) -> tuple[Mapping[str, int], ...]:
         """A curve before the dynamics, one behind them, or both, with `size` pieces each."""
-        n = PIECES if size is None else size
+        # pieces of a curve, unless `identify` is given a number
+        n = 8 if size is None else size
         pairs = ((n, 1), (1, n), (n, n))
         return tuple({"input_pieces": i, "output_pieces": o} for i, o in pairs)
 

@@ -156,9 +156,7 @@ FLAT = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """The end of a descent: parameters `x` (n,) and their sum of squares `cost`.
-    `left` is the squared distance to the minimum in standard errors, by the linear model.
-    """
+    """Parameters `x` (n,), their `cost`, and the squared distance `left` in standard errors."""
 
     x: FloatArray
     cost: float

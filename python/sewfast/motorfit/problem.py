@@ -245,7 +245,6 @@ class Problem:
 
     @property
     def count(self) -> int:
-        """Residuals."""
         return self.records.used * (2 if self.has_current else 1)
 
     def outcome(self, state: State) -> tuple[FloatArray, ...]:
@@ -330,9 +329,7 @@ class Problem:
         return np.concatenate(found), moving
 
     def is_slow(self, state: State) -> bool:
-        """Whether the accelerating part of the command hardly changes compared with the whole.
-        A constant acceleration, as in a ramp, cannot be separated from dry friction.
-        """
+        """Whether the accelerating command hardly changes: a ramp's looks like dry friction."""
         rates = [np.diff(y) / self.records.Ts for y, *_ in self.simulated(state, ())]
         u = np.concatenate([p.u for p in self.records.pieces])
         effort = state.value("k_a") * float(np.std(np.concatenate(rates)))

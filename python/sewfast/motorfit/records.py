@@ -56,9 +56,7 @@ class Records:
     spikes: int
 
     def liveliest(self, n: int) -> Records:
-        """The `n` consecutive samples whose speed varies most; all if there are no more.
-        The pieces are views: a sample left out of one is left out of the other.
-        """
+        """The `n` consecutive samples whose speed varies most, as views of the pieces; or all."""
         if sum(len(p.u) for p in self.pieces) <= n:
             return self
         windows = [
@@ -87,10 +85,7 @@ def rad_per_second(unit: str) -> float:
 def records_of(
     data: Recording | Dataset, current: str | ArrayLike | None, speed_unit: str | None
 ) -> Records:
-    """The records to fit.
-    Raises `DataError` if no usable samples are left or a current is missing, and `SettingError`
-    without a unit of the speed.
-    """
+    """The records to fit."""
     if isinstance(data, Recording):
         return _of_recording(data, current, speed_unit)
     if not isinstance(data, Dataset):

@@ -90,9 +90,7 @@ Smoothed: TypeAlias = tuple[FloatArray, FloatArray, NDArray[np.bool_]]
 
 
 def _smoothed(records: Records, width: float) -> list[Smoothed]:
-    """Signals smoothed by a bell of this width, for pieces that are longer.
-    The derivative of the bell replaces that of the speed (modulating functions, Shinbrot 1957).
-    """
+    """Signals smoothed by a bell, and its derivative for theirs (Shinbrot 1957), if long enough."""
     half = math.ceil(3.0 * width)
     k = np.arange(-half, half + 1)
     bell = np.exp(-0.5 * (k / width) ** 2)

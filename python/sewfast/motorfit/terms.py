@@ -55,11 +55,10 @@ WORSE = 1.1
 
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """Result of the fit of a motor.
-    `state` has all parameters at the least-squares solution and the terms that are shown;
-    `covariance` (n, n) is that of its free parameters. `reasons` says why the record does not show
-    a term (or the inertia). `records` have estimated initial speeds and no spikes; `problem` is
-    that of the final fit.
+    """Result of the fit of a motor. `state` has all parameters at the least-squares solution and
+    the terms that are shown; `covariance` (n, n) is that of its free parameters. `reasons` says why
+    the record does not show a term (or the inertia). `records` have estimated initial speeds and no
+    spikes; `problem` is that of the final fit.
     """
 
     state: State
@@ -160,9 +159,7 @@ def _refined(
 
 
 def _trued(records: Records, *, c: float, s: float) -> Records:
-    """Records with angles of the shaft instead of those shown by an eccentric encoder.
-    Otherwise a wave of order n would have sidebands at n - 1 and n + 1.
-    """
+    """Records with the shaft's angle: an eccentric encoder's makes sidebands of every wave."""
     if c == 0.0 and s == 0.0:
         return records
     pieces = [
@@ -377,10 +374,9 @@ Values = Mapping[str, float]
 def profiled(
     found: Estimated, of: Callable[[Values], float], slope: FloatArray, half: float
 ) -> tuple[float, float]:
-    """Ends of the 95 % interval of a quantity.
-    `of` is the quantity as a function of all parameters by name and the resistance `R`, and `slope`
-    (n,) are its derivatives with respect to the free parameters. The search starts at `half`, the
-    half-width of the interval by curvature, above 0.
+    """Ends of the 95 % interval of a quantity. `of` is the quantity as a function of all parameters
+    by name and the resistance `R`, and `slope` (n,) are its derivatives with respect to the free
+    parameters. The search starts at `half`, the half-width of the interval by curvature, above 0.
     """
     problem, state = found.problem, found.state
     x = state.vector()

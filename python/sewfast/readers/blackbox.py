@@ -21,8 +21,6 @@ from ..arrays import FloatArray
 
 BLACKBOX = b"H Product:Blackbox"
 SALEAE = b"<SALEAE>"
-_MOST_FIELDS = 512
-_MOST_NUMBERS = 500_000_000
 _FRAMES = frozenset(b"IPSGHE")
 
 
@@ -143,8 +141,6 @@ _ENCODINGS: dict[int, tuple[Callable[[_Bytes, int], list[int]], int]] = {
     10: (_tag2_3svariable, 3),
 }
 """By number in the header: the reader of a group of fields, and the size of such a group."""
-_WHOLE = (7, 8, 10)
-"""Encodings whose groups have all their fields."""
 
 
 # --- Black box: fields and frames -----------------------------------------------------------------
@@ -171,7 +167,8 @@ class _Frame:
             count = 1
             while count < most and self.encodings[k + count : k + count + 1] == [encoding]:
                 count += 1
-            if encoding in _WHOLE and count < most:
+            # encodings whose groups have all their fields
+            if encoding in (7, 8, 10) and count < most:
                 raise ValueError(f"encoding {encoding} with {count} fields, expected {most}")
             found += read(data, count)
             k += count
@@ -232,7 +229,7 @@ def _header(raw: bytes, at: int) -> tuple[_Header, int]:
             continue
         frame = found.frames.setdefault(match[1], _Frame())
         parts = value.split(",")
-        if len(parts) > _MOST_FIELDS:
+        if len(parts) > 512:
             raise ValueError(f"frames of {len(parts)} fields")
         if match[2] == "name":
             frame.names = parts
@@ -275,7 +272,7 @@ def _flight(header: _Header, data: _Bytes) -> tuple[list[str], array[int]]:
     except ValueError:
         part, whole = 1, 1
     part, whole = max(part, 1), max(whole, 1)
-    while data.at < len(data.raw) and len(rows) < _MOST_NUMBERS:
+    while data.at < len(data.raw) and len(rows) < 500_000_000:
         start = data.at
         kind = chr(data.byte())
         try:

@@ -25,28 +25,11 @@ MAX_COLUMNS = 10_000
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Table:
-    """Columns of one file by name; `table["speed"]` is a float64 array of shape (N,).
-
-    Attributes
-    ----------
-    columns : mapping of name to array
-        Columns can differ in length if the format allows it (`.mat`, `.npz`).
-    units : mapping of name to text
-        From headers such as `u [V]` or `speed (RPM)`; absent where unknown.
-    unusable : mapping of name to text
-        Columns without a usable series of numbers, each with the reason.
-    lines : sequence of int or None
-        Line of each row in a text file, 1-based.
-    Ts : float or None
-        Sample time [s] where the file states it.
-    Ts_source : str
-        The place of that statement, for messages.
-    notes : sequence of str
-        Rows and columns left out when the file was read.
-    counts_per_rev : float or None
-        Encoder counts of one turn, of the column `counts`, where the file states it.
-    moments : sequence of str
-        Columns that were dates or times of day, now in seconds from the first one.
+    """Columns of one file by name; `table["speed"]` is a float64 array of shape (N,), and lengths
+    can differ if the format allows it. `units` come from headers, `unusable` has the reason for
+    columns without numbers, `lines` the row's line in a text (1-based), `notes` what was left out.
+    `Ts` [s] and `counts_per_rev` are what the file states, at `Ts_source`; `moments` are columns
+    that were dates or times, in seconds from the first one.
     """
 
     path: Path
@@ -74,9 +57,7 @@ class Table:
         return f"Table({self.path.name!r}: {', '.join(self.names)})"
 
     def resolve(self, name: str) -> str:
-        """The column's own name for `name`, which can also be the whole header (`u [V]`).
-        Raises `DataError` if the file has no such column, or it cannot be used.
-        """
+        """The column's own name for `name`, which can also be the whole header (`u [V]`)."""
         name = printable(name)
         for candidate in (name, split_unit(name)[0]):
             if candidate in self.columns:
@@ -157,8 +138,6 @@ def freeze(values: np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> FloatAr
 
 
 _MAX_DEPTH = 16
-MAX_UNPACKED = 1 << 30
-"""Bytes: 64 columns of two million samples."""
 Value: TypeAlias = Any
 """An array, a mapping of field to value (a struct) or a list of values (struct array, cell)."""
 
@@ -168,12 +147,14 @@ def read_npz(path: Path, raw: bytes) -> Table:
     An archive can unpack to a thousand times its size. The claimed sizes of its members are
     therefore checked before any is unpacked, and a member never yields more than it claims.
     """
+    # bytes: 64 columns of two million samples
+    max_unpacked = 1 << 30
     try:
         with np.load(io.BytesIO(raw), allow_pickle=False) as archive:
             claimed = sum(member.file_size for member in archive.zip.infolist())
-            if claimed > MAX_UNPACKED:
+            if claimed > max_unpacked:
                 raise DataError(
-                    f"{path}: expected arrays of at most {MAX_UNPACKED >> 20} MB in all, received "
+                    f"{path}: expected arrays of at most {max_unpacked >> 20} MB in all, received "
                     f"{claimed >> 20} MB; save the columns that are needed, or a part of the time"
                 )
             return _table(path, {name: _npz_member(archive, name) for name in archive.files})

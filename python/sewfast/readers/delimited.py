@@ -18,8 +18,6 @@ from .containers import MAX_COLUMNS, Table, from_headers, split_units
 from .timebase import is_moment, seconds_of_texts
 
 MAX_LINE = 1_000_000
-_PREAMBLE = 200
-"""Lines within which the numbers of a table must begin for lines above its header to be skipped."""
 _MISSING = frozenset(
     re.split(" ", "nan na n/a <na> #n/a #na #nv null none nat - -- 1.#qnan -1.#ind 1.#ind")
 ) | {""}
@@ -30,10 +28,6 @@ _WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
 _MARKED = re.compile(r"[+-]?\d[\d.,]*(?:e[+-]?\d+)?", re.IGNORECASE)
 _APART = re.compile(r"[+-]?\d{1,3}(?:['’\u00a0\u2009\u202f ]\d{3})+(?=[.,]\d|$)")
 """Digits in groups of three, separated by marks with no other meaning."""
-_FOOTER = 20
-"""Most lines below a table that are left out if they have fewer cells."""
-_COMPARED = 1000
-"""Lines with which the last one is compared."""
 CORRUPT = 0.01
 """Part of the lines that can be corrupt, as serial ports lose characters: they are skipped."""
 
@@ -169,13 +163,14 @@ def _layout(path: Path, text: str) -> _Layout:
 
 
 def _below_preamble(path: Path, text: str) -> _Layout | None:
-    """The layout of a table with lines above its header.
-    None where the table begins in the first line with content, or where its beginning is not clear:
-    the first line is then the header.
+    """The layout of a table with lines above its header. None where the table begins in the first
+    line with content, or where its beginning is not clear: the first line is then the header.
     """
     lines: list[tuple[int, str]] = []
     for offset, line in _lines(text):
-        if len(line) > MAX_LINE or len(lines) >= _PREAMBLE:
+        # lines within which the numbers of a table must begin for lines above its header to be
+        # skipped
+        if len(line) > MAX_LINE or len(lines) >= 200:
             return None
         lines.append((offset, line))
         at = len(lines) - 1
@@ -328,8 +323,10 @@ def _whole(layout: _Layout) -> _Layout:
     """The layout without a last line that was cut off: it has no line end, and fewer cells or, in
     its last cell, fewer decimals than all the lines above it.
     """
+    # lines with which the last one is compared
+    compared = 1000
     body, _, last = layout.body.rpartition("\n")
-    above = body.rsplit("\n", _COMPARED)[-_COMPARED:]
+    above = body.rsplit("\n", compared)[-compared:]
     # as of corrupt lines, at most a hundredth
     if len(above) < 1.0 / CORRUPT or not last.strip():
         return layout
@@ -470,7 +467,8 @@ def _rows(
         rows.append(cells)
     below = [o for o in other if lines and o[0] > lines[-1]]
     # a footer is a few shorter lines
-    if len(below) > _FOOTER or any(len(cells) > width for _, cells in below):
+    # most lines below a table that are left out if they have fewer cells
+    if len(below) > 20 or any(len(cells) > width for _, cells in below):
         below = []
     corrupt = other[: len(other) - len(below)]
     if corrupt and len(corrupt) > CORRUPT * (len(rows) + len(corrupt)):

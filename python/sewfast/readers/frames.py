@@ -30,7 +30,6 @@ def table_of(frame: Any) -> Table:
     pyarrow reads anything with `__arrow_c_stream__`. A pandas index becomes a column if it is named
     or holds moments, `t` without a name; of several levels only the named ones do. Units are from
     headers such as `u [V]`, `attrs["units"]` (pandas, xarray) or a field's metadata `unit` (Arrow).
-    Raises `DataError` without rows or numbers, `SettingError` for other objects or without pyarrow.
     """
     kinds = {c.__module__.partition(".")[0] for c in type(frame).__mro__}
     if "polars" in kinds and hasattr(frame, "collect"):

@@ -31,13 +31,8 @@ from ..storage import file_bytes
 from .blackbox import BLACKBOX, SALEAE, blackbox_series, saleae_series
 from .containers import MAX_COLUMNS, Table, freeze
 
-LARGEST = 50_000_000
-"""Most rows of a table."""
 PATIENCE, PATIENCE_PER_MB = 20.0, 5.0
 """Time limit of a reader, and addition per megabyte of the file [s]."""
-MEMORY, MEMORY_PER_BYTE = 2_000_000_000, 50
-"""Memory limit of a reader, and addition per byte of the file [B]: a damaged length field can make
-it request any amount."""
 _DEPTH = 8
 """Deepest nesting of messages that is read."""
 _ELEMENTS = 64
@@ -60,10 +55,7 @@ def is_log(raw: bytes) -> bool:
 
 
 def read_log(path: Path, raw: bytes) -> Table:
-    """Read every signal of a log.
-    Raises `DataError` if it is damaged or holds no series of numbers, and `SettingError` if its
-    package is not installed.
-    """
+    """Read every signal of a log."""
     name = _kind_of(raw)
     assert name is not None
     kind = _KINDS[name]
@@ -108,13 +100,14 @@ def _from_a_process(path: Path, raw: bytes, name: str) -> list[Signal]:
 
 
 def send(name: str) -> None:
-    """Write the signals of the file named on the command line to stdout, as `.npz`.
-    This is the whole program of a reader's process.
-    """
+    """The program of a reader's process: the signals of the file in argv to stdout, as `.npz`."""
+    # memory limit of a reader, and addition per byte of the file [B]: a damaged length field can
+    # make it request any amount
+    memory, memory_per_byte = 2_000_000_000, 50
     out, sys.stdout = sys.stdout.buffer, sys.stderr
     path = Path(sys.argv[1])
     raw = file_bytes(path)
-    _bound_memory(MEMORY + MEMORY_PER_BYTE * len(raw))
+    _bound_memory(memory + memory_per_byte * len(raw))
     arrays: dict[str, Any] = {}
     texts: list[str] = []
     for k, signal in enumerate(_KINDS[name].signals(path, raw)):
@@ -141,9 +134,9 @@ def _bound_memory(most: int) -> None:
 
 
 def joined(path: Path, signals: Sequence[Signal], kind: str) -> Table:
-    """One table of all signals; time is its column `t`, from the first sample of any.
-    Raises `DataError` if there is no series of numbers, or there are too many.
-    """
+    """One table of all signals; time is its column `t`, from the first sample of any."""
+    # most rows of a table
+    largest = 50_000_000
     names = _unique([printable(s.name) for s in signals])
     usable: dict[str, Signal] = {}
     unusable: dict[str, str] = {}
@@ -165,8 +158,8 @@ def joined(path: Path, signals: Sequence[Signal], kind: str) -> Table:
         return Table(path, columns, units, unusable)
     main = max(timed.values(), key=lambda s: len(s.values))
     assert main.t is not None
-    if len(main.t) > LARGEST:
-        raise DataError(f"{path}: expected at most {LARGEST} rows, received {len(main.t)}")
+    if len(main.t) > largest:
+        raise DataError(f"{path}: expected at most {largest} rows, received {len(main.t)}")
     columns, held = {}, 0
     for name, signal in timed.items():
         assert signal.t is not None
@@ -283,9 +276,7 @@ def _rosbag(path: Path, raw: bytes) -> Iterator[Signal]:
 
 
 def _mcap(path: Path, raw: bytes) -> Iterator[Signal]:
-    """MCAP files with JSON messages: `/topic.field`, stamped when they were logged.
-    Topics in other encodings are listed without values.
-    """
+    """MCAP's messages in JSON: `/topic.field`, stamped when they were logged."""
     from mcap.reader import make_reader
 
     series: dict[str, tuple[list[int], list[float]]] = {}

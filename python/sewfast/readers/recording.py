@@ -41,10 +41,7 @@ LOG = logging.getLogger("sewfast")
 
 
 def read_parquet(path: Path, raw: bytes) -> Table:
-    """Read the numeric columns of a Parquet file; nulls are NaN.
-    Raises `DataError` if the file is damaged or has no rows, and `SettingError` if pyarrow is not
-    installed.
-    """
+    """Read the numeric columns of a Parquet file; nulls are NaN."""
     try:
         import pyarrow.parquet as pq
     except ImportError as e:
@@ -63,9 +60,7 @@ def read_parquet(path: Path, raw: bytes) -> Table:
 
 
 def read_mcap(path: Path, raw: bytes) -> Table:
-    """Time and columns of a recording, NaN in its gaps and where it is damaged.
-    Raises `DataError` if the file is not a recording of sewfast, or has no samples.
-    """
+    """Time and columns of a recording, NaN in its gaps and where it is damaged."""
     found = decode_recording(path, raw)
     columns = {name: freeze(c) for name, c in found.table_columns().items()}
     header = found.header
@@ -84,10 +79,7 @@ OWN = frozenset({"csv", "tsv", "txt", "mat", "npz", "npy", "parquet", "mcap", "x
 
 
 def read_installed(path: Path) -> Table | None:
-    """Read a file by the installed package that handles its ending; None if there is none.
-    Raises `DataError` if the package's function fails or returns no table of numbers, and
-    `SettingError` if several packages handle the ending or the function cannot be imported.
-    """
+    """Read a file by the installed package that handles its ending; None if there is none."""
     ending = path.suffix.lower().removeprefix(".")
     if not ending or ending in OWN:
         return None

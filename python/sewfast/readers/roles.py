@@ -121,9 +121,7 @@ def recognised(
     counts: str | None = None,
     time: str | None = None,
 ) -> Roles:
-    """Input and output of a table, as `roles`; raises `DataError` where they are in doubt.
-    There is no output if inputs are named and none is recognised.
-    """
+    """Input and output of a table, as `roles`; `DataError` where they are in doubt."""
     found = roles(table, inputs=inputs, output=output, counts=counts, time=time)
     if found is None and inputs:
         return Roles(inputs[0], None)

@@ -21,9 +21,6 @@ TOLERANCE = 0.01
 """Part of the period by which even steps can differ from it."""
 GAP = 3.5
 """Steps of more periods than this are gaps, in which nothing is known."""
-LATEST = 1e300
-"""Largest time [s]; sums of larger ones would overflow."""
-_MOST_PER_ROW = 100
 _SECONDS = {
     "": 1.0, "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3,
     "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "usec": 1e-6, "ns": 1e-9, "min": 60.0,
@@ -47,7 +44,6 @@ _NUMBER = re.compile(
     r"idx|no|nr|seq(uence)?|counter|n|k"
 )
 """Names of a column that numbers the rows, if its numbers do (`numbers_rows`)."""
-_SMALLER = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
 LONG, ABSURD, SHORT = 0.5, 900.0, 1e-5
 """Sample times [s] of a time column without a unit, read as seconds. From `LONG` on, a warning says
 that the unit can be another one: drives are sampled every 20 us to 200 ms, so a column that counts
@@ -72,11 +68,10 @@ class TimeBase:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """An even grid over uneven time stamps.
-    `count` is the number of the table's rows; `rows` are the indices of those used, of several with
-    one time stamp the last, and `t` (rows,) their times [s], the first at 0. `Ts` is the step of
-    the grid [s], and `period` the median step of the time stamps [s]. If `exact`, every row lies on
-    the grid: nothing is interpolated, rows are missing.
+    """An even grid over uneven time stamps. `count` is the number of the table's rows; `rows` are
+    the indices of those used, of several with one time stamp the last, and `t` (rows,) their times
+    [s], the first at 0. `Ts` is the step of the grid [s], and `period` the median step of the time
+    stamps [s]. If `exact`, every row lies on the grid: nothing is interpolated, rows are missing.
     """
 
     count: int
@@ -261,9 +256,7 @@ def _jumps(table: Table, name: str) -> Iterator[str]:
 
 
 def time_base(table: Table, given: float | None, column: str | None = None) -> TimeBase:
-    """Sample time and, where its time stamps are uneven, a grid for a table, as `_time_base`.
-    Where the time shows no lost rows, a column that numbers them can, which the notes state.
-    """
+    """`_time_base`, with the rows that a column of numbers shows as lost."""
     base = _time_base(table, given, column)
     if base.grid is not None and base.grid.exact:
         return base
@@ -349,12 +342,12 @@ def _unit(table: Table, name: str) -> tuple[float | None, tuple[str, ...]]:
 def _guessed(
     table: Table, name: str, step: float, given: float | None
 ) -> tuple[float, tuple[str, ...]]:
-    """Seconds per unit of a time column that states no unit, from its median step.
-    The unit is seconds, unless the caller's sample time fits a smaller one. Steps that are long for
-    a drive cause a warning, since the column then probably counts milliseconds. Raises
-    `SettingError` if seconds would make a sample time that no machine uses.
+    """Seconds per unit of a time column that states no unit, from its median step. The unit is
+    seconds, unless the caller's sample time fits a smaller one. Steps that are long for a drive
+    cause a warning, since the column then probably counts milliseconds.
     """
-    for unit, scale in _SMALLER if given is not None and given < 0.01 * step else ():
+    smaller = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
+    for unit, scale in smaller if given is not None and given < 0.01 * step else ():
         # not for a grid far finer than the rows
         if given is not None and 0.5 * given < step * scale < 2.0 * given:
             return scale, (f"{table.path.name}: column {name!r} counts {unit}, according to Ts",)
@@ -362,7 +355,7 @@ def _guessed(
         return 1.0, ()
     ways = " or ".join(
         f"--ts {step * scale:.3g} if it counts {unit}"
-        for unit, scale in _SMALLER
+        for unit, scale in smaller
         if SHORT <= step * scale < LONG
     )
     if step >= ABSURD:
@@ -380,10 +373,7 @@ def _guessed(
 
 
 def _seconds(table: Table, name: str, unit: float) -> FloatArray:
-    """Times [s] from 0 on, never decreasing.
-    Raises `DataError` for fewer than two times, values that are not finite, or a time that goes
-    back.
-    """
+    """Times [s] from 0 on, never decreasing."""
     raw = table[name]
     if len(raw) < 2:
         raise DataError(
@@ -398,7 +388,8 @@ def _seconds(table: Table, name: str, unit: float) -> FloatArray:
     with np.errstate(over="ignore", invalid="ignore"):
         t: FloatArray = (raw - raw[0]) * unit
         steps = np.diff(t)
-    if not (np.abs(t) <= LATEST).all():
+    # largest time [s]; sums of larger ones would overflow
+    if not (np.abs(t) <= 1e300).all():
         raise DataError(
             f"{table.path}: column {name!r}: expected times within the numbers, received "
             f"{raw.min():g} to {raw.max():g}; check the column"
@@ -445,7 +436,7 @@ def _grid(table: Table, name: str, t: FloatArray, period: float, given: float | 
         and (given is None or abs(given - fitted) <= TOLERANCE * given)
     )
     Ts = fitted if exact else period if given is None else float(given)
-    most = max(_MOST_PER_ROW * len(t), 10_000)
+    most = max(100 * len(t), 10_000)
     # in this order: a quotient of the largest time stamps would not be finite
     if not t[-1] < most * Ts:
         k = int(np.argmax(np.diff(t)))

@@ -24,7 +24,6 @@ from .header import Header, bearable
 # --- Sink: a file that grows by whole pieces ------------------------------------------------------
 
 
-_BATCH = 1 << 16
 _LOCKED = 0x7FFF_0000
 """The byte to lock on Windows, beyond any recording: others cannot read locked bytes there."""
 
@@ -65,9 +64,7 @@ def require_writable(path: Path, *, overwrite: bool) -> None:
 
 
 def _own(path: Path, file: int) -> None:
-    """Lock an open file: two recorders would overwrite each other's chunks.
-    Raises `SettingError` if another recorder holds the lock.
-    """
+    """Lock an open file: two recorders would overwrite each other's chunks."""
     try:
         _lock(file)
     except BlockingIOError:
@@ -82,9 +79,7 @@ def _own(path: Path, file: int) -> None:
 
 
 def _lock(file: int, *, free: bool = False) -> None:
-    """Take or release the lock of an open file; the code for Windows has not run there.
-    Raises `BlockingIOError` if another process holds it.
-    """
+    """Take or release a lock (never run on Windows); `BlockingIOError` if another holds it."""
     try:
         import fcntl
     except ImportError:
@@ -122,10 +117,7 @@ def _folder(path: Path) -> DataError:
 
 
 class Sink:
-    """An open file; a piece that cannot be written completely is removed again.
-    Raises `SettingError` if the file exists and `overwrite` is False, or another recorder is
-    writing to it, and `DataError` if it cannot be created.
-    """
+    """An open file; a piece that cannot be written completely is removed again."""
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         self.path = path
@@ -154,8 +146,8 @@ class Sink:
             raise
 
     def append(self, piece: bytes) -> None:
-        """Pass a piece to the operating system: from then on it survives `kill -9`.
-        Raises `OSError` if it does not fit; the file then ends before the piece.
+        """Pass a piece to the system, where it survives `kill -9`; `OSError`, and nothing, if it is
+        full.
         """
         rest = memoryview(piece)
         try:
@@ -182,7 +174,7 @@ def batched(pieces: Iterable[bytes]) -> Iterator[bytes]:
     batch = bytearray()
     for piece in pieces:
         batch += piece
-        if len(batch) >= _BATCH:
+        if len(batch) >= (1 << 16):
             yield bytes(batch)
             batch.clear()
     yield bytes(batch)
@@ -190,9 +182,7 @@ def batched(pieces: Iterable[bytes]) -> Iterator[bytes]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside a file, renamed to the file if the block succeeds.
-    Raises `DataError` if the file cannot be written.
-    """
+    """A temporary name beside a file, renamed to the file if the block succeeds."""
     temporary = path
     try:
         temporary, target = names(path)
@@ -224,8 +214,6 @@ MESSAGE_SAMPLES = 100
 """Samples at which a message is written."""
 OLDEST = 0.2
 """Longest wait of a sample for a full message [s]; the operating system gets it within .25 s."""
-MOST_WAITING = 10_000
-"""Most samples that wait for the disk before `put` blocks."""
 
 
 class Block(NamedTuple):
@@ -281,7 +269,8 @@ class Filing:
 
     def put(self, item: Item) -> None:
         """Queue an item; returns at once unless the disk is far behind."""
-        while self._given - self._received > MOST_WAITING and self.failure is None:
+        # most samples that wait for the disk before `put` blocks
+        while self._given - self._received > 10_000 and self.failure is None:
             time.sleep(0.001)
         self._items.put(item)
         if isinstance(item, Block):

@@ -36,9 +36,7 @@ class Topic(IntEnum):
 
 
 def schema(topic: Topic, columns: Mapping[str, str], *, single: bool = False) -> bytes:
-    """JSON schema of a topic's messages, for a recording with these columns.
-    `single` is for one message a sample: numbers in place of arrays.
-    """
+    """JSON schema of messages with these columns; `single` for one message a sample."""
     content = _object(**_PROPERTIES[topic]) if topic in _PROPERTIES else _samples(columns, single)
     return json.dumps({"title": topic.schema_name, **content}).encode()
 
@@ -107,10 +105,8 @@ EXACT = 2**53
 
 
 def numbers(name: str, values: object) -> list[Any]:
-    """A column as JSON values that parse to the same float64; NaN is null.
-    Whole numbers are written as such, float32 as the shortest text of the same float32. Raises
-    `DataError` for anything but one column of real numbers, for infinity and whole numbers above
-    2^53.
+    """A column as JSON values that parse to the same float64; NaN is null. Whole numbers are
+    written as such, float32 as the shortest text of the same float32.
     """
     array = np.asarray(values)
     if array.ndim != 1 or array.dtype.kind not in "biuf":
@@ -164,9 +160,7 @@ def dumps(content: Mapping[str, Any]) -> bytes:
 
 
 def parse(data: bytes) -> dict[str, Any]:
-    """A message's JSON object.
-    Raises `ValueError` if it is not a JSON object, or holds numbers that are not finite.
-    """
+    """A message's JSON object; `ValueError` for anything else, or numbers that are not finite."""
     try:
         content = json.loads(data, parse_constant=_refuse)
     except RecursionError as e:
@@ -188,9 +182,8 @@ class Block(NamedTuple):
 
 
 def decode(content: Mapping[str, Any], names: Iterable[str]) -> Block:
-    """The samples of a parsed message.
-    Raises `ValueError` if columns are missing or differ in length, numbers are not finite, or the
-    samples' numbers do not increase.
+    """The samples of a parsed message. Raises `ValueError` if columns are missing or differ in
+    length, numbers are not finite, or the samples' numbers do not increase.
     """
     index = _column(content, "index", (int,))
     if len(index) == 0 or index.min() < 0 or index.max() > EXACT or np.any(np.diff(index) <= 0):
@@ -266,7 +259,6 @@ def _text(text: str) -> bytes:
 
 
 def opening() -> bytes:
-    """The first bytes of a file."""
     return MAGIC + _record(HEADER, _text("") + _text(LIBRARY))
 
 
@@ -289,10 +281,7 @@ def _channel(topic: Topic) -> bytes:
 
 
 class Assembler:
-    """Chunks and the summary of one file, as bytes to append.
-    It keeps 47 bytes a chunk for the summary, so that its memory stays small over hours. Raises
-    `SettingError` if chunks are to be compressed and zstandard is not installed.
-    """
+    """Chunks and summary of one file, as bytes to append; 47 bytes a chunk stay in memory."""
 
     def __init__(
         self, columns: Mapping[str, str], *, single: bool = False, compress: bool = False

@@ -17,15 +17,10 @@ from ..errors import SettingError
 from ..storage import with_printable_texts
 
 FORMAT, VERSION = "sewfast.recording", 1
-MOST_COLUMNS = 256
 LARGEST_HEADER = 1 << 20
 """Bytes of the header as JSON."""
 MOST_MISSING = 50_000_000
 """Most values in all gaps of a recording together: a reader allocates them."""
-SHORTEST_TS, LONGEST_TS = 1e-9, 1e6
-"""Sample times [s]: the file counts nanoseconds."""
-LAST_NS = 2**64 - 1
-"""The last time that the file can state, in the year 2554."""
 _TAKEN = ("t", "index")
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
 
@@ -80,12 +75,14 @@ class Header:
     started: str = field(default_factory=now)
 
     def __post_init__(self) -> None:
+        # sample times [s]: the file counts nanoseconds
+        shortest_ts, longest_ts = 1e-9, 1e6
         if not isinstance(self.name, str):
             raise SettingError(name="name", expected="text", received=repr(self.name))
         object.__setattr__(self, "Ts", _positive("Ts", self.Ts))
-        if not SHORTEST_TS <= self.Ts <= LONGEST_TS:
+        if not shortest_ts <= self.Ts <= longest_ts:
             raise SettingError(
-                name="Ts", expected=f"{SHORTEST_TS:g} to {LONGEST_TS:g} s", received=f"{self.Ts:g}"
+                name="Ts", expected=f"{shortest_ts:g} to {longest_ts:g} s", received=f"{self.Ts:g}"
             )
         object.__setattr__(self, "columns", _columns(self.columns))
         if self.n is not None:
@@ -121,7 +118,8 @@ class Header:
 
     def time_ns(self, index: int) -> int:
         """Time of sample `index` in nanoseconds since 1970-01-01 UTC."""
-        return min(self.start_ns() + round(index * self.Ts * 1e9), LAST_NS)
+        # the last time that the file can state, in the year 2554
+        return min(self.start_ns() + round(index * self.Ts * 1e9), 2**64 - 1)
 
     def encode(self) -> bytes:
         """The header message: JSON with format and version."""
@@ -188,9 +186,10 @@ def _whole_number(value: object) -> int:
 
 
 def _columns(columns: object) -> Mapping[str, str]:
-    if not isinstance(columns, Mapping) or not 0 < len(columns) <= MOST_COLUMNS:
+    most_columns = 256
+    if not isinstance(columns, Mapping) or not 0 < len(columns) <= most_columns:
         raise SettingError(
-            name="columns", expected=f"1 to {MOST_COLUMNS} names with their units",
+            name="columns", expected=f"1 to {most_columns} names with their units",
             received=str(columns)[:200],
         )  # fmt: skip
     for name, unit in columns.items():
@@ -212,9 +211,7 @@ def _plain(what: str, content: object) -> Mapping[str, Any]:
 
 
 def plain(what: str, content: Mapping[str, Any]) -> dict[str, Any]:
-    """A deep copy of finite numbers, text, lists and dicts; NumPy's values become Python's.
-    Raises `SettingError` if a value is none of these.
-    """
+    """A deep copy of finite numbers, text, lists and dicts; NumPy's values become Python's."""
     try:
         text = json.dumps(dict(content), allow_nan=False, ensure_ascii=False, default=_python)
         # half of a surrogate pair could not be printed

@@ -54,8 +54,6 @@ LARGEST_FILE = 4 << 30
 """Bytes: more than a day of four columns at 1 kHz."""
 LARGEST_CHUNK = 4 << 20
 """Bytes; a recording's own chunks are far smaller."""
-BUDGET = 4
-"""Budget of failed checksums, in multiples of the file; each damaged chunk costs one."""
 
 
 class Chunk(NamedTuple):
@@ -67,12 +65,12 @@ class Chunk(NamedTuple):
 
 
 def chunks(raw: bytes) -> Iterator[Chunk]:
-    """Every chunk that is whole, in the file's order.
-    Raises `DataError` for a file with more heads without chunks than damage can explain, and for
-    one that unpacks to more than `MOST_RATIO` times its size; `SettingError` if a chunk is
-    compressed and zstandard is not installed.
+    """Every chunk that is whole, in the file's order. Raises `DataError` for a file with more heads
+    without chunks than damage can explain, and for one that unpacks to more than `MOST_RATIO` times
+    its size; `SettingError` if a chunk is compressed and zstandard is not installed.
     """
-    at, left, unpacked = 0, BUDGET * len(raw) + LARGEST_CHUNK, 0
+    # budget of failed checksums, in multiples of the file; each damaged chunk costs one
+    at, left, unpacked = 0, 4 * len(raw) + LARGEST_CHUNK, 0
     while (at := raw.find(CHUNK.to_bytes(1, "little"), at)) >= 0:
         claim = _claimed(raw, at)
         chunk = None if claim is None else _chunk_at(raw, at, claim)
@@ -188,9 +186,7 @@ def is_index(raw: bytes, start: int, stop: int) -> bool:
 
 
 def ending_fault(raw: bytes, start: int, *, damaged: bool) -> str | None:
-    """The fault behind the last chunk; None if the checksums of the whole file are valid.
-    In a file known to be `damaged`, the checksum over all of it is not tested.
-    """
+    """The fault behind the last chunk, or None; a `damaged` file's total checksum is not tested."""
     at = start
     for _, begin, end in records(raw, start, len(raw)):
         if not is_index(raw, begin - RECORD.size, end):
@@ -376,9 +372,7 @@ def read_recording(path: str | os.PathLike[str]) -> RecordedFile:
 
 
 def read_header(path: str | os.PathLike[str]) -> Header:
-    """Read the header of a recording, without its samples.
-    Raises `DataError` as `read_recording`.
-    """
+    """Read the header of a recording, without its samples."""
     path = _named(path)
     # both copies of the header message are in the first bytes, not compressed
     raw, found = _bytes(path, 3 * LARGEST_HEADER), _Contents()

@@ -31,9 +31,7 @@ _COMPUTED = 1 << 5
 
 
 def require_ending(path: str | os.PathLike[str]) -> Path:
-    """The path of a recording, whose ending other programs rely on.
-    Raises `SettingError` for another ending.
-    """
+    """The path of a recording, whose ending other programs rely on."""
     if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
         raise SettingError(
             name="file", expected="a file's name", received=repr(path),
@@ -68,9 +66,7 @@ def require_replaceable(path: str | os.PathLike[str], *, overwrite: bool) -> Non
 
 
 def require_free(paths: Iterable[str | os.PathLike[str] | None], *, overwrite: bool) -> None:
-    """Refuse to overwrite any file: for output that is the only record of a run on a drive.
-    Raises `SettingError` if one of the files exists.
-    """
+    """Refuse to overwrite any file: for output that is the only record of a run on a drive."""
     for path in paths:
         if path is not None and not overwrite and _is_there(Path(path)):
             raise SettingError(
@@ -351,17 +347,12 @@ def save_columns(
 # --- A recording with one message per sample, as plotting programs need it ------------------------
 
 
-CHUNK_SAMPLES, CHUNK_BYTES = 500, 1 << 20
-"""Limits of a chunk, whichever comes first: a reader accepts chunks of at most 4 MiB."""
-
-
 def save_curves(
     path: str | os.PathLike[str], recording: RecordedFile, *, compress: bool = False
 ) -> None:
     """Write a recording again with one message per sample; the file is complete or absent.
     `read_recording` reads it like any other. Samples in gaps have no message, damaged parts are
-    left out, and a torn recording stays marked as torn. Raises `DataError` if the file cannot be
-    written, and `SettingError` for compression without zstandard.
+    left out, and a torn recording stays marked as torn.
     """
     with replacing(Path(path)) as temporary:
         assembler = Assembler(recording.header.columns, single=True, compress=compress)
@@ -377,6 +368,8 @@ def save_curves(
 
 
 def _groups(recording: RecordedFile) -> Iterator[list[Message]]:
+    # limits of a chunk, whichever comes first: a reader accepts chunks of at most 4 MiB
+    chunk_samples, chunk_bytes = 500, 1 << 20
     header = recording.header
     start = header.start_ns()
     first = Message(Topic.HEADER, start, start, header.encode())
@@ -390,7 +383,7 @@ def _groups(recording: RecordedFile) -> Iterator[list[Message]]:
     for message in _samples(recording):
         group.append(message)
         size += len(message.data)
-        if len(group) == CHUNK_SAMPLES or size >= CHUNK_BYTES:
+        if len(group) == chunk_samples or size >= chunk_bytes:
             yield group
             group, size = [], 0
     if group:

@@ -59,24 +59,15 @@ def run_file(reference: str, plant: str) -> str:
 
 
 def record_of(scored: str) -> str:
-    """The recording of a scored record."""
     return "saturating_2" if scored == "saturating" else scored
 
 
 @dataclass(frozen=True, eq=False)
 class Artefacts:
-    """The content of the report: `results` is `results.json`.
-
-    Attributes
-    ----------
-    recordings : mapping of record to columns
-        t [s], u [V], counts, y (speed from counts) [RPM], speed_true [RPM].
-    predictions : mapping of scored record to columns
-        `MODEL_simulation` and `MODEL_one_step` [RPM].
-    runs : mapping of (reference, plant) to columns
-        t [s], r [RPM], u [V], y (true speed) [RPM], feedback [RPM].
-    drawn : mapping of name to inline SVG
-        Figures of the report card; empty for older results.
+    """The content of the report: `results` is `results.json`; `recordings` have t [s], u [V],
+    counts, y (speed from counts), speed_true [RPM]; `predictions` of a record have
+    `MODEL_simulation`, `MODEL_one_step` [RPM]; `runs` by (reference, plant) have t, r, u, y (true
+    speed), feedback; `drawn` are the report card's figures as SVG, none in older results.
     """
 
     folder: Path
@@ -112,9 +103,7 @@ class Artefacts:
 
 
 def load(folder: str | os.PathLike[str]) -> Artefacts:
-    """Read a result folder. Raises `DataError` if it has no results or a recording or run is
-    damaged, `ModelFileError` if `results.json` is damaged or has another version.
-    """
+    """Read a result folder."""
     folder = Path(folder)
     if not folder.is_dir():
         raise DataError(

@@ -42,19 +42,15 @@ def run_file(reference: str, kind: str) -> str:
 
 
 def file_name(reference: str) -> str:
-    """A file name for a reference of any name."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in reference)
 
 
 def is_commissioning(folder: Path) -> bool:
-    """Whether it is the folder of a commissioning."""
     return (folder / NUMBERS).is_file()
 
 
 def context(folder: Path) -> dict[str, Any]:
-    """The values for the template. Raises `DataError` or `ModelFileError` if a file is missing or
-    damaged.
-    """
+    """The values for the template."""
     found = storage.read(folder / NUMBERS, FORMAT, {VERSION})
     with style():
         return {
@@ -280,9 +276,7 @@ _CAPTIONS = {
 
 
 def section(folder: Path) -> dict[str, Any] | None:
-    """The values for the template `analysis.html`; None if the folder has no analysis.
-    Raises `DataError` or `ModelFileError` if a file is missing or damaged.
-    """
+    """The values for the template `analysis.html`; None if the folder has no analysis."""
     path = folder / analyses.NUMBERS
     if not path.is_file():
         return None
@@ -368,9 +362,7 @@ MOTOR = "motor.json"
 
 
 def motor_section(folder: Path) -> dict[str, Any] | None:
-    """The values for the template `motor.html`; None if the folder has no motor.
-    Raises `ModelFileError` if its file is damaged.
-    """
+    """The values for the template `motor.html`; None if the folder has no motor."""
     path = folder / MOTOR
     if not path.is_file():
         return None

@@ -32,7 +32,6 @@ class Goal:
 
     @property
     def verdict(self) -> str:
-        """The verdict in one or two words."""
         return {True: "reached", False: "not reached", None: "undefined"}[self.met]
 
 

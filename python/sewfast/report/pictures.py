@@ -156,9 +156,6 @@ def _scaled(columns: Columns, number: str, title: str) -> Picture:
 # --- Predictions and the machine's speed: the paper's Fig. 8 to 11 and 13 to 15 ----------------
 
 
-_ZOOM = 2.0
-"""Width of the magnified window [s]."""
-
 _BESIDE = ("paper", "neural_oe", "oe")
 
 
@@ -270,7 +267,8 @@ def _histogram(ax: Any, error: Float, model: str, limit: float) -> None:
 
 def _worst(t: Float, error: Float) -> Any:
     """The window around the largest error."""
-    width = min(_ZOOM, float(t[-1] - t[0]) / 3)
+    # width of the magnified window [s]
+    width = min(2.0, float(t[-1] - t[0]) / 3)
     start = float(t[int(np.argmax(np.abs(error)))]) - 0.5 * width
     start = min(max(start, float(t[0])), float(t[-1]) - width)
     return (t >= start) & (t <= start + width)
@@ -340,9 +338,6 @@ _PURPOSE = {
     "random": "Levels between 200 and 2,000 RPM at random.",
 }
 
-_MAGNIFIED = 0.4
-"""Width of the magnified rise [s]."""
-
 
 def opening_picture(artefacts: Artefacts) -> Picture:
     """The main result: the trapezoid as predicted and as measured, and what is between them."""
@@ -354,10 +349,6 @@ def opening_picture(artefacts: Artefacts) -> Picture:
     return hero(traces, "A trapezoid of 3,000 RPM", caption)
 
 
-HERO_WIDTH = 12.0
-"""Width of the first picture [inch], which has a page's width for itself."""
-
-
 def hero(traces: list[Trace], title: str, caption: str) -> Picture:
     """The first picture of a report: a loop as predicted and as measured, with the difference."""
     output, _, _ = loop_panels(traces, "RPM", "V")
@@ -365,7 +356,8 @@ def hero(traces: list[Trace], title: str, caption: str) -> Picture:
     if len(traces) > 1:
         rows.append(apart_panel(traces[0], traces[1], "RPM"))
         heights.append(1.1)
-    figure = stacked(rows, heights).figure(HERO_WIDTH)
+    # width of the first picture [inch], which has a page's width for itself
+    figure = stacked(rows, heights).figure(12.0)
     alt = f"{title}: reference, predicted and measured speed, below measured minus predicted"
     return Picture("opening", "", title, alt, caption, svg(figure, "opening", alt))
 
@@ -437,7 +429,8 @@ def _loop_figure(runs: dict[str, Columns], names: dict[str, str], *, magnified: 
 def _rise(trace: Trace) -> tuple[float, float]:
     """A window about the first edge of the reference [s]."""
     start = float(trace.t[int(np.argmax(trace.r > trace.r[0]))]) - 0.1
-    return start, start + _MAGNIFIED
+    # width of the magnified rise [s]
+    return start, start + 0.4
 
 
 def _magnify(ax: Axes, traces: list[Trace], window: tuple[float, float]) -> None:

@@ -41,9 +41,6 @@ from .verdict import Verdict, verdict_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-EVALUATIONS = 3000
-SIZE = 40
-_WIDE = 10.0
 _TUNED = 0.25
 """Share of the evaluations for the tuned controller from which the front starts."""
 
@@ -154,7 +151,6 @@ class ParetoFront(Plotted):
         return drawing(self)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         header = [f"{n} [{self.units[n]}]" if self.units[n] else n for n in self.objectives]
         rows = tuple(
             ("the knee" if i == self.pick else "", *map(significant, row))
@@ -189,8 +185,8 @@ def pareto(
     constraints: Constraints | None = None,
     variations: Sequence[tuple[float, int]] | None = None,
     loads: Sequence[LoadStep] = (),
-    size: int = SIZE,
-    evaluations: int = EVALUATIONS,
+    size: int = 40,
+    evaluations: int = 3000,
     time_budget: float | None = None,
     seed: int = 0,
     threads: int | None = None,
@@ -238,9 +234,7 @@ def pareto(
     time = Budget(None if time_budget is None else budget(time_budget))
     total, names = whole("evaluations", evaluations), _checked(objectives)
     if total < 2:
-        raise SettingError(
-            f"expected 2 evaluations or more, got {total}; {EVALUATIONS:,} are usual"
-        )
+        raise SettingError(f"expected 2 evaluations or more, got {total}; 3,000 are usual")
     settings: dict[str, Any] = {
         "cost": cost,
         "aggregate": aggregate,
@@ -369,13 +363,11 @@ def _units(objectives: Sequence[str], controller: Controller) -> dict[str, str]:
 
 def wide(column: NDArray[np.float64]) -> bool:
     """Whether values are so far apart that ratios matter more than differences."""
-    return bool(column.min() > 0.0 and column.max() > _WIDE * column.min())
+    return bool(column.min() > 0.0 and column.max() > 10.0 * column.min())
 
 
 def knee(values: NDArray[np.float64]) -> int:
-    """The row closest to the minimum of every column at once, relative to the columns' ranges; wide
-    ranges are on a logarithmic scale.
-    """
+    """The row closest to the minimum of all columns at once, over their (wide: log) ranges."""
     columns = [np.log(c) if wide(c) else c for c in values.T]
     shares = [(c - c.min()) / (np.ptp(c) or 1.0) for c in columns]
     return int(np.argmin(np.sum(np.square(shares), axis=0)))
@@ -397,8 +389,6 @@ NAMES = {
     "load": "deviation under a load",
     "Ms": "largest sensitivity Ms",
 }
-HEIGHT = 3.6
-"""Height of a panel [inch]."""
 
 
 def drawing(front: ParetoFront) -> Drawing:
@@ -408,7 +398,8 @@ def drawing(front: ParetoFront) -> Drawing:
     columns = min(2, len(panels))
     panels += [None] * (-len(panels) % columns)
     rows = tuple(tuple(panels[k : k + columns]) for k in range(0, len(panels), columns))
-    return Drawing(rows, (HEIGHT,) * len(rows), (1.0,) * columns, share_x=False, legend=2)
+    # height of a panel [inch]
+    return Drawing(rows, (3.6,) * len(rows), (1.0,) * columns, share_x=False, legend=2)
 
 
 def _panel(axis: Axes, front: ParetoFront, i: int, j: int) -> None:

@@ -38,15 +38,9 @@ SMOOTHINGS = (1e-3, 1e-2, 1e-1)
 """Multiples of the squared taps among which costs choose, from a sharp inverse to a calm one."""
 FURTHER, FEW = (0, 2, 4, 6, 8, 12), (4, 8)
 """Samples of preview beyond the plant's delay among which costs choose; few until a deadline."""
-BESIDE = 2e-3
-"""Distance from rest of the first levels to either side, as a share of the range: dry friction has
-its full size there, as a jump cannot be drawn."""
 LEADING, PART = 0.15, 0.6
 """Part of a time budget that the search leaves to the feedforward, and part of what is left
 then that this may take."""
-SHARES = (1.0, 0.95, 0.9, 0.8)
-"""Shares of the best feedforward, of which the first that no plant loses by is taken: a drive whose
-gain is a quarter too large needs less of it."""
 PARTS = (0.25, 0.5, 1.0)
 """The other levels, as shares of the way from rest to the ends of the range."""
 
@@ -69,7 +63,6 @@ class Effort:
         return self.deadline is None or self.deadline.budget.seconds is None
 
     def check(self) -> None:
-        """Raise `TimeUp` at the deadline."""
         if self.deadline is not None:
             self.deadline(1, 1, 0.0)
 
@@ -135,7 +128,9 @@ def _points(
 ) -> Iterator[Point]:
     """Steady states within the range; dynamics count from the distance `moving` on."""
     low, high = ends
-    beside, grid = BESIDE * (high - low), command_grid(model)
+    # distance from rest of the first levels to either side, as a share of the range: dry friction
+    # has its full size there, as a jump cannot be drawn
+    beside, grid = 2e-3 * (high - low), command_grid(model)
     for end in (low, high):
         way = end - rest
         if abs(way) <= beside:
@@ -197,17 +192,9 @@ def _local(point: OperatingPoint, slope: float) -> tuple[Any, ...]:
 
 @dataclass(frozen=True)
 class Led:
-    """What a feedforward is worth.
-
-    Attributes
-    ----------
-    alone : Controller
-        The PID without it.
-    cost, alone_cost : float
-        Cost with and without it over all plants in all variations, in which overshoot has no weight
-        unless one was given: it counts percents of small edges [y].
-    reason : str
-        Why it was not taken; empty if it was.
+    """What a feedforward is worth: the PID `alone`, and costs [y] with and without it over all
+    plants in all variations, where overshoot (percents of small edges) has no weight unless one was
+    given. `reason` says why it was not taken.
     """
 
     alone: Controller
@@ -216,7 +203,6 @@ class Led:
     reason: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values."""
         costs = {"cost": self.cost, "cost_without": self.alone_cost}
         known = {name: c if math.isfinite(c) else None for name, c in costs.items()}
         return {"taken": not self.reason, **known, "reason": self.reason}
@@ -237,11 +223,13 @@ def with_lead(
     effort: Effort | None = None,
 ) -> tuple[Controller, Led]:
     """A PID with feedforward, if that costs less over all plants of this task and of the others,
-    and no more on any of them in any variation; otherwise the PID alone.
-    The feedforward does the work of alpha and beta, which become 0 if they are `searched`. The
-    gains stay: what they owe to loads, noise and other plants, margins included, they keep. Raises
-    `TimeUp` at a deadline.
+    and no more on any of them in any variation; otherwise the PID alone. The feedforward does the
+    work of alpha and beta, which become 0 if they are `searched`. The gains stay: what they owe to
+    loads, noise and other plants, margins included, they keep. Raises `TimeUp` at a deadline.
     """
+    # shares of the best feedforward, of which the first that no plant loses by is taken: a drive
+    # whose gain is a quarter too large needs less of it
+    shares = (1.0, 0.95, 0.9, 0.8)
     effort = effort or Effort()
     among = choices(task, lead, effort)
     weights: dict[str, Any] = {name: 0.0 for name in WEIGHTS if name in searched}
@@ -253,7 +241,7 @@ def with_lead(
     best = min(range(len(tried)), key=lambda k: judged[k][::-1])
     led = Led(alone, judged[best][0], alone_cost)
     objection = ""
-    for share in SHARES if effort.is_whole else SHARES[:1]:
+    for share in shares if effort.is_whole else shares[:1]:
         part = _part(among.feedforwards[best], share, task.rest)
         controller = replace(tried[best], feedforward=part)
         said = (_objection(one, controller, alone, effort) for one in (task, *others))
@@ -267,9 +255,7 @@ def with_lead(
 
 
 def _following(task: TuningTask) -> TuningTask:
-    """The task without load steps and Ms, which a feedforward does not change, and without a weight
-    of overshoot unless one was given.
-    """
+    """The task without load steps and Ms, or a weight of overshoot that was not given."""
     weight = 0.0 if task.cost.overshoot is None else task.cost.overshoot
     limits = replace(task.constraints, Ms=math.inf, recovery=None, load=None)
     cost = replace(task.cost, overshoot=weight, recovery=0.0, load=0.0)
@@ -277,9 +263,7 @@ def _following(task: TuningTask) -> TuningTask:
 
 
 def _objection(task: TuningTask, controller: Controller, alone: Controller, effort: Effort) -> str:
-    """Why a controller is not better than another over all plants, and no worse on any in any
-    variation; empty if it is.
-    """
+    """Why a controller is not better over all plants and no worse on any; empty if it is."""
     (cost, violation), (other, own) = _judged(task, [controller, alone], effort)
     unit = alone.y_unit or "y"
     if not cost < other:

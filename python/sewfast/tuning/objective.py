@@ -240,8 +240,6 @@ def _described(name: str, limit: float | Controller) -> str:
 # --- LoadStep: a disturbance while a level is held ------------------------------------------------
 
 
-BAND = 0.01
-"""Default band of recovery as a share of the level."""
 MOST_SAMPLES = 10_000_000
 """Most samples of a load step, which every candidate runs."""
 
@@ -287,7 +285,8 @@ class LoadStep:
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name == "band" and value is None:
-                value = BAND * abs(real("level", self.level))
+                # default band of recovery as a share of the level
+                value = 0.01 * abs(real("level", self.level))
             number = real(field.name, value)
             least = -math.inf if field.name in ("level", "disturbance") else 0.0
             if not (math.isfinite(number) and number >= least):

@@ -26,20 +26,9 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class LinearLoops:
-    """The linear plants of a search.
-
-    Attributes
-    ----------
-    looked_at : tuple of (plant, float or None)
-        Every plant with the output about which it and a gain schedule are taken [y].
-    searched : tuple
-        The plants on which the core takes Ms of every candidate, at every point of a schedule.
-    measured : tuple of FrequencyResponse
-        Measured responses, whose bands count with them.
-    depends : bool
-        Whether Ms depends on the output.
-    reason : Exception or None
-        Why a plant was left out.
+    """The linear plants of a search: `looked_at`, with the output about which each is taken [y];
+    `searched`, on which the core takes Ms of every candidate; `measured` responses, whose bands
+    count. `depends` says whether Ms depends on the output, `reason` why a plant was left out.
     """
 
     looked_at: tuple[tuple[Any, float | None], ...] = ()
@@ -80,11 +69,10 @@ class LinearLoops:
 
 
 def linear_loops(task: TuningTask, time: Budget) -> LinearLoops:
-    """The linear plants of a task, from the plants of its constraints or else its models.
-    A nonlinear model is linearised half way from rest to the ends of the references; with a gain
+    """The linear plants of a task, from the plants of its constraints or else its models. A
+    nonlinear model is linearised half way from rest to the ends of the references; with a gain
     schedule also at its points; with a speed in the constraints only there. Levels at which a model
     has no stable steady state are left out: the plant stands there, one network of many does not.
-    Raises `SettingError` for measured responses without a linear plant.
     """
     controller, given = task.start, task.constraints.plant
     if not isinstance(controller, Controller):
@@ -102,15 +90,12 @@ def linear_loops(task: TuningTask, time: Budget) -> LinearLoops:
             remedy="give plant=[response, fit_shaft(response).to_model()]",
         )  # fmt: skip
     found = LinearLoops(measured=measured)
-    ends = time.share(LOOKING)
+    # part of a time budget for linearising: a grey box takes .14 s for each level
+    ends = time.share(0.1)
     for plant in plants:
         if not hasattr(plant, "lines"):
             found += _of(plant, task, controller, time, ends)
     return found
-
-
-LOOKING = 0.1
-"""Part of a time budget for linearising: a grey box takes .14 s for each level."""
 
 
 def _of(
@@ -176,5 +161,4 @@ def within_default(task: TuningTask) -> Iterator[TuningTask]:
 
 
 def with_limit(task: TuningTask, Ms: float) -> TuningTask:
-    """The same task with this limit of Ms."""
     return replace(task, constraints=replace(task.constraints, Ms=Ms))

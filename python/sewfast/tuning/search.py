@@ -41,8 +41,6 @@ from .verdict import Verdict, out_of_reach, verdict_of
 
 Method: TypeAlias = Literal["genetic", "cma-es"]
 
-EVALUATIONS = 3000
-"""Controllers tried by default."""
 _ENDED_BY = {
     "evaluations": "their number",
     "converged": "convergence",
@@ -178,7 +176,6 @@ class TuningResult:
         return loop_drawing(traces, after.units["y"], after.units["u"], limits).plot(ax, file)
 
     def _repr_html_(self) -> str:
-        """A table for a notebook."""
         unit = self.controller.y_unit or "y"
         rows = tuple(
             (v.name, significant(v.value, 4), significant(v.low), significant(v.high))
@@ -231,7 +228,7 @@ def tune(
     rival: Plants | None = None,
     feedforward: Lead = "preview",
     method: Method = "genetic",
-    evaluations: int = EVALUATIONS,
+    evaluations: int = 3000,
     time_budget: float | None = None,
     seed: int = 0,
     threads: int | None = None,

@@ -292,8 +292,6 @@ def _checked(variations: Sequence[tuple[float, int]]) -> list[tuple[float, int]]
 
 Wanted: TypeAlias = str | tuple[str, float, float]
 
-_EDGE = 1e-3
-
 
 @dataclass(frozen=True)
 class Variable:
@@ -310,8 +308,9 @@ class Variable:
     @property
     def at_bound(self) -> bool:
         """Whether it is at a bound: the best value may be beyond."""
-        room = _EDGE * (self.high - self.low)
-        near_low = self.value <= self.low + min(room, _EDGE * abs(self.low) or room)
+        edge = 1e-3
+        room = edge * (self.high - self.low)
+        near_low = self.value <= self.low + min(room, edge * abs(self.low) or room)
         return near_low or self.value >= self.high - room
 
     def __str__(self) -> str:
@@ -389,9 +388,6 @@ def _one(given: Any, start: SampledController) -> list[tuple[str, tuple[float, f
 # --- The controller to start from -----------------------------------------------------------------
 
 
-DERIVATIVE_FILTER = 10.0
-"""N of the first controller."""
-
 Encoder: TypeAlias = float | Literal["model"] | None
 
 
@@ -439,7 +435,7 @@ def first_controller(
         Ts=plant.Ts,
         alpha=rule.alpha,
         beta=rule.beta,
-        N=DERIVATIVE_FILTER,
+        N=10.0,
         u_min=low,
         u_max=high,
         filter_samples=filter_samples,
@@ -507,9 +503,7 @@ def first_of(
     filter_samples: int | None = None,
     output_unit: str | None = None,
 ) -> SampledController:
-    """The first controller of a kind; parameters are those of `tune`, errors those of
-    `first_controller`.
-    """
+    """The first controller of a kind, with the parameters of `tune`."""
     if controller == Controller.KIND:
         return first_controller(
             plant, u_min=u_min, u_max=u_max, counts_per_rev=counts_per_rev,

@@ -242,9 +242,8 @@ def _of_runs(task: TuningTask, controller: SampledController) -> list[Objection]
 
 
 def _at_limit(found: ClosedLoopRun, model: Model) -> float:
-    """Share of samples at a limit among those at which the reference needs no limit.
-
-    0 if these are less than half of the reference, or if it is not known what it needs.
+    """Share of samples at a limit among those at which the reference needs no limit. 0 if these are
+    less than half of the reference, or if it is not known what it needs.
     """
     c = found.controller
     try:
@@ -311,9 +310,7 @@ def _outside(found: ClosedLoopRun, model: Model) -> float:
 
 
 def out_of_reach(task: TuningTask) -> Iterator[Objection]:
-    """References that no gains can follow with the least gain of the variations.
-    Tuning on them minimises the loss at the limit of the command.
-    """
+    """References that no gains follow: tuning on them minimises the loss at the limit."""
     (plant, *_), start = task.plants, task.start
     gain = min(gain for gain, _ in task.variations)
     if not isinstance(plant, Model) or gain >= 1.0 or moves_on(plant, start.u_min, start.u_max):

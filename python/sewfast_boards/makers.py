@@ -11,16 +11,15 @@ import re
 import time
 from contextlib import suppress
 
-from ..errors import LinkError, SettingError
-from .boards import QUIET_WITHIN, Clock, PolledBoard
-from .ports import Port
+from sewfast.errors import LinkError, SettingError
+from sewfast.link.ports import Port
+
+from .polled import QUIET_WITHIN, Clock, PolledBoard
 
 IDLE, CLOSED_LOOP = 1, 8
 """States of an axis."""
 TORQUE, PASSTHROUGH = 1, 1
 """Control mode and input mode during a run."""
-GIMBAL = 2
-"""Motor type with voltages as commands."""
 ARMS_WITHIN = 2.0
 
 
@@ -83,7 +82,8 @@ class ODrive(PolledBoard):
             )  # fmt: skip
         if self._reads_counts:
             self.counts_per_rev = self._read(f"{self._place}.encoder.config.cpr")
-        if round(self._read(f"{self._place}.motor.config.motor_type")) == GIMBAL:
+        # motor type with voltages as commands
+        if round(self._read(f"{self._place}.motor.config.motor_type")) == 2:
             self.unit = "V"
         if round(self._read(f"{self._place}.current_state")) != IDLE:
             raise LinkError(

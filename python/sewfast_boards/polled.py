@@ -18,33 +18,25 @@ from typing import Protocol
 
 import numpy as np
 
-from ..arrays import FloatArray
-from ..control.controller import SampledController
-from ..control.machine import WATCHED, RecordedRun, Watch
-from ..errors import Interrupted, LinkError, SettingError
-from ..gains import real
-from ..recording import Recording, require_finite
-from .ports import Port, Unique, open_port
+from sewfast.arrays import FloatArray
+from sewfast.control.controller import SampledController
+from sewfast.control.machine import WATCHED, RecordedRun, Watch
+from sewfast.errors import Interrupted, LinkError, SettingError
+from sewfast.gains import real
+from sewfast.link.ports import Port, Unique, open_port
+from sewfast.recording import Recording, require_finite
 
 SHORTEST_TS, LONGEST_TS = 0.002, 0.5
 """Sample times [s] that a host without a real-time system can keep."""
 SHARE = 0.6
 """Share of a period that reading and writing may take: the rest is for the host's own pauses."""
-SPEED_WINDOW = 0.05
-"""Window of the speed that is compared with the limit [s]."""
-REST = 0.3
-"""Time without a count after which a motor counts as at rest [s]."""
 REST_WITHIN = 20.0
 """Longest wait for rest [s]."""
-ANSWER_WITHIN = 0.25
-"""Longest wait for a line [s]."""
 QUIET, QUIET_WITHIN = 0.02, 0.5
 """Time without a byte after which the line counts as quiet, and the longest wait for that [s]."""
 WATCHDOG, SAMPLES = 0.2, 3.0
 """Time without a command after which a board switches the motor off by itself [s], and its least
 number of samples: a command that is one sample late ends a run, and must find a board that runs."""
-LONGEST_LINE = 4096
-"""A line with more characters does not come from a board of this kind."""
 
 
 class Clock(Protocol):
@@ -261,7 +253,8 @@ class PolledBoard(Unique, ABC):
         self, run: _Samples, decide: Callable[[int, float], float], watch: Watch | None
     ) -> None:
         clock, begun = self._clock, self._clock.monotonic()
-        window = max(1, round(SPEED_WINDOW / self.Ts))
+        # window of the speed that is compared with the limit [s]
+        window = max(1, round(0.05 / self.Ts))
         self.late = 0.0
         for k in range(len(run.u) + 1):
             due = begun + k * self.Ts
@@ -348,7 +341,8 @@ class PolledBoard(Unique, ABC):
         clock = self._clock
         before, began = self._position(), clock.monotonic()
         since = began
-        while clock.monotonic() - since < REST:
+        # time without a count after which a motor counts as at rest [s]
+        while clock.monotonic() - since < 0.3:
             if clock.monotonic() - began > REST_WITHIN:
                 raise LinkError(
                     name=self.name, expected=f"the motor at rest within {REST_WITHIN:g} s",
@@ -396,10 +390,12 @@ class PolledBoard(Unique, ABC):
         raise self._unexpected(f"a number in answer to {text!r}", line)
 
     def _line(self, question: str) -> str:
-        deadline = self._clock.monotonic() + ANSWER_WITHIN
+        # longest wait for a line [s]
+        deadline = self._clock.monotonic() + 0.25
         while b"\n" not in self._waiting:
             left = deadline - self._clock.monotonic()
-            if left <= 0.0 or len(self._waiting) > LONGEST_LINE:
+            # a line with more characters does not come from a board of this kind
+            if left <= 0.0 or len(self._waiting) > 4096:
                 raise LinkError(
                     name=self._port.url, expected=f"an answer to {question!r}",
                     received="none" if not self._waiting else "no end of a line",
@@ -410,8 +406,8 @@ class PolledBoard(Unique, ABC):
         return line.decode("ascii", "replace").strip()
 
     def _discard(self) -> bool:
-        """Discard received bytes: answers to an earlier program or an aborted exchange.
-        Return whether the line became quiet; with telemetry on, it never does.
+        """Discard bytes of an earlier exchange; whether the line became quiet, as telemetry never
+        does.
         """
         self._waiting = b""
         deadline = self._clock.monotonic() + QUIET_WITHIN

@@ -19,12 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__, _core
-from ..control import Controller
-from ..dataset import FloatArray
-from ..errors import SettingError
-from ..gains import Gains
-from ..models import Model
+from sewfast import __version__, _core
+from sewfast.control import Controller
+from sewfast.dataset import FloatArray
+from sewfast.errors import SettingError
+from sewfast.gains import Gains
+from sewfast.models import Model
+
 from .precision import (
     Lead,
     at_rest,

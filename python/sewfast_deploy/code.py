@@ -1,8 +1,4 @@
-"""Models and controllers as code for other processors and tools.
-
-`deploy` writes a folder with C99 and its test against the step of this package, structured text, an
-FMU or ONNX.
-"""
+"""`deploy`: a model or a controller as code, in a folder."""
 
 from __future__ import annotations
 
@@ -14,10 +10,11 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from ..control.controller import Controller, SampledController, pid_of
-from ..errors import ModelFileError, SettingError
-from ..models import Model
-from ..storage import making, replace_files
+from sewfast.control.controller import Controller, SampledController, pid_of
+from sewfast.errors import ModelFileError, SettingError
+from sewfast.models import Model
+from sewfast.storage import making, replace_files
+
 from . import c99, fmi, onnx, structured_text
 
 TARGETS = ("c99", "st", "fmi", "onnx")

@@ -13,8 +13,8 @@ import pytest
 import kinds
 from sewfast import deploy, paper_controller
 from sewfast.cli import main
-from sewfast.deployment.onnx import initial_state
 from sewfast.errors import SettingError
+from sewfast_deploy.onnx import initial_state
 
 onnx = pytest.importorskip("onnx", reason="needs onnx")
 runtime = pytest.importorskip("onnxruntime", reason="needs onnxruntime")

@@ -18,7 +18,7 @@ from boards import Emulated, EmulatedODrive, EmulatedSimpleFOC, Line, odrive, on
 from refusals import refuses
 from sewfast import Controller, Gains, record, run
 from sewfast.errors import DataError, Interrupted, LinkError, SettingError
-from sewfast.link import ODrive, PolledBoard, SimpleFOC
+from sewfast_boards import ODrive, PolledBoard, SimpleFOC
 
 pytestmark = pytest.mark.alone
 BAUD = 921_600

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
-from ..control import Controller
-from ..errors import SettingError
-from ..models import Model
+from sewfast import __version__
+from sewfast.control import Controller
+from sewfast.errors import SettingError
+from sewfast.models import Model
+
 from .precision import controller_step, early, lead_of
 
 

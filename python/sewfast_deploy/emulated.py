@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ..errors import LinkError, SettingError
-from ..storage import file_bytes
+from sewfast.errors import LinkError, SettingError
+from sewfast.storage import file_bytes
 
 BOARDS = {"mps2-an386": 0x21000000, "mps2-an500": 0x60000000}
 """QEMU's boards, a Cortex-M4 and a Cortex-M7, with the address of the memory shared with us."""
@@ -34,7 +34,6 @@ _FASTEST = struct.Struct("<f")
 _STACK_TOP = 1 << 20
 _STACK = 64 << 10
 _PAINT = b"\xa5"
-_MEMORY = 16 << 20
 
 _SHIFT = 5
 """An instruction takes 2**5 ns of the board's time; a tick of its timer is 40 ns."""
@@ -320,7 +319,7 @@ class EmulatedBoard:
 def _memory(path: Path) -> mmap.mmap:
     """The board's memory as a file, its stack painted to show how deep it was used."""
     with path.open("w+b") as file:
-        file.truncate(_MEMORY)
+        file.truncate(16 << 20)
         file.seek(_STACK_TOP - _STACK)
         file.write(_PAINT * _STACK)
         file.flush()
@@ -328,10 +327,7 @@ def _memory(path: Path) -> mmap.mmap:
 
 
 def _examined(firmware: Path) -> tuple[str, int, int]:
-    """The board, and bytes of code and constants and of static memory, from an ELF file's headers.
-    Raises `SettingError` for anything but a 32-bit little-endian ELF file for ARM, and for another
-    board.
-    """
+    """The board, and bytes of code with constants and of static memory, of an ELF file."""
     remedy = "build one by `make firmware` in a source checkout"
     raw = file_bytes(firmware, SettingError)
     if len(raw) < 52 or raw[:6] != b"\x7fELF\x01\x01" or raw[18:20] != b"\x28\x00":

@@ -22,8 +22,8 @@ import deployed
 import kinds
 from sewfast import Controller, Dataset, Ensemble, Gains, LinearOE, Model, _core, deploy, identify
 from sewfast.cli import main
-from sewfast.deployment.precision import combined_run, embedded_members
 from sewfast.errors import FitError, ModelFileError, SettingError
+from sewfast_deploy.precision import combined_run, embedded_members
 
 needs_compiler = pytest.mark.skipif(not deployed.compilers(), reason="needs gcc or clang")
 PRECISIONS = ("f64", "f32")
@@ -74,7 +74,7 @@ def test_the_sketch_controls_a_motor_as_the_core_would(tmp_path: Path) -> None:
     gains = Gains.standard(Kp=0.01, Ti=0.05, Td=0.0)  # V/RPM, s
     controller = Controller(gains, Ts=0.001, u_min=-24, u_max=24)
     deploy(controller, tmp_path)
-    here = Path(__file__).parents[1] / "support"
+    here = Path(__file__).parents[2] / "support"
     sketch = here.parents[1] / "examples" / "firmware" / "sketch"
     folders = [f"-I{place}" for place in (here / "arduino", sketch, tmp_path)]
     sources = [str(here / "arduino" / "main.cpp"), str(tmp_path / "controller.c")]
@@ -299,7 +299,7 @@ def test_double_precision_is_the_baselines_free_run() -> None:
     """In a process of its own: the level of the kernels is chosen as the package is loaded."""
     program = """
 import kinds, numpy as np
-from sewfast.deployment.precision import combined_run, embedded_members
+from sewfast_deploy.precision import combined_run, embedded_members
 for name in kinds.DEPLOYED:
     model = kinds.model_of(name)
     u = kinds.levels(3000, 4, len(model.input_names))

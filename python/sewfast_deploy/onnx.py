@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__, _core
-from ..control import Controller
-from ..dataset import FloatArray
-from ..errors import SettingError, not_installed
-from ..models import Model
+from sewfast import __version__, _core
+from sewfast.control import Controller
+from sewfast.dataset import FloatArray
+from sewfast.errors import SettingError, not_installed
+from sewfast.models import Model
+
 from .precision import at_rest, embedded_members
 
 OPSET = 17

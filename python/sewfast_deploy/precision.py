@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from .. import _core
-from ..control import Controller
-from ..dataset import FloatArray
-from ..errors import FitError, SettingError
-from ..models import Ensemble, Model
+from sewfast import _core
+from sewfast.control import Controller
+from sewfast.dataset import FloatArray
+from sewfast.errors import FitError, SettingError
+from sewfast.models import Ensemble, Model
 
 MOST_LOSS = 0.01
 """Largest change by single precision that is accepted, as a share of the output's span."""
@@ -32,9 +32,7 @@ _MOST_MEMBERS = 64
 def embedded_members(
     model: Model, precision: str
 ) -> tuple[list[Model], list[_core.EmbeddedModel], str]:
-    """A model's members, their steps, and how their outputs are combined.
-    In single precision a network keeps its scaled units, which lose fewer digits.
-    """
+    """A model's members, their steps (a network's in scaled units), how outputs combine."""
     members = list(model.members) if isinstance(model, Ensemble) else [model]
     if len(members) > _MOST_MEMBERS:
         raise SettingError(
@@ -60,7 +58,6 @@ def excitation(model: Model, samples: int) -> FloatArray:
 
 def at_rest(members: list[Model]) -> tuple[list[FloatArray], FloatArray]:
     """The states of a plant's models at its operating point, and the inputs that hold it there.
-
     Models of several recordings have none in common: they begin at rest without inputs.
     """
     if len({m.rest.u for m in members}) > 1:

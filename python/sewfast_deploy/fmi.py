@@ -18,15 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
-from .. import __version__
-from ..control import Controller
-from ..errors import SettingError
-from ..models import Model
+from sewfast import __version__
+from sewfast.control import Controller
+from sewfast.errors import SettingError
+from sewfast.models import Model
+
 from . import c99
 from .precision import at_rest, embedded_members
 
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Date of all files within, so that the same model gives the same bytes."""
 _UNITS = {
     "V": ("kg=1, m=2, s=-3, A=-1", 1.0),
     "A": ("A=1", 1.0),
@@ -43,8 +42,6 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class _System:
-    """The contents of an FMU."""
-
     name: str
     title: str
     Ts: float
@@ -238,7 +235,8 @@ def _zipped(entries: dict[str, bytes]) -> bytes:
     place = io.BytesIO()
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
         for path, content in sorted(entries.items()):
-            entry = zipfile.ZipInfo(path, _EPOCH)
+            # date of all files within, so that the same model gives the same bytes
+            entry = zipfile.ZipInfo(path, (1980, 1, 1, 0, 0, 0))
             entry.external_attr = 0o644 << 16
             entry.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(entry, content)

@@ -11,9 +11,9 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from ..errors import SettingError
-from .arguments import Commands, add_command, add_overwrite
-from .output import note, print_json, suggested
+from sewfast.cli.arguments import Commands, add_command, add_overwrite
+from sewfast.cli.output import note, print_json, suggested
+from sewfast.errors import SettingError
 
 DEPLOY = """\
 Write a model or a controller as code: C99 without heap, C library or global state; IEC 61131-3
@@ -66,13 +66,14 @@ def add(commands: Commands) -> None:
 
 
 def deploy_command(args: argparse.Namespace) -> None:
-    from .. import storage
-    from ..control.controller import FORMAT as CONTROLLER
-    from ..control.files import load_pid
-    from ..deployment import deploy
-    from ..dynamic_model import FORMAT as MODEL
-    from ..errors import ModelFileError
-    from ..models import load_model
+    from sewfast import storage
+    from sewfast.control.controller import FORMAT as CONTROLLER
+    from sewfast.control.files import load_pid
+    from sewfast.dynamic_model import FORMAT as MODEL
+    from sewfast.errors import ModelFileError
+    from sewfast.models import load_model
+
+    from .code import deploy
 
     found = storage.format_of(args.file)
     if found not in ("", CONTROLLER, MODEL):
@@ -161,9 +162,10 @@ def add_pil(commands: Commands) -> None:
 
 
 def pil_command(args: argparse.Namespace) -> int:
-    from ..control import Controller
-    from ..gains import Gains
-    from ..link.emulated import EmulatedBoard, build_firmware
+    from sewfast.control import Controller
+    from sewfast.gains import Gains
+
+    from .emulated import EmulatedBoard, build_firmware
 
     _prepare_folder(args.out, args.overwrite, make=False)
     firmware = args.firmware
@@ -237,7 +239,7 @@ def _stages(args: argparse.Namespace, port: str) -> Iterator[tuple[str, list[str
 
 def _carried_out(args: argparse.Namespace, words: list[str]) -> tuple[int, Any]:
     """Run one stage; return its exit code, and with --json its output."""
-    from . import main
+    from sewfast.cli import main
 
     note(f"$ {suggested(*words)}")
     if args.quiet:
