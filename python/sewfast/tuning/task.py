@@ -413,7 +413,7 @@ def first_controller(
     if (growth := growth_rate(plant)) > 0.0:
         blank = Controller(
             gains=Gains.standard(1.0, math.inf, u_unit=u_unit, y_unit=y_unit), Ts=plant.Ts,
-            N=DERIVATIVE_FILTER, u_min=low, u_max=high,
+            N=10.0, u_min=low, u_max=high,
             filter_samples=max(1, whole("filter_samples", filter_samples or 1)),
             counts_per_rev=_encoder(plant, counts_per_rev, y_unit),
             notes="; ".join(n for n in ("least Ms of an unstable plant", note) if n),
@@ -450,8 +450,6 @@ for about twice that rate, and a delay for no more than it leaves (Astrom and Mu
 Systems*, section 14.2)."""
 LEADS = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Td that are tried, in reciprocals of the crossover."""
-INTEGRAL = 10.0
-"""Ti in reciprocals of the crossover."""
 
 
 def _holding(plant: Model, blank: Controller, growth: float) -> Controller:
@@ -463,9 +461,7 @@ def _holding(plant: Model, blank: Controller, growth: float) -> Controller:
     for share in CROSSOVERS:
         w = share * growth
         for lead in LEADS if w * plant.Ts < 1.0 else ():
-            gains = Gains.standard(
-                1.0, INTEGRAL / w, lead / w, u_unit=own.u_unit, y_unit=own.y_unit
-            )
+            gains = Gains.standard(1.0, 10.0 / w, lead / w, u_unit=own.u_unit, y_unit=own.y_unit)
             unit = float(abs(loop_response(replace(blank, gains=gains), plant, [w])[0]))
             for Kp in (1.0 / unit, -1.0 / unit) if unit > 0.0 else ():
                 one = replace(blank, gains=replace(gains, Kp=Kp))
