@@ -311,6 +311,8 @@ def _read(row: Mapping[str, Any]) -> Row:
         value = row[name]
         if of.type == "float":
             value = math.nan if value in (None, "") else float(value)
+            if storage.LARGEST_NUMBER < abs(value) < math.inf:
+                raise ValueError(f"{name}: a number larger than {storage.LARGEST_NUMBER:g}")
         elif of.type == "int":
             value = int(value)
         else:

@@ -11,6 +11,8 @@ import pytest
 from sewfast import Controller, DataError, Gains, Recording, cause_of, commission, record, run
 from sewfast.causes import cause_among
 from sewfast.commissioning import Refusal, SteppedBench
+from sewfast.commissioning.demands import demands
+from sewfast.commissioning.excitations import first_motion, lost_motion, step_response
 from sewfast.errors import LinkError
 
 TS, PER_TURN = 1e-3, 4096.0
@@ -144,24 +146,40 @@ def test_a_machine_that_did_what_it_always_did_has_no_cause() -> None:
 
 
 @pytest.mark.parametrize(
-    ("motor", "name", "said"),
+    ("motor", "u_max", "name", "said"),
     [
-        (Motor(0.0, friction=4.0), "dead zone", "the first 3.2 V"),
-        (Motor(0.0, command=40.0, inertia=400.0), "integrates", "RPM/s per V"),
-        (Motor(0.0, command=0.3), "out of reach", "or raise u_max"),
+        (Motor(0.0, friction=4.0), 10.0, "dead zone", "the first 3.2 V"),
+        (Motor(0.0, command=40.0, inertia=400.0), 10.0, "integrates", "RPM/s per V"),
+        (Motor(0.0), 5.0, "out of reach", "or raise u_max"),
+        (Motor(0.0, command=0.3), 10.0, "out of reach", "at the 10 V that it bears"),
     ],
-    ids=["friction", "integrates", "weak"],
+    ids=["friction", "integrates", "held back", "weak"],
 )
-def test_a_step_that_is_refused_has_a_cause(motor: Motor, name: str, said: str) -> None:
-    """Only of a motor that is weak is the limit the cause."""
+def test_a_step_that_is_refused_has_a_cause(
+    motor: Motor, u_max: float, name: str, said: str
+) -> None:
+    """Only where the machine bears more than it may have is the limit the cause."""
     with pytest.raises(Refusal) as refused:
-        commission(rig(motor), speed=1100.0)
+        commission(rig(motor), speed=1100.0, u_max=u_max)
     assert refused.value.stage == "step response"
     cause = refused.value.cause
     assert cause is not None
     assert (cause.name, cause.run) == (name, "step")
     assert said in cause.text
-    assert ("raise" in str(refused.value)) == (name == "out of reach")
+    assert ("raise" in str(refused.value)) == (u_max < 10.0)
+
+
+@pytest.mark.parametrize(("friction", "lost"), [(0.3, False), (3.0, True)])
+def test_a_dead_zone_is_said_of_a_machine_that_goes_on(friction: float, lost: bool) -> None:
+    motor = Motor(0.0, friction=friction)
+    asked = demands(
+        rig(motor), u_max=None, speed=700.0, references=None, members=1, evaluations=1, seed=0,
+        threads=1,
+    )  # fmt: skip
+    motion = first_motion(rig(motor), asked)
+    step = step_response(rig(motor), asked, motion)
+    cause = lost_motion(step, asked, motion)
+    assert (None if cause is None else cause.name) == ("dead zone" if lost else None)
 
 
 def test_one_motor_that_explains_all_runs_needs_no_change() -> None:

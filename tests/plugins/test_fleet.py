@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import signal
@@ -513,6 +514,15 @@ def test_a_folder_in_place_of_the_table_is_refused(folder: Path, tmp_path: Path)
         fleet(folder, out=tmp_path / "table.csv", workers=0)
     with pytest.raises(SettingError, match="a folder that exists"):
         fleet(folder, out=tmp_path / "nix" / "table.csv", workers=0)
+
+
+def test_a_number_that_nothing_can_be_computed_from_is_refused(tmp_path: Path) -> None:
+    table = tmp_path / "table.json"
+    Fleet((Row("a.csv", Ti=math.inf),)).save(table.with_suffix(".csv"))
+    assert load_fleet(table.with_suffix(".csv")).rows[0].Ti == math.inf
+    Fleet((Row("a.csv", gain=1e300),)).save(table)
+    with pytest.raises(SettingError, match="gain: a number larger than 1e"):
+        load_fleet(table)
 
 
 def test_ctrl_c_says_what_is_kept(

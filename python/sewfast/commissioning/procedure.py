@@ -35,7 +35,7 @@ from . import excitations
 from .bench import RecordedBench, bench_of, description_of
 from .checkpoint import STAGES, Checkpoint
 from .demands import Demands, Refusal, demands, require
-from .excitations import first_motion, standard, step_response
+from .excitations import first_motion, lost_motion, standard, step_response
 from .gains import (
     Requirements,
     cause,
@@ -232,11 +232,13 @@ def commission(
         try:
             return _carry_out(recorded, asked, cost, journal)
         except (Refusal, LinkError) as stop:
-            # one of a device without a recording was seen between the runs; a refusal that knows
-            # why, as a reference out of reach, does not know what put it there
-            seen_between = isinstance(stop, LinkError) and stop.recording is None
-            between = stop.cause if seen_between else None
-            cause = journal.cause or between or _cause(recorded) or stop.cause
+            # a refusal knows why, as does a device that saw it between the runs, without a
+            # recording; only one that is out of reach does not know what put it there
+            knows = isinstance(stop, Refusal) or stop.recording is None
+            known = stop.cause if knows else None
+            if known is not None and known.name == "out of reach":
+                known = None
+            cause = journal.cause or known or _cause(recorded) or stop.cause
             if cause is not None:
                 stop.explain(cause)
                 journal.keep(cause=cause)
@@ -300,13 +302,17 @@ def _carry_out(
     journal.enter("first motion")
     motion = first_motion(machine, asked)
     journal.keep(motion=motion)
-    if (moves := turns_at_rest(machine.runs[0])) is not None:
+    moves = turns_at_rest(machine.runs[0])
+    if moves is not None:
         journal.keep(cause=moves)
         journal.say(moves.text)
 
     journal.enter("step response")
     step = step_response(machine, asked, motion)
     journal.keep(fopdt=step)
+    if moves is None and (lost := lost_motion(step, asked, motion)) is not None:
+        journal.keep(cause=lost)
+        journal.say(lost.text)
 
     journal.enter("small signals")
     small = small_signal(machine, asked, motion, step)
@@ -325,7 +331,7 @@ def _carry_out(
     journal.keep(first=first, controller=first)
     r = excitations.trapezoids(step, fastest, asked, machine.Ts)
     trapezoids = machine.follow(first, r, "trapezoids")
-    require_unsaturated(trapezoids)
+    require_unsaturated(trapezoids, machine.volt)
     r = excitations.levels(step, fastest, asked, machine.Ts, asked.seed)
     levels = machine.follow(first, r, "levels")
 

@@ -19,6 +19,7 @@ from ..trust import Judgement, judge
 from ..tuning.objective import Cost
 from .bench import Aborted, RecordedBench
 from .demands import Refusal, require
+from .excitations import more_command
 from .gains import EXPECTED, Swing, frequency_of, unsettled
 from .slow import Thinning
 
@@ -177,11 +178,11 @@ def measure(
     found = dict(enumerate(predicted))
     for i in sorted(found, key=lambda i: len(found[i].predicted.r)):
         name = found[i].reference
-        watch = Watching(found[i].predicted, controller, machine.counts_per_rev)
+        watch = Watching(found[i].predicted, controller, machine.counts_per_rev, machine.volt)
         run = machine.follow(controller, references[name], name, watch=watch).run
         found[i] = replace(found[i], measured=run)
         keep(tuple(found[k] for k in range(len(predicted))))
-        require_alike(found[i])
+        require_alike(found[i], machine.volt)
         swing = restless(found[i], cost)
         if swing is not None:
             return swing
@@ -220,15 +221,19 @@ class Watching:
     It ends a run if the command chatters `TIMES` as much as predicted, as in an oscillating loop,
     or if the machine is so far from the prediction, or has been at a limit for so long, that the
     run will be refused in any case. `predicted` has the machine's samples, or for a slow drive
-    every k-th of them; `controller` is the machine's.
+    every k-th of them; `controller` is the machine's, `volt` the largest command that it bears.
     """
 
     def __init__(
-        self, predicted: ClosedLoopRun, controller: Controller, counts_per_rev: float
+        self,
+        predicted: ClosedLoopRun,
+        controller: Controller,
+        counts_per_rev: float,
+        volt: float = math.inf,
     ) -> None:
         self._predicted, self._controller, self._Ts = predicted, controller, controller.Ts
         self._k = max(1, round(predicted.Ts / controller.Ts))
-        self._per_turn = counts_per_rev
+        self._per_turn, self._volt = counts_per_rev, volt
         n = self._k * len(predicted.r)
         self._u, self._counts = np.full(n, np.nan), np.full(n, np.nan)
         self._judged, self._squares, self._railed = 0, 0.0, 0
@@ -294,7 +299,8 @@ class Watching:
     def _out_of_reach(self, end: int) -> Cause:
         y = np.diff(self._counts[:end], append=np.nan) * 60.0 / (self._per_turn * self._Ts)
         r = np.repeat(self._predicted.r, self._k)[:end]
-        return out_of_reach(r, y, self._u[:end], self._controller, self._predicted.reference)
+        reference = self._predicted.reference
+        return out_of_reach(r, y, self._u[:end], self._controller, reference, self._volt)
 
     def _end(self, end: int, reason: str, cause: Cause | None = None) -> None:
         stop = Aborted.after(
@@ -306,15 +312,22 @@ class Watching:
 
 
 def out_of_reach(
-    r: FloatArray, y: FloatArray, u: FloatArray, controller: SampledController, reference: str
+    r: FloatArray,
+    y: FloatArray,
+    u: FloatArray,
+    controller: SampledController,
+    reference: str,
+    volt: float,
 ) -> Cause:
-    """The cause of a loop at the limit of its command: where it is farthest from its reference."""
+    """The cause of a loop at the limit of its command: where it is farthest from its reference.
+    The machine bears `volt`.
+    """
     apart = _off_at_limit(r, y, u, controller)
     k = int(np.argmax(apart))
     return Cause(
         "out of reach",
         f"{reference!r} asks for {r[k]:.4g} RPM where {u[k]:.4g} V reach {y[k]:.4g}; make it lower "
-        "or slower, or raise u_max if motor and machine bear it",
+        f"or slower, or {more_command(controller.u_max, volt)}",
         reference, k * controller.Ts, float(apart[k]),
     )  # fmt: skip
 
@@ -373,11 +386,11 @@ def judged(predicted: tuple[Comparison, ...], ensemble: Ensemble) -> Judgement:
     return judge(runs, ensemble, refuse=False)
 
 
-def require_alike(c: Comparison) -> None:
-    """Raise `Refusal` if the machine deviates from the prediction."""
+def require_alike(c: Comparison, volt: float) -> None:
+    """Raise `Refusal` if the machine, which bears `volt`, deviates from the prediction."""
     assert c.measured is not None
     assert c.apart is not None
-    require_unsaturated(c.measured)
+    require_unsaturated(c.measured, volt)
     require(
         c.apart <= APART * c.span,
         f"expected the machine within {100 * APART:g} % of the span from the prediction on "
@@ -387,12 +400,12 @@ def require_alike(c: Comparison) -> None:
     )
 
 
-def require_unsaturated(found: ClosedLoopRun) -> None:
+def require_unsaturated(found: ClosedLoopRun, volt: float) -> None:
     """Raise `Refusal` for a loop that is at the limit of its command for too long."""
     saturated = _at_limit(found)
     require(
         saturated <= SATURATED,
         f"expected the command within its limits most of the time on {found.reference!r}, it was "
         f"at one for {100 * saturated:.0f} % of the samples",
-        out_of_reach(found.r, found.y, found.u, found.controller, found.reference),
+        out_of_reach(found.r, found.y, found.u, found.controller, found.reference, volt),
     )

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import FloatArray, labelled, range_of, texts
 from ..errors import DataError, SettingError
+from ..storage import LARGEST_NUMBER
 from ..tables import Table, significant
 from . import outliers, pieces, rates, summary, trends
 from .experiment import Experiment, require_some_weight
@@ -66,7 +67,7 @@ class Dataset:
             given = math.nan if isinstance(self.Ts, bool) else float(self.Ts)
         except (TypeError, ValueError):
             given = math.nan
-        if not 0.0 < given < math.inf:
+        if not 0.0 < given <= LARGEST_NUMBER:
             raise DataError(f"Ts: expected a positive sample time in seconds, received {self.Ts!r}")
         object.__setattr__(self, "Ts", given)
         widths = sorted({e.u.shape[1] for e in self.experiments})
