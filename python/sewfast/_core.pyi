@@ -105,6 +105,7 @@ def unwrap_counts(counts: _F, *, bits: int) -> _F: ...
 
 # --- greybox.rs -------------------------------------------------------------------------------------------
 
+GREYBOX_JOINT: list[str]
 GREYBOX_PARAMETERS: list[str]
 
 def greybox_run(
@@ -281,14 +282,17 @@ class GreyBox(Model):
     def __new__(
         cls, *, values: _F, free: Sequence[int], Ts: float, steps: int, mean: bool, unit: float,
         speed_scale: float, command_scale: float, residual_variance: float, process_noise: float,
-        theta: _F,
+        theta: _F, position: bool = False, joint: Sequence[float] = ...,
     ) -> GreyBox:
-        """``values`` (18,) in the order of GREYBOX_PARAMETERS, ``free`` places in it; ``unit`` of the output [rad/s]."""
+        """``values`` in the order of GREYBOX_PARAMETERS, ``joint`` in that of GREYBOX_JOINT, ``free`` places in both.
+
+        ``unit`` of the output [rad/s, of a position rad].
+        """
     @property
     def settings(self) -> dict[str, Any]:
         """Every constructor argument but theta; nx, nk, n_inputs, hidden, integrator."""
     def states(self, u: _F, state: _F) -> _F:
-        """States of the free run, (N, 3)."""
+        """States of the free run, (N, 3), of a position (N, 4)."""
 
 @final
 class HammersteinWiener(Model):

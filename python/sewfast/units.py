@@ -49,6 +49,24 @@ def revolutions_per_second(unit: str) -> float | None:
     return REVOLUTIONS_PER_SECOND.get(spelled(unit))
 
 
+ANGLES: dict[str, float] = {
+    "rad": 1.0, "deg": math.pi / 180.0, "°": math.pi / 180.0, "rev": math.tau, "turn": math.tau,
+    "turns": math.tau, "mrad": 1e-3,
+}  # fmt: skip
+"""Factor from each unit of an angle to rad."""
+LENGTHS = frozenset(["m", "cm", "mm", "um", "µm"])
+
+
+def radians(unit: str) -> float | None:
+    """Factor from a unit of an angle to rad; None for any other unit."""
+    return ANGLES.get(spelled(unit))
+
+
+def is_position(unit: str) -> bool:
+    """Whether it is a unit of an angle or a length, or counts of an encoder."""
+    return radians(unit) is not None or spelled(unit) in LENGTHS or spelled(unit) == "counts"
+
+
 def counts_per_unit(counts_per_rev: float, unit: str = "rpm") -> float:
     """Encoder counts per second at a speed of one ``unit`` (``rpm``, ``rev/s``, ``rad/s`` or
     ``deg/s``, in any usual spelling) [counts/(unit s)]. A change of ``n`` counts in ``Ts`` seconds

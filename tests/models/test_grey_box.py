@@ -134,7 +134,7 @@ def test_what_is_no_motor_is_refused() -> None:
     data = _plant(2000, 3)
     e = data.experiments[0]
     with pytest.raises(SettingError) as refused:
-        sewfast.identify(Dataset.from_arrays(e.u, e.y, TS, output_unit="mm"), model="grey_box")
+        sewfast.identify(Dataset.from_arrays(e.u, e.y, TS, output_unit="kg"), model="grey_box")
     assert refused.value.name == "output_unit"
     two = Dataset.from_arrays(np.c_[e.u, e.u**2], e.y, TS, output_unit="rpm")
     with pytest.raises(DataError) as other:

@@ -368,7 +368,7 @@ def add_physics(commands: Commands) -> None:
         "--structure", default="dcmotor", metavar="LIST",
         help="dcmotor (the usual terms that the record shows), or terms: lag,delay,coulomb,"
         "offset,drop,stribeck,load_1,load_2,inertia_2,cogging,torque_ripple,limit; dcmotor,sag "
-        "adds one of stribeck_difference,sag,eccentricity",
+        "adds one of stribeck_difference,sag,eccentricity; joint: the output is a position",
     )  # fmt: skip
     parser.add_argument(
         "--intervals", choices=("curvature", "profile"), default="curvature",
@@ -409,6 +409,11 @@ def physics_command(args: argparse.Namespace) -> None:
     _require_place_of_model(args.model)
     require_plot(args.plot)
     target, place = args.export or (None, "")
+    if args.structure == "joint" and (args.export or args.plot):
+        raise SettingError(
+            name="--export" if args.export else "--plot", expected="none with --structure joint",
+            received="a file", remedy="write the joint (-o), or it as a model (--model)",
+        )  # fmt: skip
     if target not in (None, *get_args(Target)):
         names = ", ".join(get_args(Target))
         raise SettingError(f"--export: expected one of {names}, received {target!r}")

@@ -133,6 +133,10 @@ def _motion(levels: list[tuple[float, float]], stood: float) -> Motion:
 # --- The step response: gain, time constant and dead time -----------------------------------------
 
 
+STEP = 0.6
+"""Target of the step as a share of the top speed."""
+
+
 def step_response(machine: Machine, demands: Demands, motion: Motion) -> Fopdt:
     """Record steps until one settles, and fit it.
     Each longer step is so small that even a machine that integrates stays below the top speed.
@@ -140,8 +144,7 @@ def step_response(machine: Machine, demands: Demands, motion: Motion) -> Fopdt:
     """
     # durations to try until the response settles [s]
     durations = (2.0, 6.0, 20.0)
-    # target of the step as a share of the top speed
-    u = min(motion.command(0.6 * demands.speed), demands.u_max)
+    u = min(motion.command(STEP * demands.speed), demands.u_max)
     reason: Exception | None = None
     for k, seconds in enumerate(durations):
         recording = machine.excite(step(u, seconds, machine.Ts), "step")
@@ -170,7 +173,7 @@ def lost_motion(fopdt: Fopdt, demands: Demands, motion: Motion) -> Cause | None:
     """
     if motion.threshold <= LOST * demands.u_max:
         return None
-    u = min(motion.command(SHARE * demands.speed), demands.u_max)
+    u = min(motion.command(STEP * demands.speed), demands.u_max)
     reached = fopdt.K * u + fopdt.offset
     without = demands.top * (u - motion.threshold) / reached if reached > 0.0 else math.inf
     return dead_zone(motion.threshold, "step") if without <= demands.u_max else None

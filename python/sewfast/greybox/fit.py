@@ -13,7 +13,9 @@ from ..dataset.faults import sound
 from ..errors import SettingError
 from ..motorfit import OPTIONAL, TERMS, WAVES, estimated, records_of
 from ..recording import Recording
+from ..units import is_position
 from .equations import EquationFit, Equations, fit_equations
+from .joint import Joint, joint_of
 from .motor import Motor, motor_of
 
 Intervals: TypeAlias = Literal["curvature", "profile"]
@@ -23,6 +25,12 @@ STRUCTURES = {
     "cogging": WAVES[:3],
 }
 """Names for groups of terms."""
+
+
+@overload
+def physics(  # type: ignore[overload-overlap]
+    data: Dataset, *, structure: Literal["joint"]
+) -> Joint: ...
 
 
 @overload
@@ -61,7 +69,7 @@ def physics(
     parameters: Mapping[str, float | Sequence[float]] | None = None,
     states: int = 1,
     substeps: int = 1,
-) -> Motor | EquationFit:
+) -> Motor | EquationFit | Joint:
     """Friction, inertia and electrical constants of a motor from one record, with 95 % intervals.
 
     Command and speed alone determine the command per speed `k_v` and per acceleration `k_a`, dry
@@ -70,12 +78,15 @@ def physics(
     resistance [command/A] and separates k_v into back-EMF and viscous friction; with `volts` as
     well, all are in SI units.
 
+    With ``structure="joint"`` the output is a position, and the command drives the joint or, if it
+    has the output's unit, is a position command to a controller inside; see docs/joints.md.
+
     Parameters
     ----------
     data : Recording or Dataset
         One input; of a `Recording` the counts are fitted. Random steps in both directions for 10 s
         show most; several experiments are fitted together.
-    structure : "dcmotor" or sequence of str
+    structure : "dcmotor", "joint" or sequence of str
         Possible terms, of `lag`, `delay`, `coulomb`, `offset`, `drop`, `stribeck`, `load_1`,
         `load_2`, `inertia_2` (varying once, twice per turn), `cogging` and `torque_ripple` (whose
         orders per turn are searched), `limit`, `stribeck_difference` (by direction), `sag` (of the
@@ -106,7 +117,7 @@ def physics(
 
     Returns
     -------
-    Motor or, with `equations`, EquationFit
+    Motor or, with `equations`, EquationFit, with the structure "joint" a Joint
         Parameters with intervals, and the names of those that the record does not determine.
 
     Raises
@@ -136,6 +147,8 @@ def physics(
             )  # fmt: skip
         records = records_of(data, None, speed_unit)
         return fit_equations(records, equations, parameters, states=states, substeps=substeps)
+    if structure in ("joint", ["joint"]):
+        return _joint(data, current, volts, speed_unit, intervals)
     if intervals not in get_args(Intervals):
         raise SettingError(
             name="intervals", expected="curvature or profile", received=repr(intervals),
@@ -151,6 +164,32 @@ def physics(
     records = records_of(data, current, speed_unit)
     found = estimated(records, terms, if_clear=OPTIONAL if "dcmotor" in structure else ())
     return motor_of(found, volts, profile=intervals == "profile")
+
+
+def _joint(
+    data: Recording | Dataset, current: object, volts: object, speed_unit: object, intervals: str
+) -> Joint:
+    given = {"current": current, "volts": volts, "speed_unit": speed_unit}
+    if intervals != "curvature":
+        given["intervals"] = intervals
+    for name, value in given.items():
+        if value is not None:
+            raise SettingError(
+                name=name, expected="none for a joint, which is fitted to command and position",
+                received=repr(value), remedy="leave it out",
+            )  # fmt: skip
+    if not isinstance(data, Dataset):
+        raise SettingError(
+            name="data", expected="a Dataset whose output is a position",
+            received=type(data).__name__,
+            remedy="Dataset.from_arrays(u, position, Ts, output_unit='rad') makes one of arrays",
+        )  # fmt: skip
+    if not is_position(data.output_unit):
+        raise SettingError(
+            name="output_unit", expected="an angle or a length: rad, deg, rev, m, mm, counts",
+            received=repr(data.output_unit), remedy="name the unit of the position",
+        )  # fmt: skip
+    return joint_of(sound(data)[0])
 
 
 def _terms(structure: str | Sequence[str]) -> tuple[str, ...]:

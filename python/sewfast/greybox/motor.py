@@ -32,7 +32,10 @@ FORMAT = "sewfast-motor"
 VERSION = 3
 """Version 1 has `untold` for `undetermined`, version 2 no `orders`; both are read."""
 NAMES = tuple(_core.GREYBOX_PARAMETERS)
-
+VAGUE = 1.0
+"""Half-width of an interval, relative to the value, above which a parameter is not printed."""
+APART = 10.0
+"""Half-width, relative to the value, above which other parameters can replace it."""
 
 _SI = ("resistance", "motor_constant", "inertia", "viscous_friction", "coulomb_torque")
 _NO_CURRENT = (
@@ -473,8 +476,6 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
 
 def motor_of(found: Estimated, volts: float | None, *, profile: bool) -> Motor:
     """The motor of an estimate: each parameter with its interval, or the reason for having none."""
-    # half-width, relative to the value, above which other parameters can replace it
-    apart = 10.0
     estimate, records, reasons = found.state, found.records, found.reasons
     known, names = values_of(estimate), estimate.names()
     spreads = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
@@ -490,15 +491,14 @@ def motor_of(found: Estimated, volts: float | None, *, profile: bool) -> Motor:
         value = of(known)
         slope = slope_of(known, of, names, spreads)
         half = CONFIDENCE * math.sqrt(max(float(slope @ found.covariance @ slope), 0.0))
-        # half-width of an interval, relative to the value, above which a parameter is not printed
-        vague = half >= 1.0 * abs(value)
+        vague = half >= VAGUE * abs(value)
         if name == "delay":  # a delay of zero is a valid result
-            vague = half >= apart * max(value, records.Ts)
+            vague = half >= APART * max(value, records.Ts)
         if not math.isfinite(half) or vague:
             undetermined[name] = (
                 "the record does not part it from the others; add steps to several speeds, in both "
                 "directions"
-                if not half < apart * abs(value) or name == "delay"
+                if not half < APART * abs(value) or name == "delay"
                 else f"its interval, {value - half:.3g} to {value + half:.3g} {unit}, is as wide "
                 "as its value"
             )

@@ -1,4 +1,4 @@
-"""The grey box: a motor's equations by output error, with a network if held-out data need one."""
+"""The grey box: a motor's or a joint's equations, with a network if held-out data need one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -18,9 +17,11 @@ from ..dynamic_model import INIT
 from ..errors import DataError, FitError, SettingError
 from ..models import Model
 from ..models.grey_box import MOST_UNITS, GreyBox
-from ..motorfit import PLACE, estimated, rad_per_second, records_of
+from ..motorfit import PLACE, estimated, joint, rad_per_second, records_of
 from ..motorfit.estimation import Normal, minimised
+from ..motorfit.joint import changed, weights
 from ..progress import TimeUp
+from ..units import is_position, revolutions_per_second
 from .folds import Errors, Split, compared, errors_of, folds, free_runs
 from .task import Look, Pool, Provenance, R, Task, finite
 
@@ -52,7 +53,7 @@ PROBED = 20_000
 
 def grey_box(task: Task) -> Model:
     """The motor, with a network if that is credibly better on held-out data."""
-    require_motor(task.data)
+    require_equations(task.data)
     if task.hidden is not None and task.hidden > MOST_UNITS:
         raise SettingError(
             name="hidden", expected=f"1 to {MOST_UNITS} units beside a motor",
@@ -92,19 +93,19 @@ def grey_box(task: Task) -> Model:
     return task.model(GreyBox, core, known)
 
 
-def require_motor(data: Dataset) -> None:
-    """Raise `DataError` unless there is one input, `SettingError` without a unit of speed."""
+def require_equations(data: Dataset) -> None:
+    """Raise `DataError` unless there is one input, `SettingError` without a unit of the output."""
     if data.n_inputs != 1:
         raise DataError(
             name="inputs", expected="one input, the motor's command",
             received=", ".join(data.input_names), remedy="choose its column",
         )  # fmt: skip
-    try:
-        rad_per_second(data.output_unit)
-    except SettingError:
+    unit = data.output_unit
+    if revolutions_per_second(unit) is None and not is_position(unit):
         raise SettingError(
-            name="output_unit", expected="a speed in rpm, rev/s, rad/s or deg/s",
-            received=repr(data.output_unit),
+            name="output_unit",
+            expected="a speed in rpm, rev/s, rad/s or deg/s, or an angle or a length",
+            received=repr(unit),
             remedy="name the unit of the output, or identify another kind of model",
         ) from None  # fmt: skip
 
@@ -144,15 +145,24 @@ class Motors:
 
     seed: int
     iterations: int
+    integrates: bool = False
+    """Whether an output without a unit is a position, as it integrates."""
 
     def fitted(self, data: Dataset, hidden: int, look: Look | None = None) -> _core.GreyBox:
         """A motor's parameters, a network of `hidden` units beside it, and the process noise."""
-        core = _motor(data, look)
+        core = self._equations(data, look)
         return _with_noise(self._with_network(core, data, hidden, look) if hidden else core, data)
 
     def alone(self, part: Split, look: Look | None = None) -> MotorCandidate:
         """A motor without a network."""
-        return _judged(_motor(part.fitted, look), part)
+        return _judged(self._equations(part.fitted, look), part)
+
+    def _equations(self, data: Dataset, look: Look | None) -> _core.GreyBox:
+        """The equations alone, at the least-squares solution of the free run."""
+        if revolutions_per_second(data.output_unit) is not None:
+            return _motor(data, look)
+        inside = joint.is_commanded(data)
+        return joint.fitted(data, _at_any_time(look), integrates=not inside).core
 
     def beside(
         self, motor: MotorCandidate, part: Split, look: Look | None = None
@@ -165,8 +175,11 @@ class Motors:
         It is first fitted without a network, which is the result if time is short.
         """
         try:
-            require_motor(part.fitted)
-        except (DataError, SettingError):
+            require_equations(part.fitted)
+        except SettingError:
+            if part.fitted.output_unit or not self.integrates:
+                return None
+        except DataError:
             return None
         plain = pool.map(
             lambda part, look: or_none(lambda: self.alone(part, look)),
@@ -201,7 +214,7 @@ class Motors:
                 asked()
             except TimeUp:
                 # cut short, it fits this part and nothing else: as it began, it has no effect
-                one = _changed(core, theta=start)
+                one = changed(core, theta=start)
             begun.append(one)
         best = min(begun, key=lambda c: cost_of(c, part))
         if part is data:
@@ -261,14 +274,6 @@ def _motor(data: Dataset, look: Look | None = None) -> _core.GreyBox:
     )
 
 
-def _changed(core: _core.GreyBox, **values: Any) -> _core.GreyBox:
-    own: dict[str, Any] = {**core.settings, "theta": core.theta, **values}
-    return _core.GreyBox(**{k: v for k, v in own.items() if k not in _DERIVED})
-
-
-_DERIVED = ("nx", "nk", "n_inputs", "integrator", "hidden")
-
-
 def trained_from(
     core: _core.GreyBox, start: FloatArray, data: Dataset, iterations: int, look: Look | None = None
 ) -> _core.GreyBox:
@@ -279,6 +284,9 @@ def trained_from(
     motor, hidden = start[:free], (len(start) - free) // 4
     prior = np.tile([1.0 / ARGUMENTS] * 3 + [1.0 / OUTPUTS], hidden)
     prior = np.concatenate([np.zeros(free), prior]) * math.sqrt(core.settings["residual_variance"])
+    if core.settings["position"]:
+        pieces = joint.pieces_of(data).experiments
+        return joint.descended(core, start, pieces, asked, iterations, prior)[1]
     states = [state for _, _, _, state in _runs(core, data)]
     low = np.full(len(start), -np.inf)
     for j, value in enumerate(motor):  # parameters above 0 stay there
@@ -286,7 +294,7 @@ def trained_from(
 
     def at(x: FloatArray) -> _core.GreyBox | None:
         try:
-            return _changed(core, theta=x)
+            return changed(core, theta=x)
         except SettingError:
             return None
 
@@ -297,7 +305,7 @@ def trained_from(
         cost, slope, total = float((prior * x) @ (prior * x)), prior**2 * x, np.diag(prior**2)
         for e, state in zip(data.experiments, states, strict=True):
             y, rows = own.jacobian(e.u, state)
-            known = _weights(e)
+            known = weights(e)
             error, rows = (known * (y - np.nan_to_num(e.y))), known[:, None] * rows[:, : len(x)]
             cost += float(error @ error)
             whole = gram(np.c_[rows, error])
@@ -312,7 +320,7 @@ def trained_from(
         total = float((prior * x) @ (prior * x))
         try:
             for e, state in zip(data.experiments, states, strict=True):
-                error = _weights(e) * (own.simulate(e.u, state) - np.nan_to_num(e.y))
+                error = weights(e) * (own.simulate(e.u, state) - np.nan_to_num(e.y))
                 total += float(error @ error)
         except FitError:
             return math.inf
@@ -321,15 +329,9 @@ def trained_from(
     count = sum(int(np.isfinite(e.y).sum()) for e in data.experiments)
     bounds = (low, np.full(len(start), np.inf))
     found = minimised(normal, cost, start, bounds, count, enough=ENOUGH, iterations=iterations)
-    best = _changed(core, theta=found.x)
+    best = changed(core, theta=found.x)
     residual = 2.0 * cost_of(best, data)
-    return _changed(best, residual_variance=max(residual, 1e-300))
-
-
-def _weights(e: Experiment) -> FloatArray:
-    """Square roots of the weights; 0 where nothing was measured."""
-    root = np.ones(len(e)) if e.weights is None else np.sqrt(e.weights)
-    return np.where(np.isfinite(e.y), root, 0.0)
+    return changed(best, residual_variance=max(residual, 1e-300))
 
 
 def _runs(
@@ -346,7 +348,7 @@ def _runs(
 def cost_of(core: _core.GreyBox, data: Dataset) -> float:
     """J of the free run [output unit squared]; infinite if it diverges."""
     try:
-        pairs = [(_weights(e), error) for e, _, error, _ in _runs(core, data)]
+        pairs = [(weights(e), error) for e, _, error, _ in _runs(core, data)]
     except FitError:
         return math.inf
     squares = sum(float(np.sum((w * np.nan_to_num(error)) ** 2)) for w, error in pairs)
@@ -360,14 +362,14 @@ def _with_noise(core: _core.GreyBox, data: Dataset) -> _core.GreyBox:
     ]
 
     def one_step(noise: float) -> float:
-        own, total, left = _changed(core, process_noise=noise), 0.0, PROBED
+        own, total, left = changed(core, process_noise=noise), 0.0, PROBED
         for e, state in part:
             n = min(left, len(e))
             left -= n
             if n:
                 y = e.y[:n]
-                error = _weights(e)[:n] * np.nan_to_num(own.predict(e.u[:n], y, state, 1) - y)
+                error = weights(e)[:n] * np.nan_to_num(own.predict(e.u[:n], y, state, 1) - y)
                 total += float(error @ error)
         return total
 
-    return _changed(core, process_noise=min(NOISES, key=one_step))
+    return changed(core, process_noise=min(NOISES, key=one_step))

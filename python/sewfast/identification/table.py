@@ -25,9 +25,18 @@ from ..dataset import Diagnosis, diagnose
 from ..dataset.pieces import thinned
 from ..models.base import EnsembleCore
 from . import grey_box
-from .blocks import FAR, Blocks, Mixture, Row, near
+from .blocks import Blocks, Mixture, Row, near
 from .grey_box import or_none
-from .linear import HELD_OUT, MISLED, ROUNDING, LinearTable, raised, time_constant
+from .linear import (
+    HELD_OUT,
+    INTEGRATING_POLE,
+    MISLED,
+    ROUNDING,
+    LinearTable,
+    raised,
+    slowest_pole,
+    time_constant,
+)
 from .outputs import ABS, LINEAR, Output, named, rectified_start, suggested
 from .task import Pool, Task, arrays
 from .training import Request, Start, Structure, counting, guarded, train
@@ -136,16 +145,20 @@ class Table:
     @property
     def usable(self) -> list[Row]:
         """Rows of which the model may consist.
-        Where the plant integrates, networks without an integrator follow the positions of the
-        record only: they count if all with one are far worse.
+        Where the plant integrates, a model without an integrator follows the positions of the
+        record only. Where one trajectory repeats, a network with one has learned its forces by
+        heart, which no held-out part shows: the equations of a joint count alone.
         """
         found = [r for r in self.rows.values() if r.kind == "neural_ss" or not self.wants_network]
-        least = FAR * min((r.rmse for r in found), default=math.inf)
-        if any(is_integrator(r) and r.rmse <= least for r in found) and self._integrates:
-            found = [r for r in found if is_integrator(r) or not isinstance(r.found, Structure)]
-        return found
+        able = [r for r in found if is_integrator(r)]
+        if not (able and self._integrates):
+            return found
+        joints = [r for r in able if r.kind == "grey_box"]
+        is_repeated = self.diagnosis.find("repeats") is not None
+        # repetitions tell nothing of what is new to a network: physics holds there too
+        return joints if joints and is_repeated else able
 
-    @cached_property
+    @property
     def _integrates(self) -> bool:
         return self.linear.integrates(self.task.data, self.diagnosis)
 
@@ -160,6 +173,8 @@ class Table:
         if self.wants_network or {task.nk, task.nx, task.hidden, task.output} != {None}:
             return
         until, found = self.clock.until(SHARE_OF_SEARCH), []
+        if not task.data.output_unit:
+            self.motors = replace(self.motors, integrates=self._integrates)
         for part in self.folds:
             part = part.shortened(grey_box.SEARCHED, HELD_OUT)
             one = self.motors.candidate(part, self.pool, until)
@@ -464,4 +479,10 @@ class Table:
 
 
 def is_integrator(row: Row) -> bool:
-    return isinstance(row.found, Structure) and row.found.integrator
+    """Whether its models have an integrator: a network, a joint, or a pole at 1."""
+    if isinstance(row.found, Structure):
+        return row.found.integrator
+    cores = [m[0] for m in row.models]
+    if row.kind == "grey_box":
+        return all(core.settings["integrator"] for core in cores)
+    return all(slowest_pole(core) > INTEGRATING_POLE for core in cores)

@@ -13,6 +13,7 @@ from ..storage import Fields
 from .base import SingleModel
 
 NAMES = tuple(_core.GREYBOX_PARAMETERS)
+JOINT = tuple(_core.GREYBOX_JOINT)
 WEIGHTS = ("b", "p", "q", "c")
 MOST_UNITS: int = _core.GREYBOX_UNITS
 
@@ -24,6 +25,10 @@ class GreyBox(SingleModel):
     repeat over a turn are left out, since a speed does not show where a turn begins. The network's
     output is one more load: ``sum c tanh(b + p w + q x)``, of speed w and drive x in units of
     their scales.
+
+    If the output is a position, this is a joint (docs/joints.md): gravity may pull at it, its gears
+    may rub more under load, and `u` may be a position command to a controller of its own, whose
+    gain is then the unit of all forces.
 
     References
     ----------
@@ -54,17 +59,22 @@ class GreyBox(SingleModel):
         """`k_e`, `k_a`, .. and `b[i]`, `p[i]`, `q[i]`, `c[i]`."""
         s = self.settings
         units = (f"{w}[{i}]" for i in range(s["hidden"]) for w in WEIGHTS)
-        return (*(NAMES[j] for j in s["free"]), *units)
+        return (*((*NAMES, *JOINT)[j] for j in s["free"]), *units)
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Speed, drive and the previous command, in units of their scales."""
-        return ("speed", "drive", "command before")
+        """Speed, drive and the previous command in units of their scales, and the position."""
+        return ("speed", "drive", "command before", "position")[: self.settings["nx"]]
 
     @property
     def motor(self) -> dict[str, float]:
         """The motor's parameters by name (docs/physics.md), per rad/s and in commands."""
         return dict(zip(NAMES, self.settings["values"].tolist(), strict=True))
+
+    @property
+    def joint(self) -> dict[str, float]:
+        """The parameters of a joint by name (docs/joints.md); all 0 for a motor's speed."""
+        return dict(zip(JOINT, self.settings["joint"], strict=True))
 
     def parameters(self) -> dict[str, Any]:
         s = self.settings
@@ -74,11 +84,13 @@ class GreyBox(SingleModel):
             "n_inputs": 1,
             "values": list(values.values()),
             "limit": limit if math.isfinite(limit) else None,
-            "free": [NAMES[j] for j in s["free"]],
+            "free": [(*NAMES, *JOINT)[j] for j in s["free"]],
             **{k: s[k] for k in _NUMBERS},
             "steps": s["steps"],
             "mean": s["mean"],
             "theta": self.core.theta.tolist(),
+            # a file of a speed has no field that older versions do not know
+            **({"joint": self.joint} if s["position"] else {}),
         }
 
     def with_output_scaled(self, factor: float) -> dict[str, Any]:
@@ -97,12 +109,17 @@ class GreyBox(SingleModel):
     def core_from(fields: Fields) -> _core.GreyBox:
         """The compiled model from the parameters of a file."""
         free = fields.items("free")
-        if not all(name in NAMES for name in free) or len(set(free)) != len(free):
-            raise fields.refuse("free", f"names of {', '.join(NAMES)}, each once", free)
+        known = (*NAMES, *JOINT)
+        if not all(name in known for name in free) or len(set(free)) != len(free):
+            raise fields.refuse("free", f"names of {', '.join(known)}, each once", free)
+        position = "joint" in fields.values
+        own = fields.object("joint") if position else None
         limit = fields.optional_number("limit")
         return _core.GreyBox(
             values=_completed(fields.vector("values"), math.inf if limit is None else limit),
-            free=[NAMES.index(name) for name in free],
+            joint=[0.0 if own is None else own.number(name) for name in JOINT],
+            position=position,
+            free=[known.index(name) for name in free],
             steps=fields.integer("steps"),
             mean=fields.flag("mean"),
             theta=fields.vector("theta"),
@@ -117,11 +134,37 @@ class GreyBox(SingleModel):
             f"k_s {of['k_s']:.4g} {u}",
         ]
         named = {"tau": ("lag", "s"), "delay": ("delay", "s"), "drop": ("drop", u)}
-        named |= {"sag": ("sag", f"1/{u}^2")}
-        parts += [f"{text} {of[n]:.3g} {unit}" for n, (text, unit) in named.items() if of[n]]
+        named |= {"sag": ("sag", f"1/{u}^2"), "limit": ("limit", u)}
+        of = {k: v for k, v in of.items() if math.isfinite(v)} | self.joint
+        if self.settings["position"]:
+            parts = self._of_joint(u)
+            gravity = math.hypot(of["load_1c"], of["load_1s"])
+            of |= {"gravity": gravity, "stribeck": of["k_t"]}
+            named |= {
+                "gravity": ("gravity", u), "stribeck": ("Stribeck friction", u),
+                "k_l": ("friction per load", ""), "dead_band": ("dead band", u),
+                "reach": ("largest output of the controller", u), "damping": ("k_d / k_p", "s"),
+            }  # fmt: skip
+        parts += [
+            f"{text} {of[n]:.3g} {unit}".rstrip() for n, (text, unit) in named.items() if of.get(n)
+        ]
         units = self.settings["hidden"]
         network = f"{units} tanh for what they leave" if units else "no network"
-        return [f"motor: {', '.join(parts)}", network]
+        what = "motor"
+        if self.settings["position"]:
+            inside = "a controller of its own" if self.joint["k_q"] else "a command that drives it"
+            what = f"joint with {inside}"
+        return [f"{what}: {', '.join(parts)}", network]
+
+    def _of_joint(self, u: str) -> list[str]:
+        """Inertia and friction, per unit of the output."""
+        of, unit, y = self.motor, self.settings["unit"], self.output_unit or "output"
+        return [
+            f"inertia {of['k_a'] * unit:.4g} {u}/({y}/s^2)",
+            f"viscous {(of['k_e'] + of['k_b']) * unit:.4g} {u}/({y}/s)",
+            f"friction {of['k_s']:.4g} {u}",
+            f"offset {of['offset']:.3g} {u}",
+        ]
 
 
 def _completed(values: FloatArray, limit: float) -> FloatArray:

@@ -2,8 +2,9 @@
 
 Read `terms` (the method, and profile-likelihood intervals) first, then `records` (the data),
 `problem` (free parameters and residuals), `starts` (initial values, and effects that repeat over
-the turn) and `estimation` (descent, whitening filters, covariance). The motor's equations and their
-sensitivities are in the core. `physics` prints the result, `identify` makes a model of it.
+the turn) and `estimation` (descent, whitening filters, covariance). `joint` is the same for
+positions. The motor's equations and their sensitivities are in the core. `physics` prints the
+result, `identify` makes a model of it.
 """
 
 from .problem import OPTIONAL, PLACE, TERMS, WAVES

@@ -16,6 +16,13 @@
 //!
 //! An eccentric encoder shows `w (1 + eccentric_c cos th + eccentric_s sin th)`.
 //!
+//! A joint ([`JOINT`]) also has a load on its gears, and a controller of its own if `k_q` is not 0: `u` is then a
+//! position command, and the loop gain of the controller is the unit of everything:
+//!
+//! ```text
+//! friction += k_l |x g(th) + offset + load(th)|
+//! v = (e - dead_band sign e) - damping w, |v| <= reach,    e = u - k_q q, 0 if |e| <= dead_band
+//! ```
 //!
 //! With a resistance R \[command/A\], a motor constant K and G volts per unit of command, `k_e = K/G`, `k_a = J R/K`,
 //! `k_b = B R/K`, `k_s = T R/K`. Derivatives are carried along as dual numbers (Griewank and Walther 2008, chapter 3):
@@ -25,7 +32,7 @@ mod model;
 mod motor;
 mod normal;
 
-pub use model::{Frame, GreyBox, MOST_UNITS};
+pub use model::{Frame, GreyBox, JOINT, MOST_UNITS};
 pub(crate) use motor::{Motor, Moving, tanh_of_one};
 pub use normal::{Current, Measured, Normal, normal};
 
@@ -306,6 +313,9 @@ struct Equations<const N: usize> {
     sag: Option<Dual<N>>,
     eccentric: Option<[Dual<N>; 2]>,
     waves: [Option<Wave<N>>; ORDERS],
+    /// Friction of gears per load that they carry.
+    k_l: Option<Dual<N>>,
+    inner: Option<Inner<N>>,
     /// Fraction of the way to its goal that the drive covers in a step, `1 - exp(-h / tau)`.
     share: Dual<N>,
     /// Weight of the start in the drive's mean over a step.
@@ -315,6 +325,39 @@ struct Equations<const N: usize> {
     /// those of half a step earlier.
     bend: Dual<N>,
     step: f64,
+}
+
+/// A drive's own controller, whose loop gain is 1 command per command.
+#[derive(Clone, Copy, Debug)]
+struct Inner<const N: usize> {
+    /// Commands per rad or metre.
+    k_q: Dual<N>,
+    damping: Dual<N>,
+    dead_band: Option<Dual<N>>,
+    reach: Option<Dual<N>>,
+}
+
+impl<const N: usize> Inner<N> {
+    /// Its output at a position and speed, and how the output changes over `time` at this speed.
+    #[inline(always)]
+    fn output(&self, u: &Dual<N>, q: &Dual<N>, w: &Dual<N>, time: f64) -> (Dual<N>, Dual<N>) {
+        let mut error = u.plus(-1.0, &self.k_q.times(q));
+        let mut change = self.k_q.times(w).scaled(-time);
+        if let Some(dead_band) = &self.dead_band {
+            if error.value.abs() > dead_band.value {
+                error = error.plus(-error.value.signum(), dead_band);
+            } else {
+                (error, change) = (Dual::ZERO, Dual::ZERO);
+            }
+        }
+        let output = error.plus(-1.0, &self.damping.times(w));
+        match &self.reach {
+            Some(reach) if output.value.abs() > reach.value => {
+                (reach.scaled(output.value.signum()), Dual::ZERO)
+            }
+            _ => (output, change),
+        }
+    }
 }
 
 /// `c cos(order th) + s sin(order th)`.
@@ -399,6 +442,8 @@ impl<const N: usize> Equations<N> {
                     s: one(WAVES + 2 * j + 1),
                 })
             }),
+            k_l: None,
+            inner: None,
             share,
             memory,
             bend,
@@ -488,10 +533,12 @@ impl<const N: usize> Equations<N> {
             .plus(-1.0, &self.k_b.times(middle))
             .plus(-1.0, &turn.half_slope.times(&middle.times(middle)));
         let free = from.plus(time, &smooth.times(&turn.per_inertia));
-        let most = self
-            .dry(middle, free.value.signum())
-            .times(&turn.per_inertia)
-            .scaled(time);
+        let mut dry = self.dry(middle, free.value.signum());
+        if let Some(k_l) = &self.k_l {
+            let carried = torque.plus(1.0, &turn.load);
+            dry = dry.plus(carried.value.signum(), &k_l.times(&carried));
+        }
+        let most = dry.times(&turn.per_inertia).scaled(time);
         if free.value.abs() <= most.value {
             return Dual::ZERO;
         }
@@ -547,23 +594,29 @@ impl<const N: usize> Equations<N> {
         }
     }
 
-    /// Drive and speed after a step at this command.
+    /// Drive and speed after a step at this command, from position `q`.
     #[inline(always)]
     fn advanced(
         &self,
         turn: &Turn<N>,
         x: &Dual<N>,
         w: &Dual<N>,
+        q: &Dual<N>,
         u: &Dual<N>,
     ) -> (Dual<N>, Dual<N>) {
         let middle = self.moved(turn, w, x, w, 0.5 * self.step);
         let k_e = turn.gain.map_or(self.k_e, |gain| self.k_e.times(&gain));
         let mut voltage = *u;
+        let mut change = k_e.times(&w.plus(-1.0, &middle)).scaled(2.0);
+        if let Some(inner) = &self.inner {
+            let half = q.plus(0.25 * self.step, w).plus(0.25 * self.step, &middle);
+            let (output, by) = inner.output(u, &half, &middle, self.step);
+            (voltage, change) = (output, change.plus(1.0, &by));
+        }
         if let Some(sag) = &self.sag {
             voltage = voltage.plus(-1.0, &sag.times(x).times(&u.times(u)));
         }
         let goal = voltage.plus(-1.0, &k_e.times(&middle));
-        let change = k_e.times(&w.plus(-1.0, &middle)).scaled(2.0);
         let (after, mean) = self.driven(x, &goal, &change);
         (after, self.moved(turn, w, &mean, &middle, self.step))
     }
@@ -623,7 +676,7 @@ impl<const N: usize> Kernel for Carried<'_, N> {
                 if let (Some(place), true) = (late, (0.0..1.0).contains(&old)) {
                     command.by[place] = (before - now) / step;
                 }
-                let (drive, speed) = is.advanced(&turn, &x, &w, &command);
+                let (drive, speed) = is.advanced(&turn, &x, &w, &Dual::ZERO, &command);
                 mean = mean.plus(0.5, &w).plus(0.5, &speed);
                 (x, w) = (drive, speed);
             }

@@ -72,6 +72,8 @@ pub(crate) trait Arithmetic: Copy {
     fn if_equal(self, other: Self, yes: Self, no: Self) -> Self;
     /// One bit for each lane with `self < other`, the first lane lowest.
     fn are_less(self, other: Self) -> u8;
+    /// A function of each number, one by one: for what is rare, or has no form in lanes.
+    fn each(self, of: impl Fn(f64) -> f64) -> Self;
 }
 
 /// Eight numbers in registers.

@@ -7,13 +7,14 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::{Listening, TRACKED, Tracker as Core};
 use sewfast_core::Error;
-use sewfast_core::greybox::{self, Current, Frame, Measured, ORDERS, PARAMETERS, Run};
+use sewfast_core::greybox::{self, Current, Frame, JOINT, Measured, ORDERS, PARAMETERS, Run};
 
 use crate::models::{Kind, Model, Rows, Values};
 use crate::seam::{array1, array2, raise, rows, slice, watched_over};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("GREYBOX_PARAMETERS", PARAMETERS)?;
+    module.add("GREYBOX_JOINT", JOINT)?;
     module.add_class::<Tracker>()?;
     module.add_function(wrap_pyfunction!(greybox_run, module)?)?;
     module.add_function(wrap_pyfunction!(greybox_normal, module)?)?;
@@ -266,7 +267,8 @@ impl Kind for GreyBox {
 impl GreyBox {
     #[new]
     #[pyo3(signature = (
-        *, values, free, Ts, steps, mean, unit, speed_scale, command_scale, residual_variance, process_noise, theta
+        *, values, free, Ts, steps, mean, unit, speed_scale, command_scale, residual_variance, process_noise, theta,
+        position=false, joint=[0.0; JOINT.len()]
     ))]
     #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
@@ -282,6 +284,8 @@ impl GreyBox {
         residual_variance: f64,
         process_noise: f64,
         theta: Values<'_>,
+        position: bool,
+        joint: [f64; JOINT.len()],
     ) -> PyResult<PyClassInitializer<Self>> {
         let given = slice(&values, "values")?;
         let values = given.try_into().map_err(|_| {
@@ -294,10 +298,12 @@ impl GreyBox {
         })?;
         let frame = Frame {
             values,
+            joint,
             free,
             sample_time: Ts,
             steps,
             mean,
+            position,
             unit,
             speed_scale,
             command_scale,
@@ -313,16 +319,18 @@ impl GreyBox {
     fn settings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let frame = self.inner.frame();
         let settings = PyDict::new(py);
-        settings.set_item("nx", 3)?;
+        settings.set_item("nx", self.inner.order())?;
         settings.set_item("nk", self.inner.nk())?;
         settings.set_item("n_inputs", 1)?;
-        settings.set_item("integrator", false)?;
+        settings.set_item("integrator", self.inner.integrates())?;
         settings.set_item("hidden", self.inner.units())?;
         settings.set_item("values", array1(py, frame.values.to_vec()))?;
+        settings.set_item("joint", frame.joint)?;
         settings.set_item("free", frame.free.clone())?;
         settings.set_item("Ts", frame.sample_time)?;
         settings.set_item("steps", frame.steps)?;
         settings.set_item("mean", frame.mean)?;
+        settings.set_item("position", frame.position)?;
         settings.set_item("unit", frame.unit)?;
         settings.set_item("speed_scale", frame.speed_scale)?;
         settings.set_item("command_scale", frame.command_scale)?;
@@ -339,6 +347,6 @@ impl GreyBox {
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let ((u, channels), state) = (rows(&u, "u")?, slice(&state, "state")?);
         let found = py.detach(|| self.inner.states(u, channels, state));
-        array2(py, found.map_err(|e| raise(py, e))?, 3)
+        array2(py, found.map_err(|e| raise(py, e))?, self.inner.order())
     }
 }

@@ -312,8 +312,8 @@ impl<V: F64x8> Plant for ScalarMotor<'_, V> {
     }
 }
 
-/// Numbers in [`BatchPlant::phi`] for a motor: output, speed, drive, command of the last sample.
-const OF_MOTOR: usize = 4;
+/// Numbers in [`BatchPlant::phi`] for a motor: output, speed, drive, command of the last sample, position.
+const OF_MOTOR: usize = 5;
 
 /// Eight runs of one plant, side by side.
 pub(super) struct BatchPlant<'a> {
@@ -392,18 +392,20 @@ impl<'a> BatchPlant<'a> {
 
     #[inline(always)]
     fn turn<V: F64x8>(&mut self, motor: &Motor, due: V, meanwhile: &mut impl Meanwhile) {
-        let [output, w, x, before] = &mut self.phi[..] else {
+        let [output, w, x, before, q] = &mut self.phi[..] else {
             return;
         };
         let mut at = Moving {
             w: V::load(&w.0),
             x: V::load(&x.0),
             before: V::load(&before.0),
+            q: V::load(&q.0),
         };
         let (y, moved) = motor.step(&mut at, due, V::tanh, meanwhile);
         at.w.store(&mut w.0);
         at.x.store(&mut x.0);
         at.before.store(&mut before.0);
+        at.q.store(&mut q.0);
         y.store(&mut output.0);
         let position = V::load(&self.position.0).add(moved);
         position.store(&mut self.position.0);

@@ -7,11 +7,16 @@
 //! ```
 //!
 //! held over a sample. The states are speed, drive and previous command, in units of the scales. An output belongs to the end of its
-//! sample, so it depends on the command `v(k) = u(k - nk)`, where `nk` is one sample plus the whole samples of the delay. Terms that
-//! depend on the shaft angle are excluded: a record of the speed does not say at which angle it begins.
+//! sample, so it depends on the command `v(k) = u(k - nk)`, where `nk` is one sample plus the whole samples of the delay.
+//!
+//! If the output is a position, it is the last state, in units of the output. It then also says at which angle a record begins, which a
+//! speed does not: gravity (`load_1`) is allowed, and the friction and the controller of a joint ([`JOINT`]).
 
 use super::motor::{self, Motor};
-use super::{DELAY, Dual, Equations, ORDERS, PARAMETERS, Run, Turn, check, varies};
+use super::{
+    DELAY, Dual, Equations, FIRST_OVER_THE_TURN, Inner, ORDERS, PARAMETERS, Run, Turn, check,
+    varies,
+};
 use crate::closed_loop::{KernelPlant, Known, Plant};
 use crate::embedded::Embedded;
 use crate::lagged::finite;
@@ -20,13 +25,26 @@ use crate::model::{ClonePlant, Model, RunAndRows};
 use crate::neural::Nothing;
 use crate::simd::{self, F64x8, Kernel};
 use crate::{Error, Result};
+use nalgebra::{DMatrix, DVector};
 
-/// Speed, drive, previous command.
-const STATES: usize = 3;
-/// States that a measurement corrects: speed and drive.
-const FILTERED: usize = 2;
+/// Names of the parameters of a joint beyond those of a motor, in their order after [`PARAMETERS`]; 0 for none.
+pub const JOINT: [&str; 5] = ["k_l", "k_q", "damping", "dead_band", "reach"];
+const K_L: usize = 0;
+const K_Q: usize = 1;
+const DAMPING: usize = 2;
+const DEAD_BAND: usize = 3;
+const REACH: usize = 4;
+
+/// Most states: speed, drive, previous command, and the position if it is the output.
+const STATES: usize = 4;
+/// Places of the states that a measurement corrects: all but the previous command.
+const FILTERED: [usize; 3] = [0, 1, 3];
 /// Weights of a unit: `b`, `p`, `q`, `c`.
 const WEIGHTS: usize = 4;
+/// The first parameter of a joint.
+const OF_JOINT: usize = PARAMETERS.len();
+/// Places of the load once per turn, which is gravity if the position is known.
+const GRAVITY: [usize; 2] = [FIRST_OVER_THE_TURN, FIRST_OVER_THE_TURN + 1];
 /// Most units: whatever needs more is no residual of a motor.
 pub const MOST_UNITS: usize = 6;
 /// Weight of an initial state's distance from what the first outputs say, relative to a squared error.
@@ -38,7 +56,9 @@ const STATE_STEPS: usize = 20;
 pub struct Frame {
     /// Values in the order of [`PARAMETERS`]; theta replaces those of the free parameters.
     pub values: [f64; PARAMETERS.len()],
-    /// Indices of the free parameters.
+    /// Values in the order of [`JOINT`].
+    pub joint: [f64; JOINT.len()],
+    /// Indices of the free parameters, those of a joint after those of the motor.
     pub free: Vec<usize>,
     /// Sample time \[s\].
     pub sample_time: f64,
@@ -46,7 +66,9 @@ pub struct Frame {
     pub steps: usize,
     /// Whether an output is the mean speed over its sample, as from a difference of counts.
     pub mean: bool,
-    /// One unit of the output \[rad/s\].
+    /// Whether the output is the position, else the speed.
+    pub position: bool,
+    /// One unit of the output \[rad/s, or rad\].
     pub unit: f64,
     /// Scale of the speed \[rad/s\].
     pub speed_scale: f64,
@@ -101,22 +123,94 @@ impl GreyBox {
                 "expected finite weights and a process noise from 0 on, got others; identify the model again",
             ));
         }
-        for (place, value) in frame.free.iter().zip(theta) {
-            if let Some(one) = frame.values.get_mut(*place) {
+        for (&place, value) in frame.free.iter().zip(theta) {
+            let (values, joint) = (&mut frame.values, &mut frame.joint);
+            if let Some(one) = values.iter_mut().chain(joint).nth(place) {
                 *one = *value;
             }
         }
         let network = network.as_chunks::<WEIGHTS>().0.to_vec();
         let made = Self { frame, network };
-        check(&made.run(), &[])?;
-        let turns = (0..PARAMETERS.len()).any(|j| varies(j) && made.frame.values[j] != 0.0);
-        if turns || made.frame.free.iter().any(|&j| varies(j) || j == DELAY) {
+        made.check_frame()?;
+        Ok(made)
+    }
+
+    fn check_frame(&self) -> Result<()> {
+        let frame = &self.frame;
+        let last = OF_JOINT + JOINT.len();
+        if let Some(j) = frame.free.iter().find(|&&j| j >= last) {
+            return Err(Error::setting(format!(
+                "expected places of parameters from 0 to {}, got {j}",
+                last - 1
+            )));
+        }
+        let motor: Vec<usize> = frame
+            .free
+            .iter()
+            .copied()
+            .filter(|&j| j < OF_JOINT)
+            .collect();
+        // the angle of a run is given or integrated, that of a model is a state
+        check(
+            &Run {
+                angle: Some(&[]),
+                free: &motor,
+                ..self.run()
+            },
+            &[],
+        )?;
+        let excluded = |j: usize| varies(j) && !(frame.position && GRAVITY.contains(&j));
+        let turns = (0..PARAMETERS.len()).any(|j| excluded(j) && frame.values[j] != 0.0);
+        if turns
+            || motor
+                .iter()
+                .any(|&j| excluded(j) || j == DELAY && !frame.position)
+        {
             return Err(Error::setting(
                 "expected a motor without loads over the turn and with a fixed delay, got others; leave load_1, load_2, \
                  inertia_2, cogging, torque_ripple and eccentricity out",
             ));
         }
-        Ok(made)
+        let joint = (frame.joint != [0.0; JOINT.len()]) || motor.len() < frame.free.len();
+        if joint && !frame.position {
+            return Err(Error::setting(
+                "expected a position as the output of a joint, got a speed; leave k_l, k_q and the controller out",
+            ));
+        }
+        for (&value, name) in frame.joint.iter().zip(JOINT) {
+            if !value.is_finite() || value < 0.0 && name != "k_q" && name != "damping" {
+                return Err(Error::setting(format!(
+                    "expected a finite number from 0 on as {name}, got {value}"
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    /// States of this model.
+    pub fn order(&self) -> usize {
+        STATES - usize::from(!self.frame.position)
+    }
+
+    /// Whether a constant command moves the output on and on.
+    pub fn integrates(&self) -> bool {
+        self.frame.position && self.frame.joint[K_Q] == 0.0
+    }
+
+    /// Places of the states that a measurement corrects.
+    fn filtered(&self) -> &'static [usize] {
+        &FILTERED[..self.order() - 1]
+    }
+
+    /// The scales of the states.
+    fn scales(&self) -> [f64; STATES] {
+        let frame = &self.frame;
+        [
+            frame.speed_scale,
+            frame.command_scale,
+            frame.command_scale,
+            frame.unit,
+        ]
     }
 
     /// All settings apart from theta.
@@ -154,9 +248,10 @@ impl GreyBox {
     }
 
     fn check(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<()> {
-        if channels != 1 || state.len() != STATES {
+        if channels != 1 || state.len() != self.order() {
             return Err(Error::data(format!(
-                "expected u of shape (N, 1) and {STATES} states, got (N, {channels}) and {}; a motor has one command",
+                "expected u of shape (N, 1) and {} states, got (N, {channels}) and {}; a motor has one command",
+                self.order(),
                 state.len()
             )));
         }
@@ -182,9 +277,9 @@ impl GreyBox {
         self.check(u, channels, state)?;
         let stepper = Stepper::<0>::new(self, false);
         let mut at = Moving::at(self, state);
-        let mut found = Vec::with_capacity(STATES * u.len());
+        let mut found = Vec::with_capacity(self.order() * u.len());
         for v in self.acting(u) {
-            found.extend(at.state(self));
+            found.extend(&at.state(self)[..self.order()]);
             stepper.step(&mut at, &Dual::constant(v));
         }
         finite(found)
@@ -196,39 +291,49 @@ impl GreyBox {
     }
 }
 
-/// The motor's state with its derivatives.
+/// The motor's state with its derivatives; the position stays 0 if it is not the output.
 #[derive(Clone, Copy, Debug)]
 struct Moving<const N: usize> {
     w: Dual<N>,
     x: Dual<N>,
     before: Dual<N>,
+    q: Dual<N>,
 }
 
 impl<const N: usize> Moving<N> {
     fn at(model: &GreyBox, state: &[f64]) -> Self {
-        let frame = &model.frame;
+        let scales = model.scales();
+        let one = |j: usize| Dual::constant(scales[j] * state.get(j).copied().unwrap_or(0.0));
         Self {
-            w: Dual::constant(frame.speed_scale * state[0]),
-            x: Dual::constant(frame.command_scale * state[1]),
-            before: Dual::constant(frame.command_scale * state[2]),
+            w: one(0),
+            x: one(1),
+            before: one(2),
+            q: one(3),
         }
     }
 
     /// With derivatives by the states, from index `place` on.
     fn seeded(mut self, model: &GreyBox, place: usize) -> Self {
-        self.w.by[place] = model.frame.speed_scale;
-        self.x.by[place + 1] = model.frame.command_scale;
-        self.before.by[place + 2] = model.frame.command_scale;
+        let states = [&mut self.w, &mut self.x, &mut self.before, &mut self.q];
+        for (j, (state, scale)) in states.into_iter().zip(model.scales()).enumerate() {
+            if j < model.order() {
+                state.by[place + j] = scale;
+            }
+        }
         self
     }
 
+    /// The states in units of their scales.
+    fn scaled(&self, model: &GreyBox) -> [Dual<N>; STATES] {
+        let scales = model.scales();
+        let states = [self.w, self.x, self.before, self.q];
+        std::array::from_fn(|j| states[j].scaled(1.0 / scales[j]))
+    }
+
     fn state(&self, model: &GreyBox) -> [f64; STATES] {
-        let frame = &model.frame;
-        [
-            self.w.value / frame.speed_scale,
-            self.x.value / frame.command_scale,
-            self.before.value / frame.command_scale,
-        ]
+        let scales = model.scales();
+        let states = [self.w, self.x, self.before, self.q];
+        std::array::from_fn(|j| states[j].value / scales[j])
     }
 }
 
@@ -238,9 +343,13 @@ pub(super) struct Stepper<const N: usize> {
     pub equations: Equations<N>,
     pub turn: Turn<N>,
     pub network: Vec<[Dual<N>; WEIGHTS]>,
+    /// Load over the angle, `c cos q + s sin q`.
+    pub gravity: Option<[Dual<N>; 2]>,
     pub frame: Frame,
     /// Fraction of a sample in the command's delay.
     pub part: f64,
+    /// Place of the delay among the free parameters.
+    pub late: Option<usize>,
 }
 
 impl<const N: usize> Stepper<N> {
@@ -252,7 +361,29 @@ impl<const N: usize> Stepper<N> {
             free: if by_theta { &frame.free } else { &[] },
             ..model.run()
         };
-        let equations = Equations::new(&run, step);
+        let mut equations = Equations::new(&run, step);
+        let joint = |j: usize| {
+            let mut dual = Dual::constant(frame.joint[j]);
+            if let Some(place) = run.free.iter().position(|&free| free == OF_JOINT + j) {
+                dual.by[place] = 1.0;
+            }
+            dual
+        };
+        let some = |j: usize| frame.joint[j] != 0.0 || run.free.contains(&(OF_JOINT + j));
+        equations.k_l = some(K_L).then(|| joint(K_L));
+        equations.inner = some(K_Q).then(|| Inner {
+            k_q: joint(K_Q),
+            damping: joint(DAMPING),
+            dead_band: some(DEAD_BAND).then(|| joint(DEAD_BAND)),
+            reach: (frame.joint[REACH] > 0.0).then(|| joint(REACH)),
+        });
+        let [c, s, ..] = equations.turn;
+        let by_angle = GRAVITY
+            .iter()
+            .any(|&j| frame.values[j] != 0.0 || run.free.contains(&j));
+        if by_angle {
+            (equations.turn[0], equations.turn[1]) = (Dual::ZERO, Dual::ZERO);
+        }
         let mut next = frame.free.len();
         let mut weight = |value: f64| {
             let mut dual = Dual::constant(value);
@@ -265,6 +396,7 @@ impl<const N: usize> Stepper<N> {
         Self {
             turn: equations.at(0.0, 0.0),
             equations,
+            gravity: by_angle.then_some([c, s]),
             network: model
                 .network
                 .iter()
@@ -272,6 +404,7 @@ impl<const N: usize> Stepper<N> {
                 .collect(),
             frame: frame.clone(),
             part: model.delay().fract(),
+            late: run.free.iter().position(|&j| j == DELAY),
         }
     }
 
@@ -299,17 +432,39 @@ impl<const N: usize> Stepper<N> {
             turn.load = turn.load.plus(1.0, &self.residual(&at.w, &at.x));
         }
         let steps = self.frame.steps;
+        let step = self.equations.step;
         let mut mean = Dual::ZERO;
         for j in 0..steps {
-            let old = (self.part * steps as f64 - j as f64).clamp(0.0, 1.0);
-            let command = now.scaled(1.0 - old).plus(old, &at.before);
-            let (drive, speed) = self.equations.advanced(&turn, &at.x, &at.w, &command);
-            mean = mean.plus(0.5, &at.w).plus(0.5, &speed);
+            let left = self.part * steps as f64 - j as f64;
+            let old = left.clamp(0.0, 1.0);
+            let mut command = now.scaled(1.0 - old).plus(old, &at.before);
+            if let (Some(place), true) = (self.late, (0.0..1.0).contains(&left)) {
+                command.by[place] += (at.before.value - now.value) / step;
+            }
+            let mut turn = turn;
+            if let Some([c, s]) = &self.gravity {
+                let angle = at.q.plus(0.5 * step, &at.w);
+                let (sin, cos) = angle.value.sin_cos();
+                turn.load = turn
+                    .load
+                    .plus(1.0, &c.times(&angle.through(cos, -sin)))
+                    .plus(1.0, &s.times(&angle.through(sin, cos)));
+            }
+            let equations = &self.equations;
+            let (drive, speed) = equations.advanced(&turn, &at.x, &at.w, &at.q, &command);
+            if self.frame.position {
+                at.q = at.q.plus(0.5 * step, &at.w).plus(0.5 * step, &speed);
+            } else {
+                mean = mean.plus(0.5, &at.w).plus(0.5, &speed);
+            }
             (at.x, at.w) = (drive, speed);
         }
         at.before = *now;
-        let mean = mean.scaled(1.0 / steps as f64);
-        let output = if self.frame.mean { mean } else { at.w };
+        let output = match &self.frame {
+            frame if frame.position => at.q,
+            frame if frame.mean => mean.scaled(1.0 / steps as f64),
+            _ => at.w,
+        };
         output.scaled(1.0 / self.frame.unit)
     }
 }
@@ -328,39 +483,34 @@ impl<const N: usize> Kernel for Carried<'_, N> {
         let mut rows = Vec::new();
         if N > 0 {
             at = at.seeded(model, columns);
-            rows.reserve(v.len() * (columns + STATES));
+            rows.reserve(v.len() * (columns + model.order()));
         }
         let mut run = Vec::with_capacity(v.len());
         for &v in v {
             let y = stepper.step(&mut at, &Dual::constant(v));
             run.push(y.value);
             if N > 0 {
-                rows.extend_from_slice(&y.by[..columns + STATES]);
+                rows.extend_from_slice(&y.by[..columns + model.order()]);
             }
         }
         (run, rows)
     }
 }
 
-/// Speed and drive with their covariance, corrected by measured outputs (extended Kalman filter: Anderson and Moore 1979, section 8.2).
+/// The states with their covariance, corrected by measured outputs (extended Kalman filter: Anderson and Moore 1979, section 8.2).
 struct Filter<'a> {
     model: &'a GreyBox,
     stepper: Stepper<STATES>,
     state: [f64; STATES],
-    covariance: [[f64; FILTERED]; FILTERED],
+    covariance: [[f64; FILTERED.len()]; FILTERED.len()],
 }
 
 impl Filter<'_> {
-    /// The predicted output, the scaled speed and drive that follow, and the state that follows, each with derivatives.
-    fn step(&self, v: f64) -> (Dual<STATES>, [Dual<STATES>; FILTERED], Moving<STATES>) {
+    /// The predicted output and the state that follows, each with derivatives.
+    fn step(&self, v: f64) -> (Dual<STATES>, Moving<STATES>) {
         let mut at = Moving::at(self.model, &self.state).seeded(self.model, 0);
         let y = self.stepper.step(&mut at, &Dual::constant(v));
-        let frame = &self.model.frame;
-        let scaled = [
-            at.w.scaled(1.0 / frame.speed_scale),
-            at.x.scaled(1.0 / frame.command_scale),
-        ];
-        (y, scaled, at)
+        (y, at)
     }
 
     /// Corrects the state by one output; NaN is skipped.
@@ -368,33 +518,43 @@ impl Filter<'_> {
         if y.is_nan() {
             return;
         }
-        let (predicted, ..) = self.step(v);
-        let row = [predicted.by[0], predicted.by[1]];
+        let (predicted, _) = self.step(v);
+        let places = self.model.filtered();
         let p = self.covariance;
-        let gain = [0, 1].map(|i| p[i][0] * row[0] + p[i][1] * row[1]);
-        let spread = self.model.frame.residual_variance + row[0] * gain[0] + row[1] * gain[1];
-        for i in 0..FILTERED {
-            self.state[i] += gain[i] * (y - predicted.value) / spread;
-            for j in 0..FILTERED {
+        let mut gain = [0.0; FILTERED.len()];
+        let mut spread = self.model.frame.residual_variance;
+        for (i, gain) in gain.iter_mut().enumerate().take(places.len()) {
+            for (j, &place) in places.iter().enumerate() {
+                *gain += p[i][j] * predicted.by[place];
+            }
+            spread += predicted.by[places[i]] * *gain;
+        }
+        for (i, &place) in places.iter().enumerate() {
+            self.state[place] += gain[i] * (y - predicted.value) / spread;
+            for j in 0..places.len() {
                 self.covariance[i][j] -= gain[i] * gain[j] / spread;
             }
         }
     }
 
     fn advance(&mut self, v: f64) {
-        let (_, next, at) = self.step(v);
+        let (_, at) = self.step(v);
+        let next = at.scaled(self.model);
+        let places = self.model.filtered();
         let p = self.covariance;
-        let through = |a: &Dual<STATES>, b: &Dual<STATES>| -> f64 {
-            (0..FILTERED)
-                .flat_map(|i| (0..FILTERED).map(move |j| (i, j)))
-                .map(|(i, j)| a.by[i] * p[i][j] * b.by[j])
-                .sum()
-        };
-        for i in 0..FILTERED {
-            for j in 0..FILTERED {
-                self.covariance[i][j] = through(&next[i], &next[j]);
+        for (i, &a) in places.iter().enumerate() {
+            for (j, &b) in places.iter().enumerate() {
+                self.covariance[i][j] = places
+                    .iter()
+                    .enumerate()
+                    .flat_map(|(k, c)| places.iter().enumerate().map(move |(l, d)| (k, c, l, d)))
+                    .map(|(k, &c, l, &d)| next[a].by[c] * p[k][l] * next[b].by[d])
+                    .sum();
             }
-            self.covariance[i][i] += self.model.frame.process_noise;
+            // a position moves with the speed only
+            if a < 2 {
+                self.covariance[i][i] += self.model.frame.process_noise;
+            }
         }
         self.state = at.state(self.model);
     }
@@ -402,14 +562,14 @@ impl Filter<'_> {
 
 impl Model for GreyBox {
     fn theta(&self) -> Vec<f64> {
-        let motor = self.frame.free.iter().map(|&j| self.frame.values[j]);
-        motor
-            .chain(self.network.iter().flatten().copied())
-            .collect()
+        let frame = &self.frame;
+        let all: Vec<f64> = frame.values.iter().chain(&frame.joint).copied().collect();
+        let free = frame.free.iter().map(|&j| all[j]);
+        free.chain(self.network.iter().flatten().copied()).collect()
     }
 
     fn rest_state(&self) -> Vec<f64> {
-        vec![0.0; STATES]
+        vec![0.0; self.order()]
     }
 
     fn simulate(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<Vec<f64>> {
@@ -444,12 +604,14 @@ impl Model for GreyBox {
         let mut filter = Filter {
             model: self,
             stepper: Stepper::new(self, false),
-            state: [state[0], state[1], state[2]],
-            covariance: [[noise, 0.0], [0.0, noise]],
+            state: std::array::from_fn(|j| state.get(j).copied().unwrap_or(0.0)),
+            covariance: std::array::from_fn(|i| {
+                std::array::from_fn(|j| if i == j { noise } else { 0.0 })
+            }),
         };
         let plain = Stepper::<0>::new(self, false);
         let ahead = |state: &[f64], v: &[f64]| {
-            let mut at = Moving::at(self, state);
+            let mut at = Moving::at(self, &state[..self.order()]);
             v.iter()
                 .map(|v| plain.step(&mut at, &Dual::constant(*v)).value)
                 .last()
@@ -465,23 +627,33 @@ impl Model for GreyBox {
         finite(found)
     }
 
-    /// Speed and drive by least squares, close to what the first outputs say about them.
+    /// The states by least squares, close to what the first outputs say about them.
     fn estimate_state(&self, u: &[f64], channels: usize, y: &[f64]) -> Result<Vec<f64>> {
-        self.check(u, channels, &[0.0; STATES])?;
+        self.check(u, channels, &self.rest_state())?;
         let known: Vec<f64> = y.iter().copied().filter(|v| v.is_finite()).collect();
         if known.is_empty() || y.len() != u.len() {
             return Err(Error::data(
                 "expected measured outputs to estimate the initial state from, one per input, got none; give 20 or so",
             ));
         }
-        let frame = &self.frame;
+        let (frame, scales, places) = (&self.frame, self.scales(), self.filtered());
         let v = self.acting(u);
         let first = &known[..known.len().min(3)];
         let level = frame.unit * first.iter().sum::<f64>() / first.len() as f64;
-        let drive = (v[0] - frame.values[0] * level) / frame.command_scale;
-        let prior = [level / frame.speed_scale, drive];
         // a step of one scale weighs as much as the output change it makes
-        let weight = PRIOR * (frame.speed_scale / frame.unit).powi(2);
+        let mut weight = PRIOR * (frame.speed_scale / frame.unit).powi(2);
+        let mut prior = [level, v[0] - frame.values[0] * level, v[0], 0.0];
+        if frame.position {
+            weight *= frame.sample_time.powi(2);
+            let voltage = v[0] - frame.joint[K_Q] * level;
+            let reach = match frame.joint[REACH] {
+                0.0 => f64::INFINITY,
+                reach => reach,
+            };
+            prior = [0.0, voltage.clamp(-reach, reach), v[0], level];
+        }
+        let mut prior: [f64; STATES] = std::array::from_fn(|j| prior[j] / scales[j]);
+        prior[2] = v[0] / scales[2];
         let plain = Self {
             network: self.network.clone(),
             frame: Frame {
@@ -489,42 +661,50 @@ impl Model for GreyBox {
                 ..frame.clone()
             },
         };
-        let at = |z: [f64; FILTERED]| [z[0], z[1], v[0] / frame.command_scale];
-        let cost = |z: [f64; FILTERED]| -> f64 {
-            let run = plain.carried::<0>(&v, &at(z)).0;
+        let off = |z: &[f64; STATES]| {
+            places
+                .iter()
+                .map(|&j| (z[j] - prior[j]).powi(2))
+                .sum::<f64>()
+        };
+        let cost = |z: &[f64; STATES]| -> f64 {
+            let run = plain.carried::<0>(&v, &z[..self.order()]).0;
             let errors = run.iter().zip(y).filter(|(_, y)| !y.is_nan());
-            errors.map(|(run, y)| (y - run).powi(2)).sum::<f64>()
-                + weight * ((z[0] - prior[0]).powi(2) + (z[1] - prior[1]).powi(2))
+            errors.map(|(run, y)| (y - run).powi(2)).sum::<f64>() + weight * off(z)
         };
         let (mut z, mut damping) = (prior, 0.0);
-        let mut now = cost(z);
+        let mut now = cost(&z);
+        let n = places.len();
         for _ in 0..STATE_STEPS {
-            let (run, rows) = plain.slopes(&v, &at(z));
-            let mut matrix = [[weight, 0.0], [0.0, weight]];
-            let mut slope = [weight * (prior[0] - z[0]), weight * (prior[1] - z[1])];
+            let (run, rows) = plain.slopes(&v, &z[..self.order()]);
+            let mut matrix = DMatrix::from_diagonal_element(n, n, weight);
+            let mut slope = DVector::from_fn(n, |i, _| weight * (prior[places[i]] - z[places[i]]));
             for ((run, y), row) in run.iter().zip(y).zip(rows.chunks_exact(plain.columns())) {
-                let row = &row[row.len() - STATES..];
+                let row = &row[row.len() - self.order()..];
                 if y.is_nan() {
                     continue;
                 }
-                for i in 0..FILTERED {
-                    slope[i] += row[i] * (y - run);
-                    for j in 0..FILTERED {
-                        matrix[i][j] += row[i] * row[j];
+                for (i, &a) in places.iter().enumerate() {
+                    slope[i] += row[a] * (y - run);
+                    for (j, &b) in places.iter().enumerate() {
+                        matrix[(i, j)] += row[a] * row[b];
                     }
                 }
             }
-            let [[a, b], [_, d]] = matrix;
-            let (a, d) = (a * (1.0 + damping), d * (1.0 + damping));
-            let size = a * d - b * b;
-            if !(size > 0.0 && now.is_finite()) {
+            for i in 0..n {
+                matrix[(i, i)] *= 1.0 + damping;
+            }
+            let Some(step) = matrix.cholesky().map(|root| root.solve(&slope)) else {
+                break;
+            };
+            if !now.is_finite() {
                 break;
             }
-            let trial = [
-                z[0] + (d * slope[0] - b * slope[1]) / size,
-                z[1] + (a * slope[1] - b * slope[0]) / size,
-            ];
-            let after = cost(trial);
+            let mut trial = z;
+            for (i, &place) in places.iter().enumerate() {
+                trial[place] += step[i];
+            }
+            let after = cost(&trial);
             if after < now {
                 let done = now - after <= 1e-12 * now;
                 (z, now, damping) = (trial, after, 0.1 * damping);
@@ -535,7 +715,7 @@ impl Model for GreyBox {
                 damping = f64::max(8.0 * damping, 1e-3);
             }
         }
-        finite(at(z).to_vec())
+        finite(z[..self.order()].to_vec())
     }
 
     fn jacobian(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<RunAndRows> {
@@ -547,22 +727,18 @@ impl Model for GreyBox {
     fn linearise(&self, u: &[f64], state: &[f64]) -> Result<Linearised> {
         self.check(u, u.len(), state)?;
         const INPUT: usize = STATES;
+        let order = self.order();
         let mut at = Moving::<{ STATES + 1 }>::at(self, state).seeded(self, 0);
         let mut v = Dual::constant(u[0]);
         v.by[INPUT] = 1.0;
         let y = Stepper::new(self, false).step(&mut at, &v);
-        let frame = &self.frame;
-        let next = [
-            at.w.scaled(1.0 / frame.speed_scale),
-            at.x.scaled(1.0 / frame.command_scale),
-            at.before.scaled(1.0 / frame.command_scale),
-        ];
+        let next = &at.scaled(self)[..order];
         Ok(Linearised {
-            a: next.iter().flat_map(|z| z.by[..STATES].to_vec()).collect(),
+            a: next.iter().flat_map(|z| z.by[..order].to_vec()).collect(),
             b: next.iter().map(|z| z.by[INPUT]).collect(),
-            c: y.by[..STATES].to_vec(),
+            c: y.by[..order].to_vec(),
             d: vec![y.by[INPUT]],
-            states: STATES,
+            states: order,
             inputs: 1,
         })
     }
@@ -595,7 +771,7 @@ impl Model for GreyBox {
 
 impl GreyBox {
     fn columns(&self) -> usize {
-        self.frame.free.len() + WEIGHTS * self.network.len() + STATES
+        self.frame.free.len() + WEIGHTS * self.network.len() + self.order()
     }
 
     /// The free run and its derivatives by theta and the states.

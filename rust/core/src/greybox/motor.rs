@@ -24,6 +24,9 @@ pub(crate) struct Motor {
     limit: Option<f64>,
     uneven: Option<f64>,
     sag: Option<f64>,
+    k_l: Option<f64>,
+    inner: Option<Inner>,
+    gravity: Option<[f64; 2]>,
     network: Vec<[f64; 4]>,
     /// Integration steps per sample, and their length \[s\].
     steps: usize,
@@ -31,7 +34,8 @@ pub(crate) struct Motor {
     /// Fraction of a sample in the command's delay, and its whole samples.
     part: f64,
     whole: usize,
-    /// Whether the output is the mean speed over a sample.
+    /// Whether the output is the position, or the mean speed over a sample.
+    position: bool,
     mean: bool,
     sample_time: f64,
     unit: f64,
@@ -44,13 +48,23 @@ pub(crate) struct Motor {
     per_command: f64,
 }
 
+/// The drive's own controller; names as in [`Inner`](super::Inner), infinite where it has no limit.
+#[derive(Clone, Copy, Debug)]
+struct Inner {
+    k_q: f64,
+    damping: f64,
+    dead_band: f64,
+    reach: f64,
+}
+
 /// What one motor, or each of eight, remembers; all 0 at rest.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Moving<A> {
-    /// Speed \[rad/s\], drive, and the command of the last sample.
+    /// Speed \[rad/s\], drive, the command of the last sample, and the position \[rad\] if it is the output.
     pub w: A,
     pub x: A,
     pub before: A,
+    pub q: A,
 }
 
 impl<A: Arithmetic> Moving<A> {
@@ -60,6 +74,7 @@ impl<A: Arithmetic> Moving<A> {
             w: zero,
             x: zero,
             before: zero,
+            q: zero,
         }
     }
 }
@@ -84,6 +99,14 @@ impl Motor {
             limit: is.limit.map(|limit| limit.value),
             uneven: is.uneven.map(|uneven| uneven.value),
             sag: is.sag.map(|sag| sag.value),
+            k_l: is.k_l.map(|k_l| k_l.value),
+            inner: is.inner.map(|inner| Inner {
+                k_q: inner.k_q.value,
+                damping: inner.damping.value,
+                dead_band: inner.dead_band.map_or(0.0, |band| band.value),
+                reach: inner.reach.map_or(f64::INFINITY, |reach| reach.value),
+            }),
+            gravity: stepper.gravity.map(|waves| waves.map(|wave| wave.value)),
             network: stepper
                 .network
                 .iter()
@@ -93,6 +116,7 @@ impl Motor {
             time: is.step,
             part: stepper.part,
             whole,
+            position: frame.position,
             mean: frame.mean,
             sample_time: frame.sample_time,
             unit: frame.unit,
@@ -129,15 +153,61 @@ impl Motor {
         for j in 0..self.steps {
             let old = (self.part * self.steps as f64 - j as f64).clamp(0.0, 1.0);
             let command = now.mul(all(1.0 - old)).add(all(old).mul(at.before));
+            let load = self.with_gravity(load, at);
             let (drive, speed) = self.advanced(load, at, command, meanwhile);
-            mean = mean.add(all(0.5).mul(at.w)).add(all(0.5).mul(speed));
+            if self.position {
+                let half = all(0.5 * self.time);
+                at.q = at.q.add(half.mul(at.w)).add(half.mul(speed));
+            } else {
+                mean = mean.add(all(0.5).mul(at.w)).add(all(0.5).mul(speed));
+            }
             (at.x, at.w) = (drive, speed);
         }
         at.before = now;
+        if self.position {
+            // only a speed is measured by counts of its position
+            let output = at.q.mul(all(self.per_unit));
+            return (output, all(0.0));
+        }
         let mean = mean.mul(all(self.per_steps));
         let output = if self.mean { mean } else { at.w };
         let moved = all(self.sample_time).mul(mean).div(all(self.unit));
         (output.mul(all(self.per_unit)), moved)
+    }
+
+    /// The load with gravity in the middle of a step.
+    #[inline(always)]
+    fn with_gravity<A: Arithmetic>(&self, load: A, at: &Moving<A>) -> A {
+        let Some([c, s]) = self.gravity else {
+            return load;
+        };
+        let all = A::splat;
+        let angle = at.q.add(all(0.5 * self.time).mul(at.w));
+        load.add(all(c).mul(angle.each(f64::cos)))
+            .add(all(s).mul(angle.each(f64::sin)))
+    }
+
+    /// The output of the drive's own controller, and how it changes over a step at this speed.
+    #[inline(always)]
+    fn controlled<A: Arithmetic>(&self, inner: &Inner, u: A, q: A, w: A) -> (A, A) {
+        let all = A::splat;
+        let error = u.sub(all(inner.k_q).mul(q));
+        let change = all(inner.k_q).mul(w).mul(all(-self.time));
+        let side = error.if_less(all(0.0), all(-inner.dead_band), all(inner.dead_band));
+        let acts = all(inner.dead_band);
+        let left = acts.if_less(error.abs(), error.sub(side), all(0.0));
+        let (error, change) = if inner.dead_band > 0.0 {
+            (left, acts.if_less(error.abs(), change, all(0.0)))
+        } else {
+            (error, change)
+        };
+        let output = error.sub(all(inner.damping).mul(w));
+        let reach = all(inner.reach);
+        let most = output.if_less(all(0.0), all(-inner.reach), reach);
+        (
+            reach.if_less(output.abs(), most, output),
+            reach.if_less(output.abs(), all(0.0), change),
+        )
     }
 
     /// The network's load, in units of the command.
@@ -166,12 +236,18 @@ impl Motor {
         let all = A::splat;
         let (w, x) = (at.w, at.x);
         let middle = self.moved(load, w, x, w, 0.5 * self.time);
-        let voltage = match self.sag {
-            Some(sag) => u.sub(all(sag).mul(x).mul(u.mul(u))),
-            None => u,
-        };
+        let mut change = all(self.k_e).mul(w.sub(middle)).mul(all(2.0));
+        let mut voltage = u;
+        if let Some(inner) = &self.inner {
+            let quarter = all(0.25 * self.time);
+            let half = at.q.add(quarter.mul(w)).add(quarter.mul(middle));
+            let (output, by) = self.controlled(inner, u, half, middle);
+            (voltage, change) = (output, change.add(by));
+        }
+        if let Some(sag) = self.sag {
+            voltage = voltage.sub(all(sag).mul(x).mul(u.mul(u)));
+        }
         let goal = voltage.sub(all(self.k_e).mul(middle));
-        let change = all(self.k_e).mul(w.sub(middle)).mul(all(2.0));
         let (after, mean) = self.driven(x, goal, change, meanwhile);
         (after, self.moved(load, w, mean, middle, self.time))
     }
@@ -183,10 +259,11 @@ impl Motor {
         let smooth = drive.sub(load).sub(all(self.k_b).mul(middle));
         let free = from.add(all(time).mul(smooth.mul(all(self.per_inertia))));
         let direction = free.if_less(all(0.0), all(-1.0), all(1.0));
-        let most = self
-            .dry(middle, direction)
-            .mul(all(self.per_inertia))
-            .mul(all(time));
+        let mut dry = self.dry(middle, direction);
+        if let Some(k_l) = self.k_l {
+            dry = dry.add(all(k_l).mul(drive.add(load)).abs());
+        }
+        let most = dry.mul(all(self.per_inertia)).mul(all(time));
         let moved = free.sub(direction.mul(most));
         // friction that could take more than all of the speed stops the shaft; NaN is neither less nor equal, and stays
         let stopped = free.abs().if_less(most, all(0.0), moved);

@@ -95,6 +95,11 @@ impl Arithmetic for Plain {
     fn are_less(self, other: Self) -> u8 {
         (0..LANES).fold(0, |bits, i| bits | u8::from(self.0[i] < other.0[i]) << i)
     }
+
+    #[inline(always)]
+    fn each(self, of: impl Fn(f64) -> f64) -> Self {
+        Self(self.0.map(of))
+    }
 }
 
 impl F64x8 for Plain {
@@ -246,5 +251,10 @@ impl Arithmetic for f64 {
     #[inline(always)]
     fn are_less(self, other: Self) -> u8 {
         u8::from(self < other)
+    }
+
+    #[inline(always)]
+    fn each(self, of: impl Fn(f64) -> f64) -> Self {
+        of(self)
     }
 }

@@ -173,6 +173,13 @@ impl Arithmetic for Wide {
         // SAFETY: as `splat`.
         unsafe { _mm512_cmp_pd_mask::<_CMP_LT_OQ>(self.0, other.0) }
     }
+
+    #[inline(always)]
+    fn each(self, of: impl Fn(f64) -> f64) -> Self {
+        let mut lanes = [0.0; LANES];
+        self.store(&mut lanes);
+        Self::load(&lanes.map(of))
+    }
 }
 
 impl F64x8 for Wide {
@@ -391,6 +398,13 @@ impl Arithmetic for Halves {
             // Lanes 4 to 7 are in the upper register: the order of bits is that of AVX-512's mask.
             (low | high << 4) as u8
         }
+    }
+
+    #[inline(always)]
+    fn each(self, of: impl Fn(f64) -> f64) -> Self {
+        let mut lanes = [0.0; LANES];
+        self.store(&mut lanes);
+        Self::load(&lanes.map(of))
     }
 }
 

@@ -304,10 +304,12 @@ fn motor(values: &[(usize, f64)], units: usize, steps: usize, mean: bool) -> Gre
     let weights: Vec<f64> = (0..4 * units).map(|_| 0.3 * random.normal()).collect();
     let frame = greybox::Frame {
         values: all,
+        joint: [0.0; greybox::JOINT.len()],
         free: Vec::new(),
         sample_time: TS,
         steps,
         mean,
+        position: false,
         unit: std::f64::consts::TAU / 60.0,
         speed_scale: 150.0,
         command_scale: 3.0,
@@ -337,6 +339,33 @@ proptest! {
         let plant = Varied::new(Boxed(model.plant(TS).unwrap()), gain, more).unwrap();
         let reference = references(seed, SAMPLES);
         check(&plant, &designs, Signals::new(&reference), encoder(counts, 0.25).unwrap().as_ref());
+    }
+}
+
+proptest! {
+    #![proptest_config(crate::laws::cases(60))]
+    #[test]
+    fn a_lane_around_a_joint_is_its_loop(
+        designs in of_a_search(),
+        seed in any::<u64>(),
+        (k_l, dead, reach, gravity) in (0.0..0.2_f64, 0.0..0.1_f64, 0.5..2.0_f64, -0.5..0.5_f64),
+        given in prop::array::uniform4(any::<bool>()),
+        inside in any::<bool>(),
+        (units, steps, delay) in (0_usize..3, 1_usize..4, 0.0..3.5_f64),
+    ) {
+        let with = |given: bool, value: f64| if given { value } else { 0.0 };
+        let base = motor(&[(0, 0.2), (2, 0.05), (16, delay * TS)], units, steps, false);
+        let mut frame = base.frame().clone();
+        frame.position = true;
+        frame.joint = [with(given[0], k_l), 0.0, 0.0, 0.0, 0.0];
+        if inside {
+            frame.joint = [with(given[0], k_l), 1.0, 0.02, with(given[1], dead), with(given[2], reach)];
+        }
+        (frame.values[10], frame.values[11]) = (with(given[3], gravity), with(given[3], 0.1));
+        let model = GreyBox::new(frame, &Model::theta(&base)).unwrap();
+        let plant = Boxed(model.plant(TS).unwrap());
+        let reference = references(seed, SAMPLES);
+        check(&plant, &designs, Signals::new(&reference), None);
     }
 }
 

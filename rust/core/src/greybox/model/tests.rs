@@ -9,10 +9,12 @@ fn frame(delay: f64) -> Frame {
     values[17] = f64::INFINITY;
     Frame {
         values,
+        joint: [0.0; JOINT.len()],
         free: vec![0, 2, 3, 4, 5, 6, 7, 8, 9],
         sample_time: 0.002,
         steps: 2,
         mean: true,
+        position: false,
         unit: std::f64::consts::TAU / 60.0,
         speed_scale: 150.0,
         command_scale: 3.0,
@@ -85,7 +87,7 @@ fn a_loop_steps_it_as_the_free_run_goes() {
         let mut plant = model.plant(0.002).unwrap();
         // from rest, where a zero command before the first sample keeps it
         let padded: Vec<f64> = std::iter::repeat_n(0.0, 8).chain(u.clone()).collect();
-        let run = model.simulate(&padded, 1, &[0.0; STATES]).unwrap();
+        let run = model.simulate(&padded, 1, &model.rest_state()).unwrap();
         for (k, u) in u.iter().enumerate() {
             plant.advance(*u);
             if let Some(free) = run.get(k + 9) {
@@ -133,6 +135,141 @@ fn small_signals_are_the_derivatives_of_a_step() {
             "{i}"
         );
     }
+}
+
+/// A joint under gravity with a controller inside, behind gears that rub more under load.
+fn joint(inside: bool, units: usize) -> GreyBox {
+    let mut frame = frame(0.0033);
+    (frame.position, frame.unit, frame.speed_scale) = (true, 0.5, 3.0);
+    frame.values[..3].copy_from_slice(&[0.4, 0.0, 0.05]);
+    (frame.values[10], frame.values[11]) = (0.3, -0.4);
+    frame.joint = [0.05, 2.0, 0.02, 0.05, 1.5];
+    frame.free = vec![0, 2, 6, 7, 8, 9, 10, 11, DELAY];
+    frame.free.extend(OF_JOINT..OF_JOINT + JOINT.len());
+    if !inside {
+        frame.joint = [0.05, 0.0, 0.0, 0.0, 0.0];
+        frame.free.truncate(10);
+    }
+    let mut random = Random::new(7);
+    let all: Vec<f64> = frame.values.iter().chain(&frame.joint).copied().collect();
+    let mut theta: Vec<f64> = frame.free.iter().map(|&j| all[j]).collect();
+    theta.extend((0..WEIGHTS * units).map(|_| 0.3 * random.normal()));
+    GreyBox::new(frame, &theta).unwrap()
+}
+
+#[test]
+fn the_derivatives_of_a_joint_are_those_of_its_values() {
+    for (inside, units) in [(false, 0), (true, 0), (true, 3)] {
+        let model = joint(inside, units);
+        let u: Vec<f64> = commands(60).iter().map(|u| 0.5 * u).collect();
+        let state = [0.3, 0.2, 0.4, 0.7];
+        let (run, rows) = model.jacobian(&u, 1, &state).unwrap();
+        assert_eq!(run, model.simulate(&u, 1, &state).unwrap());
+        let (theta, columns) = (Model::theta(&model), model.columns());
+        for j in 0..columns {
+            let moved = |by: f64| {
+                let (mut theta, mut state) = (theta.clone(), state);
+                match j.checked_sub(theta.len()) {
+                    None => theta[j] += by,
+                    Some(i) => state[i] += by,
+                }
+                let other = GreyBox::new(model.frame.clone(), &theta).unwrap();
+                other.simulate(&u, 1, &state).unwrap()
+            };
+            let h = 1e-6 * theta.get(j).map_or(1.0, |v| v.abs().max(1e-3));
+            let (more, less) = (moved(h), moved(-h));
+            let column = |k: usize| rows[k * columns + j];
+            let scale = (0..60).map(|k| column(k).abs()).fold(1e-9, f64::max);
+            let differs =
+                |k: &usize| ((more[*k] - less[*k]) / (2.0 * h) - column(*k)).abs() > 2e-3 * scale;
+            let off = (0..60).filter(differs).count();
+            assert!(
+                off <= 6,
+                "inside {inside}, {units} units, column {j}: {off} samples"
+            );
+        }
+    }
+}
+
+/// At rest under a held command the error is what gravity and friction take: the unit is the loop gain.
+#[test]
+fn a_controller_without_an_integral_sags() {
+    let mut model = joint(true, 0);
+    model.frame.values[4] = 0.0;
+    model.frame.values[6..12].copy_from_slice(&[0.0, 0.0, 0.0, 1.0, 0.25, 0.0]);
+    model.frame.joint = [0.0, 2.0, 0.05, 0.0, 0.0];
+    let run = model.simulate(&[0.8; 4000], 1, &[0.0; 4]).unwrap();
+    let q = model.frame.unit * run[3999];
+    assert!((0.8 - 2.0 * q - 0.25 * q.cos()).abs() < 1e-6, "{q}");
+    // dry friction of half the pull holds it wherever it is put
+    model.frame.values[6] = 0.5;
+    let held = model
+        .simulate(&[0.6; 300], 1, &[0.0, 0.0, 0.0, 0.5])
+        .unwrap();
+    assert!(held.iter().all(|y| (y - 0.5).abs() < 1e-3));
+}
+
+#[test]
+fn the_state_of_a_joint_is_found_from_its_first_outputs() {
+    for inside in [false, true] {
+        let model = joint(inside, 0);
+        let u: Vec<f64> = commands(40).iter().map(|u| 0.5 * u).collect();
+        let true_ = [1.2, 0.2, u[0] / 3.0, -0.8];
+        let y = model.simulate(&u, 1, &true_).unwrap();
+        let state = model.estimate_state(&u, 1, &y).unwrap();
+        let run = model.simulate(&u, 1, &state).unwrap();
+        let off = run
+            .iter()
+            .zip(&y)
+            .map(|(a, b)| (a - b).abs())
+            .fold(0.0, f64::max);
+        assert!(off < 2e-3, "{inside}: {off}");
+        let ahead = model.predict(&u, 1, &y, &state, 1).unwrap();
+        let off = ahead.iter().zip(&y).map(|(a, b)| (a - b).abs());
+        assert!(off.fold(0.0, f64::max) < 5e-3, "{inside}");
+    }
+}
+
+#[test]
+fn a_loop_steps_a_joint_as_its_free_run_goes() {
+    for inside in [false, true] {
+        let model = joint(inside, 2);
+        let u = commands(300);
+        let mut plant = model.plant(0.002).unwrap();
+        let padded: Vec<f64> = std::iter::repeat_n(0.0, 1).chain(u.clone()).collect();
+        // gravity moves it while the free run's first commands are due
+        (0..2).for_each(|_| plant.advance(0.0));
+        let run = model.simulate(&padded, 1, &model.rest_state()).unwrap();
+        for (k, u) in u.iter().enumerate() {
+            plant.advance(*u);
+            if let Some(free) = run.get(k + 2) {
+                assert_eq!(plant.output().to_bits(), free.to_bits(), "{inside} {k}");
+            }
+        }
+    }
+}
+
+#[test]
+fn what_is_no_joint_is_refused() {
+    let model = joint(true, 0);
+    let refused = |change: &dyn Fn(&mut Frame)| {
+        let mut frame = model.frame.clone();
+        change(&mut frame);
+        let theta = Model::theta(&model);
+        GreyBox::new(frame, &theta).unwrap_err().message
+    };
+    assert!(refused(&|f| f.position = false).contains("load_1"));
+    assert!(refused(&|f| f.values[12] = 0.1).contains("load_2"));
+    assert!(refused(&|f| f.free[13] = 40).contains("40"));
+    let mut frame = model.frame.clone();
+    (frame.free, frame.joint[REACH]) = (vec![], -1.0);
+    assert!(
+        GreyBox::new(frame, &[])
+            .unwrap_err()
+            .message
+            .contains("reach")
+    );
+    assert!(joint(false, 0).integrates() && !model.integrates());
 }
 
 #[test]

@@ -1,0 +1,247 @@
+"""`Joint`: the parameters of a joint that its positions determine, and the names of the others."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from .. import _core, storage
+from ..arrays import FloatArray
+from ..dataset import Dataset
+from ..errors import DataError
+from ..frequency.shaft import Parameter
+from ..models.grey_box import JOINT as JOINT_NAMES
+from ..models.grey_box import NAMES as MOTOR_NAMES
+from ..models.grey_box import GreyBox
+from ..motorfit.estimation import CONFIDENCE
+from ..motorfit.joint import fitted, is_commanded
+from ..tables import html_of
+from .motor import APART, VAGUE
+
+FORMAT, VERSION = "sewfast-joint", 1
+Values: TypeAlias = Mapping[str, float]
+_INSIDE = {
+    "k_p": "encoder and command show the controller's gain only relative to the inertia; it takes "
+    "a known inertia, or a current and its torque constant",
+    "inertia_kg_m2": "encoder and command show it only in units of the controller's gain",
+}
+_OF_TERM = {"loaded": "load_friction"}
+_DIRECT = {
+    "inertia_kg_m2": "encoder and command show it only in units of the command; it takes the "
+    "torque per command",
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Joint:
+    """The parameters of a joint, identified from positions.
+
+    Attributes
+    ----------
+    parameters : mapping of Parameter by name
+        Value, 95 % interval and unit, in units of the command, or if `inside`, of the position
+        command: `inertia` (per acceleration), `viscous` (per speed), `friction` (against dry
+        friction), `offset`, `delay`; of the terms that the record shows `lag`, `stribeck` and
+        `stribeck_speed`, `gravity`, `load_friction` (per load), `dead_band`, `reach` (largest
+        output of the controller) and `damping` (k_d / k_p); if `inside`, `stiffness` (k_p / J).
+    undetermined : mapping of str by name
+        Parameters that the record does not determine, and why.
+    terms : tuple of str
+        Terms that the record shows.
+    inside : bool
+        Whether the command is a position, for a controller inside.
+    fit_percent, rmse : float
+        Fit of the free runs over the pieces of the record; rmse in `output_unit`.
+    model : GreyBox
+        The joint as a model: `simulate`, `sewfast.run`, `sewfast.tune`.
+    """
+
+    parameters: Mapping[str, Parameter]
+    undetermined: Mapping[str, str]
+    terms: tuple[str, ...]
+    inside: bool
+    fit_percent: float
+    rmse: float
+    samples: int
+    model: GreyBox
+
+    def value(self, name: str) -> float:
+        """A parameter's value.
+
+        Raises
+        ------
+        DataError
+            If the record does not determine it; the message gives the reason.
+        """
+        if name in self.parameters:
+            return self.parameters[name].value
+        raise DataError(
+            f"{name}: {self.undetermined[name]}"
+            if name in self.undetermined
+            else f"expected a parameter of {', '.join(self.parameters)}, received {name!r}"
+        )
+
+    def to_model(self) -> GreyBox:
+        """The joint as a model for loops and free runs."""
+        return self.model
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, as JSON values."""
+        return {
+            "parameters": {n: vars(p) for n, p in self.parameters.items()},
+            "undetermined": dict(self.undetermined),
+            "terms": list(self.terms),
+            "inside": self.inside,
+            "fit_percent": self.fit_percent,
+            "rmse": self.rmse,
+            "samples": self.samples,
+            "model": self.model.to_dict(),
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the joint as JSON; the file is complete or absent.
+
+        Raises
+        ------
+        ModelFileError
+            If the file cannot be written.
+        """
+        storage.write(path, FORMAT, VERSION, self.to_dict())
+
+    def _repr_html_(self) -> str:
+        return html_of(str(self))
+
+    def __repr__(self) -> str:
+        return f"<{str(self).splitlines()[0]}>"
+
+    def __str__(self) -> str:
+        terms = ", ".join(self.terms) or "no further terms"
+        width = max(map(len, self.parameters), default=0)
+        what = "joint with a controller inside" if self.inside else "joint"
+        lines = [
+            f"{what}: free run {self.fit_percent:.2f} %, {self.rmse:.3g} {self.model.output_unit} "
+            f"rmse of {self.samples:,} samples ({terms}); 95 % intervals"
+        ]
+        lines += [f"  {name:<{width}}  {p}" for name, p in self.parameters.items()]
+        for why in dict.fromkeys(self.undetermined.values()):
+            names = [name for name, reason in self.undetermined.items() if reason == why]
+            lines.append(f"  not determined: {', '.join(names)}: {why}")
+        return "\n".join(lines)
+
+
+def joint_of(data: Dataset) -> Joint:
+    """The joint of a record of positions: each parameter with its interval, or why it has none."""
+    inside = is_commanded(data)
+    fit = fitted(data, integrates=not inside, covariance=True)
+    core, covariance = fit.core, fit.covariance
+    assert covariance is not None
+    names = [(*MOTOR_NAMES, *JOINT_NAMES)[j] for j in core.settings["free"]]
+    known = dict(zip(MOTOR_NAMES, core.settings["values"].tolist(), strict=True))
+    known |= dict(zip(JOINT_NAMES, core.settings["joint"], strict=True))
+    parameters: dict[str, Parameter] = {}
+    undetermined: dict[str, str] = {}
+    for name, unit, of in _quantities(core, fit.terms, data, inside):
+        value = of(known)
+        slope = _slope(known, of, names)
+        half = CONFIDENCE * math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+        # an offset or a delay of 0 is a valid result
+        least = {"delay": data.Ts, "offset": known["k_s"]}.get(name, 0.0)
+        if half < VAGUE * max(abs(value), least):
+            low = value - half if name == "offset" else max(value - half, 0.0)
+            parameters[name] = Parameter(value, low, value + half, unit)
+        elif half < APART * max(abs(value), least):
+            undetermined[name] = (
+                f"its interval, {value - half:.3g} to {value + half:.3g} {unit}, is as wide as its "
+                "value"
+            )
+        else:
+            undetermined[name] = "the record does not part it from the others"
+    undetermined |= {_OF_TERM.get(t, t): "not shown, if there is any" for t in fit.missing}
+    undetermined |= _INSIDE if inside else _DIRECT
+    y = np.concatenate([e.y for e in data.experiments])
+    rmse = math.sqrt(core.settings["residual_variance"])
+    d = data
+    model = GreyBox(
+        core, d.Ts, d.input_names, d.output_name, d.input_units, d.output_unit, d.counts, {}
+    )
+    return Joint(
+        parameters, undetermined, fit.terms, inside,
+        100.0 * (1.0 - rmse / max(float(np.nanstd(y)), 1e-300)), rmse,
+        int(np.isfinite(y).sum()), model,
+    )  # fmt: skip
+
+
+Quantity: TypeAlias = tuple[str, str, Callable[[Values], float]]
+
+
+def _quantities(
+    core: _core.GreyBox, terms: tuple[str, ...], data: Dataset, inside: bool
+) -> list[Quantity]:
+    """Name, unit and value of every quantity that can be printed."""
+    u, y = data.input_units[0] or "command", data.output_unit or "output"
+    unit = float(core.settings["unit"])
+    found: list[Quantity] = [
+        ("inertia", f"{u}/({y}/s^2)", lambda p: p["k_a"] * unit),
+        ("viscous", f"{u}/({y}/s)", lambda p: (p["k_e"] + p["k_b"]) * unit),
+        ("friction", u, lambda p: p["k_s"]),
+        ("offset", u, lambda p: p["offset"]),
+        ("delay", "s", lambda p: p["delay"]),
+    ]
+    if inside:
+        found.append(("stiffness", "1/s^2", lambda p: p["k_q"] / p["k_a"]))
+    of_terms: dict[str, list[Quantity]] = {
+        "lag": [("lag", "s", lambda p: p["tau"])],
+        "stribeck": [
+            ("stribeck", u, lambda p: p["k_t"]),
+            ("stribeck_speed", f"{y}/s", lambda p: p["w_s"] / unit),
+        ],
+        "gravity": [("gravity", u, lambda p: math.hypot(p["load_1c"], p["load_1s"]))],
+        "loaded": [("load_friction", "1", lambda p: p["k_l"])],
+        "reach": [("reach", u, lambda p: p["reach"]), ("damping", "s", lambda p: p["damping"])],
+        "dead_band": [("dead_band", u, lambda p: p["dead_band"])],
+    }
+    return found + [q for t in terms for q in of_terms[t]]
+
+
+def _slope(known: Values, of: Callable[[Values], float], names: list[str]) -> FloatArray:
+    """Derivatives of a quantity by the free parameters, (n,)."""
+    slope = np.zeros(len(names))
+    for j, name in enumerate(names):
+        h = 1e-4 * abs(known[name]) or 1e-9
+        more, less = (of({**known, name: known[name] + s * h}) for s in (1.0, -1.0))
+        slope[j] = (more - less) / (2.0 * h)
+    return slope
+
+
+def load_joint(path: str | os.PathLike[str]) -> Joint:
+    """Read a file of `Joint.save`; nothing in it is executed.
+
+    Raises
+    ------
+    ModelFileError
+        For any other file.
+    """
+    from ..models.files import restored
+
+    document = storage.read(path, FORMAT, (VERSION,))
+    fields = storage.Fields(str(path), document)
+    stored = fields.object("parameters")
+    parameters = {}
+    for name in stored.values:
+        one = stored.object(name)
+        value, low, high = (one.number(n) for n in ("value", "low", "high"))
+        parameters[name] = Parameter(value, low, high, one.text("unit"))
+    undetermined = fields.object("undetermined")
+    model = restored(dict(fields.object("model").values), ())
+    if not isinstance(model, GreyBox):
+        raise fields.refuse("model", "a grey box", model.kind)
+    return Joint(
+        parameters, {n: undetermined.text(n) for n in undetermined.values},
+        tuple(map(str, fields.items("terms"))), fields.flag("inside"),
+        fields.number("fit_percent"), fields.number("rmse"), fields.integer("samples"), model,
+    )  # fmt: skip

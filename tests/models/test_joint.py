@@ -1,0 +1,161 @@
+"""Joints: parameters from positions, with and without a controller inside; choice, files, loops."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sewfast
+from sewfast import Dataset, physics
+from sewfast.errors import DataError, ModelFileError, SettingError
+from sewfast.greybox import Joint, load_joint
+from sewfast.models.grey_box import GreyBox
+
+TS, SUBSTEPS, STEP = 0.01, 20, 2.0 * math.pi / 4096
+
+
+def _levels(n: int, seed: int, size: float, hold: int) -> Any:
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(-size, size, n // hold + 1), hold)[:n]
+
+
+def _servo(n: int, seed: int, *, reach: float = 9.0) -> Dataset:
+    """Angle in 12-bit steps of a joint with k_p / J = 400 1/s^2 behind its controller: friction .02
+    rad, gravity .06 rad, late by 15 ms; all in units of the position error."""
+    u = _levels(n, seed, 0.9, 60)
+    y, q, w, h = np.zeros(n), 0.0, 0.0, TS / SUBSTEPS
+    for k in range(n * SUBSTEPS):
+        if k % SUBSTEPS == 0:
+            y[k // SUBSTEPS] = np.floor(q / STEP + 0.5) * STEP
+        due = u[max(k - 30, 0) // SUBSTEPS] if k >= 30 else u[0]
+        drive = np.clip(due - q - 0.02 * w, -reach, reach) - 0.05 * w
+        free = w + 400.0 * h * (drive - 0.06 * np.sin(q + 0.4))
+        w = np.sign(free) * max(abs(free) - 400.0 * h * 0.02, 0.0)
+        q += h * w
+    return Dataset.from_arrays(u, y, TS, input_units=("rad",), output_unit="rad")
+
+
+def _axis(n: int, seed: int, noise: float = 2e-5, unit: str = "m") -> Dataset:
+    """Position of a carriage of 2 N s^2/m with 3 N s/m, .8 N of friction and -.1 N, under a force
+    that a controller computes from it."""
+    rng, r = np.random.default_rng(seed), _levels(n, seed, 0.2, 120)
+    u, y, q, w, h = np.zeros(n), np.zeros(n), 0.0, 0.0, TS / SUBSTEPS
+    for k in range(n):
+        y[k] = q
+        u[k] = np.clip(40.0 * (r[k] - q) - 10.0 * w, -6.0, 6.0)
+        for _ in range(SUBSTEPS):
+            free = w + h / 2.0 * (u[k] - 3.0 * w + 0.1)
+            w = np.sign(free) * max(abs(free) - h / 2.0 * 0.8, 0.0)
+            q += h * w
+    return Dataset.from_arrays(u, y + noise * rng.normal(size=n), TS, output_unit=unit)
+
+
+@cache
+def _joint(kind: str) -> Joint:
+    return physics(_servo(1500, 1) if kind == "servo" else _axis(1500, 1), structure="joint")
+
+
+def test_command_and_encoder_tell_what_a_servo_does_with_its_gain_as_the_unit() -> None:
+    joint = _joint("servo")
+    assert joint.inside
+    assert "gravity" in joint.terms
+    truth = {
+        "inertia": 1 / 400, "viscous": 0.07, "friction": 0.02, "gravity": 0.06, "delay": 0.015,
+        "stiffness": 400.0,
+    }  # fmt: skip
+    for name, value in truth.items():
+        assert joint.value(name) == pytest.approx(value, rel=0.05, abs=2e-4), name
+    assert {"k_p", "inertia_kg_m2"} <= set(joint.undetermined)
+    assert "reach" in joint.undetermined  # it never reached its limit
+    with pytest.raises(DataError, match="known inertia"):
+        joint.value("k_p")
+    assert "not determined: k_p" in str(joint)
+    assert "controller inside" in str(joint)
+
+
+def test_a_force_and_a_position_tell_inertia_and_friction() -> None:
+    joint = _joint("axis")
+    assert not joint.inside
+    for name, value in {"inertia": 2.0, "viscous": 3.0, "friction": 0.8, "offset": -0.1}.items():
+        found = joint.parameters[name]
+        assert found.value == pytest.approx(value, rel=0.05), name
+    assert "gravity" not in joint.parameters  # a carriage has no angle
+
+
+def test_a_limit_that_is_reached_is_found() -> None:
+    joint = physics(_servo(1500, 2, reach=0.3), structure="joint")
+    assert joint.value("reach") == pytest.approx(0.3, rel=0.05)
+
+
+@pytest.mark.parametrize("kind", ["servo", "axis"])
+def test_a_joint_goes_freely_where_it_was_not_recorded(kind: str) -> None:
+    model = _joint(kind).to_model()
+    fresh = _servo(1000, 31) if kind == "servo" else _axis(1000, 31, noise=0.0)
+    (e,), spread = fresh.experiments, np.std(fresh.experiments[0].y)
+    assert model.validate(fresh).simulation.rmse < 0.02 * spread
+    assert model.validate(fresh).one_step.rmse < 0.01 * spread
+    assert model.core.states(e.u, model.core.rest_state()).shape == (len(e), 4)
+    assert model.state_names[-1] == "position"
+
+
+def test_its_files_come_back(tmp_path: Path) -> None:
+    joint = _joint("servo")
+    joint.save(tmp_path / "j.json")
+    again = load_joint(tmp_path / "j.json")
+    assert str(again) == str(joint)
+    joint.to_model().save(tmp_path / "m.json")
+    model: Any = sewfast.load_model(tmp_path / "m.json")
+    u = _levels(300, 5, 0.5, 50)
+    np.testing.assert_array_equal(model.simulate(u), joint.model.simulate(u))
+    assert model.joint == joint.model.joint
+    document = json.loads((tmp_path / "m.json").read_text())
+    document["parameters"]["joint"].pop("k_q")
+    (tmp_path / "m.json").write_text(json.dumps(document))
+    with pytest.raises(ModelFileError, match="k_q"):
+        sewfast.load_model(tmp_path / "m.json")
+
+
+def test_a_loop_is_closed_and_tuned_around_it() -> None:
+    model = _joint("axis").to_model()
+    gains = sewfast.Gains("standard", 80.0, 20.0, 0.3, u_unit="", y_unit="m")
+    controller = sewfast.Controller(gains, TS, u_min=-6.0, u_max=6.0)
+    run = sewfast.run(controller, model, np.repeat([0.0, 0.1, -0.1], 300))
+    assert abs(run.y[599] - 0.1) < 0.02
+    assert abs(run.y[-1] + 0.1) < 0.02
+    with pytest.raises(SettingError, match="microcontrollers"):
+        model.core.embedded()
+
+
+def test_it_is_a_candidate_where_the_output_is_a_position() -> None:
+    model: Any = sewfast.identify(_servo(1200, 3), model="grey_box", select=False)
+    assert isinstance(model, GreyBox)
+    assert model.joint["k_q"] == 1.0
+    assert "joint with a controller of its own" in str(model)
+
+
+@pytest.mark.nightly("a default search")
+def test_the_equations_of_a_joint_win_where_they_hold() -> None:
+    """Also without a unit, where the linear models or the record show the integrator."""
+    data = _axis(2500, 6, unit="")
+    model = sewfast.identify(data)
+    fresh = _axis(1000, 41, noise=0.0, unit="")
+    assert model.validate(fresh).simulation.rmse < 0.02 * np.std(fresh.experiments[0].y)
+    for member in model.members or (model,):
+        assert member.core.settings["integrator"]
+
+
+def test_what_is_no_joint_is_refused() -> None:
+    e = _axis(300, 3).experiments[0]
+    with pytest.raises(SettingError, match="output_unit"):
+        physics(Dataset.from_arrays(e.u, e.y, TS, output_unit="rpm"), structure="joint")
+    with pytest.raises(SettingError, match="current"):
+        physics(_axis(300, 3), structure="joint", current="i")  # type: ignore[call-overload]
+    two = Dataset.from_arrays(np.c_[e.u, e.u**2], e.y, TS, output_unit="m")
+    with pytest.raises(DataError, match="inputs"):
+        physics(two, structure="joint")
