@@ -29,7 +29,7 @@ MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest n
   night-bits night-logs night-computing night-waiting night-budgets
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning tracking drives faults nonsense motors fleet interrupts fuzz-logs mutations screens studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed parting laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help dev demo pictures publishable accuracy assumptions battery strangers commissioning tracking drives faults nonsense motors fleet interrupts fuzz-logs mutations screens studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed parting laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -306,6 +306,9 @@ battery: $(VENV)/bench.stamp ## identify on simulated systems of known truth (SP
 	$(BIN)/python benches/battery.py --cache target/battery.json $(if $(SPLIT),--split $(SPLIT)) \
 	  $(if $(FAMILIES),--families $(FAMILIES)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(RUNS),--runs $(RUNS)) \
 	  $(if $(QUICK),--quick) $(if $(JSON),--json $(JSON))
+
+assumptions: $(DEV) ## unstable plants in loops, single steps, seeds of the search (COUNT=20)
+	$(BIN)/python benches/assumptions.py $(if $(COUNT),--count $(COUNT))
 
 strangers: $(DEV) ## takes twelve files in users' formats to a controller with three commands (SEEDS="0 1", ONLY=counts,iso)
 	$(BIN)/python benches/strangers.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(ONLY),--only $(ONLY))
