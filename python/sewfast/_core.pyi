@@ -837,7 +837,7 @@ def copied(experiments: _Experiments) -> tuple[int, float, float, int] | None:
     """Input, gain, offset and delay if the output repeats an input to rounding."""
 
 def computed(experiments: _Experiments) -> str | None:
-    """Whether the "output" or its "change" is a sum of inputs in the same sample and some before."""
+    """Whether the "output" or its "change" is a sum of inputs in the same sample and some before, or a "curve" of them."""
 
 def order_in_time(experiments: _Experiments) -> tuple[str, int, int, float] | None:
     """Kind, input, shift and twice the log-likelihood of an input that moves after the output."""

@@ -9,7 +9,7 @@ import pytest
 
 import sewfast as api
 from cli import called as sewfast
-from deceivers import GOOD, HELD, NONSENSE, data, good, held, lag, nonsense
+from deceivers import GOOD, HELD, INPUTS, NONSENSE, data, good, held, lag, nonsense
 from effort import FULL
 from sewfast import diagnose
 from sewfast.dataset import Dataset
@@ -64,6 +64,28 @@ def test_another_scale_is_found(gain: float, start: int) -> None:
     assert found["first"] == pytest.approx(start, abs=len(u) / 50)
     assert found["gain"] == pytest.approx(gain, rel=0.15, abs=0.05)
     assert found["shift"] == 0.0
+
+
+@pytest.mark.parametrize("moves", ["prbs", "sweep", "levels"])
+def test_an_input_in_other_units_is_found(moves: str) -> None:
+    """Of two levels a curve says as much, of a sweep a filter: but the output goes on as before."""
+    random = np.random.default_rng(5)
+    u = INPUTS[moves](random, 4000)
+    y = lag(u) + 2.0 * random.normal(size=4000)
+    u[2100:] *= 3.0
+    found = change_of(u, y)
+    assert found["first"] == pytest.approx(2100, abs=len(u) / 25)
+    assert found["gain"] == pytest.approx(1.0 / 3.0, rel=0.1)
+
+
+def test_a_plant_that_is_driven_harder_has_not_changed() -> None:
+    """Its output grows with the input, though less."""
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        u = INPUTS["prbs"](random, 4000)
+        u[2100:] *= 3.0
+        y = lag(8.0 * np.tanh(u / 8.0)) + 2.0 * random.normal(size=4000)
+        assert diagnose(Dataset.from_arrays(u, y, 0.01)).find("changes") is None
 
 
 @pytest.mark.parametrize("lost", [60, 300])
@@ -143,6 +165,18 @@ def test_a_torn_record_is_no_better_than_poor() -> None:
 
 
 # --- a column that is computed from another -------------------------------------------------------
+
+
+def test_curves_and_printed_copies_of_the_input_are_refused() -> None:
+    u = steps(5)[0]
+    for y, said in (
+        (u**2 + 3.0 * u, "is a curve of u in the same sample"),
+        (np.roll(np.round(-0.25 * u, 3), 3), "is u of 3 samples before times -0.25"),
+    ):
+        with pytest.raises(api.DataError, match=said):
+            api.identify(Dataset.from_arrays(u[3:], y[3:], 0.001), model="oe")
+    late = np.roll(u**2 + 3.0 * u, 1)[3:]
+    assert "no_dynamics" not in {f.kind for f in faults(data((u[3:], late)))}
 
 
 @pytest.mark.parametrize("of", ["mean", "difference", "sum"])

@@ -182,7 +182,7 @@ NONSENSE: dict[str, Nonsense] = {
     "mean of u, printed": Nonsense(
         lambda u, y, r: (u, np.round(mean_of(u, 8), 5)), _COMPUTED, HOLDS
     ),
-    "square of u": Nonsense(lambda u, y, r: (u, u**2 + 3.0 * u), ()),
+    "square of u": Nonsense(lambda u, y, r: (u, u**2 + 3.0 * u), _COMPUTED),
     "exchanged": Nonsense(lambda u, y, r: (y, u), ("exchanged",)),
     "output leads": Nonsense(lambda u, y, r: (u[:-6], y[6:]), ("late_input", "at_once"), HOLDS),
     # values

@@ -8,8 +8,8 @@ fails on any numbers: columns are compared about their mean, in units of their d
 - A sensor that died, or said nonsense for a few samples (`sensor`).
 - A counter that wraps: the output jumps by its whole range against the way that it moves before and
   after.
-- No dynamics: for the whole record, the output is the input times a number, or it or its change is
-  a sum of an input in the same sample and in some before.
+- No dynamics: for the whole record, the output is the input times a number or a curve of it, or it
+  or its change is a sum of an input in the same sample and in some before.
 - A change: one part of the record predicts the other with another sign, scale or time (`changes`).
 - The order in time: the past of a cause helps to predict its effect beyond the effect's own past,
   and not the other way (Granger 1969).
@@ -152,9 +152,12 @@ def _order_fault(data: Dataset) -> Iterator[Fault]:
         names = " and ".join(data.input_names)
         yield Fault(
             "no_dynamics",
-            f"{'each change of ' if sums == 'change' else ''}{y} is a sum of {names} in the same "
-            f"sample and in up to {PAST} before, to rounding: the column was computed from the "
-            "other, as a mean, a difference or an integral is",
+            f"{y} is a curve of {names} in the same sample, to rounding: there are no dynamics "
+            "between the two, as the column was computed from the other"
+            if sums == "curve"
+            else f"{'each change of ' if sums == 'change' else ''}{y} is a sum of {names} in the "
+            f"same sample and in up to {PAST} before, to rounding: the column was computed from "
+            "the other, as a mean, a difference or an integral is",
             "name the column of a sensor as output",
             {"input": names, "sums": sums},
         )

@@ -24,6 +24,8 @@ const SURE: f64 = 60.0;
 const PARTS: usize = 8;
 /// Means of an input over 10, 20, 40 .. samples before these: plants with long dead times.
 const OCTAVES: usize = 6;
+/// Powers of the inputs of which an output is a curve.
+const POWERS: usize = 3;
 /// Singular values below this part of the largest count as 0.
 const DEPENDENT: f64 = 1e-10;
 
@@ -81,7 +83,8 @@ fn copy_of(rows: &[Rows], j: usize, delay: usize) -> Option<Copy> {
     let offset = y_mean - gain * u_mean;
     let rounding = rounding(&y) + gain.abs() * rounding(&u);
     let off = u.iter().zip(&y).map(|(u, y)| (y - gain * u - offset).abs());
-    (off.fold(0.0, f64::max) <= 1.01 * rounding).then_some(Copy {
+    // the line of least squares is off the true one by a rounding as well
+    (off.fold(0.0, f64::max) <= 2.0 * rounding).then_some(Copy {
         input: j,
         gain,
         offset,
@@ -101,14 +104,27 @@ fn of_line(u: &[f64], y: &[f64]) -> Option<f64> {
     (covariance.abs() >= 0.999 * (u_size * y_size)).then_some(covariance)
 }
 
-/// Half of a step: of the grid that was printed, or of six digits where none is seen or the grid is so coarse that its steps are levels.
+/// Half of a step: of the grid of the values or of the digits that were printed, or of six digits where neither is seen or both are so
+/// coarse that their steps are levels.
 fn rounding(column: &[f64]) -> f64 {
-    let step = quantum(column).unwrap_or(0.0);
-    if 0.0 < step && step < 0.02 * whole(column).1 {
-        return 0.5 * step;
-    }
+    let steps = [quantum(column), printed(column)].into_iter().flatten();
+    let fine = steps.filter(|step| *step < 0.02 * whole(column).1);
     let (low, high) = range(column.iter().copied());
-    0.5e-5 * (high - low)
+    fine.reduce(f64::max)
+        .map_or(0.5e-5 * (high - low), |step| 0.5 * step)
+}
+
+/// The power of ten of the last digit that the values have, of six in their range.
+fn printed(column: &[f64]) -> Option<f64> {
+    let known = || column.iter().copied().filter(|v| v.is_finite());
+    let (low, high) = range(known());
+    let first = (high - low).log10().floor();
+    let is_multiple = |v: f64, step: f64| {
+        let places = v / step;
+        (places - places.round()).abs() < 1e-9 * places.abs().max(1.0)
+    };
+    let steps = (0..6).map(|digit| 10.0_f64.powf(first - f64::from(digit)));
+    { steps }.find(|step| known().all(|v| is_multiple(v, *step)))
 }
 
 /// Known stretches of the longest experiments, at most [`MOST`] samples, every column scaled.
@@ -136,9 +152,11 @@ pub enum Sum {
     Output,
     /// Its change.
     Change,
+    /// The output itself, of powers of the inputs in the same sample.
+    Curve,
 }
 
-/// Whether the output, or its change, is a sum of inputs in the same sample and in some before, to rounding.
+/// Whether the output, or its change, is a sum of inputs in the same sample and in some before, or the output a curve of them, to rounding.
 ///
 /// A simulation without noise answers one sample later, and a plant has a memory of its own.
 pub fn computed(experiments: &[Samples]) -> Option<Sum> {
@@ -189,11 +207,41 @@ pub fn computed(experiments: &[Samples]) -> Option<Sum> {
         (all.column(target) - all.columns(first, used) * theta).amax() <= allowed
     };
     let found = [(Sum::Output, inputs + 1), (Sum::Change, inputs + 2)];
-    let found = found.into_iter();
+    let mut found = found.into_iter();
     found
-        .filter(|(_, target)| is_exact(*target, 0) && !is_exact(*target, channels))
+        .find(|(_, target)| is_exact(*target, 0) && !is_exact(*target, channels))
         .map(|(sum, _)| sum)
-        .next()
+        .or_else(|| is_curve(&pieces, &y).then_some(Sum::Curve))
+}
+
+/// Whether the output is a polynomial of the inputs of the same sample, to rounding.
+fn is_curve(pieces: &[Rows], y: &[f64]) -> bool {
+    let channels = pieces[0].width() - 1;
+    let used = channels * POWERS + 1;
+    let rows = pieces
+        .iter()
+        .flat_map(|p| (PAST..p.len()).map(move |k| (p, k)));
+    let u: Vec<f64> = rows
+        .flat_map(|(p, k)| {
+            let powers = (1..=POWERS as i32).flat_map(move |i| (0..channels).map(move |j| (i, j)));
+            { powers }.map(move |(i, j)| p.at(k, j).powi(i))
+        })
+        .collect();
+    let value = |i: usize, c: usize| match c {
+        c if c < used - 1 => u[i * (used - 1) + c],
+        c if c < used => 1.0,
+        _ => y[i],
+    };
+    let all = DMatrix::from_fn(y.len(), used + 1, value);
+    let r = triangle_of(&all);
+    let goal = r.column(used).into_owned();
+    let theta = solve(r.columns(0, used).into_owned(), &goal, DEPENDENT).theta;
+    let of_u = |c: usize| {
+        let (low, high) = range(all.column(c).iter().copied());
+        theta[c].abs() * 0.5e-5 * (high - low)
+    };
+    let allowed = 2.0 * rounding(y) + (0..used - 1).map(of_u).sum::<f64>();
+    (all.column(used) - all.columns(0, used) * theta).amax() <= allowed
 }
 
 fn triangle_of(all: &DMatrix<f64>) -> DMatrix<f64> {
@@ -434,6 +482,9 @@ mod tests {
             total
         };
         let integral: Vec<f64> = u.iter().map(add).collect();
+        let square: Vec<f64> = u.iter().map(|u| 3.0 * u + u * u).collect();
+        assert_eq!(computed(&samples(&u, &square)), Some(Sum::Curve));
+        assert_eq!(computed(&samples(&u[..1999], &square[1..])), None);
         assert_eq!(computed(&samples(&u, &integral)), Some(Sum::Change));
         assert_eq!(computed(&samples(&u[..20], &sum[..20])), None);
     }

@@ -71,6 +71,7 @@ fn computed(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<&'s
     Ok(found.map(|sum| match sum {
         faults::Sum::Output => "output",
         faults::Sum::Change => "change",
+        faults::Sum::Curve => "curve",
     }))
 }
 
