@@ -1,16 +1,19 @@
 """Positions: drives like EMPS, smart servos and MuJoCo joints, drawn by a seed; whole `identify`.
 
-Two kinds of joints that share nothing with the package's equations but physics:
+Three kinds of joints that share nothing with the package's equations but physics:
 
 drives   a carriage behind a force or a voltage of unknown unit (EMPS: Janot, Gautier and Brunot
          2019), in a cascade that repeats one trajectory; friction by direction, Stribeck's fall, a
          slightly flexible belt, encoder steps. Test: the same with pulses of force.
 servos   a position command to a controller inside (PD, dead band, limited torque), gravity,
          12-bit steps, 50 to 200 Hz. Test: other motions.
+mujoco   the same at 200 Hz on MuJoCo's integrator and dry friction, with gravity and the friction
+         models M1 to M6 of Rhoban's "better actuator models", by seed one after the other.
 
     python benches/joints.py                        the half for rules: seeds 0 to 9 of each kind
     python benches/joints.py --held                 seeds 100 to 109, on which nothing is decided
     python benches/joints.py --kind servos --seeds 3 4
+    python benches/joints.py --physics              parameters and intervals only, without a search
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ from numpy.typing import NDArray
 sys.path.insert(0, __file__.rpartition("/")[0] or ".")
 
 from battery.simulators import compiled
-from sewfast import Dataset, identify
+from sewfast import Dataset, identify, physics
 
 F = NDArray[np.float64]
 SUBSTEPS = 10
@@ -210,7 +213,81 @@ def servo(seed: int) -> Case:
     return Case(make(r, y), make(v, z), exact, own)
 
 
-KINDS = {"drives": drive, "servos": servo}
+# --- joints of MuJoCo -----------------------------------------------------------------------------
+
+
+def _friction(kind: int, p: dict[str, float], w: float, motor: float, outer: float) -> float:
+    """Dry friction of M1 to M6 at a speed, a motor's torque and an outer one."""
+    fall = math.exp(-((abs(w) / p["fall"]) ** 1.5))
+    dry = p["coulomb"]
+    if kind in (2, 4, 5, 6):
+        dry += fall * p["stribeck"]
+    if kind in (3, 4):
+        dry += p["loaded"] * abs(motor - outer)
+    if kind in (5, 6):
+        dry += p["loaded"] * abs(motor) + 0.5 * p["loaded"] * abs(outer)
+    if kind == 6:
+        dry += 0.3 * p["loaded"] / p["most"] * motor**2
+    return dry
+
+
+def mujoco_joint(seed: int) -> Case:
+    """20 s at 200 Hz; M1 for seed 0, M2 for seed 1, .. M6 for seed 5, and again."""
+    import mujoco
+
+    rng = np.random.default_rng([seed, 3])
+    kind, Ts, every, N = seed % 6 + 1, 0.005, 5, 4000
+    load, arm = rng.uniform(0.05, 0.3), rng.uniform(0.05, 0.12)
+    armature = rng.uniform(0.003, 0.015)
+    J, pull = armature + load * arm**2, load * arm * 9.81
+    w = rng.uniform(15.0, 25.0)
+    kp = max(J * w * w, 8.0 * pull)
+    p = {
+        "coulomb": kp * rng.uniform(0.01, 0.03), "stribeck": kp * 0.01, "fall": 0.15,
+        "loaded": rng.uniform(0.03, 0.12), "most": kp * float(rng.choice([0.5, 10.0])),
+    }  # fmt: skip
+    viscous, emf = J * rng.uniform(1.0, 4.0), J * w * rng.uniform(0.6, 1.4)
+    kd, late = J * w * rng.uniform(0.2, 0.6), int(rng.integers(2, 12))
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco>
+  <option timestep="0.001" integrator="implicitfast" gravity="0 0 -9.81"/>
+  <worldbody><body><joint name="j" axis="0 1 0" damping="{viscous + emf}" armature="{armature}"
+    frictionloss="0.01" solreffriction="0.004 1"/>
+    <inertial pos="0 0 -{arm}" mass="{load}" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody>
+  <actuator><motor joint="j"/></actuator></mujoco>""")
+    step = 2.0 * math.pi / 4096
+
+    def run(kind_of_motion: int) -> tuple[F, F, F]:
+        r = np.concatenate(
+            [_motion(rng, N // 2, Ts, kind_of_motion), _motion(rng, N - N // 2, Ts, 1)]
+        )
+        data, exact = mujoco.MjData(model), np.empty(N)
+        data.qpos[0] = r[0]
+        mujoco.mj_forward(model, data)
+        for k in range(N * every):
+            if k % every == 0:
+                exact[k // every] = data.qpos[0]
+            q, v = float(data.qpos[0]), float(data.qvel[0])
+            torque = kp * (r[max(k - late, 0) // every] - q) - kd * v
+            torque = min(max(torque, -p["most"]), p["most"])
+            outer = -pull * math.sin(q)
+            model.dof_frictionloss[0] = _friction(kind, p, v, torque - emf * v, outer)
+            data.ctrl[0] = torque
+            mujoco.mj_step(model, data)
+        return r, np.floor(exact / step + 0.5) * step, exact
+
+    make = lambda u, y: Dataset.from_arrays(  # noqa: E731
+        u, y, Ts, input_units=("rad",), output_unit="rad", name=f"mujoco/{seed}"
+    )
+    (r, y, _), (v, z, exact) = run(2), run(0)
+    truth = {
+        "inertia": J / kp, "friction": p["coulomb"] / kp, "stiffness": kp / J,
+        "gravity": pull / kp, "delay": 1e-3 * late, "reach": p["most"] / kp,
+        "damping": kd / kp,
+    }  # fmt: skip
+    return Case(make(r, y), make(v, z), exact, truth)
+
+
+KINDS = {"drives": drive, "servos": servo, "mujoco": mujoco_joint}
 
 
 def judged(case: Case, model: Any) -> float:
@@ -234,16 +311,55 @@ def delayed(case: Case) -> float:
     return late(case.test, case.clean, n)
 
 
+def parameters(kind: str, seed: int) -> None:
+    """Print what `physics` tells: the free run over the true one, and intervals with truths."""
+    case, began = KINDS[kind](seed), time.process_time()
+    joint = physics(case.train, structure="joint")
+    seconds = time.process_time() - began
+    truth = dict(case.truth)
+    if kind == "servos":
+        kp = truth["kp"]
+        truth = {
+            "inertia": truth["J"] / kp, "friction": truth["coulomb"] / kp,
+            "stiffness": kp / truth["J"], "gravity": truth["gravity"] / kp,
+            "delay": 2.5e-4 * truth["late"], "reach": truth["most"] / kp,
+            "damping": truth["kd"] / kp, "dead_band": truth["dead"],
+            "load_friction": truth["loaded"],
+        }  # fmt: skip
+    elif kind == "drives":
+        truth = {"inertia": truth["M"], "viscous": truth["viscous"]}
+    of, told = joint.parameters, []
+    for name, true in truth.items():
+        if name in of:
+            holds = "" if of[name].low <= true <= of[name].high else "!"
+            told.append(
+                f"{name} {100 * (of[name].value / true - 1) if true else math.inf:+.1f}%{holds}"
+            )
+    e = case.test.experiments[0]
+    own = judged(case, joint.model)
+    steps = float(np.sqrt(np.mean((e.y - case.clean)[FIRST:] ** 2)))
+    ratio = math.hypot(own, steps) / steps
+    print(
+        f"{kind} {seed}: {own / np.std(case.clean):.4f} of the spread, {ratio:.2f} of the true "
+        f"free run; {', '.join(told)}; terms {', '.join(joint.terms)}; processor {seconds:.1f} s",
+        flush=True,
+    )
+
+
 def main() -> None:
     """Print one row for each joint."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kind", choices=list(KINDS), nargs="*", default=list(KINDS))
     parser.add_argument("--seeds", type=int, nargs="*")
+    parser.add_argument("--physics", action="store_true", help="parameters only")
     parser.add_argument("--held", action="store_true", help="seeds 100 to 109")
     given = parser.parse_args()
     seeds = given.seeds if given.seeds else range(100, 110) if given.held else range(10)
     for kind in given.kind:
         for seed in seeds:
+            if given.physics:
+                parameters(kind, seed)
+                continue
             case = KINDS[kind](seed)
             began, cpu = time.perf_counter(), time.process_time()
             model = identify(case.train, seed=seed)

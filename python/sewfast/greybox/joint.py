@@ -29,6 +29,7 @@ _INSIDE = {
     "k_p": "encoder and command show the controller's gain only relative to the inertia; it takes "
     "a known inertia, or a current and its torque constant",
     "inertia_kg_m2": "encoder and command show it only in units of the controller's gain",
+    "lag": "behind a controller it acts as a part of the delay",
 }
 _OF_TERM = {"loaded": "load_friction"}
 _DIRECT = {

@@ -156,6 +156,11 @@ class Ending:
         """Why there is no network among the rows."""
         if self.table.is_exact:
             return ["the linear model's error is at rounding: no network was asked"]
+        if self.table.joints_decide:
+            return [
+                "the record repeats one trajectory, so that no part of it can judge a network: the "
+                "equations decide"
+            ]
         if is_interrupted or any(isinstance(r.found, Structure) for r in rows):
             return []
         if TRAINING in self.clock.lost:

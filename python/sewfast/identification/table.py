@@ -119,7 +119,7 @@ class Table:
             self._try_motor()
         self.linear.search(self.clock.within(SHARE_OF_LINEAR, SHARE_OF_SEARCH))
         self.enter_linear()
-        if self.is_exact:
+        if self.is_exact or self.joints_decide:
             return
         alive = self._screened()
         for iterations in HALVINGS:
@@ -150,13 +150,18 @@ class Table:
         heart, which no held-out part shows: the equations of a joint count alone.
         """
         found = [r for r in self.rows.values() if r.kind == "neural_ss" or not self.wants_network]
+        if self.joints_decide:
+            return [r for r in found if r.kind == "grey_box"]
         able = [r for r in found if is_integrator(r)]
-        if not (able and self._integrates):
-            return found
-        joints = [r for r in able if r.kind == "grey_box"]
-        is_repeated = self.diagnosis.find("repeats") is not None
-        # repetitions tell nothing of what is new to a network: physics holds there too
-        return joints if joints and is_repeated else able
+        return able if able and self._integrates else found
+
+    @property
+    def joints_decide(self) -> bool:
+        """Whether the equations of a joint count alone: repetitions tell nothing of what is new to
+        a network, while physics holds there too."""
+        joints = (r for r in self.rows.values() if r.kind == "grey_box" and is_integrator(r))
+        repeats = any(joints) and self._integrates and self.diagnosis.find("repeats") is not None
+        return repeats and not self.wants_network
 
     @property
     def _integrates(self) -> bool:

@@ -50,7 +50,7 @@ PIECES = 4
 """Pieces of the last fit, beside which the drift of a whole record is another error."""
 SHORTEST, FIRST = 50, 30
 """Least samples of a piece, and those of its first outputs that give its state."""
-STEPS_PER_RADIAN = 12.0
+STEPS_PER_RADIAN = 50.0
 """Integration steps while the fastest of the dynamics turns by one radian."""
 
 
@@ -255,7 +255,22 @@ class _Fit:
             own, best = one, cost
             tried = [t for t in tried if t != term]
             taken.append(term)
-        return self.descended(own), tuple(t for t in TERMS if t in taken), tuple(tried)
+        own = self.descended(own)
+        # one that another has made superfluous goes again
+        for term in taken[:-1]:
+            best, fewer = self.reached, _without(own, term)
+            try:
+                fewer = self.descended(fewer)
+            except FitError:
+                continue
+            n = self.independent(own)
+            if n * math.log(self.reached / max(best, 1e-300)) < len(TERMS[term]) * math.log(n):
+                own = fewer
+                taken.remove(term)
+            else:
+                self.reached = best
+        missing = tuple(t for t in TERMS if t not in taken and self._may_have(t, core))
+        return own, tuple(t for t in TERMS if t in taken), missing
 
     def covariance(self, core: _core.GreyBox) -> FloatArray:
         """Covariance of the free parameters, (n, n), with the pieces' states estimated beside them;
@@ -280,7 +295,8 @@ class _Fit:
     def _may_have(self, term: str, core: _core.GreyBox) -> bool:
         if term == "gravity":
             return self.is_angle
-        return not core.settings["integrator"] or term not in ("reach", "dead_band")
+        # behind a controller inside, a lag of the current is a part of the delay
+        return (term == "lag") == core.settings["integrator"] or term in ("stribeck", "loaded")
 
     def _begun(self, core: _core.GreyBox, term: str) -> Iterator[_core.GreyBox]:
         """Starts of a core with one more term."""
@@ -319,6 +335,20 @@ class _Fit:
         return max(n * total / max(spread, 1e-300), 3.0)
 
 
+def _without(core: _core.GreyBox, term: str) -> _core.GreyBox:
+    """The core without a term."""
+    s, gone = core.settings, [PLACES[n] for n in TERMS[term]]
+    kept = [j for j, place in enumerate(s["free"]) if place not in gone]
+    values, own = s["values"].copy(), list(s["joint"])
+    for place in gone:
+        if place < len(PARAMETERS):
+            values[place] = NOTHING[place]
+        else:
+            own[place - len(PARAMETERS)] = 0.0
+    free = [s["free"][j] for j in kept]
+    return changed(core, values=values, joint=own, free=free, theta=core.theta[kept])
+
+
 def descended(
     core: _core.GreyBox,
     start: FloatArray,
@@ -348,6 +378,7 @@ def descended(
         except SettingError:
             return None, states
 
+    @np.errstate(over="ignore", invalid="ignore")
     def normal(x: FloatArray) -> Normal:
         look()
         own, states = parts(x)
@@ -365,6 +396,11 @@ def descended(
             cost += float(error @ error)
             slope[at] += rows.T @ error
             total[np.ix_(at, at)] += rows.T @ rows
+        if not np.isfinite(total).all():
+            raise FitError(
+                name="data", expected="a free run that changes with the parameters by finite "
+                "amounts", received="infinite ones", remedy="record more moves in both directions",
+            )  # fmt: skip
         return cost, slope, total
 
     def cost(x: FloatArray) -> float:
