@@ -36,6 +36,26 @@ fn a_sound_record_has_no_change() {
 }
 
 #[test]
+fn another_scale_of_a_sweep_is_found() {
+    for later in [3.0, 0.25] {
+        let sine = |k: usize| (k as f64 * (0.015 + 2e-5 * k as f64)).sin();
+        let mut u: Vec<f64> = (0..4000).map(sine).collect();
+        let mut x = 0.0;
+        let y = u.iter().map(|u| {
+            let before = x;
+            x += 0.1 * (u - x);
+            before
+        });
+        let y: Vec<f64> = y.collect();
+        assert_eq!(change_of(&[(u.clone(), y.clone())], 1), None);
+        u[2100..].iter_mut().for_each(|u| *u *= later);
+        let found = change_of(&[(u, y)], 1).unwrap();
+        assert!((found.gain * later - 1.0).abs() < 0.1, "{found:?}");
+        assert!(found.start.abs_diff(2100) < 150, "{found:?}");
+    }
+}
+
+#[test]
 fn another_sign_or_scale_is_found_where_it_begins() {
     for (gain, seed) in [(-1.0, 1), (0.5, 2), (3.0, 3), (0.0, 4)] {
         let (u, mut y) = record(3000, seed);
