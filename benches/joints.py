@@ -281,7 +281,7 @@ def mujoco_joint(seed: int) -> Case:
     (r, y, _), (v, z, exact) = run(2), run(0)
     truth = {
         "inertia": J / kp, "friction": p["coulomb"] / kp, "stiffness": kp / J,
-        "gravity": pull / kp, "delay": 1e-3 * late, "reach": p["most"] / kp,
+        "gravity": pull / kp, "delay": 1e-3 * (late - 0.5), "reach": p["most"] / kp,
         "damping": kd / kp,
     }  # fmt: skip
     return Case(make(r, y), make(v, z), exact, truth)
@@ -311,6 +311,7 @@ def delayed(case: Case) -> float:
     return late(case.test, case.clean, n)
 
 
+# both simulators take the position from the speed at the end of a step: half of one early
 def parameters(kind: str, seed: int) -> None:
     """Print what `physics` tells: the free run over the true one, and intervals with truths."""
     case, began = KINDS[kind](seed), time.process_time()
@@ -322,7 +323,7 @@ def parameters(kind: str, seed: int) -> None:
         truth = {
             "inertia": truth["J"] / kp, "friction": truth["coulomb"] / kp,
             "stiffness": kp / truth["J"], "gravity": truth["gravity"] / kp,
-            "delay": 2.5e-4 * truth["late"], "reach": truth["most"] / kp,
+            "delay": 2.5e-4 * (truth["late"] - 0.5), "reach": truth["most"] / kp,
             "damping": truth["kd"] / kp, "dead_band": truth["dead"],
             "load_friction": truth["loaded"],
         }  # fmt: skip
