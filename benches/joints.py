@@ -23,7 +23,7 @@ import itertools
 import math
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -133,7 +133,7 @@ def drive(seed: int) -> Case:
     make = lambda u, y: Dataset.from_arrays(  # noqa: E731
         u, factor * y, Ts, output_unit=unit, name=f"drives/{seed}"
     )
-    return Case(make(u, y), make(v, z), factor * exact, own)
+    return Case(make(u, y), make(v, z), factor * exact, own | {"unit": gain * factor})
 
 
 # --- smart servos ---------------------------------------------------------------------------------
@@ -287,6 +287,7 @@ def mujoco_joint(seed: int) -> Case:
     return Case(make(r, y), make(v, z), exact, truth)
 
 
+_OF_DRIVES = {"inertia": "M", "viscous": "viscous"}
 KINDS = {"drives": drive, "servos": servo, "mujoco": mujoco_joint}
 
 
@@ -315,7 +316,8 @@ def delayed(case: Case) -> float:
 def parameters(kind: str, seed: int) -> None:
     """Print what `physics` tells: the free run over the true one, and intervals with truths."""
     case, began = KINDS[kind](seed), time.process_time()
-    joint = physics(case.train, structure="joint")
+    data = replace(case.train, output_unit=case.train.output_unit or "m")
+    joint = physics(data, structure="joint")
     seconds = time.process_time() - began
     truth = dict(case.truth)
     if kind == "servos":
@@ -328,7 +330,7 @@ def parameters(kind: str, seed: int) -> None:
             "load_friction": truth["loaded"],
         }  # fmt: skip
     elif kind == "drives":
-        truth = {"inertia": truth["M"], "viscous": truth["viscous"]}
+        truth = {n: truth[m] / truth["unit"] for n, m in _OF_DRIVES.items()}
     of, told = joint.parameters, []
     for name, true in truth.items():
         if name in of:
