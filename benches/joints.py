@@ -23,7 +23,7 @@ import itertools
 import math
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -133,7 +133,7 @@ def drive(seed: int) -> Case:
     make = lambda u, y: Dataset.from_arrays(  # noqa: E731
         u, factor * y, Ts, output_unit=unit, name=f"drives/{seed}"
     )
-    return Case(make(u, y), make(v, z), factor * exact, own)
+    return Case(make(u, y), make(v, z), factor * exact, own | {"unit": gain * factor})
 
 
 # --- smart servos ---------------------------------------------------------------------------------
@@ -281,12 +281,13 @@ def mujoco_joint(seed: int) -> Case:
     (r, y, _), (v, z, exact) = run(2), run(0)
     truth = {
         "inertia": J / kp, "friction": p["coulomb"] / kp, "stiffness": kp / J,
-        "gravity": pull / kp, "delay": 1e-3 * late, "reach": p["most"] / kp,
+        "gravity": pull / kp, "delay": 1e-3 * (late - 0.5), "reach": p["most"] / kp,
         "damping": kd / kp,
     }  # fmt: skip
     return Case(make(r, y), make(v, z), exact, truth)
 
 
+_OF_DRIVES = {"inertia": "M", "viscous": "viscous"}
 KINDS = {"drives": drive, "servos": servo, "mujoco": mujoco_joint}
 
 
@@ -311,10 +312,12 @@ def delayed(case: Case) -> float:
     return late(case.test, case.clean, n)
 
 
+# both simulators take the position from the speed at the end of a step: half of one early
 def parameters(kind: str, seed: int) -> None:
     """Print what `physics` tells: the free run over the true one, and intervals with truths."""
     case, began = KINDS[kind](seed), time.process_time()
-    joint = physics(case.train, structure="joint")
+    data = replace(case.train, output_unit=case.train.output_unit or "m")
+    joint = physics(data, structure="joint")
     seconds = time.process_time() - began
     truth = dict(case.truth)
     if kind == "servos":
@@ -322,12 +325,12 @@ def parameters(kind: str, seed: int) -> None:
         truth = {
             "inertia": truth["J"] / kp, "friction": truth["coulomb"] / kp,
             "stiffness": kp / truth["J"], "gravity": truth["gravity"] / kp,
-            "delay": 2.5e-4 * truth["late"], "reach": truth["most"] / kp,
+            "delay": 2.5e-4 * (truth["late"] - 0.5), "reach": truth["most"] / kp,
             "damping": truth["kd"] / kp, "dead_band": truth["dead"],
             "load_friction": truth["loaded"],
         }  # fmt: skip
     elif kind == "drives":
-        truth = {"inertia": truth["M"], "viscous": truth["viscous"]}
+        truth = {n: truth[m] / truth["unit"] for n, m in _OF_DRIVES.items()}
     of, told = joint.parameters, []
     for name, true in truth.items():
         if name in of:

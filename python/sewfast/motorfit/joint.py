@@ -51,7 +51,8 @@ PIECES = 4
 SHORTEST, FIRST = 50, 30
 """Least samples of a piece, and those of its first outputs that give its state."""
 STEPS_PER_RADIAN = 50.0
-"""Integration steps while the fastest of the dynamics turns by one radian."""
+"""Integration steps while the fastest of the dynamics turns by one radian. With 12 a limit of the
+controller was seen as a lag besides (benches/joints.py, servos 0, 3 and 5)."""
 
 
 @dataclass(frozen=True, eq=False)
