@@ -52,13 +52,14 @@ def test_a_model_that_runs_away_is_a_row() -> None:
     long = Dataset.from_arrays(
         np.ones(3000), np.ones(3000), HELD.Ts, input_units="V", output_unit="RPM"
     )
-    found = sewfast.compare({"wild": unstable(), "calm": models()[1]}, long)
+    wild = sewfast.Ensemble.of([unstable(), unstable()])
+    found = sewfast.compare({"wild": wild, "calm": models()[1]}, long)
     assert found.validations[0] is None
     assert found.best == "calm"
     assert "runs away" in str(found)
     with pytest.raises(KeyError, match="calm"):
         found["wild"]
-    alone = sewfast.compare(unstable(), long)
+    alone = sewfast.compare(wild, long)
     assert (alone.best, alone.to_json()["best"]) == ("", None)
     pytest.importorskip("matplotlib", reason="needs the report extra")
     with pytest.raises(SettingError, match="all diverge"):

@@ -140,7 +140,7 @@ def _order_fault(data: Dataset) -> Iterator[Fault]:
         after = "" if delay == 0 else f" of {delay} samples before"
         yield Fault(
             "no_dynamics",
-            f"{y} is {name}{after} times {gain:.6g}, exactly: there are no dynamics between "
+            f"{y} is {name}{after} times {gain:.4g}, exactly: there are no dynamics between "
             "the two, as one column was read twice or computed from the other",
             "name the column of a sensor as output",
             {"input": name, "gain": gain, "offset": offset, "delay": float(delay)},
