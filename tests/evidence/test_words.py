@@ -72,12 +72,11 @@ def test_an_output_that_the_input_does_not_move_is_no_good_fit(shape: str) -> No
     u = np.repeat(rng.uniform(-5.0, 5.0, n // 6), 6)
     y = {"ramp": t, "decay": 10.0 * np.exp(-t / 2.0), "sine": np.sin(2.0 * np.pi * t)}[shape]
     data = Dataset.from_arrays(u, y + 0.01 * rng.standard_normal(n), 0.01)
-    model = identify(data, time_budget=1.0, seed=0)
+    model = identify(data, time_budget=1.0)
     verdict = model.training["verdict"]
     found = validate(model, data)
     for grade in (verdict["grade"], found.grade):
         assert grade in ("poor", "useless"), (verdict, found.verdict)
-    assert found.without_input < 2.0 * found.simulation.rmse
     assert check(model, data).lines[0].verdict in ("warn", "fail")
 
 
