@@ -132,6 +132,8 @@ class Validation(Plotted):
         Sample time of the data [s].
     without_input : float
         Root mean square error of the free run with the inputs at rest (`without_input`) [unit].
+    ahead : int or None
+        Samples after which the free run of an unstable model began anew; None for other models.
     """
 
     simulation: Scores
@@ -145,6 +147,7 @@ class Validation(Plotted):
     notes: tuple[str, ...] = ()
     Ts: float | None = None
     without_input: float = math.inf
+    ahead: int | None = None
 
     @property
     def unmeasured(self) -> int:
@@ -163,7 +166,9 @@ class Validation(Plotted):
     def _graded(self) -> tuple[str, str]:
         s = self.simulation
         share = by_input(s.rmse, self.without_input)
-        return judged(s.fit_percent, s.rmse, self.noise, share)
+        grade, resting = judged(s.fit_percent, s.rmse, self.noise, share)
+        # nobody has seen an unstable plant run freely
+        return ("fair" if grade == "good" and self.ahead is not None else grade), resting
 
     @property
     def verdict(self) -> str:
@@ -344,21 +349,24 @@ def scored_runs(model: DynamicModel, data: Dataset, init: int) -> list[FloatArra
 
 def _restarted(model: DynamicModel, e: Experiment, ahead: int) -> FloatArray:
     before = min(max(INIT, ahead), len(e))
+    least = min(INIT, before)
     places = range(before, max(len(e), before + 1), ahead)
     counts = [int(np.isfinite(e.y[at - before : at]).sum()) for at in places]
-    # where too few outputs are known a run goes on
-    kept = [(at, n) for at, n in zip(places, counts, strict=True) if n >= INIT]
+    # where too few outputs are known a run goes on, at the beginning from the first that are
+    kept = [(at, n) for at, n in zip(places, counts, strict=True) if 2 * n >= least]
     if not kept:
         raise DataError(
-            f"{e.name}: expected {INIT} measured outputs among {before} samples to begin a free "
+            f"{e.name}: expected {least} measured outputs among {before} samples to begin a free "
             "run of an unstable model with, received fewer; give a longer range"
         )
-    edges = [0, *(at for at, _ in kept[1:]), len(e)]
+    first = kept[0][0] - before
+    edges = [first, *(at for at, _ in kept[1:]), len(e)]
     y = np.empty(len(e))
     for (at, n), (begin, end) in zip(kept, itertools.pairwise(edges), strict=True):
         window = e.cut(at - before, end)
-        state = model.initial_state(window, n)
-        y[begin:end] = model.core.simulate(window.u, state)[begin - end :]
+        run = model.core.simulate(window.u, model.initial_state(window, n))
+        y[begin:end] = run[begin - end :]
+    y[:first] = y[first]  # little is known there, and little scored
     return y
 
 
@@ -477,6 +485,7 @@ def validate(
         tuple(_beyond_training(model, data)),
         data.Ts,
         without_input(model, data, init) if against is None else math.inf,
+        doubling(model),
     )
 
 

@@ -136,6 +136,25 @@ def test_an_unstable_plant_is_identified_and_tuned_without_an_option() -> None:
     assert np.abs(after.y[-100:] - 0.05).max() < 0.01
 
 
+def test_gaps_and_a_level_at_rest_are_no_obstacle() -> None:
+    _, data = held()
+    (e,) = data.experiments
+    y = e.y + 2.0
+    y[[5, *range(700, 720)]] = np.nan
+    moved = Dataset.from_arrays(e.u + 3.0, y, 0.01, input_units=("V",), output_unit="rad")
+    model = identify(moved)
+    assert isinstance(model, ARX)
+    assert np.abs(model.poles) == pytest.approx([1.0502, 0.9522], abs=3e-3)
+    assert model.rest.u[0] == pytest.approx(3.0, abs=0.1)
+    assert model.rest.y == pytest.approx(2.0, abs=0.05)
+    found = model.validate(moved)
+    assert (found.grade, found.ahead) == ("fair", 14)
+    assert found.simulation.fit_percent > 90.0
+    tuned = tune(model, evaluations=200, threads=1)
+    assert tuned.verdict.grade == "fair"
+    assert tuned.pid.u_min < 3.0 < tuned.pid.u_max
+
+
 def test_least_squares_of_many_orders_say_what_noise_leaves_of_them() -> None:
     _, data = held()
     verdict = identify(data, model="arx", na=8, nb=8).training["verdict"]
@@ -143,7 +162,7 @@ def test_least_squares_of_many_orders_say_what_noise_leaves_of_them() -> None:
 
 
 def test_an_unstable_plant_that_no_pid_holds_is_refused() -> None:
-    # it doubles within two samples, and answers after six
+    # it doubles within two samples, and answers after six of them
     model = LinearOE.from_tf([0.0] * 6 + [0.4], [1.0, -1.4], 0.01)
     model = replace(model, training={"input_range": [[-1.0, 1.0]], "output_range": [-1.0, 1.0]})
     with pytest.raises(FitError, match=r"none of \d+ PIDs holds"):

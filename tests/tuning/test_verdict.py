@@ -196,6 +196,9 @@ def test_gains_that_do_not_bring_the_model_to_a_held_level_are_poor() -> None:
     assert found.verdict.grade == "poor"
     assert "RPM that the reference holds" in (found.warning or "")
     assert "holds" not in (tune(drive(), [SHORT], start=QUIET, **settings).warning or "")
+    # nor is a level that ends before the drive can have moved
+    short = np.concatenate([SHORT[:500], np.full(20, SHORT[499] + 1000.0)])
+    assert "holds" not in (tune(drive(), [short], start=QUIET, **settings).warning or "")
     # a level that the command cannot hold is no fault of the gains
     far = np.interp(np.arange(3000), [0, 1000, 3000], [0.0, 12_000.0, 12_000.0])
     assert "holds" not in (tune(drive(), [far], start=QUIET, **settings).warning or "")

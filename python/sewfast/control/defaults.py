@@ -18,7 +18,7 @@ import numpy as np
 from .. import _core, signals
 from ..dataset import FloatArray
 from ..errors import DataError, FitError, SettingError
-from ..evidence.operating import integrating_pole
+from ..evidence.operating import INTEGRATES, integrating_pole
 from ..evidence.region import stored_region
 from ..gains import real
 from ..models import Model
@@ -249,7 +249,7 @@ def growth_rate(model: Model) -> float:
     """The rate at which an unstable linear model leaves its rest [1/s]; 0 for others."""
     largest = max(map(abs, model.poles)) if isinstance(model, LinearDifference) else 0.0
     # an integrator's pole is 1 but for its estimate
-    return math.log(largest) / model.Ts if largest > 1.0 and not integrating_pole(model) else 0.0
+    return math.log(largest) / model.Ts if largest > 1.0 + INTEGRATES else 0.0
 
 
 def moves_on(model: Model, u_min: float, u_max: float) -> bool:

@@ -98,18 +98,27 @@ def held_by_a_loop(task: Task) -> Model | None:
     look = task.clock.limited(task.progress, 0.9, "larger orders of an unstable plant")
 
     def plant(data: Dataset) -> Model | None:
-        fit = _core.fit_innovations(arrays(data), nk=task.nk, progress=look)
+        fit = _core.fit_innovations(
+            arrays(data), nk=task.nk, max_iterations=task.iterations or 60, progress=look
+        )
         if fit.termination == "interrupted" and not task.clock.truncated:
             raise KeyboardInterrupt
         known = linear_provenance(fit)
         known |= {"initial_state": "measured", "cost_horizon": "one step", "method": ARMAX}
+        if any(e.weights is not None for e in data.experiments):
+            known["notes"] = ["the fit of an unstable plant knows no weights but 0"]
         found = task.model(ARX, fit.model, known)
         return None if doubling(found) is None else found
 
     try:
         model = plant(task.data)
         part = next(iter(folds(task.data, task.validation)), None)
-        earlier = model if part is None else plant(part.fitted)
+        try:
+            earlier = model if part is None else plant(part.fitted)
+        except KeyboardInterrupt:
+            if model is None:
+                raise
+            raise Interrupted(model) from None
     except (DataError, FitError):
         return None
     if model is None or part is None or earlier is None:

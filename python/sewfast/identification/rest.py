@@ -19,7 +19,7 @@ from ..evidence.region import stored_region
 from ..evidence.residuals import representative
 from ..models import Model
 from ..models.rest import Rest
-from ..validation import noise_of
+from ..validation import doubling, noise_of
 from .task import free_run_rmse, with_provenance
 
 M = TypeVar("M", bound=Model)
@@ -62,6 +62,8 @@ def _equilibrium(model: Model, data: Dataset) -> Rest | None:
     The record has been at rest or not, so the level is kept within the recorded outputs. It is zero
     if the model's own error does not tell it from zero.
     """
+    if doubling(model) is not None:
+        return _held(data)
     low, high = np.array(data.input_range, dtype=np.float64).T
     zero = np.zeros(len(low))
     off = _level(model, zero)
@@ -75,6 +77,18 @@ def _equilibrium(model: Model, data: Dataset) -> Rest | None:
     if not u.any() and abs(y) <= free_run_rmse(model, data):
         return None
     return Rest(tuple(float(v) for v in u), y, "equilibrium")
+
+
+def _held(data: Dataset) -> Rest | None:
+    """The mean command and output of a record that a loop held, which are an equilibrium but for
+    what the motion at both ends is worth; none if both are within a standard deviation of zero.
+    """
+    u = np.concatenate([e.u for e in data.experiments])
+    y = np.concatenate([e.y for e in data.experiments])
+    level, mean = float(np.nanmean(y)), u.mean(axis=0)
+    if abs(level) <= float(np.nanstd(y)) and (np.abs(mean) <= u.std(axis=0)).all():
+        return None
+    return Rest(tuple(float(v) for v in mean), level, "equilibrium")
 
 
 def _level(model: Model, u: FloatArray) -> float | None:

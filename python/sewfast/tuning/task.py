@@ -460,7 +460,7 @@ def _holding(plant: Model, blank: Controller, growth: float) -> Controller:
     found: list[tuple[float, Controller]] = []
     for share in CROSSOVERS:
         w = share * growth
-        for lead in LEADS if w * plant.Ts < 1.0 else ():
+        for lead in LEADS if w * plant.Ts < 3.0 else ():
             gains = Gains.standard(1.0, 10.0 / w, lead / w, u_unit=own.u_unit, y_unit=own.y_unit)
             unit = float(abs(loop_response(replace(blank, gains=gains), plant, [w])[0]))
             for Kp in (1.0 / unit, -1.0 / unit) if unit > 0.0 else ():

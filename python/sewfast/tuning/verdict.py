@@ -14,6 +14,7 @@ from ..arrays import in_unit
 from ..control.controller import SampledController
 from ..control.defaults import (
     drive_step,
+    growth_rate,
     moves_on,
     rate_step,
     recorded_limits,
@@ -263,10 +264,25 @@ def _missed(found: ClosedLoopRun, model: Model) -> str:
     """
     r, rest = found.r, model.rest.y
     span = max(float(r.max()), rest) - min(float(r.min()), rest)
+    least = _settling(model, found.controller)
     for mean, level, hold in missed_levels(found, MISSED * span):
-        if not np.any(_railed(found)[hold]):
+        # the last quarter of a hold that is long enough to be met
+        if 4 * (hold.stop - hold.start) >= least and not np.any(_railed(found)[hold]):
             return f"{mean:.4g} instead of {in_unit(f'{level:.4g}', found.controller.y_unit)}"
     return ""
+
+
+def _settling(model: Model, c: SampledController) -> float:
+    """Samples in which a loop around the model can be expected to meet a level: the model's dead
+    time and time constant; infinite if these are not known.
+    """
+    if (growth := growth_rate(model)) > 0.0:
+        return 1.0 / (growth * model.Ts)
+    try:
+        step = rate_step(model, c.u_min, c.u_max) or drive_step(model, c.u_min, c.u_max)
+    except (FitError, SettingError):
+        return math.inf
+    return (step.fopdt.L + step.slowest) / model.Ts
 
 
 def _railed(found: ClosedLoopRun) -> NDArray[np.bool_]:
