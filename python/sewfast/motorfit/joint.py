@@ -93,10 +93,19 @@ def fitted(
     core = fit.started(integrates)
     for share in (32, 16, 8, PIECES):
         fit.cut(share)
-        core = fit.descended(core)
-    core = fit.without_delay(core)
-    core, terms, missing = fit.with_terms(core)
-    return JointFit(core, terms, missing, fit.covariance(core) if covariance else None)
+        found = fit.descended(core)
+        core = found.core
+    found, terms, missing = fit.with_terms(fit.without_delay(found))
+    return JointFit(found.core, terms, missing, fit.covariance(found) if covariance else None)
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """The least sum of squares, its core, and the initial states of the pieces there."""
+
+    cost: float
+    core: _core.GreyBox
+    states: Sequence[FloatArray]
 
 
 class _Fit:
@@ -210,74 +219,67 @@ class _Fit:
             return math.inf
         return total if math.isfinite(total) else math.inf
 
-    def descended(self, core: _core.GreyBox, iterations: int = ITERATIONS) -> _core.GreyBox:
-        """The core at the least squares over the pieces, whose states are fitted with it."""
-        self.reached, found = descended(core, core.theta, self.pieces, self.look, iterations)
-        return found
+    def descended(self, core: _core.GreyBox, iterations: int = ITERATIONS) -> Descent:
+        """The least squares over the pieces, whose states are fitted with the core."""
+        return descended(core, core.theta, self.pieces, self.look, iterations)
 
-    def without_delay(self, core: _core.GreyBox) -> _core.GreyBox:
-        """The core, or the one that a descent without a delay finds: stops of dry friction give the
+    def without_delay(self, found: Descent) -> Descent:
+        """The fit, or the one that a descent without a delay finds: stops of dry friction give the
         delay more than one minimum.
         """
-        cost, place = self.reached, core.settings["free"].index(PLACE["delay"])
-        theta = core.theta.copy()
+        place = found.core.settings["free"].index(PLACE["delay"])
+        theta = found.core.theta.copy()
         theta[place] = 0.0
-        other = self.descended(changed(core, theta=theta))
-        if self.reached < cost:
-            return other
-        self.reached = cost
-        return core
+        other = self.descended(changed(found.core, theta=theta))
+        return other if other.cost < found.cost else found
 
-    def with_terms(
-        self, core: _core.GreyBox
-    ) -> tuple[_core.GreyBox, tuple[str, ...], tuple[str, ...]]:
-        """The core with those of the terms that lower the cost by more than their number explains:
+    def with_terms(self, plain: Descent) -> tuple[Descent, tuple[str, ...], tuple[str, ...]]:
+        """The fit with those of the terms that lower the cost by more than their number explains:
         one after the other, the one that lowers it most first (Schwarz 1978, with the number of
         samples that the residuals' correlation leaves).
         """
-        own, best, taken = core, self.reached, list[str]()
-        tried = [t for t in TERMS if self._may_have(t, core)]
+        own, taken = plain, list[str]()
+        tried = [t for t in TERMS if self._may_have(t, plain.core)]
         while tried:
             found = []
             for term in tried:
-                for begun in self._begun(own, term):
+                for begun in self._begun(own.core, term):
                     try:
-                        one = self.descended(begun, 12)
+                        found.append((term, self.descended(begun, 12)))
                     except (FitError, SettingError):
                         continue
-                    found.append((self.reached, term, one))
             if not found:
                 break
-            cost, term, one = min(found, key=lambda f: f[0])
-            free = len(TERMS[term])
-            n = self.independent(own)
-            if n * math.log(max(best, 1e-300) / max(cost, 1e-300)) < free * math.log(n):
+            term, one = min(found, key=lambda f: f[1].cost)
+            if not self._explains(own, one, term, self.independent(own)):
                 break
-            own, best = one, cost
+            own = one
             tried = [t for t in tried if t != term]
             taken.append(term)
-        own = self.descended(own)
+        own = self.descended(own.core)
         # one that another has made superfluous goes again
         for term in taken[:-1]:
-            best, fewer = self.reached, _without(own, term)
             try:
-                fewer = self.descended(fewer)
+                fewer = self.descended(_without(own.core, term))
             except FitError:
                 continue
-            n = self.independent(own)
-            if n * math.log(self.reached / max(best, 1e-300)) < len(TERMS[term]) * math.log(n):
+            if not self._explains(fewer, own, term, self.independent(own)):
                 own = fewer
                 taken.remove(term)
-            else:
-                self.reached = best
-        missing = tuple(t for t in TERMS if t not in taken and self._may_have(t, core))
+        missing = tuple(t for t in TERMS if t not in taken and self._may_have(t, plain.core))
         return own, tuple(t for t in TERMS if t in taken), missing
 
-    def covariance(self, core: _core.GreyBox) -> FloatArray:
+    @staticmethod
+    def _explains(fewer: Descent, more: Descent, term: str, n: float) -> bool:
+        """Whether a term lowers the cost by more than the number of its parameters explains."""
+        gain = n * math.log(max(fewer.cost, 1e-300) / max(more.cost, 1e-300))
+        return gain >= len(TERMS[term]) * math.log(n)
+
+    def covariance(self, found: Descent) -> FloatArray:
         """Covariance of the free parameters, (n, n), with the pieces' states estimated beside them;
         from sums of scores over a window (`covariance_of`).
         """
-        states, n = self.states(core), len(core.theta)
+        core, states, n = found.core, found.states, len(found.core.theta)
         places = [n, n + core.settings["nx"] - 1]
         rows, residuals, lengths = [], [], []
         for i, (p, state) in enumerate(zip(self.pieces, states, strict=True)):
@@ -321,11 +323,11 @@ class _Fit:
             names = [*s["free"], *(PLACES[n] for n in values)]
             yield changed(core, free=names, theta=np.array([*core.theta, *values.values()]))
 
-    def independent(self, core: _core.GreyBox) -> float:
+    def independent(self, found: Descent) -> float:
         """Number of samples that are as good as independent, by the residuals' correlation."""
         total = spread = 0.0
-        for p, state in zip(self.pieces, self.states(core), strict=True):
-            error = np.nan_to_num(core.simulate(p.u, state) - p.y)
+        for p, state in zip(self.pieces, found.states, strict=True):
+            error = np.nan_to_num(found.core.simulate(p.u, state) - p.y)
             power = np.abs(np.fft.rfft(error, 2 * len(error))) ** 2
             r = np.fft.irfft(power)[: len(error) // 4]
             positive = np.flatnonzero(r <= 0.0)
@@ -357,8 +359,8 @@ def descended(
     look: Callable[[], object],
     iterations: int,
     prior: FloatArray | None = None,
-) -> tuple[float, _core.GreyBox]:
-    """The least sum of squares from `start` (p,), and its core. The initial speed and position of
+) -> Descent:
+    """The least sum of squares from `start` (p,). The initial speed and position of
     each piece are fitted too. `prior` (p,) are inverse standard deviations about 0, in units of the
     residuals.
     """
@@ -429,7 +431,8 @@ def descended(
     bounds = (low, np.full(len(x0), np.inf))
     found = minimised(normal, cost, x0, bounds, count, enough=ENOUGH, iterations=iterations)
     variance = max(found.cost / max(count, 1), 1e-300)
-    return found.cost, changed(core, theta=found.x[:p], residual_variance=variance)
+    best = changed(core, theta=found.x[:p], residual_variance=variance)
+    return Descent(found.cost, best, parts(found.x)[1])
 
 
 def begun(core: _core.GreyBox, piece: Experiment) -> FloatArray:
