@@ -176,6 +176,29 @@ def test_intervals_are_those_at_the_fitted_states_of_the_pieces() -> None:
     assert inertia.high - inertia.low < 0.1 * inertia.value
 
 
+@pytest.mark.parametrize("unit", ["rad", "deg", "mrad", "rev"])
+def test_the_unit_of_an_angle_changes_the_unit_of_the_result_alone(unit: str) -> None:
+    plain = physics(_of_machine(), structure="joint")
+    scale = {"rad": 1.0, "deg": 180.0 / math.pi, "mrad": 1e3, "rev": 0.5 / math.pi}[unit]
+    joint = physics(_of_machine(unit, scale), structure="joint")
+    assert joint.terms == plain.terms
+    assert joint.rmse == pytest.approx(scale * plain.rmse, rel=1e-6)
+    assert joint.parameters.keys() == plain.parameters.keys()
+    for name, one in plain.parameters.items():
+        per = scale if name in ("inertia", "viscous") else 1.0
+        found = joint.parameters[name]
+        for a, b in ((found.value, one.value), (found.low, one.low), (found.high, one.high)):
+            assert per * a == pytest.approx(b, rel=1e-4, abs=1e-6), name
+
+
+def test_the_unit_of_a_length_changes_the_unit_of_the_result_alone() -> None:
+    e, plain = _axis(1500, 1).experiments[0], _joint("axis")
+    data = Dataset.from_arrays(e.u, 1e3 * e.y, TS, output_unit="mm")
+    joint = physics(data, structure="joint")
+    assert joint.terms == plain.terms
+    assert 1e3 * joint.value("inertia") == pytest.approx(plain.value("inertia"), rel=1e-6)
+
+
 def test_what_is_no_joint_is_refused() -> None:
     e = _axis(300, 3).experiments[0]
     with pytest.raises(SettingError, match="output_unit"):

@@ -50,6 +50,8 @@ PIECES = 4
 """Pieces of the last fit, beside which the drift of a whole record is another error."""
 SHORTEST, FIRST = 50, 30
 """Least samples of a piece, and those of its first outputs that give its state."""
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
+"""Factor from each unit of a length to m."""
 STEPS_PER_RADIAN = 50.0
 """Integration steps while the fastest of the dynamics turns by one radian. With 12 a limit of the
 controller was seen as a lag besides (benches/joints.py, servos 0, 3 and 5)."""
@@ -113,7 +115,7 @@ class _Fit:
 
     def __init__(self, data: Dataset, look: Callable[[], object]) -> None:
         self.data, self.look = data, look
-        self.unit = radians(data.output_unit) or 1.0
+        self.unit = radians(data.output_unit) or METRES.get(spelled(data.output_unit), 1.0)
         self.is_angle = radians(data.output_unit) is not None
         self.pieces: Sequence[Experiment] = data.experiments
 
@@ -436,8 +438,13 @@ def descended(
 
 
 def begun(core: _core.GreyBox, piece: Experiment) -> FloatArray:
-    """The state at the beginning of a piece, from its first outputs."""
-    state: FloatArray = core.estimate_initial_state(piece.u[:FIRST], piece.y[:FIRST])
+    """The state at the beginning of a piece, from its first outputs. They are taken in rad or m:
+    what holds the state near them depends on the unit.
+    """
+    unit = core.settings["unit"]
+    y = unit * piece.y[:FIRST]
+    state: FloatArray = changed(core, unit=1.0).estimate_initial_state(piece.u[:FIRST], y)
+    state[-1] /= unit
     return state
 
 
