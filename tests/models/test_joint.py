@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -197,6 +198,39 @@ def test_the_unit_of_a_length_changes_the_unit_of_the_result_alone() -> None:
     joint = physics(data, structure="joint")
     assert joint.terms == plain.terms
     assert 1e3 * joint.value("inertia") == pytest.approx(plain.value("inertia"), rel=1e-6)
+
+
+def test_an_interval_holds_its_value_and_is_none_without_information() -> None:
+    u, q, Ts = _recorded()
+    # two holds: friction and offset show as a sum alone, which had an interval of no width
+    few = Dataset.from_arrays(u[:120], q[:120], Ts, input_units=("V",), output_unit="rad")
+    joint = physics(few, structure="joint")
+    assert {"friction", "offset"} <= set(joint.undetermined)
+    for p in (*joint.parameters.values(), *_joint("servo").parameters.values()):
+        assert p.low <= p.value <= p.high
+        assert p.low < p.high
+    with pytest.raises(DataError, match="constant"):
+        physics(Dataset.from_arrays(0.0 * u + 2.0, q, Ts, output_unit="rad"), structure="joint")
+
+
+def test_a_bump_of_friction_may_be_a_dip(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, of = _of_machine(), motorfit.joint.fitted
+
+    def dipped(*given: Any, **named: Any) -> Any:
+        fit = of(*given, **named)
+        core, n = fit.core, len(fit.core.theta)
+        places = [motorfit.joint.PLACES[name] for name in ("k_t", "w_s")]
+        core = motorfit.joint.changed(
+            core, free=[*core.settings["free"], *places], theta=np.array([*core.theta, -0.2, 1.0])
+        )
+        return replace(
+            fit, core=core, terms=("stribeck",), covariance=1e-6 * np.eye(n + 2),
+            determined=np.ones(n + 2, bool),
+        )  # fmt: skip
+
+    monkeypatch.setattr("sewfast.greybox.joint.fitted", dipped)
+    bump = physics(data, structure="joint").parameters["stribeck"]
+    assert bump.low < bump.value < bump.high < 0.0
 
 
 def test_what_is_no_joint_is_refused() -> None:

@@ -31,6 +31,7 @@ _INSIDE = {
     "inertia_kg_m2": "encoder and command show it only in units of the controller's gain",
     "lag": "behind a controller it acts as a part of the delay",
 }
+_SIGNED = {"offset", "stribeck"}
 _OF_TERM = {"loaded": "load_friction"}
 _DIRECT = {
     "inertia_kg_m2": "encoder and command show it only in units of the command; it takes the "
@@ -137,10 +138,12 @@ class Joint:
 
 def joint_of(data: Dataset) -> Joint:
     """The joint of a record of positions: each parameter with its interval, or why it has none."""
+    data.require_excited()
     inside = is_commanded(data)
     fit = fitted(data, integrates=not inside, covariance=True)
-    core, covariance = fit.core, fit.covariance
+    core, covariance, determined = fit.core, fit.covariance, fit.determined
     assert covariance is not None
+    assert determined is not None
     names = [(*MOTOR_NAMES, *JOINT_NAMES)[j] for j in core.settings["free"]]
     known = dict(zip(MOTOR_NAMES, core.settings["values"].tolist(), strict=True))
     known |= dict(zip(JOINT_NAMES, core.settings["joint"], strict=True))
@@ -150,10 +153,12 @@ def joint_of(data: Dataset) -> Joint:
         value = of(known)
         slope = _slope(known, of, names)
         half = CONFIDENCE * math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+        if not determined[slope != 0.0].all():
+            half = math.inf
         # an offset or a delay of 0 is a valid result
         least = {"delay": data.Ts, "offset": known["k_s"]}.get(name, 0.0)
         if half < VAGUE * max(abs(value), least):
-            low = value - half if name == "offset" else max(value - half, 0.0)
+            low = value - half if name in _SIGNED else max(value - half, 0.0)
             parameters[name] = Parameter(value, low, value + half, unit)
         elif half < APART * max(abs(value), least):
             undetermined[name] = (

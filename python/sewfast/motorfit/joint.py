@@ -18,13 +18,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import _core
-from ..arrays import FloatArray
+from ..arrays import FloatArray, gram
 from ..dataset import Dataset, Experiment
 from ..errors import DataError, FitError, SettingError
 from ..units import is_position, radians, spelled
-from .estimation import Normal, covariance_of, minimised
+from .estimation import SINGULAR, Normal, covariance_of, minimised
 from .problem import NOTHING, PARAMETERS, PLACE
 
 JOINT = {name: len(PARAMETERS) + j for j, name in enumerate(_core.GREYBOX_JOINT)}
@@ -46,6 +47,8 @@ DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
 NOT_NEGATIVE = {"k_e", "tau", "delay", "k_s", "k_l", "dead_band", "damping"}
 POSITIVE = {"k_a", "w_s", "reach", "limit", "k_q"}
 ITERATIONS, ENOUGH = 30, 1.0
+LEAK = 1e-3
+"""Least part of a parameter in a direction without information, for it to be undetermined."""
 PIECES = 4
 """Pieces of the last fit, beside which the drift of a whole record is another error."""
 SHORTEST, FIRST = 50, 30
@@ -60,13 +63,15 @@ controller was seen as a lag besides (benches/joints.py, servos 0, 3 and 5)."""
 @dataclass(frozen=True, eq=False)
 class JointFit:
     """A fitted joint: its core, the terms that its record shows, and those that it does not.
-    `covariance` (n, n) is that of the free parameters; None unless it was asked for.
+    `covariance` (n, n) is that of the free parameters, and `determined` (n,) says of which the
+    record holds any information; None unless they were asked for.
     """
 
     core: _core.GreyBox
     terms: tuple[str, ...]
     missing: tuple[str, ...]
     covariance: FloatArray | None = None
+    determined: NDArray[np.bool_] | None = None
 
 
 def is_commanded(data: Dataset) -> bool:
@@ -98,7 +103,8 @@ def fitted(
         found = fit.descended(core)
         core = found.core
     found, terms, missing = fit.with_terms(fit.without_delay(found))
-    return JointFit(found.core, terms, missing, fit.covariance(found) if covariance else None)
+    known = fit.covariance(found) if covariance else (None, None)
+    return JointFit(found.core, terms, missing, *known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,9 +283,9 @@ class _Fit:
         gain = n * math.log(max(fewer.cost, 1e-300) / max(more.cost, 1e-300))
         return gain >= len(TERMS[term]) * math.log(n)
 
-    def covariance(self, found: Descent) -> FloatArray:
-        """Covariance of the free parameters, (n, n), with the pieces' states estimated beside them;
-        from sums of scores over a window (`covariance_of`).
+    def covariance(self, found: Descent) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Covariance of the free parameters, (n, n), with the pieces' states estimated beside them,
+        from sums of scores over a window (`covariance_of`); and which of them are determined, (n,).
         """
         core, states, n = found.core, found.states, len(found.core.theta)
         places = [n, n + core.settings["nx"] - 1]
@@ -294,8 +300,9 @@ class _Fit:
             residuals.append(w * (run - np.nan_to_num(p.y)))
             lengths.append(len(p))
         windows = [max(1, min(round(math.sqrt(m)), m // 15)) for m in lengths]
-        whole = covariance_of(np.concatenate(rows), np.concatenate(residuals), lengths, windows)
-        return whole[:n, :n]
+        J = np.concatenate(rows)
+        whole = covariance_of(J, np.concatenate(residuals), lengths, windows)
+        return whole[:n, :n], _determined(J)[:n]
 
     def _may_have(self, term: str, core: _core.GreyBox) -> bool:
         if term == "gravity":
@@ -338,6 +345,16 @@ class _Fit:
             total += float(r[0])
         n = sum(len(p) for p in self.pieces)
         return max(n * total / max(spread, 1e-300), 3.0)
+
+
+def _determined(jacobian: FloatArray) -> NDArray[np.bool_]:
+    """Which parameters are in no direction without information, (n,)."""
+    d = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
+    d[d == 0.0] = 1.0
+    size, along = np.linalg.eigh(gram(jacobian / d))
+    share = np.sum(along[:, size <= SINGULAR * size[-1]] ** 2, axis=1)
+    found: NDArray[np.bool_] = share < LEAK**2
+    return found
 
 
 def _without(core: _core.GreyBox, term: str) -> _core.GreyBox:
