@@ -233,6 +233,27 @@ def test_a_bump_of_friction_may_be_a_dip(monkeypatch: pytest.MonkeyPatch) -> Non
     assert bump.low < bump.value < bump.high < 0.0
 
 
+@pytest.mark.parametrize("gap", ["long", "fifths", "many", "start"])
+def test_gaps_in_the_positions_are_left_out(gap: str) -> None:
+    q = _recorded()[1].copy()
+    at = np.arange(len(q))
+    missing = {
+        "long": (at >= 300) & (at < 420), "fifths": at % 5 == 0, "many": at % 40 < 4,
+        "start": at < 100,
+    }[gap]  # fmt: skip
+    q[missing] = np.nan
+    plain, joint = (physics(d, structure="joint") for d in (_of_machine(), _of_machine(q=q)))
+    assert joint.samples == np.sum(~missing)
+    assert joint.fit_percent > 99.0
+    assert joint.value("inertia") == pytest.approx(plain.value("inertia"), rel=0.1)
+
+
+def test_a_record_of_gaps_alone_is_refused_as_one() -> None:
+    q = np.where(np.arange(len(_recorded()[1])) % 100, math.nan, _recorded()[1])
+    with pytest.raises(DataError, match="fewer gaps"):
+        physics(_of_machine(q=q), structure="joint")
+
+
 def test_what_is_no_joint_is_refused() -> None:
     e = _axis(300, 3).experiments[0]
     with pytest.raises(SettingError, match="output_unit"):

@@ -52,7 +52,10 @@ LEAK = 1e-3
 PIECES = 4
 """Pieces of the last fit, beside which the drift of a whole record is another error."""
 SHORTEST, FIRST = 50, 30
-"""Least samples of a piece, and those of its first outputs that give its state."""
+"""Least samples of a piece, and those of its first outputs that give its state. A piece with fewer
+measured ones is left out."""
+BRIDGED = 3
+"""Longest gap that a start interpolates [samples], if its bells are not wider."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
 """Factor from each unit of a length to m."""
 STEPS_PER_RADIAN = 50.0
@@ -129,6 +132,14 @@ class _Fit:
         """Each experiment in as many pieces as belong to it."""
         length = max(len(self.data) / share, SHORTEST)
         self.pieces = [p for e in self.data.experiments for p in _cut(e, length)]
+        if not self.pieces:
+            measured = sum(int(np.isfinite(e.y).sum()) for e in self.data.experiments)
+            raise DataError(
+                name=self.data.source,
+                expected=f"pieces of {len(self.data) / share:.0f} samples with at least {FIRST} "
+                "measured positions", received=f"none, and {measured:,} in all",
+                remedy="record more, with fewer gaps",
+            )  # fmt: skip
 
     # --- the start ------------------------------------------------------------------------------
 
@@ -193,13 +204,17 @@ class _Fit:
         bend = (bend - bend.sum() * bell) / Ts**2
         rows, drives = [], []
         for e in self.pieces:
-            if len(e) <= 2 * half + 4 or not np.isfinite(e.y).all():
+            if len(e) <= 2 * half + 4:
                 continue
-            q = self.unit * e.y
+            y, known = _bridged(e.y, max(width, BRIDGED))
+            whole = np.convolve(~known, np.ones(len(k)), "valid") < 0.5
+            if not whole.any():
+                continue
+            q = self.unit * y
             at = np.arange(len(e)) - 0.5 - delay
             u = np.interp(at, np.arange(len(e)), e.u[:, 0])
             q_s, v, a = (np.convolve(q, taps, "valid") for taps in (bell, slope, bend))
-            clear = np.abs(v) > 0.05 * max(float(np.abs(v).max()), 1e-300)
+            clear = whole & (np.abs(v) > 0.05 * max(float(np.abs(v[whole]).max()), 1e-300))
             rows.append(np.stack([v, a, np.sign(v), np.ones_like(v)], axis=1)[clear])
             drives.append((np.convolve(u, bell, "valid") - k_q * q_s)[clear])
         if not rows or sum(map(len, rows)) < 20:
@@ -343,7 +358,7 @@ class _Fit:
             end = int(positive[0]) if len(positive) else len(r)
             spread += 2.0 * float(r[:end].sum()) - float(r[0])
             total += float(r[0])
-        n = sum(len(p) for p in self.pieces)
+        n = sum(int(np.isfinite(p.y).sum()) for p in self.pieces)
         return max(n * total / max(spread, 1e-300), 3.0)
 
 
@@ -458,9 +473,10 @@ def begun(core: _core.GreyBox, piece: Experiment) -> FloatArray:
     """The state at the beginning of a piece, from its first outputs. They are taken in rad or m:
     what holds the state near them depends on the unit.
     """
-    unit = core.settings["unit"]
-    y = unit * piece.y[:FIRST]
-    state: FloatArray = changed(core, unit=1.0).estimate_initial_state(piece.u[:FIRST], y)
+    unit, measured = core.settings["unit"], np.flatnonzero(np.isfinite(piece.y))
+    n = int(measured[:FIRST][-1]) + 1 if len(measured) else FIRST
+    y = unit * piece.y[:n]
+    state: FloatArray = changed(core, unit=1.0).estimate_initial_state(piece.u[:n], y)
     state[-1] /= unit
     return state
 
@@ -480,10 +496,28 @@ def weights(e: Experiment) -> FloatArray:
     return np.where(np.isfinite(e.y), root, 0.0)
 
 
+def _bridged(y: FloatArray, longest: float) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Outputs with interpolated gaps, and where they are measured or in a short gap, both (N,)."""
+    at, known = np.arange(len(y)), np.isfinite(y)
+    if known.all() or not known.any():
+        return np.nan_to_num(y), known
+    i = np.searchsorted(at[known], at)
+    edges = np.concatenate([[-np.inf], at[known], [np.inf]])
+    gap = edges[i + 1] - edges[i] - 1.0
+    bridged: FloatArray = np.interp(at, at[known], y[known])
+    return bridged, known | (gap <= longest)
+
+
 def _cut(e: Experiment, length: float) -> list[Experiment]:
+    """Pieces of about a length, from their first to their last measured output."""
     count = max(1, round(len(e) / length))
     edges = np.linspace(0, len(e), count + 1).round().astype(int)
-    return [e.cut(a, b) for a, b in itertools.pairwise(edges.tolist())]
+    pieces = []
+    for a, b in itertools.pairwise(edges.tolist()):
+        measured = np.flatnonzero(np.isfinite(e.y[a:b]))
+        if len(measured) >= min(FIRST, len(e)):
+            pieces.append(e.cut(a + int(measured[0]), a + int(measured[-1]) + 1))
+    return pieces
 
 
 def pieces_of(data: Dataset) -> Dataset:
