@@ -254,6 +254,26 @@ def test_a_record_of_gaps_alone_is_refused_as_one() -> None:
         physics(_of_machine(q=q), structure="joint")
 
 
+def test_only_ratios_of_weights_count() -> None:
+    q, ones = _recorded()[1], np.ones(len(_recorded()[1]))
+    plain = physics(_of_machine(), structure="joint")
+    for weight in (4.0, 0.01):
+        joint = physics(_of_machine(weights=weight * ones), structure="joint")
+        assert joint.rmse == pytest.approx(plain.rmse, rel=1e-9)
+        assert joint.fit_percent == pytest.approx(plain.fit_percent, rel=1e-9)
+    some = np.where(np.arange(len(q)) % 2, 0.25, 1.0)
+    data = _of_machine(weights=some)
+    fit = motorfit.joint._Fit(data, lambda: None)
+    found = fit.descended(fit.started(True))
+    variance = found.core.settings["residual_variance"]
+    assert variance == pytest.approx(found.cost / some.sum(), rel=1e-9)
+    # a sample of weight 0 counts as not measured
+    joint = physics(
+        _of_machine(weights=np.where(np.arange(len(q)) % 5, 1.0, 0.0)), structure="joint"
+    )
+    assert joint.samples == np.sum(np.arange(len(q)) % 5 > 0)
+
+
 def test_what_is_no_joint_is_refused() -> None:
     e = _axis(300, 3).experiments[0]
     with pytest.raises(SettingError, match="output_unit"):

@@ -13,6 +13,7 @@ import numpy as np
 from .. import _core, storage
 from ..arrays import FloatArray
 from ..dataset import Dataset
+from ..dataset.experiment import in_effect, weights_of
 from ..errors import DataError
 from ..frequency.shaft import Parameter
 from ..models.grey_box import JOINT as JOINT_NAMES
@@ -138,6 +139,7 @@ class Joint:
 
 def joint_of(data: Dataset) -> Joint:
     """The joint of a record of positions: each parameter with its interval, or why it has none."""
+    data = in_effect(data)
     data.require_excited()
     inside = is_commanded(data)
     fit = fitted(data, integrates=not inside, covariance=True)
@@ -170,6 +172,9 @@ def joint_of(data: Dataset) -> Joint:
     undetermined |= {_OF_TERM.get(t, t): "not shown, if there is any" for t in fit.missing}
     undetermined |= _INSIDE if inside else _DIRECT
     y = np.concatenate([e.y for e in data.experiments])
+    w = np.concatenate([weights_of(e) for e in data.experiments])[np.isfinite(y)]
+    y = y[np.isfinite(y)]
+    spread = math.sqrt(np.average((y - np.average(y, weights=w)) ** 2, weights=w))
     rmse = math.sqrt(core.settings["residual_variance"])
     d = data
     model = GreyBox(
@@ -177,8 +182,7 @@ def joint_of(data: Dataset) -> Joint:
     )
     return Joint(
         parameters, undetermined, fit.terms, inside,
-        100.0 * (1.0 - rmse / max(float(np.nanstd(y)), 1e-300)), rmse,
-        int(np.isfinite(y).sum()), model,
+        100.0 * (1.0 - rmse / max(spread, 1e-300)), rmse, len(y), model,
     )  # fmt: skip
 
 

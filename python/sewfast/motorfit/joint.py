@@ -351,7 +351,7 @@ class _Fit:
         """Number of samples that are as good as independent, by the residuals' correlation."""
         total = spread = 0.0
         for p, state in zip(self.pieces, found.states, strict=True):
-            error = np.nan_to_num(found.core.simulate(p.u, state) - p.y)
+            error = weights(p) * np.nan_to_num(found.core.simulate(p.u, state) - p.y)
             power = np.abs(np.fft.rfft(error, 2 * len(error))) ** 2
             r = np.fft.irfft(power)[: len(error) // 4]
             positive = np.flatnonzero(r <= 0.0)
@@ -464,7 +464,8 @@ def descended(
     count = sum(int(np.isfinite(e.y).sum()) for e in pieces)
     bounds = (low, np.full(len(x0), np.inf))
     found = minimised(normal, cost, x0, bounds, count, enough=ENOUGH, iterations=iterations)
-    variance = max(found.cost / max(count, 1), 1e-300)
+    total = sum(float(np.sum(weights(e) ** 2)) for e in pieces)
+    variance = max(found.cost / max(total, 1e-300), 1e-300)
     best = changed(core, theta=found.x[:p], residual_variance=variance)
     return Descent(found.cost, best, parts(found.x)[1])
 
