@@ -274,6 +274,29 @@ def test_only_ratios_of_weights_count() -> None:
     assert joint.samples == np.sum(np.arange(len(q)) % 5 > 0)
 
 
+@pytest.mark.parametrize(
+    "units", [("°", "deg"), ("deg", "°"), ("turn", "rev"), ("deg", "rad"), ("rad", "mrad")]
+)
+def test_a_command_and_an_output_may_have_other_units_or_spellings(units: tuple[str, str]) -> None:
+    plain, (given, of) = _joint("servo"), units
+    e = _servo(1500, 1).experiments[0]
+    per = {"rad": 1.0, "mrad": 1e3, "rev": 0.5 / math.pi, "turn": 0.5 / math.pi}
+    a, b = (per.get(unit, 180.0 / math.pi) for unit in units)
+    data = Dataset.from_arrays(a * e.u[:, 0], b * e.y, TS, input_units=(given,), output_unit=of)
+    joint = physics(data, structure="joint")
+    assert joint.inside
+    assert joint.terms == plain.terms
+    for name, scale in {"stiffness": 1.0, "friction": a, "inertia": a / b}.items():
+        assert joint.value(name) == pytest.approx(scale * plain.value(name), rel=1e-4), name
+
+
+def test_a_length_does_not_command_an_angle() -> None:
+    e = _servo(300, 1).experiments[0]
+    for given, of, inside in (("mm", "deg", False), ("mm", "m", True), ("V", "V", False)):
+        data = Dataset.from_arrays(e.u, e.y, TS, input_units=(given,), output_unit=of)
+        assert motorfit.joint.is_commanded(data) is inside
+
+
 def test_what_is_no_joint_is_refused() -> None:
     e = _axis(300, 3).experiments[0]
     with pytest.raises(SettingError, match="output_unit"):

@@ -78,9 +78,18 @@ class JointFit:
 
 
 def is_commanded(data: Dataset) -> bool:
-    """Whether the command is a position, for a controller inside: input and output in one unit."""
-    unit = data.output_unit
-    return is_position(unit) and spelled(data.input_units[0]) == spelled(unit)
+    """Whether the command is a position, for a controller inside: input and output both angles, or
+    both lengths, or in one unit.
+    """
+    given, unit = data.input_units[0], data.output_unit
+    both_angles = radians(given) is not None and radians(unit) is not None
+    both_lengths = spelled(given) in METRES and spelled(unit) in METRES
+    return is_position(unit) and (both_angles or both_lengths or spelled(given) == spelled(unit))
+
+
+def _factor(unit: str) -> float:
+    """Factor from a unit to rad or m; 1 for any other."""
+    return radians(unit) or METRES.get(spelled(unit), 1.0)
 
 
 def fitted(
@@ -124,7 +133,7 @@ class _Fit:
 
     def __init__(self, data: Dataset, look: Callable[[], object]) -> None:
         self.data, self.look = data, look
-        self.unit = radians(data.output_unit) or METRES.get(spelled(data.output_unit), 1.0)
+        self.unit, self.command_unit = _factor(data.output_unit), _factor(data.input_units[0])
         self.is_angle = radians(data.output_unit) is not None
         self.pieces: Sequence[Experiment] = data.experiments
 
@@ -147,7 +156,7 @@ class _Fit:
         """The best of regressions of smoothed signals, by free run over short pieces."""
         self.cut(32)
         best, least = None, math.inf
-        k_q = 0.0 if integrates else 1.0 / self.unit
+        k_q = 0.0 if integrates else 1.0 / self.command_unit
         for width in WIDTHS:
             for delay in DELAYS:
                 k_v, k_a, k_s, offset = self._regressed(width, delay, k_q)
