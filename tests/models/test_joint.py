@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import sewfast
-from sewfast import Dataset, physics
+from sewfast import Dataset, motorfit, physics
 from sewfast.errors import DataError, ModelFileError, SettingError
 from sewfast.greybox import Joint, load_joint
 from sewfast.models.grey_box import GreyBox
@@ -148,6 +149,152 @@ def test_the_equations_of_a_joint_win_where_they_hold() -> None:
     assert model.validate(fresh).simulation.rmse < 0.02 * np.std(fresh.experiments[0].y)
     for member in model.members or (model,):
         assert member.core.settings["integrator"]
+
+
+@cache
+def _recorded() -> tuple[Any, Any, float]:
+    """Command [V], angle [rad] and sample time of a machine."""
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.uniform(-3.0, 3.0, 20), 60)
+    r = sewfast.record(sewfast.VirtualMachine(3), u, name="steps")
+    return u, r.counts * 2.0 * np.pi / r.counts_per_rev, r.Ts
+
+
+def _of_machine(unit: str = "rad", scale: float = 1.0, **more: Any) -> Dataset:
+    u, q, Ts = _recorded()
+    return Dataset.from_arrays(
+        u, more.pop("q", q) * scale, Ts, input_units=("V",), output_unit=unit, **more
+    )
+
+
+def test_intervals_are_those_at_the_fitted_states_of_the_pieces() -> None:
+    data = _of_machine()
+    fit = motorfit.joint._Fit(data, lambda: None)
+    found = fit.descended(fit.started(True))
+    assert fit.cost(found.core, found.states) == pytest.approx(found.cost, rel=1e-9)
+    # at states from the first outputs alone, the errors were 9 times as large
+    inertia = physics(data, structure="joint").parameters["inertia"]
+    assert inertia.high - inertia.low < 0.1 * inertia.value
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg", "mrad", "rev"])
+def test_the_unit_of_an_angle_changes_the_unit_of_the_result_alone(unit: str) -> None:
+    plain = physics(_of_machine(), structure="joint")
+    scale = {"rad": 1.0, "deg": 180.0 / math.pi, "mrad": 1e3, "rev": 0.5 / math.pi}[unit]
+    joint = physics(_of_machine(unit, scale), structure="joint")
+    assert joint.terms == plain.terms
+    assert joint.rmse == pytest.approx(scale * plain.rmse, rel=1e-6)
+    assert joint.parameters.keys() == plain.parameters.keys()
+    for name, one in plain.parameters.items():
+        per = scale if name in ("inertia", "viscous") else 1.0
+        found = joint.parameters[name]
+        for a, b in ((found.value, one.value), (found.low, one.low), (found.high, one.high)):
+            assert per * a == pytest.approx(b, rel=1e-4, abs=1e-6), name
+
+
+def test_the_unit_of_a_length_changes_the_unit_of_the_result_alone() -> None:
+    e, plain = _axis(1500, 1).experiments[0], _joint("axis")
+    data = Dataset.from_arrays(e.u, 1e3 * e.y, TS, output_unit="mm")
+    joint = physics(data, structure="joint")
+    assert joint.terms == plain.terms
+    assert 1e3 * joint.value("inertia") == pytest.approx(plain.value("inertia"), rel=1e-6)
+
+
+def test_an_interval_holds_its_value_and_is_none_without_information() -> None:
+    u, q, Ts = _recorded()
+    # two holds: friction and offset show as a sum alone, which had an interval of no width
+    few = Dataset.from_arrays(u[:120], q[:120], Ts, input_units=("V",), output_unit="rad")
+    joint = physics(few, structure="joint")
+    assert {"friction", "offset"} <= set(joint.undetermined)
+    for p in (*joint.parameters.values(), *_joint("servo").parameters.values()):
+        assert p.low <= p.value <= p.high
+        assert p.low < p.high
+    with pytest.raises(DataError, match="constant"):
+        physics(Dataset.from_arrays(0.0 * u + 2.0, q, Ts, output_unit="rad"), structure="joint")
+
+
+def test_a_bump_of_friction_may_be_a_dip(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, of = _of_machine(), motorfit.joint.fitted
+
+    def dipped(*given: Any, **named: Any) -> Any:
+        fit = of(*given, **named)
+        core, n = fit.core, len(fit.core.theta)
+        places = [motorfit.joint.PLACES[name] for name in ("k_t", "w_s")]
+        core = motorfit.joint.changed(
+            core, free=[*core.settings["free"], *places], theta=np.array([*core.theta, -0.2, 1.0])
+        )
+        return replace(
+            fit, core=core, terms=("stribeck",), covariance=1e-6 * np.eye(n + 2),
+            determined=np.ones(n + 2, bool),
+        )  # fmt: skip
+
+    monkeypatch.setattr("sewfast.greybox.joint.fitted", dipped)
+    bump = physics(data, structure="joint").parameters["stribeck"]
+    assert bump.low < bump.value < bump.high < 0.0
+
+
+@pytest.mark.parametrize("gap", ["long", "fifths", "many", "start"])
+def test_gaps_in_the_positions_are_left_out(gap: str) -> None:
+    q = _recorded()[1].copy()
+    at = np.arange(len(q))
+    missing = {
+        "long": (at >= 300) & (at < 420), "fifths": at % 5 == 0, "many": at % 40 < 4,
+        "start": at < 100,
+    }[gap]  # fmt: skip
+    q[missing] = np.nan
+    plain, joint = (physics(d, structure="joint") for d in (_of_machine(), _of_machine(q=q)))
+    assert joint.samples == np.sum(~missing)
+    assert joint.fit_percent > 99.0
+    assert joint.value("inertia") == pytest.approx(plain.value("inertia"), rel=0.1)
+
+
+def test_a_record_of_gaps_alone_is_refused_as_one() -> None:
+    q = np.where(np.arange(len(_recorded()[1])) % 100, math.nan, _recorded()[1])
+    with pytest.raises(DataError, match="fewer gaps"):
+        physics(_of_machine(q=q), structure="joint")
+
+
+def test_only_ratios_of_weights_count() -> None:
+    q, ones = _recorded()[1], np.ones(len(_recorded()[1]))
+    plain = physics(_of_machine(), structure="joint")
+    for weight in (4.0, 0.01):
+        joint = physics(_of_machine(weights=weight * ones), structure="joint")
+        assert joint.rmse == pytest.approx(plain.rmse, rel=1e-9)
+        assert joint.fit_percent == pytest.approx(plain.fit_percent, rel=1e-9)
+    some = np.where(np.arange(len(q)) % 2, 0.25, 1.0)
+    data = _of_machine(weights=some)
+    fit = motorfit.joint._Fit(data, lambda: None)
+    found = fit.descended(fit.started(True))
+    variance = found.core.settings["residual_variance"]
+    assert variance == pytest.approx(found.cost / some.sum(), rel=1e-9)
+    # a sample of weight 0 counts as not measured
+    joint = physics(
+        _of_machine(weights=np.where(np.arange(len(q)) % 5, 1.0, 0.0)), structure="joint"
+    )
+    assert joint.samples == np.sum(np.arange(len(q)) % 5 > 0)
+
+
+@pytest.mark.parametrize(
+    "units", [("°", "deg"), ("deg", "°"), ("turn", "rev"), ("deg", "rad"), ("rad", "mrad")]
+)
+def test_a_command_and_an_output_may_have_other_units_or_spellings(units: tuple[str, str]) -> None:
+    plain, (given, of) = _joint("servo"), units
+    e = _servo(1500, 1).experiments[0]
+    per = {"rad": 1.0, "mrad": 1e3, "rev": 0.5 / math.pi, "turn": 0.5 / math.pi}
+    a, b = (per.get(unit, 180.0 / math.pi) for unit in units)
+    data = Dataset.from_arrays(a * e.u[:, 0], b * e.y, TS, input_units=(given,), output_unit=of)
+    joint = physics(data, structure="joint")
+    assert joint.inside
+    assert joint.terms == plain.terms
+    for name, scale in {"stiffness": 1.0, "friction": a, "inertia": a / b}.items():
+        assert joint.value(name) == pytest.approx(scale * plain.value(name), rel=1e-4), name
+
+
+def test_a_length_does_not_command_an_angle() -> None:
+    e = _servo(300, 1).experiments[0]
+    for given, of, inside in (("mm", "deg", False), ("mm", "m", True), ("V", "V", False)):
+        data = Dataset.from_arrays(e.u, e.y, TS, input_units=(given,), output_unit=of)
+        assert motorfit.joint.is_commanded(data) is inside
 
 
 def test_what_is_no_joint_is_refused() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from .. import _core, storage
 from ..arrays import FloatArray
 from ..dataset import Dataset
+from ..dataset.experiment import in_effect, weights_of
 from ..errors import DataError
 from ..frequency.shaft import Parameter
 from ..models.grey_box import JOINT as JOINT_NAMES
@@ -31,6 +32,7 @@ _INSIDE = {
     "inertia_kg_m2": "encoder and command show it only in units of the controller's gain",
     "lag": "behind a controller it acts as a part of the delay",
 }
+_SIGNED = {"offset", "stribeck"}
 _OF_TERM = {"loaded": "load_friction"}
 _DIRECT = {
     "inertia_kg_m2": "encoder and command show it only in units of the command; it takes the "
@@ -137,10 +139,13 @@ class Joint:
 
 def joint_of(data: Dataset) -> Joint:
     """The joint of a record of positions: each parameter with its interval, or why it has none."""
+    data = in_effect(data)
+    data.require_excited()
     inside = is_commanded(data)
     fit = fitted(data, integrates=not inside, covariance=True)
-    core, covariance = fit.core, fit.covariance
+    core, covariance, determined = fit.core, fit.covariance, fit.determined
     assert covariance is not None
+    assert determined is not None
     names = [(*MOTOR_NAMES, *JOINT_NAMES)[j] for j in core.settings["free"]]
     known = dict(zip(MOTOR_NAMES, core.settings["values"].tolist(), strict=True))
     known |= dict(zip(JOINT_NAMES, core.settings["joint"], strict=True))
@@ -150,10 +155,12 @@ def joint_of(data: Dataset) -> Joint:
         value = of(known)
         slope = _slope(known, of, names)
         half = CONFIDENCE * math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+        if not determined[slope != 0.0].all():
+            half = math.inf
         # an offset or a delay of 0 is a valid result
         least = {"delay": data.Ts, "offset": known["k_s"]}.get(name, 0.0)
         if half < VAGUE * max(abs(value), least):
-            low = value - half if name == "offset" else max(value - half, 0.0)
+            low = value - half if name in _SIGNED else max(value - half, 0.0)
             parameters[name] = Parameter(value, low, value + half, unit)
         elif half < APART * max(abs(value), least):
             undetermined[name] = (
@@ -165,6 +172,9 @@ def joint_of(data: Dataset) -> Joint:
     undetermined |= {_OF_TERM.get(t, t): "not shown, if there is any" for t in fit.missing}
     undetermined |= _INSIDE if inside else _DIRECT
     y = np.concatenate([e.y for e in data.experiments])
+    w = np.concatenate([weights_of(e) for e in data.experiments])[np.isfinite(y)]
+    y = y[np.isfinite(y)]
+    spread = math.sqrt(np.average((y - np.average(y, weights=w)) ** 2, weights=w))
     rmse = math.sqrt(core.settings["residual_variance"])
     d = data
     model = GreyBox(
@@ -172,8 +182,7 @@ def joint_of(data: Dataset) -> Joint:
     )
     return Joint(
         parameters, undetermined, fit.terms, inside,
-        100.0 * (1.0 - rmse / max(float(np.nanstd(y)), 1e-300)), rmse,
-        int(np.isfinite(y).sum()), model,
+        100.0 * (1.0 - rmse / max(spread, 1e-300)), rmse, len(y), model,
     )  # fmt: skip
 
 

@@ -286,7 +286,9 @@ def trained_from(
     prior = np.concatenate([np.zeros(free), prior]) * math.sqrt(core.settings["residual_variance"])
     if core.settings["position"]:
         pieces = joint.pieces_of(data).experiments
-        return joint.descended(core, start, pieces, asked, iterations, prior)[1]
+        squares = np.concatenate([weights(e) ** 2 for e in pieces])
+        prior *= math.sqrt(float(squares[squares > 0.0].mean()))  # the residuals are weighted
+        return joint.descended(core, start, pieces, asked, iterations, prior).core
     states = [state for _, _, _, state in _runs(core, data)]
     low = np.full(len(start), -np.inf)
     for j, value in enumerate(motor):  # parameters above 0 stay there

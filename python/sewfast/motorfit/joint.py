@@ -18,13 +18,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import _core
-from ..arrays import FloatArray
+from ..arrays import FloatArray, gram
 from ..dataset import Dataset, Experiment
 from ..errors import DataError, FitError, SettingError
 from ..units import is_position, radians, spelled
-from .estimation import Normal, covariance_of, minimised
+from .estimation import SINGULAR, Normal, covariance_of, minimised
 from .problem import NOTHING, PARAMETERS, PLACE
 
 JOINT = {name: len(PARAMETERS) + j for j, name in enumerate(_core.GREYBOX_JOINT)}
@@ -46,10 +47,17 @@ DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
 NOT_NEGATIVE = {"k_e", "tau", "delay", "k_s", "k_l", "dead_band", "damping"}
 POSITIVE = {"k_a", "w_s", "reach", "limit", "k_q"}
 ITERATIONS, ENOUGH = 30, 1.0
+LEAK = 1e-3
+"""Least part of a parameter in a direction without information, for it to be undetermined."""
 PIECES = 4
 """Pieces of the last fit, beside which the drift of a whole record is another error."""
 SHORTEST, FIRST = 50, 30
-"""Least samples of a piece, and those of its first outputs that give its state."""
+"""Least samples of a piece, and those of its first outputs that give its state. A piece with fewer
+measured ones is left out."""
+BRIDGED = 3
+"""Longest gap that a start interpolates [samples], if its bells are not wider."""
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
+"""Factor from each unit of a length to m."""
 STEPS_PER_RADIAN = 50.0
 """Integration steps while the fastest of the dynamics turns by one radian. With 12 a limit of the
 controller was seen as a lag besides (benches/joints.py, servos 0, 3 and 5)."""
@@ -58,19 +66,30 @@ controller was seen as a lag besides (benches/joints.py, servos 0, 3 and 5)."""
 @dataclass(frozen=True, eq=False)
 class JointFit:
     """A fitted joint: its core, the terms that its record shows, and those that it does not.
-    `covariance` (n, n) is that of the free parameters; None unless it was asked for.
+    `covariance` (n, n) is that of the free parameters, and `determined` (n,) says of which the
+    record holds any information; None unless they were asked for.
     """
 
     core: _core.GreyBox
     terms: tuple[str, ...]
     missing: tuple[str, ...]
     covariance: FloatArray | None = None
+    determined: NDArray[np.bool_] | None = None
 
 
 def is_commanded(data: Dataset) -> bool:
-    """Whether the command is a position, for a controller inside: input and output in one unit."""
-    unit = data.output_unit
-    return is_position(unit) and spelled(data.input_units[0]) == spelled(unit)
+    """Whether the command is a position, for a controller inside: input and output both angles, or
+    both lengths, or in one unit.
+    """
+    given, unit = data.input_units[0], data.output_unit
+    both_angles = radians(given) is not None and radians(unit) is not None
+    both_lengths = spelled(given) in METRES and spelled(unit) in METRES
+    return is_position(unit) and (both_angles or both_lengths or spelled(given) == spelled(unit))
+
+
+def _factor(unit: str) -> float:
+    """Factor from a unit to rad or m; 1 for any other."""
+    return radians(unit) or METRES.get(spelled(unit), 1.0)
 
 
 def fitted(
@@ -93,10 +112,20 @@ def fitted(
     core = fit.started(integrates)
     for share in (32, 16, 8, PIECES):
         fit.cut(share)
-        core = fit.descended(core)
-    core = fit.without_delay(core)
-    core, terms, missing = fit.with_terms(core)
-    return JointFit(core, terms, missing, fit.covariance(core) if covariance else None)
+        found = fit.descended(core)
+        core = found.core
+    found, terms, missing = fit.with_terms(fit.without_delay(found))
+    known = fit.covariance(found) if covariance else (None, None)
+    return JointFit(found.core, terms, missing, *known)
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """The least sum of squares, its core, and the initial states of the pieces there."""
+
+    cost: float
+    core: _core.GreyBox
+    states: Sequence[FloatArray]
 
 
 class _Fit:
@@ -104,7 +133,7 @@ class _Fit:
 
     def __init__(self, data: Dataset, look: Callable[[], object]) -> None:
         self.data, self.look = data, look
-        self.unit = radians(data.output_unit) or 1.0
+        self.unit, self.command_unit = _factor(data.output_unit), _factor(data.input_units[0])
         self.is_angle = radians(data.output_unit) is not None
         self.pieces: Sequence[Experiment] = data.experiments
 
@@ -112,6 +141,14 @@ class _Fit:
         """Each experiment in as many pieces as belong to it."""
         length = max(len(self.data) / share, SHORTEST)
         self.pieces = [p for e in self.data.experiments for p in _cut(e, length)]
+        if not self.pieces:
+            measured = sum(int(np.isfinite(e.y).sum()) for e in self.data.experiments)
+            raise DataError(
+                name=self.data.source,
+                expected=f"pieces of {len(self.data) / share:.0f} samples with at least {FIRST} "
+                "measured positions", received=f"none, and {measured:,} in all",
+                remedy="record more, with fewer gaps",
+            )  # fmt: skip
 
     # --- the start ------------------------------------------------------------------------------
 
@@ -119,7 +156,7 @@ class _Fit:
         """The best of regressions of smoothed signals, by free run over short pieces."""
         self.cut(32)
         best, least = None, math.inf
-        k_q = 0.0 if integrates else 1.0 / self.unit
+        k_q = 0.0 if integrates else 1.0 / self.command_unit
         for width in WIDTHS:
             for delay in DELAYS:
                 k_v, k_a, k_s, offset = self._regressed(width, delay, k_q)
@@ -176,13 +213,17 @@ class _Fit:
         bend = (bend - bend.sum() * bell) / Ts**2
         rows, drives = [], []
         for e in self.pieces:
-            if len(e) <= 2 * half + 4 or not np.isfinite(e.y).all():
+            if len(e) <= 2 * half + 4:
                 continue
-            q = self.unit * e.y
+            y, known = _bridged(e.y, max(width, BRIDGED))
+            whole = np.convolve(~known, np.ones(len(k)), "valid") < 0.5
+            if not whole.any():
+                continue
+            q = self.unit * y
             at = np.arange(len(e)) - 0.5 - delay
             u = np.interp(at, np.arange(len(e)), e.u[:, 0])
             q_s, v, a = (np.convolve(q, taps, "valid") for taps in (bell, slope, bend))
-            clear = np.abs(v) > 0.05 * max(float(np.abs(v).max()), 1e-300)
+            clear = whole & (np.abs(v) > 0.05 * max(float(np.abs(v[whole]).max()), 1e-300))
             rows.append(np.stack([v, a, np.sign(v), np.ones_like(v)], axis=1)[clear])
             drives.append((np.convolve(u, bell, "valid") - k_q * q_s)[clear])
         if not rows or sum(map(len, rows)) < 20:
@@ -210,74 +251,67 @@ class _Fit:
             return math.inf
         return total if math.isfinite(total) else math.inf
 
-    def descended(self, core: _core.GreyBox, iterations: int = ITERATIONS) -> _core.GreyBox:
-        """The core at the least squares over the pieces, whose states are fitted with it."""
-        self.reached, found = descended(core, core.theta, self.pieces, self.look, iterations)
-        return found
+    def descended(self, core: _core.GreyBox, iterations: int = ITERATIONS) -> Descent:
+        """The least squares over the pieces, whose states are fitted with the core."""
+        return descended(core, core.theta, self.pieces, self.look, iterations)
 
-    def without_delay(self, core: _core.GreyBox) -> _core.GreyBox:
-        """The core, or the one that a descent without a delay finds: stops of dry friction give the
+    def without_delay(self, found: Descent) -> Descent:
+        """The fit, or the one that a descent without a delay finds: stops of dry friction give the
         delay more than one minimum.
         """
-        cost, place = self.reached, core.settings["free"].index(PLACE["delay"])
-        theta = core.theta.copy()
+        place = found.core.settings["free"].index(PLACE["delay"])
+        theta = found.core.theta.copy()
         theta[place] = 0.0
-        other = self.descended(changed(core, theta=theta))
-        if self.reached < cost:
-            return other
-        self.reached = cost
-        return core
+        other = self.descended(changed(found.core, theta=theta))
+        return other if other.cost < found.cost else found
 
-    def with_terms(
-        self, core: _core.GreyBox
-    ) -> tuple[_core.GreyBox, tuple[str, ...], tuple[str, ...]]:
-        """The core with those of the terms that lower the cost by more than their number explains:
+    def with_terms(self, plain: Descent) -> tuple[Descent, tuple[str, ...], tuple[str, ...]]:
+        """The fit with those of the terms that lower the cost by more than their number explains:
         one after the other, the one that lowers it most first (Schwarz 1978, with the number of
         samples that the residuals' correlation leaves).
         """
-        own, best, taken = core, self.reached, list[str]()
-        tried = [t for t in TERMS if self._may_have(t, core)]
+        own, taken = plain, list[str]()
+        tried = [t for t in TERMS if self._may_have(t, plain.core)]
         while tried:
             found = []
             for term in tried:
-                for begun in self._begun(own, term):
+                for begun in self._begun(own.core, term):
                     try:
-                        one = self.descended(begun, 12)
+                        found.append((term, self.descended(begun, 12)))
                     except (FitError, SettingError):
                         continue
-                    found.append((self.reached, term, one))
             if not found:
                 break
-            cost, term, one = min(found, key=lambda f: f[0])
-            free = len(TERMS[term])
-            n = self.independent(own)
-            if n * math.log(max(best, 1e-300) / max(cost, 1e-300)) < free * math.log(n):
+            term, one = min(found, key=lambda f: f[1].cost)
+            if not self._explains(own, one, term, self.independent(own)):
                 break
-            own, best = one, cost
+            own = one
             tried = [t for t in tried if t != term]
             taken.append(term)
-        own = self.descended(own)
+        own = self.descended(own.core)
         # one that another has made superfluous goes again
         for term in taken[:-1]:
-            best, fewer = self.reached, _without(own, term)
             try:
-                fewer = self.descended(fewer)
+                fewer = self.descended(_without(own.core, term))
             except FitError:
                 continue
-            n = self.independent(own)
-            if n * math.log(self.reached / max(best, 1e-300)) < len(TERMS[term]) * math.log(n):
+            if not self._explains(fewer, own, term, self.independent(own)):
                 own = fewer
                 taken.remove(term)
-            else:
-                self.reached = best
-        missing = tuple(t for t in TERMS if t not in taken and self._may_have(t, core))
+        missing = tuple(t for t in TERMS if t not in taken and self._may_have(t, plain.core))
         return own, tuple(t for t in TERMS if t in taken), missing
 
-    def covariance(self, core: _core.GreyBox) -> FloatArray:
-        """Covariance of the free parameters, (n, n), with the pieces' states estimated beside them;
-        from sums of scores over a window (`covariance_of`).
+    @staticmethod
+    def _explains(fewer: Descent, more: Descent, term: str, n: float) -> bool:
+        """Whether a term lowers the cost by more than the number of its parameters explains."""
+        gain = n * math.log(max(fewer.cost, 1e-300) / max(more.cost, 1e-300))
+        return gain >= len(TERMS[term]) * math.log(n)
+
+    def covariance(self, found: Descent) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Covariance of the free parameters, (n, n), with the pieces' states estimated beside them,
+        from sums of scores over a window (`covariance_of`); and which of them are determined, (n,).
         """
-        states, n = self.states(core), len(core.theta)
+        core, states, n = found.core, found.states, len(found.core.theta)
         places = [n, n + core.settings["nx"] - 1]
         rows, residuals, lengths = [], [], []
         for i, (p, state) in enumerate(zip(self.pieces, states, strict=True)):
@@ -290,8 +324,9 @@ class _Fit:
             residuals.append(w * (run - np.nan_to_num(p.y)))
             lengths.append(len(p))
         windows = [max(1, min(round(math.sqrt(m)), m // 15)) for m in lengths]
-        whole = covariance_of(np.concatenate(rows), np.concatenate(residuals), lengths, windows)
-        return whole[:n, :n]
+        J = np.concatenate(rows)
+        whole = covariance_of(J, np.concatenate(residuals), lengths, windows)
+        return whole[:n, :n], _determined(J)[:n]
 
     def _may_have(self, term: str, core: _core.GreyBox) -> bool:
         if term == "gravity":
@@ -321,19 +356,29 @@ class _Fit:
             names = [*s["free"], *(PLACES[n] for n in values)]
             yield changed(core, free=names, theta=np.array([*core.theta, *values.values()]))
 
-    def independent(self, core: _core.GreyBox) -> float:
+    def independent(self, found: Descent) -> float:
         """Number of samples that are as good as independent, by the residuals' correlation."""
         total = spread = 0.0
-        for p, state in zip(self.pieces, self.states(core), strict=True):
-            error = np.nan_to_num(core.simulate(p.u, state) - p.y)
+        for p, state in zip(self.pieces, found.states, strict=True):
+            error = weights(p) * np.nan_to_num(found.core.simulate(p.u, state) - p.y)
             power = np.abs(np.fft.rfft(error, 2 * len(error))) ** 2
             r = np.fft.irfft(power)[: len(error) // 4]
             positive = np.flatnonzero(r <= 0.0)
             end = int(positive[0]) if len(positive) else len(r)
             spread += 2.0 * float(r[:end].sum()) - float(r[0])
             total += float(r[0])
-        n = sum(len(p) for p in self.pieces)
+        n = sum(int(np.isfinite(p.y).sum()) for p in self.pieces)
         return max(n * total / max(spread, 1e-300), 3.0)
+
+
+def _determined(jacobian: FloatArray) -> NDArray[np.bool_]:
+    """Which parameters are in no direction without information, (n,)."""
+    d = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
+    d[d == 0.0] = 1.0
+    size, along = np.linalg.eigh(gram(jacobian / d))
+    share = np.sum(along[:, size <= SINGULAR * size[-1]] ** 2, axis=1)
+    found: NDArray[np.bool_] = share < LEAK**2
+    return found
 
 
 def _without(core: _core.GreyBox, term: str) -> _core.GreyBox:
@@ -357,8 +402,8 @@ def descended(
     look: Callable[[], object],
     iterations: int,
     prior: FloatArray | None = None,
-) -> tuple[float, _core.GreyBox]:
-    """The least sum of squares from `start` (p,), and its core. The initial speed and position of
+) -> Descent:
+    """The least sum of squares from `start` (p,). The initial speed and position of
     each piece are fitted too. `prior` (p,) are inverse standard deviations about 0, in units of the
     residuals.
     """
@@ -428,13 +473,21 @@ def descended(
     count = sum(int(np.isfinite(e.y).sum()) for e in pieces)
     bounds = (low, np.full(len(x0), np.inf))
     found = minimised(normal, cost, x0, bounds, count, enough=ENOUGH, iterations=iterations)
-    variance = max(found.cost / max(count, 1), 1e-300)
-    return found.cost, changed(core, theta=found.x[:p], residual_variance=variance)
+    total = sum(float(np.sum(weights(e) ** 2)) for e in pieces)
+    variance = max(found.cost / max(total, 1e-300), 1e-300)
+    best = changed(core, theta=found.x[:p], residual_variance=variance)
+    return Descent(found.cost, best, parts(found.x)[1])
 
 
 def begun(core: _core.GreyBox, piece: Experiment) -> FloatArray:
-    """The state at the beginning of a piece, from its first outputs."""
-    state: FloatArray = core.estimate_initial_state(piece.u[:FIRST], piece.y[:FIRST])
+    """The state at the beginning of a piece, from its first outputs. They are taken in rad or m:
+    what holds the state near them depends on the unit.
+    """
+    unit, measured = core.settings["unit"], np.flatnonzero(np.isfinite(piece.y))
+    n = int(measured[:FIRST][-1]) + 1 if len(measured) else FIRST
+    y = unit * piece.y[:n]
+    state: FloatArray = changed(core, unit=1.0).estimate_initial_state(piece.u[:n], y)
+    state[-1] /= unit
     return state
 
 
@@ -453,10 +506,28 @@ def weights(e: Experiment) -> FloatArray:
     return np.where(np.isfinite(e.y), root, 0.0)
 
 
+def _bridged(y: FloatArray, longest: float) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Outputs with interpolated gaps, and where they are measured or in a short gap, both (N,)."""
+    at, known = np.arange(len(y)), np.isfinite(y)
+    if known.all() or not known.any():
+        return np.nan_to_num(y), known
+    i = np.searchsorted(at[known], at)
+    edges = np.concatenate([[-np.inf], at[known], [np.inf]])
+    gap = edges[i + 1] - edges[i] - 1.0
+    bridged: FloatArray = np.interp(at, at[known], y[known])
+    return bridged, known | (gap <= longest)
+
+
 def _cut(e: Experiment, length: float) -> list[Experiment]:
+    """Pieces of about a length, from their first to their last measured output."""
     count = max(1, round(len(e) / length))
     edges = np.linspace(0, len(e), count + 1).round().astype(int)
-    return [e.cut(a, b) for a, b in itertools.pairwise(edges.tolist())]
+    pieces = []
+    for a, b in itertools.pairwise(edges.tolist()):
+        measured = np.flatnonzero(np.isfinite(e.y[a:b]))
+        if len(measured) >= min(FIRST, len(e)):
+            pieces.append(e.cut(a + int(measured[0]), a + int(measured[-1]) + 1))
+    return pieces
 
 
 def pieces_of(data: Dataset) -> Dataset:
