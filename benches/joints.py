@@ -24,6 +24,7 @@ import math
 import sys
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -123,17 +124,27 @@ def drive(seed: int) -> Case:
     kp, kv = rng.uniform(15.0, 30.0), M * rng.uniform(20.0, 40.0)
     most = 4.0 * M / gain
     values = [float(v) for v in own.values()]
-    run = lambda pulses: _drive(r, pulses, kp, kv, gain, most, *values, Ts, SUBSTEPS)  # noqa: E731
+
+    def run(pulses: F) -> tuple[F, F, F]:
+        found: tuple[F, F, F] = _drive(r, pulses, kp, kv, gain, most, *values, Ts, SUBSTEPS)
+        return found
+
     u, y, _ = run(np.zeros(N))
     pulses = np.zeros(N)
     for at in rng.integers(500, N - 500, 12):
         pulses[at : at + int(rng.integers(50, 200))] += rng.choice([-1, 1]) * 0.4 * np.abs(u).max()
     v, z, exact = run(pulses * gain)
     unit, factor = (("m", 1.0), ("mm", 1e3), ("", 1.0))[seed % 3]
-    make = lambda u, y: Dataset.from_arrays(  # noqa: E731
-        u, factor * y, Ts, output_unit=unit, name=f"drives/{seed}"
-    )
-    return Case(make(u, y), make(v, z), factor * exact, own | {"unit": gain * factor})
+
+    def made(u: F, y: F) -> Dataset:
+        return Dataset.from_arrays(u, factor * y, Ts, output_unit=unit, name=f"drives/{seed}")
+
+    return Case(made(u, y), made(v, z), factor * exact, own | {"unit": gain * factor})
+
+
+def _commanded(u: F, y: F, Ts: float, name: str) -> Dataset:
+    """The record of a joint with a controller inside."""
+    return Dataset.from_arrays(u, y, Ts, input_units=("rad",), output_unit="rad", name=name)
 
 
 # --- smart servos ---------------------------------------------------------------------------------
@@ -207,9 +218,7 @@ def servo(seed: int) -> Case:
 
     r, y, _ = run(2)
     v, z, exact = run(0)
-    make = lambda u, y: Dataset.from_arrays(  # noqa: E731
-        u, y, Ts, input_units=("rad",), output_unit="rad", name=f"servos/{seed}"
-    )
+    make = partial(_commanded, Ts=Ts, name=f"servos/{seed}")
     return Case(make(r, y), make(v, z), exact, own)
 
 
@@ -275,9 +284,7 @@ def mujoco_joint(seed: int) -> Case:
             mujoco.mj_step(model, data)
         return r, np.floor(exact / step + 0.5) * step, exact
 
-    make = lambda u, y: Dataset.from_arrays(  # noqa: E731
-        u, y, Ts, input_units=("rad",), output_unit="rad", name=f"mujoco/{seed}"
-    )
+    make = partial(_commanded, Ts=Ts, name=f"mujoco/{seed}")
     (r, y, _), (v, z, exact) = run(2), run(0)
     truth = {
         "inertia": J / kp, "friction": p["coulomb"] / kp, "stiffness": kp / J,

@@ -330,9 +330,14 @@ def judged(fit: float, error: float, noise: float, share: float) -> tuple[str, s
     )
 
 
+def largest_pole(model: DynamicModel) -> float:
+    """Modulus of a linear model's largest pole; 0 for other kinds."""
+    return float(max(map(abs, getattr(model, "poles", ())), default=0.0))
+
+
 def doubling(model: DynamicModel) -> int | None:
     """Samples in which the free run of an unstable linear model doubles; None for other models."""
-    largest = max(map(abs, getattr(model, "poles", ())), default=0.0)
+    largest = largest_pole(model)
     return max(1, round(math.log(2.0) / math.log(largest))) if largest > 1.0 else None
 
 

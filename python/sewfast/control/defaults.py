@@ -25,6 +25,7 @@ from ..models import Model
 from ..models.linear import LinearDifference
 from ..rules import Fopdt, fit_fopdt
 from ..units import spelled
+from ..validation import largest_pole
 from .controller import SampledController
 
 NAMES = ("trapezoid", "trapezoids", "random")
@@ -247,7 +248,7 @@ def _slowest(fopdt: Fopdt, y: FloatArray, Ts: float) -> float:
 
 def growth_rate(model: Model) -> float:
     """The rate at which an unstable linear model leaves its rest [1/s]; 0 for others."""
-    largest = max(map(abs, model.poles)) if isinstance(model, LinearDifference) else 0.0
+    largest = largest_pole(model)
     # an integrator's pole is 1 but for its estimate
     return math.log(largest) / model.Ts if largest > 1.0 + INTEGRATES else 0.0
 

@@ -14,7 +14,6 @@ from .. import _core, storage
 from ..arrays import FloatArray
 from ..dataset import Dataset
 from ..dataset.experiment import in_effect, weights_of
-from ..errors import DataError
 from ..frequency.shaft import Parameter
 from ..models.grey_box import JOINT as JOINT_NAMES
 from ..models.grey_box import NAMES as MOTOR_NAMES
@@ -22,7 +21,7 @@ from ..models.grey_box import GreyBox
 from ..motorfit.estimation import CONFIDENCE
 from ..motorfit.joint import fitted, is_commanded
 from ..tables import html_of
-from .motor import APART, VAGUE
+from .motor import APART, VAGUE, Findings, stored_parameters
 
 FORMAT, VERSION = "sewfast-joint", 1
 Values: TypeAlias = Mapping[str, float]
@@ -41,7 +40,7 @@ _DIRECT = {
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Joint:
+class Joint(Findings):
     """The parameters of a joint, identified from positions.
 
     Attributes
@@ -72,22 +71,6 @@ class Joint:
     rmse: float
     samples: int
     model: GreyBox
-
-    def value(self, name: str) -> float:
-        """A parameter's value.
-
-        Raises
-        ------
-        DataError
-            If the record does not determine it; the message gives the reason.
-        """
-        if name in self.parameters:
-            return self.parameters[name].value
-        raise DataError(
-            f"{name}: {self.undetermined[name]}"
-            if name in self.undetermined
-            else f"expected a parameter of {', '.join(self.parameters)}, received {name!r}"
-        )
 
     def to_model(self) -> GreyBox:
         """The joint as a model for loops and free runs."""
@@ -124,17 +107,12 @@ class Joint:
 
     def __str__(self) -> str:
         terms = ", ".join(self.terms) or "no further terms"
-        width = max(map(len, self.parameters), default=0)
         what = "joint with a controller inside" if self.inside else "joint"
         lines = [
             f"{what}: free run {self.fit_percent:.2f} %, {self.rmse:.3g} {self.model.output_unit} "
             f"rmse of {self.samples:,} samples ({terms}); 95 % intervals"
         ]
-        lines += [f"  {name:<{width}}  {p}" for name, p in self.parameters.items()]
-        for why in dict.fromkeys(self.undetermined.values()):
-            names = [name for name, reason in self.undetermined.items() if reason == why]
-            lines.append(f"  not determined: {', '.join(names)}: {why}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *self._lines()])
 
 
 def joint_of(data: Dataset) -> Joint:
@@ -240,18 +218,11 @@ def load_joint(path: str | os.PathLike[str]) -> Joint:
 
     document = storage.read(path, FORMAT, (VERSION,))
     fields = storage.Fields(str(path), document)
-    stored = fields.object("parameters")
-    parameters = {}
-    for name in stored.values:
-        one = stored.object(name)
-        value, low, high = (one.number(n) for n in ("value", "low", "high"))
-        parameters[name] = Parameter(value, low, high, one.text("unit"))
-    undetermined = fields.object("undetermined")
+    parameters, undetermined = stored_parameters(fields)
     model = restored(dict(fields.object("model").values), ())
     if not isinstance(model, GreyBox):
         raise fields.refuse("model", "a grey box", model.kind)
     return Joint(
-        parameters, {n: undetermined.text(n) for n in undetermined.values},
-        tuple(map(str, fields.items("terms"))), fields.flag("inside"),
+        parameters, undetermined, tuple(map(str, fields.items("terms"))), fields.flag("inside"),
         fields.number("fit_percent"), fields.number("rmse"), fields.integer("samples"), model,
     )  # fmt: skip

@@ -47,8 +47,40 @@ _NO_VOLTS = (
 )
 
 
+class Findings:
+    """Parameters with their intervals, and the reasons why the record does not determine others."""
+
+    parameters: Mapping[str, Parameter]
+    undetermined: Mapping[str, str]
+
+    def value(self, name: str) -> float:
+        """A parameter's value.
+
+        Raises
+        ------
+        DataError
+            If the record does not determine it; the message gives the reason.
+        """
+        if name in self.parameters:
+            return self.parameters[name].value
+        raise DataError(
+            f"{name}: {self.undetermined[name]}"
+            if name in self.undetermined
+            else f"expected a parameter of {', '.join(self.parameters)}, received {name!r}"
+        )
+
+    def _lines(self) -> list[str]:
+        """A line for each parameter, and for each reason the names of those that it concerns."""
+        width = max(map(len, self.parameters), default=0)
+        found = [f"  {name:<{width}}  {p}" for name, p in self.parameters.items()]
+        for why in dict.fromkeys(self.undetermined.values()):
+            names = [name for name, reason in self.undetermined.items() if reason == why]
+            found.append(f"  not determined: {', '.join(names)}: {why}")
+        return found
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Motor:
+class Motor(Findings):
     """The parameters of a motor, identified from a record.
 
     Attributes
@@ -91,23 +123,6 @@ class Motor:
     """Orders per turn of three cogging terms and of the torque ripple; 0 for none."""
     shown: tuple[FloatArray, FloatArray] | None = field(default=None)
     """Speed, measured and in the free run [rad/s], for plots; not stored in files."""
-
-    def value(self, name: str) -> float:
-        """A parameter's value.
-
-        Raises
-        ------
-        DataError
-            If the record does not determine it; the message gives the reason.
-        """
-        if name in self.parameters:
-            return self.parameters[name].value
-        known = ", ".join(self.parameters)
-        raise DataError(
-            f"{name}: {self.undetermined[name]}"
-            if name in self.undetermined
-            else f"expected a parameter of {known}, received {name!r}"
-        )
 
     def simulate(self, u: ArrayLike, *, Ts: float | None = None, speed: float = 0.0) -> FloatArray:
         """Speed [speed_unit] under commands, (N,), from an initial speed; the angle starts at zero.
@@ -355,15 +370,11 @@ class Motor:
 
     def __str__(self) -> str:
         terms = ", ".join(self.terms) or "no further terms"
-        width = max(map(len, self.parameters), default=0)
         lines = [
             f"motor: free run {self.fit_percent:.2f} %, {self.rmse:.3g} {self.speed_unit} rmse of "
             f"{self.samples:,} samples ({terms}); 95 % intervals"
         ]
-        lines += [f"  {name:<{width}}  {p}" for name, p in self.parameters.items()]
-        for why in dict.fromkeys(self.undetermined.values()):
-            names = [name for name, reason in self.undetermined.items() if reason == why]
-            lines.append(f"  not determined: {', '.join(names)}: {why}")
+        lines += self._lines()
         if not self.converged:
             lines.append("  note: the least squares did not converge; intervals may be wrong")
         if self.spikes:
@@ -385,8 +396,8 @@ _NUMBERS = (
 )
 
 
-def findings(fields: storage.Fields) -> tuple[dict[str, Parameter], dict[str, str], str]:
-    """From a file: parameters, reasons for undetermined ones, unit of the speed."""
+def stored_parameters(fields: storage.Fields) -> tuple[dict[str, Parameter], dict[str, str]]:
+    """From a file: parameters, reasons for undetermined ones."""
     stored, undetermined = fields.object("parameters"), fields.object("undetermined")
     parameters = {}
     for name in stored.values:
@@ -394,12 +405,18 @@ def findings(fields: storage.Fields) -> tuple[dict[str, Parameter], dict[str, st
         one.require_only(["value", "low", "high", "unit"])
         value, low, high = (one.number(n) for n in ("value", "low", "high"))
         parameters[name] = Parameter(value, low, high, one.text("unit"))
+    return parameters, {n: undetermined.text(n) for n in undetermined.values}
+
+
+def findings(fields: storage.Fields) -> tuple[dict[str, Parameter], dict[str, str], str]:
+    """From a file: parameters, reasons for undetermined ones, unit of the speed."""
+    parameters, undetermined = stored_parameters(fields)
     unit = fields.text("speed_unit")
     try:
         rad_per_second(unit)
     except SettingError:
         raise fields.refuse("speed_unit", "rpm, rev/s, rad/s or deg/s", unit) from None
-    return parameters, {n: undetermined.text(n) for n in undetermined.values}, unit
+    return parameters, undetermined, unit
 
 
 def load_motor(path: str | os.PathLike[str]) -> Motor:

@@ -21,6 +21,7 @@ from ..validation import (
     free_run_error,
     grade_of,
     judged,
+    largest_pole,
     noise_of,
     scored_runs,
     without_input,
@@ -326,7 +327,7 @@ def unstable_verdict(model: Model, part: Split, where: str) -> Provenance:
     """`verdict` on an unstable model, by free runs of as many samples as it doubles in. It is at
     most "fair": nobody has seen its plant run freely.
     """
-    ahead, pole = doubling(model), max(map(abs, getattr(model, "poles", (math.nan,))))
+    ahead, pole = doubling(model), largest_pole(model)
     try:
         runs = scored_runs(model, part.held, INIT)
     except (DataError, FitError):

@@ -319,14 +319,7 @@ def trained_from(
         own = at(x)
         if own is None:
             return math.inf
-        total = float((prior * x) @ (prior * x))
-        try:
-            for e, state in zip(data.experiments, states, strict=True):
-                error = weights(e) * (own.simulate(e.u, state) - np.nan_to_num(e.y))
-                total += float(error @ error)
-        except FitError:
-            return math.inf
-        return total if math.isfinite(total) else math.inf
+        return float((prior * x) @ (prior * x)) + joint.squares(own, data.experiments, states)
 
     count = sum(int(np.isfinite(e.y).sum()) for e in data.experiments)
     bounds = (low, np.full(len(start), np.inf))

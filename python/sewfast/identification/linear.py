@@ -75,9 +75,10 @@ def oe(task: Task) -> Model:
     short a delay makes a start in motion explain what is none, and the gain with it is any.
     """
     fit = _core.fit_oe(arrays(task.data), **task.fit_options())
-    nk, idle = fit.model.nk, 0
+    # a delay that is given leaves nothing to look for
+    nk, idle = fit.model.nk, 0 if task.nk is None and moves_once(task.data) else PATIENCE
     try:
-        while task.nk is None and moves_once(task.data) and idle < PATIENCE:
+        while idle < PATIENCE:
             nk += 1
             other = _tried(task.data, task.fit_options(nk=nk))
             if other is not None and other.cost < fit.cost:

@@ -168,7 +168,7 @@ class _Fit:
                     "delay": delay * self.data.Ts,
                 }  # fmt: skip
                 core = self.core(known, k_q, list(known))
-                cost = self.cost(core, self.states(core))
+                cost = squares(core, self.pieces, self.states(core))
                 if cost < least:
                     best, least = core, cost
         if best is None:
@@ -239,17 +239,6 @@ class _Fit:
     def states(self, core: _core.GreyBox) -> list[FloatArray]:
         """Initial states of the pieces, from their first outputs."""
         return [begun(core, p) for p in self.pieces]
-
-    def cost(self, core: _core.GreyBox, states: Sequence[FloatArray]) -> float:
-        """Sum of the squared errors of the free runs; infinite if one diverges."""
-        total = 0.0
-        try:
-            for p, state in zip(self.pieces, states, strict=True):
-                error = weights(p) * (core.simulate(p.u, state) - np.nan_to_num(p.y))
-                total += float(error @ error)
-        except FitError:
-            return math.inf
-        return total if math.isfinite(total) else math.inf
 
     def descended(self, core: _core.GreyBox, iterations: int = ITERATIONS) -> Descent:
         """The least squares over the pieces, whose states are fitted with the core."""
@@ -371,6 +360,20 @@ class _Fit:
         return max(n * total / max(spread, 1e-300), 3.0)
 
 
+def squares(
+    core: _core.GreyBox, experiments: Sequence[Experiment], states: Sequence[FloatArray]
+) -> float:
+    """Weighted squared errors of free runs from these states; infinite if one diverges."""
+    total = 0.0
+    try:
+        for e, state in zip(experiments, states, strict=True):
+            error = weights(e) * (core.simulate(e.u, state) - np.nan_to_num(e.y))
+            total += float(error @ error)
+    except FitError:
+        return math.inf
+    return total if math.isfinite(total) else math.inf
+
+
 def _determined(jacobian: FloatArray) -> NDArray[np.bool_]:
     """Which parameters are in no direction without information, (n,)."""
     d = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
@@ -454,14 +457,7 @@ def descended(
         own, states = parts(x)
         if own is None:
             return math.inf
-        total = float((known * x[:p]) @ (known * x[:p]))
-        try:
-            for e, state in zip(pieces, states, strict=True):
-                error = weights(e) * (own.simulate(e.u, state) - np.nan_to_num(e.y))
-                total += float(error @ error)
-        except FitError:
-            return math.inf
-        return total if math.isfinite(total) else math.inf
+        return float((known * x[:p]) @ (known * x[:p])) + squares(own, pieces, states)
 
     names = {place: name for name, place in PLACES.items()}
     low = np.full(len(x0), -np.inf)
