@@ -63,6 +63,7 @@ static uint64_t switched_on; /* us: when the output was last switched on */
 static uint32_t fault;       /* the number of what is wrong with the motor */
 static bool wrong;           /* it has begun */
 static float stays;          /* V: its command then */
+static bool idle;            /* nothing was measured, read or written since the last look for bytes */
 
 /* A byte for which the ring has no room stays in the UART, which then accepts no other. */
 static void pump(void) {
@@ -142,6 +143,7 @@ bool board_measure(sewfast_measurement *measurement, uint64_t *when) {
         elapsed -= PERIOD * TICKS_PER_US;
     }
     turn_the_motor();
+    idle = false;
     sampled += PERIOD;
     const sewfast_measurement found = {counts, NAN, NULL, 0};
     *measurement = found;
@@ -180,15 +182,30 @@ static bool catching_up(void) {
     return periods > 0 && periods < LATE;
 }
 
+/* On credit nothing can happen before the host says something. To sleep until then leaves the emulator to its other thread,
+ * which brings the bytes: on a busy computer a loop that polls its registers keeps it waiting for seconds. */
+static void sleep_until_bytes_come(void) {
+    uint64_t until;
+    if (!idle || !on_credit(&until)) return;
+    __asm__ volatile("cpsid i" ::: "memory");
+    if (taken == written) __asm__ volatile("wfi"); /* a byte that comes before it ends it at once */
+    __asm__ volatile("cpsie i" ::: "memory");
+}
+
 size_t board_read(uint8_t *bytes, size_t size) {
     size_t count = 0;
+    sleep_until_bytes_come();
+    idle = true;
     const uint32_t come = written; /* before the clock is read: the emulator can be paused between the two */
     if (catching_up()) return 0;
     while (count < size && taken != come) {
         bytes[count++] = ring[taken % RING];
         taken++;
     }
-    if (count > 0) shared.heard = board_time();
+    if (count > 0) {
+        shared.heard = board_time();
+        idle = false;
+    }
     __asm__ volatile("cpsid i" ::: "memory");
     pump(); /* bytes that had no room */
     __asm__ volatile("cpsie i" ::: "memory");
@@ -197,6 +214,7 @@ size_t board_read(uint8_t *bytes, size_t size) {
 
 size_t board_write(const uint8_t *bytes, size_t count) {
     size_t sent = 0;
+    idle = false;
     while (sent < count && (UART->state & 1u) == 0) UART->data = bytes[sent++];
     return sent;
 }

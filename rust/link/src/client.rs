@@ -25,7 +25,7 @@
 
 use std::collections::VecDeque;
 
-use sewfast_control::link::{Body, Fields, Frame, Header, MAX_WIRE, encode};
+use sewfast_control::link::{Body, Fields, Frame, Header, MAX_WIRE, capability, encode};
 
 use crate::bodies::{self, Beat, Greeting};
 use crate::receiver::{Counters, Receiver};
@@ -56,6 +56,8 @@ pub const STOP_REPEAT: u64 = 10_000;
 /// How long a command is repeated before it is given up, if the watchdog's time is not longer: a motor may turn for
 /// that long, and STOP must not be given up earlier.
 pub const PATIENCE: u64 = 1_000_000;
+/// The same for a device on credit: nothing there turns meanwhile, and a busy computer may not come to it for seconds.
+pub const PATIENCE_ON_CREDIT: u64 = 20_000_000;
 /// Most events and beats kept for a caller who takes none; later ones are dropped.
 const ROOM: usize = 256;
 
@@ -246,6 +248,8 @@ struct Session {
     number: u32,
     tag: Option<u16>,
     key: u32,
+    /// How long a command is repeated at least.
+    patience: u64,
     /// Number of the last command.
     command: u32,
     /// Number of the last heartbeat.
@@ -267,6 +271,7 @@ impl Client {
                 number: session,
                 tag: None,
                 key: 0,
+                patience: PATIENCE,
                 command: 0,
                 heartbeat: 0,
                 hello: None,
@@ -361,7 +366,7 @@ impl Client {
     pub fn begin(&mut self, kind: u8, body: Body) {
         let session = &mut self.session;
         session.command = session.command.wrapping_add(1);
-        let patience = PATIENCE.max(self.watchdog.into());
+        let patience = session.patience.max(self.watchdog.into());
         session.request = Some(Request::new(kind, session.command, body, patience));
     }
 
@@ -534,6 +539,10 @@ impl Session {
                 self.newest = answer.time;
             }
             (self.tag, self.key) = (tag, greeting.key);
+            self.patience = match greeting.capabilities & capability::CREDIT {
+                0 => PATIENCE,
+                _ => PATIENCE_ON_CREDIT,
+            };
             if let Some(request) = &mut self.request {
                 request.sent = 0;
             }

@@ -5,7 +5,9 @@ use sewfast_control::link::{
     Body, Device, Fields, Header, Identity, MAX_WIRE, Measurement, State, capability, encode,
 };
 
-use super::{Client, Event, PATIENCE, REPEAT, Reply, STOP_REPEAT, Unanswered, kind};
+use super::{
+    Client, Event, PATIENCE, PATIENCE_ON_CREDIT, REPEAT, Reply, STOP_REPEAT, Unanswered, kind,
+};
 use crate::bench;
 use crate::bodies::{self, Status};
 use crate::samples::Channel;
@@ -427,6 +429,25 @@ fn a_session_that_is_confirmed_gives_its_command_all_tries_again() {
         world.pass(1);
     }
     assert_eq!(world.now - confirmed, u64::from(WATCHDOG));
+}
+
+#[test]
+fn a_device_on_credit_has_the_time_of_a_busy_computer() {
+    let mut world = World::quiet();
+    world.device = Device::new(Identity {
+        capabilities: capability::DRIVE | capability::CREDIT,
+        ..bench::identity()
+    })
+    .unwrap();
+    world.pass(200);
+    world.greet();
+    world.client.begin(kind::STATUS, Body::new());
+    let asked = world.now;
+    while world.client.expire(world.now).is_none() {
+        world.client.transmit(world.now);
+        world.now += REPEAT;
+    }
+    assert_eq!(world.now - asked, PATIENCE_ON_CREDIT);
 }
 
 #[test]
