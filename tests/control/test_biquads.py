@@ -329,7 +329,7 @@ def test_the_command_line_proposes_and_tunes_with_notches(tmp_path: Path, capsys
     assert load_controller(out).u_max == 10.0
     tune_it = [
         "tune", str(tmp_path / "model.json"), "--reference", "trapezoid", "--u-min", "-10",
-        "--u-max", "10", "--evaluations", "20", "-o", out,
+        "--u-max", "10", "--evaluations", "80", "-o", out,
     ]  # fmt: skip
     limits = ["--constraint", "Ms=3", "--response", response]
     assert not main([*tune_it, "--notch", "60:0.2:0.4", *limits])

@@ -23,6 +23,8 @@ pub struct Judgement {
     pub violation: f64,
     /// Its cost; a lower bound of it if the candidate cannot beat what it has to.
     pub cost: f64,
+    /// The largest relative excess over a limit, below 0 within all of them; minus infinity without limits.
+    pub excess: f64,
 }
 
 impl Judgement {
@@ -30,6 +32,7 @@ impl Judgement {
     pub const HOPELESS: Self = Self {
         violation: f64::INFINITY,
         cost: f64::INFINITY,
+        excess: f64::INFINITY,
     };
 
     /// The judgement of a feasible candidate.
@@ -37,6 +40,7 @@ impl Judgement {
         Self {
             violation: 0.0,
             cost,
+            excess: f64::NEG_INFINITY,
         }
     }
 

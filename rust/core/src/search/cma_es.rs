@@ -19,7 +19,7 @@ const SMALL_STEP: f64 = 0.03;
 /// Size of a refinement's generations relative to the usual one: larger generations follow the slope of a rough landscape.
 pub(super) const GENERATION: f64 = 1.4;
 /// A refinement ends when the best improves by less than this share within so many generations.
-pub(super) const STALLED: (f64, usize) = (1e-3, 12);
+pub(super) const STALLED: (f64, usize) = (1e-6, 30);
 /// Steps smaller than this share of the box change nothing.
 const SMALLEST_STEP: f64 = 1e-11;
 /// Squared ratio of the longest to the shortest axis beyond which the matrix is of no use.
@@ -29,8 +29,6 @@ const ABANDONED: f64 = 3.0;
 /// Radii within which a model's minimum is searched, in standard deviations: about the length of the samples' steps in
 /// few dimensions, so that none need clipping.
 const TRUST: [f64; 2] = [1.5, 3.0];
-/// Most generations without a model's minimum after all of a model's candidates were infeasible.
-const PAUSE: usize = 16;
 
 /// Searches the box, beginning around `start` if there is one.
 ///
@@ -226,10 +224,6 @@ pub(super) struct Evolution {
     /// Best of each generation.
     history: Vec<Judgement>,
     last: Vec<Judgement>,
-    /// How many candidates of this generation, the first ones, come from a model.
-    promising: usize,
-    /// Generations for which the model pauses, and how many of them are left.
-    pause: (usize, usize),
 }
 
 impl Evolution {
@@ -248,8 +242,6 @@ impl Evolution {
             steps: Vec::new(),
             history: Vec::new(),
             last: Vec::new(),
-            promising: 0,
-            pause: (0, 0),
         }
     }
 
@@ -271,15 +263,8 @@ impl Evolution {
     ) -> Vec<Candidate> {
         let to_beat = self.to_beat();
         let size = self.weights.size.min(limit);
-        let mut points = match self.pause.1.checked_sub(1) {
-            Some(left) => {
-                self.pause.1 = left;
-                Vec::new()
-            }
-            None => self.promising(known),
-        };
+        let mut points = self.promising(known);
         points.truncate(size);
-        self.promising = points.len();
         let step = |point: &DVector<f64>| (point - &self.mean) / self.sigma;
         self.steps = points.iter().map(step).collect();
         let mut points: Vec<Vec<f64>> = points.iter().map(|p| p.as_slice().to_vec()).collect();
@@ -325,7 +310,6 @@ impl Evolution {
 
     /// Moves the mean towards the best, updates the paths, then step size and covariance (Hansen 2016, Fig. 6).
     pub(super) fn adapt(&mut self, judgements: &[Judgement]) {
-        self.consider(&judgements[..self.promising]);
         let mut order: Vec<usize> = (0..judgements.len()).collect();
         order.sort_by(|&a, &b| judgements[a].order(&judgements[b]));
         let steps = std::mem::take(&mut self.steps);
@@ -388,21 +372,6 @@ impl Evolution {
                 self.covariance.row_mut(i).neg_mut();
                 self.covariance.column_mut(i).neg_mut();
             }
-        }
-    }
-
-    /// A model knows nothing of constraints: if its minima violate them, it pauses for longer and longer. Candidates
-    /// that diverge do not count: they say nothing about constraints.
-    fn consider(&mut self, promising: &[Judgement]) {
-        let violates = |j: &Judgement| j.violation > 0.0 && j.violation.is_finite();
-        if !promising.is_empty() {
-            let misled = promising.iter().all(violates);
-            let pause = if misled {
-                (2 * self.pause.0).clamp(1, PAUSE)
-            } else {
-                0
-            };
-            self.pause = (pause, pause);
         }
     }
 

@@ -1,4 +1,5 @@
-//! A quadratic model of the cost around the centre of a search, fitted to the nearest judged points.
+//! Quadratic models of the cost and of the excess over the limits around the centre of a search, fitted to the nearest judged points.
+//! The least cost mostly lies on a limit, which a model of the cost alone would lead beyond.
 //!
 //! Nearness is measured by the search's own distribution, whose axes and lengths define the model's coordinates; near points count more
 //! (Kern, Hansen and Koumoutsakos 2006, "Local meta-models for optimization using evolution strategies").
@@ -27,46 +28,54 @@ fn coefficients(dimensions: usize) -> usize {
     (dimensions + 1) * (dimensions + 2) / 2
 }
 
-/// Feasible points that were fully judged, the latest last.
+/// Points that were judged, the latest last.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Archive {
-    points: Vec<(DVector<f64>, f64)>,
+    /// Those whose cost is known.
+    costs: Vec<(DVector<f64>, f64)>,
+    /// Those whose excess is known.
+    excesses: Vec<(DVector<f64>, f64)>,
 }
 
 impl Archive {
-    /// Keeps the points whose cost is known: a candidate that could not beat `to_beat` has only a bound.
+    /// Keeps what is known: a candidate that could not beat `to_beat` has only a bound of its cost.
     pub(super) fn keep(&mut self, candidates: &[Candidate], judgements: &[Judgement]) {
-        for (candidate, judged) in candidates.iter().zip(judgements) {
-            let feasible = judged.violation == 0.0 && judged.cost.is_finite();
-            if feasible && judged.beats(&candidate.to_beat) {
-                let point = DVector::from_column_slice(&candidate.point);
-                self.points.push((point, judged.cost));
-            }
-        }
         let dimensions = candidates.first().map_or(0, |c| c.point.len());
-        if self.points.len() > KEPT * coefficients(dimensions) {
-            self.points.drain(..self.points.len() / 2);
+        for (candidate, judged) in candidates.iter().zip(judgements) {
+            let point = DVector::from_column_slice(&candidate.point);
+            if judged.excess.is_finite() {
+                self.excesses.push((point.clone(), judged.excess));
+            }
+            if judged.cost.is_finite() && judged.beats(&candidate.to_beat) {
+                self.costs.push((point, judged.cost));
+            }
+        }
+        for points in [&mut self.costs, &mut self.excesses] {
+            if points.len() > KEPT * coefficients(dimensions) {
+                points.drain(..points.len() / 2);
+            }
         }
     }
+}
 
-    /// The points nearest to the centre, in the distribution's coordinates.
-    fn nearest(&self, about: Ellipsoid<'_>, count: usize) -> Option<Vec<Near>> {
-        let beyond = count
-            .checked_sub(1)
-            .filter(|last| *last < self.points.len())?;
-        let near = |(point, cost): &(DVector<f64>, f64)| {
-            let place = about.place(point);
-            Near {
-                far: place.norm_squared(),
-                place,
-                cost: *cost,
-            }
-        };
-        let mut all: Vec<Near> = self.points.iter().map(near).collect();
-        all.select_nth_unstable_by(beyond, |a, b| a.far.total_cmp(&b.far));
-        all.truncate(count);
-        Some(all)
+/// The points nearest to the centre, in the distribution's coordinates; `None` if there are not enough.
+fn nearest(points: &[(DVector<f64>, f64)], about: Ellipsoid<'_>) -> Option<Vec<Near>> {
+    let count = POINTS * coefficients(about.centre.len());
+    if points.len() < count {
+        return None;
     }
+    let near = |(point, value): &(DVector<f64>, f64)| {
+        let place = about.place(point);
+        Near {
+            far: place.norm_squared(),
+            place,
+            value: *value,
+        }
+    };
+    let mut all: Vec<Near> = points.iter().map(near).collect();
+    all.select_nth_unstable_by(count - 1, |a, b| a.far.total_cmp(&b.far));
+    all.truncate(count);
+    Some(all)
 }
 
 /// A judged point in the distribution's coordinates.
@@ -74,7 +83,7 @@ struct Near {
     place: DVector<f64>,
     /// Squared distance from the centre.
     far: f64,
-    cost: f64,
+    value: f64,
 }
 
 /// The distribution of a search: `centre + axes (lengths z)` with standard normal `z`.
@@ -102,12 +111,55 @@ impl Ellipsoid<'_> {
     }
 }
 
-/// `g' d + d' H d / 2` of a distance `d` from the centre, and the metric of the distribution.
+/// `c + g' d + d' H d / 2` of a distance `d` from the centre.
+#[derive(Clone, Debug)]
+struct Quadratic {
+    level: f64,
+    slope: DVector<f64>,
+    curvature: DMatrix<f64>,
+}
+
+impl Quadratic {
+    /// Fitted to the nearest points; those whose value is far from `base` count less, much dearer points say little about a valley.
+    /// With the standard deviation of its residuals.
+    fn fit(near: &[Near], about: Ellipsoid<'_>, base: f64) -> Option<(Self, f64)> {
+        let n = about.centre.len();
+        let (found, scatter) = regression(near, n, base)?;
+        let mut curvature = DMatrix::zeros(n, n);
+        for ((i, j), c) in pairs(n).zip(found.iter().skip(1 + n)) {
+            curvature[(i, j)] += c;
+            curvature[(j, i)] += c;
+        }
+        let whitening = about.whitening();
+        let quadratic = Self {
+            level: base + found[0],
+            slope: whitening.tr_mul(&found.rows(1, n)),
+            curvature: whitening.tr_mul(&curvature) * &whitening,
+        };
+        Some((quadratic, scatter))
+    }
+
+    fn at(&self, step: &DVector<f64>) -> f64 {
+        self.level + step.dot(&self.slope) + 0.5 * step.dot(&(&self.curvature * step))
+    }
+
+    /// Its sum with a multiple of another one.
+    fn plus(&self, factor: f64, other: &Self) -> Self {
+        Self {
+            level: self.level + factor * other.level,
+            slope: &self.slope + factor * &other.slope,
+            curvature: &self.curvature + factor * &other.curvature,
+        }
+    }
+}
+
+/// The cost, the excess over the limits if there are any, and the metric of the distribution.
 #[derive(Clone, Debug)]
 pub(super) struct Model {
     centre: DVector<f64>,
-    slope: DVector<f64>,
-    curvature: DMatrix<f64>,
+    cost: Quadratic,
+    /// With its residuals' standard deviation above it, so that what is below 0 is within the limits.
+    excess: Option<Quadratic>,
     /// The inverse of the distribution's covariance.
     metric: DMatrix<f64>,
 }
@@ -115,37 +167,70 @@ pub(super) struct Model {
 impl Model {
     /// `None` with too few points or too many dimensions.
     pub(super) fn fit(archive: &Archive, about: Ellipsoid<'_>) -> Option<Self> {
-        let n = about.centre.len();
-        if n > DIMENSIONS {
+        if about.centre.len() > DIMENSIONS {
             return None;
         }
-        let near = archive.nearest(about, POINTS * coefficients(n))?;
-        let found = regression(&near, n)?;
-        let mut curvature = DMatrix::zeros(n, n);
-        for ((i, j), c) in pairs(n).zip(found.iter().skip(1 + n)) {
-            curvature[(i, j)] += c;
-            curvature[(j, i)] += c;
-        }
+        let near = nearest(&archive.costs, about)?;
+        let cheapest = near.iter().map(|p| p.value).fold(f64::INFINITY, f64::min);
+        let limit = |near: Vec<Near>| {
+            let (excess, scatter) = Quadratic::fit(&near, about, 0.0)?;
+            let level = excess.level + scatter;
+            Some(Quadratic { level, ..excess })
+        };
         let whitening = about.whitening();
         Some(Self {
             centre: about.centre.clone(),
-            slope: whitening.tr_mul(&found.rows(1, n)),
-            curvature: whitening.tr_mul(&curvature) * &whitening,
+            cost: Quadratic::fit(&near, about, cheapest)?.0,
+            excess: nearest(&archive.excesses, about).and_then(limit),
             metric: whitening.tr_mul(&whitening),
         })
     }
 
-    /// The minimum within the box and within `radius` standard deviations from the centre. A coordinate that leaves the
-    /// box is fixed at its edge, and the others are solved again.
+    /// The least cost within the box, the limits and `radius` standard deviations from the centre. The weight of the excess beside the cost
+    /// is the least that keeps the point within the limits, or that comes nearest to them.
     pub(super) fn least(&self, radius: f64) -> Option<DVector<f64>> {
+        let free = self.boxed(&self.cost, radius)?;
+        let Some(excess) = self.excess.as_ref().filter(|e| e.at(&free) > 0.0) else {
+            return Some(self.place(&free));
+        };
+        let within = |weight: f64| {
+            let step = self.boxed(&self.cost.plus(weight, excess), radius)?;
+            (excess.at(&step) <= 0.0).then_some(step)
+        };
+        let (mut low, mut high) = (0.0, self.cost.slope.norm() / excess.slope.norm());
+        let doubled = (0..PULLS.1).find_map(|_| {
+            high *= 2.0;
+            within(high)
+        });
+        let Some(mut best) = doubled else {
+            return self.boxed(excess, radius).map(|step| self.place(&step));
+        };
+        for _ in 0..PULLS.1 {
+            let middle = 0.5 * (low + high);
+            match within(middle) {
+                Some(step) => (best, high) = (step, middle),
+                None => low = middle,
+            }
+        }
+        Some(self.place(&best))
+    }
+
+    fn place(&self, step: &DVector<f64>) -> DVector<f64> {
+        (&self.centre + step).map(|x| x.clamp(0.0, 1.0))
+    }
+
+    /// The step to the minimum within the box and the radius. A coordinate that leaves the box is fixed at its edge, and the others are
+    /// solved again.
+    fn boxed(&self, of: &Quadratic, radius: f64) -> Option<DVector<f64>> {
         let n = self.centre.len();
         let mut fixed = vec![None; n];
         loop {
-            let point = &self.centre + self.step(&fixed, radius)?;
+            let step = self.step(of, &fixed, radius)?;
+            let point = &self.centre + &step;
             let leaves = |i: &usize| fixed[*i].is_none() && !(0.0..=1.0).contains(&point[*i]);
             let leaving: Vec<usize> = (0..n).filter(leaves).collect();
             if leaving.is_empty() {
-                return Some(point.map(|x| x.clamp(0.0, 1.0)));
+                return Some(step);
             }
             for i in leaving {
                 fixed[i] = Some(point[i].clamp(0.0, 1.0) - self.centre[i]);
@@ -155,21 +240,21 @@ impl Model {
 
     /// The best step within a radius with some coordinates fixed. Halving finds the least pull to the centre that keeps
     /// the step inside (Nocedal and Wright 2006, section 4.3).
-    fn step(&self, fixed: &[Option<f64>], radius: f64) -> Option<DVector<f64>> {
+    fn step(&self, of: &Quadratic, fixed: &[Option<f64>], radius: f64) -> Option<DVector<f64>> {
         let inside = |pull: f64| {
-            let step = self.pulled(fixed, pull)?;
+            let step = self.pulled(of, fixed, pull)?;
             (step.dot(&(&self.metric * &step)) <= radius * radius).then_some(step)
         };
         if let Some(step) = inside(0.0) {
             return Some(step);
         }
-        let (mut low, mut high) = (0.0, self.curvature.norm() / self.metric.norm());
+        let (mut low, mut high) = (0.0, of.curvature.norm() / self.metric.norm());
         let doubled = (0..PULLS.0).find_map(|_| {
             high *= 2.0;
             inside(high)
         });
         // Coordinates fixed at the edge may already lie beyond the radius.
-        let mut best = doubled.or_else(|| self.pulled(fixed, high))?;
+        let mut best = doubled.or_else(|| self.pulled(of, fixed, high))?;
         for _ in 0..PULLS.1 {
             let middle = 0.5 * (low + high);
             match inside(middle) {
@@ -181,11 +266,11 @@ impl Model {
     }
 
     /// Solves `(H + pull M) d = -g` for the free coordinates; `None` if that is no minimum.
-    fn pulled(&self, fixed: &[Option<f64>], pull: f64) -> Option<DVector<f64>> {
+    fn pulled(&self, of: &Quadratic, fixed: &[Option<f64>], pull: f64) -> Option<DVector<f64>> {
         let free: Vec<usize> = (0..fixed.len()).filter(|&i| fixed[i].is_none()).collect();
         let mut step = DVector::from_iterator(fixed.len(), fixed.iter().map(|f| f.unwrap_or(0.0)));
-        let matrix = &self.curvature + pull * &self.metric;
-        let slope = &self.slope + &matrix * &step;
+        let matrix = &of.curvature + pull * &self.metric;
+        let slope = &of.slope + &matrix * &step;
         let own = matrix.select_rows(&free).select_columns(&free);
         let found = own.cholesky()?.solve(&slope.select_rows(&free));
         for (i, x) in free.iter().zip(found.iter()) {
@@ -195,29 +280,35 @@ impl Model {
     }
 }
 
-/// Coefficients of `1, z, z_i z_j` fitted to the costs; near and cheap points weigh more.
-fn regression(near: &[Near], n: usize) -> Option<DVector<f64>> {
-    let mut costs: Vec<f64> = near.iter().map(|p| p.cost).collect();
-    costs.sort_by(f64::total_cmp);
-    let base = costs[0];
-    let cheap = costs[(CHEAP * costs.len() as f64) as usize] - base;
+/// Coefficients of `1, z, z_i z_j` fitted to values less `base`, and the standard deviation of the residuals; near points, and those with
+/// values near to the base, weigh more.
+fn regression(near: &[Near], n: usize, base: f64) -> Option<(DVector<f64>, f64)> {
+    let mut beyond: Vec<f64> = near.iter().map(|p| (p.value - base).abs()).collect();
+    beyond.sort_by(f64::total_cmp);
+    let cheap = beyond[(CHEAP * beyond.len() as f64) as usize];
     let reach = REACH * near.iter().map(|p| p.far).fold(0.0, f64::max);
     let size = coefficients(n);
     let (mut normal, mut right) = (DMatrix::zeros(size, size), DVector::zeros(size));
-    for Near { place, far, cost } in near {
-        let dear = ((cost - base) / cheap.max(f64::MIN_POSITIVE)).powi(2);
+    let mut rows = Vec::with_capacity(near.len());
+    for Near { place, far, value } in near {
+        let dear = ((value - base) / cheap.max(f64::MIN_POSITIVE)).powi(2);
         let weight = (1.0 - far / reach).powi(2) / (1.0 + dear);
         let products = pairs(n).map(|(i, j)| place[i] * place[j]);
         let terms = std::iter::once(1.0).chain(place.iter().copied());
         let row = DVector::from_iterator(size, terms.chain(products));
         normal.ger(weight, &row, &row, 1.0);
-        right.axpy(weight * (cost - base), &row, 1.0);
+        right.axpy(weight * (value - base), &row, 1.0);
+        rows.push((weight, row, value - base));
     }
     let ridge = RIDGE * normal.trace() / size as f64;
     for i in 0..size {
         normal[(i, i)] += ridge;
     }
-    Some(normal.cholesky()?.solve(&right))
+    let found = normal.cholesky()?.solve(&right);
+    let square = |(w, row, value): &(f64, DVector<f64>, f64)| w * (row.dot(&found) - value).powi(2);
+    let squares: f64 = rows.iter().map(square).sum();
+    let weights: f64 = rows.iter().map(|(weight, ..)| weight).sum();
+    Some((found, (squares / weights).sqrt()))
 }
 
 /// Indices of a matrix on and below its diagonal.

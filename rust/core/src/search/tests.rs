@@ -146,7 +146,11 @@ fn a_model_is_made_of_feasible_points_that_were_judged_to_their_end() {
             point: vec![random.uniform(), random.uniform()],
             to_beat: Judgement::feasible(2.0),
         };
-        known.keep(&[candidate], &[Judgement { violation, cost }]);
+        let judged = Judgement {
+            violation,
+            ..Judgement::feasible(cost)
+        };
+        known.keep(&[candidate], &[judged]);
     };
     for k in 0..30 {
         keep(&mut known, 0.1, 1.0);
@@ -185,7 +189,7 @@ fn a_minimum_on_the_edge_is_found() {
 fn constraints_hold_and_the_way_to_the_feasible_is_found() {
     // Least x^2 + y^2 with x + y >= 3: at (1.5, 1.5); a quarter of the box -5 .. 5 is feasible.
     let function = Function {
-        violation: |x| (3.0 - x[0] - x[1]).max(0.0),
+        violation: |x| 3.0 - x[0] - x[1],
         ..Function::new(2, (-5.0, 5.0), |x| x.iter().map(|x| x * x).sum())
     };
     for (name, search) in SEARCHES {
@@ -209,7 +213,7 @@ fn constraints_hold_and_the_way_to_the_feasible_is_found() {
 fn the_least_at_a_constraint_is_found_in_many_dimensions() {
     // Least at (1, .., 1), with cost 6, where the constraint on the sum is active; there a model points into the infeasible.
     let function = Function {
-        violation: |x| (6.0 - x.iter().sum::<f64>()).max(0.0),
+        violation: |x| 6.0 - x.iter().sum::<f64>(),
         ..Function::new(6, (-5.0, 5.0), |x| x.iter().map(|x| x * x).sum())
     };
     for (name, search) in SEARCHES {
@@ -340,7 +344,7 @@ pub(super) struct Function {
     pub(super) low: f64,
     pub(super) high: f64,
     pub(super) value: fn(&[f64]) -> f64,
-    /// Sum of violations.
+    /// By how much it leaves the limit.
     pub(super) violation: fn(&[f64]) -> f64,
 }
 
@@ -351,7 +355,7 @@ impl Function {
             low,
             high,
             value,
-            violation: |_| 0.0,
+            violation: |_| f64::NEG_INFINITY,
         }
     }
 
@@ -382,9 +386,11 @@ impl Function {
     fn judge_one(&self, point: &[f64]) -> Judgement {
         assert!(point.iter().all(|x| (0.0..=1.0).contains(x)), "{point:?}");
         let x = self.at(point);
+        let violation = (self.violation)(&x);
         Judgement {
-            violation: (self.violation)(&x),
+            violation: violation.max(0.0),
             cost: (self.value)(&x),
+            excess: violation,
         }
     }
 }

@@ -5,7 +5,7 @@ use std::cell::OnceCell;
 
 use sewfast_control::{AnyController, AnyDesign, Controller};
 
-use super::cost::{Course, Measure, SMOOTHING, Terms, Weights};
+use super::cost::{Course, Excess, Measure, SMOOTHING, Terms, Weights};
 use super::{Aggregate, Extent, LoadLimit, LoadStep, Task};
 use crate::closed_loop::batch::{
     BatchLoop, InLanes, MOST, Sums, Tally, WithKind, are_of_a_kind, of_a_kind,
@@ -91,7 +91,7 @@ impl<P: Plant + Clone> Bench<P> {
     ) -> Vec<Judgement> {
         let weights = self.weights;
         let designs = trials.iter().map(|(design, _)| design);
-        let loops: Vec<f64> = designs.map(|d| task.constraints.of_loops(d)).collect();
+        let loops: Vec<_> = designs.map(|d| task.constraints.of_loops(d)).collect();
         let mut totals = vec![Total::default(); trials.len()];
         let mut judgements = vec![Judgement::HOPELESS; trials.len()];
         let designs = trials.iter().map(|(design, _)| *design).collect();
@@ -103,11 +103,14 @@ impl<P: Plant + Clone> Bench<P> {
             let total = &mut totals[i];
             total.go_to(plant);
             total.largest = total.largest.max(&terms);
-            total.late = f64::max(total.late, task.constraints.of_load(plant, &terms));
+            total.late = total.late.worse(task.constraints.of_load(plant, &terms));
             total.own += share * weights.of(&terms) / task.alike(run);
+            let runs = task.constraints.of_runs(&total.largest);
+            let excess = loops[i].and(total.late).and(runs);
             judgements[i] = Judgement {
-                violation: loops[i] + total.late + task.constraints.of_runs(&total.largest),
+                violation: excess.sum,
                 cost: total.lower_bound(task),
+                excess: excess.largest,
             };
             // Later runs can only increase either.
             !trials[i].1.beats(&judgements[i])
@@ -132,19 +135,19 @@ impl<P: Plant + Clone> Bench<P> {
             };
             mean.go_to(plant, task);
             mean.largest = mean.largest.max(&terms);
-            mean.late = f64::max(mean.late, task.constraints.of_load(plant, &terms));
+            mean.late = mean.late.worse(task.constraints.of_load(plant, &terms));
             mean.own = mean.own.plus(&terms, 1.0 / task.alike(run));
             true
         });
         let aggregated = |(mean, design): (Option<Mean>, &AnyDesign<f64>)| {
             let mut mean = mean?;
             mean.go_to(task.plants.len(), task);
-            let runs = mean.late + task.constraints.of_runs(&mean.largest);
+            let runs = mean.late.and(task.constraints.of_runs(&mean.largest));
             let terms = match task.aggregate {
                 Aggregate::Mean => mean.sum,
                 Aggregate::Worst => mean.worst,
             };
-            Some((terms, task.constraints.of_loops(design) + runs))
+            Some((terms, task.constraints.of_loops(design).and(runs).sum))
         };
         means.into_iter().zip(designs).map(aggregated).collect()
     }
@@ -300,8 +303,8 @@ struct Total {
     own: f64,
     /// The largest of each term over all runs.
     largest: Terms,
-    /// The largest violation under a load step.
-    late: f64,
+    /// The largest excess under a load step.
+    late: Excess,
 }
 
 impl Total {
@@ -329,7 +332,7 @@ struct Mean {
     worst: Terms,
     own: Terms,
     largest: Terms,
-    late: f64,
+    late: Excess,
 }
 
 impl Mean {

@@ -395,34 +395,79 @@ impl Constraints<'_> {
         Ok(())
     }
 
-    /// Relative violation by the linear loops; infinite if one is unstable.
-    pub(super) fn of_loops(&self, design: &AnyDesign<f64>) -> f64 {
-        self.ms.map_or(0.0, |(limit, sensitivity)| {
-            excess(sensitivity(design), limit)
+    /// Excess by the linear loops; infinite if one is unstable.
+    pub(super) fn of_loops(&self, design: &AnyDesign<f64>) -> Excess {
+        self.ms.map_or(Excess::NONE, |(limit, sensitivity)| {
+            Excess::of(sensitivity(design), limit)
         })
     }
 
-    /// Sum of a plant's relative violations by a run under a load step.
-    pub(super) fn of_load(&self, plant: usize, terms: &Terms) -> f64 {
-        self.loads.get(plant).map_or(0.0, |limit| {
-            excess(terms.recovery, limit.recovery) + excess(terms.load, limit.load)
+    /// Excess of a plant by a run under a load step.
+    pub(super) fn of_load(&self, plant: usize, terms: &Terms) -> Excess {
+        self.loads.get(plant).map_or(Excess::NONE, |limit| {
+            let recovery = Excess::of(terms.recovery, limit.recovery);
+            recovery.and(Excess::of(terms.load, limit.load))
         })
     }
 
-    /// Sum of the relative violations by the largest terms over all runs.
-    pub(super) fn of_runs(&self, largest: &Terms) -> f64 {
-        let over = |limit: Option<f64>, value| limit.map_or(0.0, |limit| excess(value, limit));
-        over(self.overshoot, largest.overshoot) + over(self.u, largest.u_max)
+    /// Excess by the largest terms over all runs.
+    pub(super) fn of_runs(&self, largest: &Terms) -> Excess {
+        let over = |limit: Option<f64>, value| limit.map_or(Excess::NONE, |l| Excess::of(value, l));
+        over(self.overshoot, largest.overshoot).and(over(self.u, largest.u_max))
     }
 }
 
-fn excess(value: f64, limit: f64) -> f64 {
-    if value.is_nan() {
-        f64::INFINITY
-    } else if limit == f64::INFINITY {
-        0.0
-    } else {
-        ((value - limit) / limit).max(0.0)
+/// By what shares values exceed their limits.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Excess {
+    /// Sum of what is above 0.
+    pub sum: f64,
+    /// The largest, below 0 within all limits; minus infinity without limits.
+    pub largest: f64,
+}
+
+impl Excess {
+    pub const NONE: Self = Self {
+        sum: 0.0,
+        largest: f64::NEG_INFINITY,
+    };
+
+    fn of(value: f64, limit: f64) -> Self {
+        let largest = if value.is_nan() {
+            f64::INFINITY
+        } else if limit == f64::INFINITY {
+            f64::NEG_INFINITY
+        } else {
+            (value - limit) / limit
+        };
+        Self {
+            sum: largest.max(0.0),
+            largest,
+        }
+    }
+
+    /// Of both.
+    #[must_use]
+    pub fn and(self, other: Self) -> Self {
+        Self {
+            sum: self.sum + other.sum,
+            largest: self.largest.max(other.largest),
+        }
+    }
+
+    /// The worse of two plants or runs.
+    #[must_use]
+    pub fn worse(self, other: Self) -> Self {
+        Self {
+            sum: self.sum.max(other.sum),
+            largest: self.largest.max(other.largest),
+        }
+    }
+}
+
+impl Default for Excess {
+    fn default() -> Self {
+        Self::NONE
     }
 }
 
