@@ -701,3 +701,12 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     said = capsys.readouterr().err
     assert "other.json: expected a model or a controller" in said
     assert "'something'" in said
+
+
+@pytest.mark.parametrize("pole", [1.002, 1.05, 1.5])
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_an_unstable_model_is_said_to_be_one(pole: float, precision: str, tmp_path: Path) -> None:
+    model = LinearOE.from_tf([0.0, 0.1], [1.0, -pole], 0.01)
+    notes = str(deploy(model, tmp_path, precision=precision))
+    assert "the model is unstable" in notes
+    assert "in any precision its free run doubles every" in notes
