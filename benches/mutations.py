@@ -76,8 +76,8 @@ from whole_files import (
 
 PATIENCE = 20
 """Most processor time of one file, with everything that is done with it [s]."""
-SILENCE = 300.0
-"""Longest time in which a fork reports nothing: it waits for what never comes [s]."""
+SILENCE = 60.0
+"""A fork that has used no processor for this time waits for what never comes [s]."""
 MEMORY = 2 << 30
 """Most address space of one process above what it has at its start [bytes]."""
 COMMANDS = 20
@@ -451,7 +451,10 @@ def tried(
         os.close(write)
         buffer = b""
         while todo:
-            ready, _, _ = select.select([read], [], [], SILENCE)
+            used, ready = -1, []
+            while not ready and (now := _ticks(child)) > used:
+                used = now
+                ready, _, _ = select.select([read], [], [], SILENCE)
             part = os.read(read, 1 << 16) if ready else b""
             if not part:
                 break
@@ -466,9 +469,18 @@ def tried(
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         if todo:
             hung = not ready or status == -signal.SIGXCPU
-            limit = f"{PATIENCE} s of processor" if ready else f"silent for {SILENCE:g} s"
+            limit = f"{PATIENCE} s of processor" if ready else f"idle for {SILENCE:g} s"
             why = limit if hung else f"the process ended with {status}"
             yield todo.pop(0), "HANG" if hung else "CRASH", why, PATIENCE
+
+
+def _ticks(child: int) -> int:
+    """Processor time that a process has used; 0 where the system does not say."""
+    try:
+        fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0
+    return int(fields[11]) + int(fields[12])
 
 
 def _serve(name: str, folder: Path, seed: int, indices: Sequence[int], write: int) -> None:
