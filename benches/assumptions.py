@@ -1,14 +1,22 @@
-"""Records that break assumptions: unstable plants in loops, single steps, other seeds of a search.
+"""Records that break assumptions: unstable plants in loops, steps, coloured noise, sound records.
 
-    python benches/assumptions.py [loops|steps|seeds ..] [--count 20] [--first 0]
+    python benches/assumptions.py [loops|gaps|steps|coloured|accused|seeds ..] [--count 20]
     make assumptions
 
 loops: an unstable plant (first order, with a lag, a falling body), recorded under a controller with
 a dither on the command, noise of .3 to 3 %. The tuned controller has to hold the true plant, or
 `identify` or `tune` to refuse.
 
+gaps: the same with every ninth output missing.
+
 steps: one step after 3 to 20 standing samples, one or two lags, a dead time, any level at rest. It
 counts against `identify` if a model graded good or fair has a steady gain more than 10 % off.
+
+coloured: records of the battery with a coloured noise (AR(1) of .9, drift, mains hum) of 3 to 20 %.
+It counts against `identify` if a model graded good has a test fit below 80 %.
+
+accused: single steps, whole records of the battery and 100 to 500 samples of them. It counts if the
+record is said to change or its columns to be exchanged.
 
 seeds: heaters and axes, output error, six seeds of `tune` each: cost of the worst over the best.
 """
@@ -25,17 +33,26 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 import sewfast
+from battery.families import FAMILIES, make
+from battery.families import NAMES as FAMILY_NAMES
+from battery.references import score
 from sewfast import Dataset, SewfastError, identify, tune
 from sewfast.arrays import FloatArray
+from sewfast.dataset.faults import faults
 from sewfast.models.linear import LinearDifference
 
 Sampled = tuple[FloatArray, FloatArray]
+QUICK = [name for name in FAMILY_NAMES if FAMILIES[name].quick]
+"""Families whose records are small."""
 
 
 def main() -> int:
     """Run the parts that were asked for; 1 if one misses its goal."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parts = {"loops": loops, "steps": steps, "seeds": seeds}
+    parts = {
+        "loops": loops, "gaps": lambda drawn: loops(drawn, missing=9), "steps": steps,
+        "coloured": coloured, "accused": accused, "seeds": seeds,
+    }  # fmt: skip
     parser.add_argument("parts", nargs="*", metavar="|".join(parts), choices=[*parts, []])
     parser.add_argument("--count", type=int, default=20, help="systems of each part")
     parser.add_argument("--first", type=int, default=0, help="the first system's seed")
@@ -121,11 +138,13 @@ def is_held(plant: Sampled, controller: sewfast.Controller) -> bool:
     return bool(np.abs(y[-500:]).max() < 0.5 * np.abs(y[:500]).max())
 
 
-def loops(drawn: range) -> int:
-    """Unstable plants that are neither held nor refused."""
+def loops(drawn: range, missing: int = 0) -> int:
+    """Unstable plants that are neither held nor refused, without every `missing`-th output."""
     missed, refused, off = 0, 0, 0.0
     for seed in drawn:
         data, plant = recorded(seed)
+        if missing:
+            data = data.mask(np.arange(len(data)) % missing == missing - 1)
         try:
             model = identify(data, threads=1)
             pole = float(np.abs(np.linalg.eigvals(plant[0])).max())
@@ -184,6 +203,92 @@ def steps(drawn: range) -> int:
                 print(f"  {seed} {kind}: {grade}, gain {model.dc_gain[0]:.3g} for {gain:.3g}")
     print(f"steps: {len(drawn)} records, {off} of {2 * len(drawn)} gains off, {praised} praised")
     return praised
+
+
+# --- Coloured noise -------------------------------------------------------------------------------
+
+
+def colour(rng: np.random.Generator, kind: str, n: int, Ts: float) -> FloatArray:
+    """Noise of deviation 1."""
+    white = rng.standard_normal(n)
+    if kind == "hum":
+        f = 50.0 if Ts < 0.008 else 0.13 / Ts
+        noise = np.sin(2.0 * np.pi * (f * Ts * np.arange(n) + rng.uniform())) + 0.1 * white
+    elif kind == "drift":
+        noise = np.cumsum(white)
+    else:
+        noise = lfilter([1.0], [1.0, -0.9], white) if kind == "AR(1)" else white
+    noise = noise - noise.mean()
+    return np.asarray(noise / noise.std())
+
+
+def coloured(drawn: range) -> int:
+    """Models graded good whose test fit is below 80 %; the same records with white noise beside."""
+    kinds, names, praised, ratios = ("AR(1)", "drift", "hum"), QUICK, 0, []
+    for seed in drawn:
+        rng = np.random.default_rng([seed, 40])
+        case = make(names[seed % len(names)], seed)
+        kind, share = kinds[seed % 3], float(rng.choice([0.03, 0.1, 0.2]))
+        clean = [case.truth.simulate(r) for r in case.train]
+        size = share * float(np.concatenate(clean).std())
+        own = rng.spawn(len(clean))
+        errors, words = {}, []
+        for of in ("white", kind):
+            noisy = [
+                case.dataset(r.u, y + size * colour(g, of, len(y), case.Ts))
+                for r, y, g in zip(case.train, clean, own, strict=True)
+            ]
+            for model in ("oe", "auto")[: 1 if of == "white" else 2]:
+                try:
+                    found = identify(Dataset.concat(noisy), model=model, threads=1)
+                except SewfastError as error:
+                    words.append(f"{of} {model}: refused ({str(error)[:60]})")
+                    continue
+                spread = float(np.concatenate([r.y[case.n :] for r in case.test]).std())
+                errors[of, model] = score(case, found)
+                fit = 100.0 * (1.0 - errors[of, model] / spread)
+                verdict = found.training["verdict"]
+                is_praised = verdict["grade"] == "good" and fit < 80.0
+                praised += is_praised and of != "white"
+                orders = " ".join(f"{k} {v}" for k, v in found.orders.items() if k != "parameters")
+                words.append(
+                    f"{of} {model}: {found.kind} {orders}, {verdict['grade']}, test fit {fit:.1f} %"
+                    f"{' PRAISED' if is_praised else ''}"
+                )
+        if (kind, "oe") in errors and errors.get(("white", "oe"), 0.0) > 0.0:
+            ratios.append(errors[kind, "oe"] / errors["white", "oe"])
+        print(
+            f"  {seed} {case.family}, {kind} of {share:.0%}\n    " + "\n    ".join(words),
+            flush=True,
+        )
+    print(
+        f"coloured: {len(drawn)} records, {praised} praised wrongly; test error over that with "
+        f"white noise of the same size: median {np.median(ratios):.2f}, worst {max(ratios):.2f}"
+    )
+    return praised
+
+
+# --- Sound records that are accused ---------------------------------------------------------------
+
+
+def accused(drawn: range) -> int:
+    """Sound records that are said to change, or to have exchanged columns."""
+    count = 0
+    for seed in drawn:
+        case = make(FAMILY_NAMES[seed % len(FAMILY_NAMES)], seed)
+        rng = np.random.default_rng([seed, 9])
+        first = case.train[0]
+        n = min(int(rng.integers(100, 500)), len(first.y))
+        at = int(rng.integers(0, len(first.y) - n + 1))
+        short = case.dataset(first.u[at : at + n], first.y[at : at + n])
+        records = {"step": single_step(seed)[0], case.family: case.training, "short": short}
+        for name, data in records.items():
+            for fault in faults(data):
+                if fault.kind in ("changes", "exchanged"):
+                    count += 1
+                    print(f"  {seed} {name} ({case.family}): {fault.text[:110]}", flush=True)
+    print(f"accused: {3 * len(drawn)} records, {count} accused")
+    return count
 
 
 # --- Seeds of the search --------------------------------------------------------------------------

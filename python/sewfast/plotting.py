@@ -148,16 +148,22 @@ def thin(x: Float, y: Float, buckets: int = BUCKETS) -> tuple[Float, Float]:
     if n <= 2 * buckets:
         return x, y
     edges = np.linspace(0, n, buckets + 1).astype(int)
-    kept = {0, n - 1}
-    for start, stop in itertools.pairwise(edges):
-        part = y[start:stop]
-        missing = np.isnan(part)
-        if 2 * np.count_nonzero(missing) >= len(part):
-            kept.add(start + int(np.argmax(missing)))
-        if not missing.all():
-            kept.add(start + int(np.nanargmin(part)))
-            kept.add(start + int(np.nanargmax(part)))
-    index = np.array(sorted(kept))
+    first, size = edges[:-1, None], np.diff(edges)[:, None]
+    place = np.arange(size.max())
+    part = y[np.minimum(first + place, n - 1)]
+    inside = place < size
+    seen = inside & ~np.isnan(part)
+    gap = 2 * seen.sum(1) <= size[:, 0]
+    index = np.unique(
+        np.concatenate(
+            (
+                [0, n - 1],
+                (first[:, 0] + (inside & ~seen).argmax(1))[gap],
+                (first[:, 0] + np.where(seen, part, np.inf).argmin(1))[seen.any(1)],
+                (first[:, 0] + np.where(seen, part, -np.inf).argmax(1))[seen.any(1)],
+            )
+        )
+    )
     return x[index], y[index]
 
 

@@ -36,6 +36,7 @@ from .precision import (
     excitation,
     lead_of,
     model_loss,
+    runs_away,
     signals,
 )
 
@@ -179,6 +180,7 @@ def _model(model: Model, code: Code) -> tuple[str, str, str, list[str]]:
     members, embedded, combined = embedded_members(model, code.precision)
     functions = ", ".join(f"{code.name}_{f}" for f in ("init", "begin", "step"))
     notes = [f"{model.title} as C99 in {code.real}: {functions}"]
+    notes += runs_away(members)
     if code.single:
         notes.append(model_loss(model, members, embedded, combined))
     numbers = sum(len(v) for e in embedded for v in e.parts.values())

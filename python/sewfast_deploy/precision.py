@@ -18,6 +18,7 @@ from sewfast.control import Controller
 from sewfast.dataset import FloatArray
 from sewfast.errors import FitError, SettingError
 from sewfast.models import Ensemble, Model
+from sewfast.validation import doubling, largest_pole
 
 MOST_LOSS = 0.01
 """Largest change by single precision that is accepted, as a share of the output's span."""
@@ -100,7 +101,9 @@ def model_loss(
 ) -> str:
     """A note on the loss of single precision; `SettingError` if it is more than `MOST_LOSS`."""
     _, exact, _ = embedded_members(model, "f64")
-    u = excitation(model, _SAMPLES)
+    # errors of an unstable model grow as its outputs do
+    samples = min([_SAMPLES, *(n for m in members if (n := doubling(m)) is not None)])
+    u = excitation(model, samples)
     with np.errstate(all="ignore"):
         double = combined_run(members, exact, combined, u, "f64")
         single = combined_run(members, embedded, combined, u, "f32")
@@ -122,7 +125,19 @@ def model_loss(
             received=f"{got}{slow}",
             remedy="deploy it with precision f64, or identify it at a longer sample time",
         )  # fmt: skip
-    return f"single precision changes a free run of {_SAMPLES} samples by {loss:.1e} of its span"
+    return f"single precision changes a free run of {samples} samples by {loss:.1e} of its span"
+
+
+def runs_away(members: list[Model]) -> list[str]:
+    """A note on an unstable model, whatever the precision."""
+    unstable = [(n, m) for m in members if (n := doubling(m)) is not None]
+    if not unstable:
+        return []
+    ahead, worst = min(unstable, key=lambda pair: pair[0])
+    return [
+        f"the model is unstable, with a pole at {largest_pole(worst):.6g}: in any precision its "
+        f"free run doubles every {ahead} samples; begin it anew from measured outputs as often"
+    ]
 
 
 # --- The controller -------------------------------------------------------------------------------

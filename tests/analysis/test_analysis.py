@@ -248,6 +248,9 @@ def test_files_and_figures_are_whole(tmp_path: Path) -> None:
     assert drawn["responses"].axes[0].get_ylabel() == "output [RPM]"
     assert "[Hz]" in drawn["bode"].axes[3].get_xlabel()
     written = several().save(tmp_path / "new")
+    drawn = [path.read_bytes() for path in written if path.suffix == ".png"]
+    assert drawn
+    assert all(content.startswith(b"\x89PNG") for content in drawn)
     assert all(p.stat().st_size > 1000 for p in written)
     told = json.loads((tmp_path / "new" / "analysis.json").read_text())
     assert told["format"] == "sewfast.analysis"

@@ -242,6 +242,16 @@ def test_simulate_is_the_free_run_of_the_api(tmp_path: Path, walk: Path) -> None
     np.testing.assert_array_equal([float(r[2]) for r in rows], expected)
 
 
+def test_simulate_says_that_an_unstable_model_runs_away(tmp_path: Path) -> None:
+    falling = api.LinearOE.from_tf([0.0, 1.0], [1.0, -1.05], 0.001, input_names=("u",))
+    falling.save(tmp_path / "falling.json")
+    api.write_table(tmp_path / "inputs.csv", {"t": 0.001 * np.arange(2000), "u": np.ones(2000)})
+    arguments = ("simulate", "falling.json", "inputs.csv", "--init", 0, "-o", "p.csv")
+    assert "doubles every 14 samples" in sewfast(tmp_path, *arguments).out
+    found = json.loads(sewfast(tmp_path, *arguments, "--json").out)
+    assert found["doubles_every"] == 14
+
+
 def test_simulate_needs_no_output_beyond_its_start(tmp_path: Path, walk: Path) -> None:
     head, rows = header_and_rows(walk / "two.csv")
     emptied = [row if k < 20 else [*row[:2], ""] for k, row in enumerate(rows)]

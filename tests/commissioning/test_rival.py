@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -193,3 +194,22 @@ def test_the_rival_learns_where_the_drive_is_linear() -> None:
     stood_in = alone.alone(judge)
     assert stood_in.ensemble.members == (alone.model,)
     assert stood_in.rmse == (alone.rmse,)
+
+
+def test_what_a_frozen_sensor_said_is_not_learned() -> None:
+    bench = MachineBench(VirtualMachine())
+    asked = demands(
+        bench, u_max=None, speed=None, references=None, members=1, evaluations=1, seed=0, threads=1
+    )
+    rng = np.random.default_rng(0)
+    gentle = 2.0 + np.repeat(rng.uniform(-0.5, 0.5, 40), 100)
+    record = bench.excite(gentle, "gentle")
+    judge = bench.excite(np.repeat([1.5, 2.5, 3.0, 2.0], 600), "levels")
+    fopdt = Fopdt(K=490.0, T=0.25, L=0.008)
+
+    y = record.y.copy()
+    y[1000:2200] = y[1000]
+    sound, beside = (linear_rival([r], judge, fopdt, asked) for r in (record, replace(record, y=y)))
+    assert sound is not None
+    assert beside is not None
+    assert beside.rmse < 2.0 * sound.rmse  # 15 times without the mask

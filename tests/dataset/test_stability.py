@@ -136,6 +136,16 @@ def test_an_unstable_plant_is_identified_and_tuned_without_an_option() -> None:
     assert np.abs(after.y[-100:] - 0.05).max() < 0.01
 
 
+@pytest.mark.parametrize("every", [2, 9])
+def test_outputs_that_are_missing_one_by_one_are_predicted(every: int) -> None:
+    _, data = held()
+    data = data.mask(np.arange(len(data)) % every == every - 1)
+    assert diagnose(data).find("unstable") is not None
+    model = identify(data)
+    assert isinstance(model, ARX)
+    assert np.abs(model.poles).max() == pytest.approx(1.0502, abs=3e-3)
+
+
 def test_gaps_and_a_level_at_rest_are_no_obstacle() -> None:
     _, data = held()
     (e,) = data.experiments

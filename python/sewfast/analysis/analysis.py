@@ -504,7 +504,8 @@ def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> li
                     text = svg(figure, f"analysis-{name}", ALT[name])
                     if png:
                         content = io.BytesIO()
-                        figure.savefig(content, dpi=150)
+                        # `svg` leaves its canvas, whose own format is SVG
+                        figure.savefig(content, format="png", dpi=150)
                         contents[place / f"{name}.png"] = content.getvalue()
                 contents[place / f"{name}.svg"] = text.encode()
             storage.replace_files(contents)

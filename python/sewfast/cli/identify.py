@@ -430,6 +430,7 @@ def validate_command(args: argparse.Namespace) -> None:
 
 def simulate_command(args: argparse.Namespace) -> None:
     from ..models import load_model
+    from ..validation import doubling
 
     require_place(args.out, TABLES)
     model = load_model(args.model)
@@ -438,12 +439,27 @@ def simulate_command(args: argparse.Namespace) -> None:
     (y_hat,) = model.simulate(data, init=args.init)
     columns = {"t": _time(table, data), **_inputs(data), "y_hat": y_hat}
     low, high = float(y_hat.min()), float(y_hat.max())
+    ahead = doubling(model)
+    lines = [f"{model.title}, free run of {len(y_hat)} samples: y_hat from {low:.6g} to {high:.6g}"]
+    if ahead is not None:
+        lines.append(
+            "note: the model is unstable, as a plant that only a loop holds: without one its run "
+            f"doubles every {ahead} samples, whatever was recorded; sewfast validate begins it "
+            "anew as often, sewfast run closes a loop around it"
+        )
     write_columns(
         args.out,
         columns,
         {},
-        {"n": len(y_hat), "init": args.init, "Ts": data.Ts, "y_hat_min": low, "y_hat_max": high},
-        [f"{model.title}, free run of {len(y_hat)} samples: y_hat from {low:.6g} to {high:.6g}"],
+        {
+            "n": len(y_hat),
+            "init": args.init,
+            "Ts": data.Ts,
+            "y_hat_min": low,
+            "y_hat_max": high,
+            "doubles_every": ahead,
+        },
+        lines,
         as_json=args.json,
     )
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..dataset import Dataset, Experiment
 from ..dataset.pieces import thinned
+from ..dataset.sensor import measuring
 from ..errors import FitError
 from ..evidence import ReportCard, check, with_training_evidence
 from ..identification import seeded
@@ -58,14 +59,14 @@ def train(
     Raises `Refusal` if no network can be trained, or the best one does not predict well enough, and
     `Interrupted` on Ctrl-C.
     """
-    data = thinned(Dataset.concat([r.dataset() for r in recordings]), MOST_SAMPLES)
+    data = thinned(_measured(recordings), MOST_SAMPLES)
     members = _members(data, demands, progress)
     require(
         bool(members),
         "expected networks that can be trained on the recordings, none could; see the recordings "
         "and `sewfast identify`",
     )
-    held_out = judge.dataset()
+    held_out = _measured([judge])
     scores = [validate_member(m, held_out) for m in members]
     best = min(rmse for rmse, _ in scores)
     # who errs by twice as much as the best on held-out data is left out, but not within .02 of the
@@ -88,6 +89,11 @@ def train(
         len(members) - len(kept),
         check(members[min(kept, key=lambda i: scores[i][0])], held_out),
     )
+
+
+def _measured(recordings: Sequence[Recording]) -> Dataset:
+    """The recordings without what no plant has left in them, as `identify` takes them."""
+    return measuring(Dataset.concat([r.dataset() for r in recordings]))
 
 
 def validate_member(model: Model, data: Dataset) -> tuple[float, float]:
@@ -190,7 +196,7 @@ class Rival:
             (self.rmse,),
             self.fit_percent,
             0,
-            check(self.model, judge.dataset()),
+            check(self.model, _measured([judge])),
         )
 
 
@@ -205,10 +211,11 @@ def linear_rival(
     fitted. `judge` is the held-out recording, `fopdt` gives the command that holds a speed, and the
     order is one of `orders`.
     """
-    found = [part for r in recordings for part in _stretches(r, fopdt, LINEAR * demands.u_max)]
+    whole, reach = _measured(recordings), LINEAR * demands.u_max
+    pairs = zip(recordings, whole.experiments, strict=True)
+    found = [part for r, e in pairs for part in _stretches(r, e, fopdt, reach)]
     if not found:
         return None
-    whole = recordings[0].dataset()
     data = thinned(replace(whole, experiments=tuple(found)), MOST_SAMPLES)
     parts = folds(data)
     if not parts:
@@ -218,16 +225,17 @@ def linear_rival(
     if not fits:
         return None
     model = wrap(LinearOE, fits[simplest(fits)][0], data)
-    rmse, fit = validate_member(model, judge.dataset())
+    rmse, fit = validate_member(model, _measured([judge]))
     return Rival(model, rmse, fit)
 
 
-def _stretches(recording: Recording, fopdt: Fopdt, reach: float) -> list[Experiment]:
+def _stretches(
+    recording: Recording, experiment: Experiment, fopdt: Fopdt, reach: float
+) -> list[Experiment]:
     """The stretches with the command within `reach` [V] of the one that holds the speed."""
     holding = (recording.y - fopdt.offset) / fopdt.K
     near = np.concatenate([[False], np.abs(recording.u - holding) <= reach, [False]])
     begins, ends = np.flatnonzero(np.diff(near)).reshape(-1, 2).T
-    (experiment,) = recording.dataset().experiments
     runs = zip(begins, ends, strict=True)
     # least samples of a stretch: in shorter ones the initial state dominates
     return [experiment.cut(int(a), int(b)) for a, b in runs if b - a >= 200]

@@ -157,7 +157,8 @@ class Motor(Findings):
         k_v, tau = of["k_e"] + of["k_b"], max(of["tau"], 1e-3 * self.Ts)
         gain = 1.0 / (k_v * rad_per_second(self.speed_unit))
         lags = (of["k_a"] + tau * of["k_b"]) / k_v, tau * of["k_a"] / k_v
-        theta = np.array([*np.log([gain, *lags]), of["delay"] / self.Ts])
+        # an inertia of 0 has no lag, but a logarithm
+        theta = np.array([*np.log(np.maximum([gain, *lags], 1e-300)), of["delay"] / self.Ts])
         return sampled_model(theta, self.Ts, self.u_unit, self.speed_unit)
 
     def machine(self, *, u_limit: float | None = None) -> VirtualMachine:

@@ -545,6 +545,11 @@ impl Rows {
         let (least, shift) = shifts
             .map(|shift| (error(shift), shift))
             .min_by(|a, b| a.0.total_cmp(&b.0))?;
+        // if an end of the search does about as well, no shift is determined: a slow answer to one step goes on as it began
+        let end = error(far).min(error(-far));
+        if rest.alone() + end <= TIES * TIES * (rest.alone() + least) {
+            return None;
+        }
         let i = at(shift);
         let level = (sy[i] - sf[i]) / count[i].max(1.0);
         let from = |k: usize| (k as isize + shift).clamp(0, fit.len() as isize - 1) as usize;

@@ -6,6 +6,7 @@ use std::f64::consts::TAU;
 use crate::column::{LARGEST, MAD, MEASURED, distinct, median, quantile, range, runs};
 use crate::data::Samples;
 use crate::fourier;
+use crate::innovations::MOST_ORDER;
 use crate::{Record, Result, arx};
 
 /// Part of the samples that must be at one of two levels, and least part at each of them.
@@ -253,7 +254,7 @@ pub fn unstable_pole(experiments: &[Samples]) -> Option<f64> {
             let part = second * k..(second + 1) * k;
             (
                 r.u[part.start * m..part.end * m].to_vec(),
-                r.y[part].to_vec(),
+                bridged(&r.y[part]),
             )
         };
         let parts: Vec<_> = experiments
@@ -266,6 +267,24 @@ pub fn unstable_pole(experiments: &[Samples]) -> Option<f64> {
     let (first, second) = (half(0), half(1));
     let (pole, growth) = if second.1 < first.1 { second } else { first };
     (growth >= GROWTH.ln()).then_some(pole)
+}
+
+/// An output whose short gaps are lines: every ninth value missing would leave no sample with a known past.
+fn bridged(y: &[f64]) -> Vec<f64> {
+    let mut found = y.to_vec();
+    for (first, count) in runs(y.iter().map(|y| y.is_nan())) {
+        if count > MOST_ORDER || first == 0 || first + count == y.len() {
+            continue;
+        }
+        let (from, slope) = (
+            y[first - 1],
+            (y[first + count] - y[first - 1]) / (count + 1) as f64,
+        );
+        for (k, y) in found[first..first + count].iter_mut().enumerate() {
+            *y = from + slope * (k + 1) as f64;
+        }
+    }
+    found
 }
 
 /// Modulus of the largest pole, and the logarithm of its growth over the mean experiment.

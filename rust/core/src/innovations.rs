@@ -14,17 +14,19 @@
 //! C(q) y^(k) = B(q) u(k) + (C(q) - A(q)) y(k) + offset.
 //! ```
 //!
-//! This is the free run of an output-error model whose inputs are `u` and the measured `y`, so that `oe` fits it.
+//! This is the free run of an output-error model whose inputs are `u` and the measured `y`, so that `oe` fits it. Where
+//! an output is missing, the prediction takes its place, and has no error.
 
 use nalgebra::DMatrix;
 
-use crate::column::{MEASURED, Rows, stretches};
+use crate::column::{MEASURED, Rows, runs};
 use crate::lagged::Lagged;
 use crate::linear::{LinearFit, LinearModel};
 use crate::{Error, Monitor, Record, Result, oe};
 
-/// Largest order, and how many orders in a row without gain end the search.
-const MOST_ORDER: usize = 8;
+/// Largest order. Longer runs of missing outputs part a record: a part costs as many initial states as its order.
+pub(crate) const MOST_ORDER: usize = 8;
+/// How many orders in a row without gain end the search.
 const PATIENCE: usize = 2;
 
 /// Fits ARMAX models of rising order and delay, and returns the plant of the one with the least Bayesian information
@@ -39,7 +41,7 @@ pub fn fit(
     max_iterations: usize,
     monitor: &Monitor,
 ) -> Result<LinearFit> {
-    let parts = stretches(records, MEASURED);
+    let parts = bridged(records);
     let channels = records.first().map_or(0, |r| r.channels);
     let of = |order, nk| one(&parts, channels, order, nk, max_iterations, monitor);
     let first = nk.unwrap_or(1);
@@ -72,6 +74,26 @@ pub fn fit(
         }
     }
     Ok(best.fit)
+}
+
+/// The stretches of the records, each from a known sample to another, in which a few outputs at a time can be missing.
+fn bridged(records: &[Record]) -> Vec<Rows> {
+    let mut parts = Vec::new();
+    for record in records {
+        let rows = Rows::of(record, MEASURED);
+        let commanded = |k: usize| (0..record.channels).all(|j| rows.at(k, j).is_finite());
+        let mut found: Vec<(usize, usize)> = Vec::new();
+        for (first, count) in runs(rows.known()) {
+            match found.last_mut() {
+                Some((_, end)) if first - *end <= MOST_ORDER && (*end..first).all(commanded) => {
+                    *end = first + count;
+                }
+                _ => found.push((first, first + count)),
+            }
+        }
+        parts.extend(found.iter().map(|&(a, b)| rows.part(a, b - a)));
+    }
+    parts
 }
 
 /// A fit and its criterion.
@@ -107,7 +129,8 @@ fn one(
         .filter(able)
         .map(|p| advanced(p, channels, nk))
         .collect();
-    let samples: usize = columns.iter().map(|(_, y)| y.len()).sum();
+    let outputs = columns.iter().flat_map(|(_, y)| y);
+    let samples = outputs.filter(|y| !y.is_nan()).count();
     if samples < 10 * unknowns {
         return Err(Error::data(format!(
             "expected at least {} samples for {unknowns} parameters of a plant in a loop, got {samples}; record longer",
@@ -116,9 +139,9 @@ fn one(
     }
     let records = columns
         .iter()
-        .map(|(u, y)| Record::new(u, channels + 1, y))
+        .map(|(u, y)| Record::with_gaps(u, channels + 1, y))
         .collect::<Result<Vec<_>>>()?;
-    let fit = oe::fit(&records, order, order, 1, true, max_iterations, monitor)?;
+    let fit = oe::fit_predictor(&records, order, max_iterations, monitor)?;
     let fit = plant(&fit, order, channels, nk)?;
     let n = samples as f64;
     Ok(Candidate {
@@ -127,16 +150,24 @@ fn one(
     })
 }
 
-/// Inputs row by row, each command earlier by what its delay is beyond a sample, then the output; and the output alone.
+/// Inputs row by row, each command earlier by what its delay is beyond a sample, then the output, the last one where it
+/// is missing; and the output alone.
 fn advanced(part: &Rows, channels: usize, nk: usize) -> (Vec<f64>, Vec<f64>) {
     let late = nk.saturating_sub(1);
-    let rows = late..part.len();
+    let mut last = f64::NAN;
+    let held: Vec<f64> = part
+        .column(channels)
+        .map(|y| {
+            last = if y.is_nan() { last } else { y };
+            last
+        })
+        .collect();
     let row = |k: usize| {
         let inputs = (0..channels).map(move |j| part.at(k - late, j));
-        inputs.chain([part.at(k, channels)])
+        inputs.chain([held[k]])
     };
-    let u = rows.clone().flat_map(row).collect();
-    (u, rows.map(|k| part.at(k, channels)).collect())
+    let u = (late..part.len()).flat_map(row).collect();
+    (u, part.column(channels).skip(late).collect())
 }
 
 /// The plant of a predictor: `A` is `C` less the predictor's numerator of the output.
@@ -218,6 +249,21 @@ mod tests {
         assert!((most - 1.051_27).abs() < 3e-3, "{most}");
         let short = Record::new(&u[..30], 1, &y[..30]).unwrap();
         assert!(fit(&[short], None, 60, &Monitor::default()).is_err());
+    }
+
+    #[test]
+    fn missing_outputs_are_predicted() {
+        for missing in [9, 3, 2] {
+            let (u, mut y) = held(3_000, 0.003, 4);
+            y.iter_mut().step_by(missing).for_each(|y| *y = f64::NAN);
+            let record = Record::with_gaps(&u, 1, &y).unwrap();
+            let found = fit(&[record], None, 60, &Monitor::default()).unwrap();
+            let mut poles: Vec<f64> = found.model.poles().iter().map(|p| p.re).collect();
+            poles.sort_by(f64::total_cmp);
+            assert_eq!(found.model.a().len(), 2, "{missing}: {poles:?}");
+            assert!((poles[1] - 1.051_27).abs() < 3e-3, "{missing}: {poles:?}");
+            assert!((poles[0] - 0.951_23).abs() < 8e-3, "{missing}: {poles:?}");
+        }
     }
 
     #[test]

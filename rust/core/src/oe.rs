@@ -63,9 +63,32 @@ pub fn fit(
     monitor: &Monitor,
 ) -> Result<LinearFit> {
     let lags = arx::check(records, na, nb, nk)?;
+    by_search(records, lags, offset, false, max_iterations, monitor)
+}
+
+/// [`fit`] of a predictor of `order`: its last input is the output itself. In its place the model's own output is fed
+/// back where none was measured, so that the error there is 0, whatever the input has; starts use the input.
+pub(crate) fn fit_predictor(
+    records: &[Record],
+    order: usize,
+    max_iterations: usize,
+    monitor: &Monitor,
+) -> Result<LinearFit> {
+    let lags = arx::check(records, order, order, 1)?;
+    by_search(records, lags, true, true, max_iterations, monitor)
+}
+
+fn by_search(
+    records: &[Record],
+    lags: Lags,
+    offset: bool,
+    fed: bool,
+    max_iterations: usize,
+    monitor: &Monitor,
+) -> Result<LinearFit> {
     let iterations = max_iterations + (REFINED - 1) * HEAT;
     from_rest_or_motion(records, iterations, monitor, |records| {
-        let mut problem = OutputError::new(records, lags, offset, monitor)?;
+        let mut problem = OutputError::new(records, lags, offset, fed, monitor)?;
         let from_pieces = excerpt(records)
             .and_then(|pieces| searched_in(&pieces, &mut problem, max_iterations, monitor));
         let (best, spent) = match from_pieces {
@@ -106,7 +129,7 @@ pub fn fit_from(
         )));
     }
     from_rest_or_motion(records, max_iterations, monitor, |records| {
-        let mut problem = OutputError::new(records, lags, offset, monitor)?;
+        let mut problem = OutputError::new(records, lags, offset, false, monitor)?;
         let (cost, theta) = problem
             .with_states(initial)
             .or_else(|| problem.with_poles(&stabilised(initial.a())))
@@ -226,7 +249,7 @@ fn searched_in(
     monitor: &Monitor,
 ) -> Option<(Outcome, usize)> {
     let offset = problem.shared() > problem.lags.regressors();
-    let mut part = OutputError::new(pieces, problem.lags, offset, monitor).ok()?;
+    let mut part = OutputError::new(pieces, problem.lags, offset, problem.fed, monitor).ok()?;
     let (mut found, spent) = searched(&mut part, pieces, max_iterations, monitor)?;
     let states = vec![0.0; problem.parameters() - problem.shared()];
     found.theta.truncate(problem.shared());

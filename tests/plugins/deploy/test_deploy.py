@@ -549,7 +549,11 @@ def test_poles_that_single_precision_cannot_keep_are_refused(tmp_path: Path) -> 
     assert "double" in deploy(slow, tmp_path / "out", precision="f64").notes[0]
 
 
-def test_a_model_that_runs_away_is_refused_in_single_precision(tmp_path: Path) -> None:
+def test_a_model_that_runs_away_is_refused_in_single_precision(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # as one that is not linear, of which nobody knows when it doubles
+    monkeypatch.setattr("sewfast_deploy.precision.doubling", lambda _: None)
     with pytest.raises(FitError, match="stays finite"):
         deploy(_linear([-1.5], [1.0]), tmp_path)
 
@@ -701,3 +705,12 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     said = capsys.readouterr().err
     assert "other.json: expected a model or a controller" in said
     assert "'something'" in said
+
+
+@pytest.mark.parametrize("pole", [1.002, 1.05, 1.5])
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_an_unstable_model_is_said_to_be_one(pole: float, precision: str, tmp_path: Path) -> None:
+    model = LinearOE.from_tf([0.0, 0.1], [1.0, -pole], 0.01)
+    notes = str(deploy(model, tmp_path, precision=precision))
+    assert "the model is unstable" in notes
+    assert "in any precision its free run doubles every" in notes

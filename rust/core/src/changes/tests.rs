@@ -36,6 +36,27 @@ fn a_sound_record_has_no_change() {
 }
 
 #[test]
+fn a_slow_answer_to_one_step_has_lost_no_rows() {
+    let mut random = Random::new(65);
+    for _ in 0..60 {
+        let n = random.between(150.0, 600.0) as usize;
+        let at = random.between(3.0, 21.0) as usize;
+        let poles = [15.0, 5.0].map(|tau: f64| (-1.0 / (tau * random.between(1.0, 5.0))).exp());
+        let u: Vec<f64> = (0..n).map(|k| f64::from(u8::from(k >= at))).collect();
+        let mut x = [0.0; 2];
+        let y = u.iter().map(|u| {
+            x = [
+                poles[0] * x[0] + (1.0 - poles[0]) * u,
+                poles[1] * x[1] + (1.0 - poles[1]) * x[0],
+            ];
+            x[1] + 0.003 * random.normal()
+        });
+        let y = y.collect();
+        assert_eq!(change_of(&[(u, y)], 1), None);
+    }
+}
+
+#[test]
 fn another_scale_of_a_sweep_is_found() {
     for later in [3.0, 0.25] {
         let sine = |k: usize| (k as f64 * (0.015 + 2e-5 * k as f64)).sin();

@@ -23,6 +23,8 @@ pub(super) struct OutputError<'a> {
     records: &'a [Record<'a>],
     monitor: &'a Monitor,
     offset: bool,
+    /// Whether the last input is the output itself, with as many lags as the model's own.
+    pub fed: bool,
     /// Number of samples that count, and the sum of their weights; both are equal if all count alike.
     samples: f64,
     weight: f64,
@@ -42,6 +44,7 @@ impl<'a> OutputError<'a> {
         records: &'a [Record<'a>],
         lags: Lags,
         offset: bool,
+        fed: bool,
         monitor: &'a Monitor,
     ) -> Result<Self> {
         let samples: usize = records.iter().map(Record::counting).sum();
@@ -64,6 +67,7 @@ impl<'a> OutputError<'a> {
             records,
             monitor,
             offset,
+            fed,
             samples: samples as f64,
             weight: records.iter().map(Record::total_weight).sum(),
             places,
@@ -212,6 +216,9 @@ impl<'a> OutputError<'a> {
                 return None;
             }
             lags.write_inputs(record.u, k, &mut self.phi[lags.na..]);
+            if self.fed {
+                feed_back(&mut self.phi, lags.na, record.y, k);
+            }
             let y = model.output(&self.phi);
             push_past(&mut self.phi[..lags.na], y);
             *out = y;
@@ -239,7 +246,7 @@ impl<'a> OutputError<'a> {
             lags.regressors(),
             lags.regressors() + usize::from(self.offset),
         );
-        let gains: Vec<f64> = theta[..na].iter().map(|a| -a).collect();
+        let mut gains: Vec<f64> = theta[..na].iter().map(|a| -a).collect();
         let state = self.state(theta, experiment);
         self.phi[..na].copy_from_slice(&state);
         let rest = self.places[experiment]
@@ -260,6 +267,13 @@ impl<'a> OutputError<'a> {
                 return;
             }
             lags.write_inputs(record.u, k, &mut self.phi[na..]);
+            if self.fed {
+                feed_back(&mut self.phi, na, record.y, k);
+                for (i, gain) in gains.iter_mut().enumerate() {
+                    let own = is_missing(record.y, k, i);
+                    *gain = if own { theta[n_phi - na + i] } else { 0.0 } - theta[i];
+                }
+            }
             let phi = &self.phi;
             let weight = weights.map_or(1.0, |w| w[k]);
             let error = (record.y[k] - y, weight);
@@ -272,6 +286,22 @@ impl<'a> OutputError<'a> {
                 row[n_phi..shared].fill(1.0);
             });
             push_past(&mut self.phi[..na], y);
+        }
+    }
+}
+
+/// Whether the output at `lag + 1` samples before `k` was recorded without a value.
+fn is_missing(y: &[f64], k: usize, lag: usize) -> bool {
+    k > lag && y[k - lag - 1].is_nan()
+}
+
+/// Past outputs that are inputs, where they were not measured: the model's own.
+fn feed_back(phi: &mut [f64], na: usize, y: &[f64], k: usize) {
+    let (own, inputs) = phi.split_at_mut(na);
+    let first = inputs.len() - na;
+    for (i, (fed, own)) in inputs[first..].iter_mut().zip(own).enumerate() {
+        if is_missing(y, k, i) {
+            *fed = *own;
         }
     }
 }
@@ -339,10 +369,23 @@ mod tests {
         let theta = [-1.2, 0.5, 0.4, -0.3, 0.1, 0.3, -0.2, 0.7, 0.4];
         let w = weights(400, 1);
         let weighted = [records[0].with_weights(&w).unwrap(), records[1]];
-        let problem = |records| OutputError::new(records, lags, true, &monitor).unwrap();
+        let problem = |records| OutputError::new(records, lags, true, false, &monitor).unwrap();
         check_gradient(&mut problem(&weighted), &theta);
         let begun = [records[0].at_rest(true), records[1]];
         check_gradient(&mut problem(&begun), &theta[..7]);
+        // outputs that are fed back, with and without some of them
+        let both: Vec<f64> = u
+            .iter()
+            .zip(&y)
+            .flat_map(|(u, y)| [*u, if y.is_nan() { 0.0 } else { *y }])
+            .collect();
+        let fed = [Record::with_gaps(&both, 2, &y).unwrap()];
+        let lags = Lags::new(2, 2, 1, 2).unwrap();
+        let mut predictor = OutputError::new(&fed, lags, true, true, &monitor).unwrap();
+        check_gradient(
+            &mut predictor,
+            &[-1.2, 0.5, 0.4, -0.3, 0.5, -0.3, 0.1, 0.3, -0.2],
+        );
         // weights of 1, and of 3 on a part
         let part = |k: usize| k % 7 < 3;
         let tripled: Vec<f64> = (0..400).map(|k| if part(k) { 3.0 } else { 1.0 }).collect();
