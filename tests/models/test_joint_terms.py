@@ -109,11 +109,13 @@ def test_a_file_from_before_the_terms_loads(tmp_path: Path) -> None:
     joint = physics(_rubbing(600, 3), structure="joint")
     joint.to_model().save(tmp_path / "m.json")
     document = json.loads((tmp_path / "m.json").read_text())
-    for name in ("k_m", "k_g", "creep", "exponent"):
+    for name in ("k_m", "k_g", "creep", "exponent", "k_mm"):
         value = document["parameters"]["joint"].pop(name)
         assert value == 0.0 or name in document["parameters"]["free"]
     document["parameters"]["free"] = [
-        n for n in document["parameters"]["free"] if n not in ("k_m", "k_g", "creep", "exponent")
+        n
+        for n in document["parameters"]["free"]
+        if n not in ("k_m", "k_g", "creep", "exponent", "k_mm")
     ]
     document["parameters"]["theta"] = document["parameters"]["theta"][
         : len(document["parameters"]["free"])

@@ -49,11 +49,12 @@ class Joint(Findings):
     parameters : mapping of Parameter by name
         Value, 95 % interval and unit, in units of the command, or if `inside`, of the position
         command: `inertia` (per acceleration), `viscous` (per speed), `friction` (against dry
-        friction), `offset`, `delay`; of the terms that the record shows `lag`, `stribeck` and
-        `stribeck_speed`, `stribeck_exponent`, `gravity`, `load_friction` (per load that the gears
-        carry), `drive_friction` and `outer_friction` (per drive, and per load from outside),
-        `creep` (time constant with which friction holds), `dead_band`, `reach` (largest
-        output of the controller) and `damping` (k_d / k_p); if `inside`, `stiffness` (k_p / J).
+        friction), `offset`, `delay`; of the terms that the record shows `lag`, `stribeck`,
+        `stribeck_speed` and `stribeck_exponent`, `gravity`, `load_friction` (per load that the
+        gears carry), `drive_friction` and `outer_friction` (per drive, and per load from outside),
+        `quadratic_friction` (per square of the drive), `creep` (time constant with which friction
+        holds), `dead_band`, `reach` (largest output of the controller) and `damping` (k_d / k_p);
+        if `inside`, `stiffness` (k_p / J).
     undetermined : mapping of str by name
         Parameters that the record does not determine, and why.
     terms : tuple of str
@@ -242,6 +243,7 @@ def _quantities(
             ("drive_friction", "1", lambda p: p["k_m"]),
             ("outer_friction", "1", lambda p: p["k_g"]),
         ],
+        "quadratic": [("quadratic_friction", f"1/{u}", lambda p: p["k_mm"])],
         "creep": [("creep", "s", lambda p: p["creep"])],
         "reach": [("reach", u, lambda p: p["reach"]), ("damping", "s", lambda p: p["damping"])],
         "dead_band": [("dead_band", u, lambda p: p["dead_band"])],

@@ -7,6 +7,7 @@ Positions of a simulator are the same in either case.
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ LATER = {
     "stribeck": "friction that falls with speed",
     "loaded": "friction per load",
     "directional": "friction per drive and load",
+    "quadratic": "friction per square of the drive",
     "dead_band": "dead band of the controller",
 }
 """Terms that MuJoCo's joint and actuator do not have."""
@@ -126,6 +128,7 @@ class _Parts:
             "load_friction": of["k_l"],
             "load_friction_motor": of["k_m"],
             "load_friction_external": of["k_g"],
+            "load_friction_motor_quad": of["k_mm"] / scale,
             "gravity_cos": self.gravity[0],
             "gravity_sin": self.gravity[1],
             "offset": self.offset,
@@ -203,11 +206,13 @@ def checked(joint: Joint, text: str, data: Dataset) -> Replay:
     Raises `SettingError` without the package mujoco.
     """
     try:
-        import mujoco
-    except ImportError as e:
-        raise not_installed("mujoco", "a check in MuJoCo", "mujoco") from e
+        mujoco: Any = importlib.import_module("mujoco")
+    except ImportError as error:
+        raise not_installed("mujoco", "a check in MuJoCo", "mujoco") from error
     model = mujoco.MjModel.from_xml_string(text)
-    off, apart, own = [], [], joint.model.core
+    off: list[FloatArray] = []
+    apart: list[FloatArray] = []
+    own = joint.model.core
     to_command = factor(data.input_units[0]) if is_commanded(data) else 1.0
     for e in data.experiments:
         first = e.initial_samples(30)

@@ -184,7 +184,7 @@ def _completed(values: FloatArray, limit: float) -> FloatArray:
     return np.insert(values, min(at, len(values)), limit)
 
 
-_LATER = ("k_m", "k_g", "creep", "exponent")
+_LATER = ("k_m", "k_g", "creep", "exponent", "k_mm")
 _NUMBERS = (
     "Ts", "unit", "speed_scale", "command_scale", "residual_variance", "process_noise",
 )  # fmt: skip

@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,7 +36,8 @@ TERMS: dict[str, tuple[str, ...]] = {
     "stribeck": ("k_t", "w_s", "exponent"),
     "gravity": ("load_1c", "load_1s"),
     "loaded": ("k_l", "k_b"),
-    "directional": ("k_m", "k_g"),
+    "directional": ("k_m", "k_g", "k_b"),
+    "quadratic": ("k_mm",),
     "creep": ("creep",),
     "reach": ("reach", "damping"),
     "dead_band": ("dead_band",),
@@ -47,19 +48,22 @@ WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Delays of a start [samples]."""
 NOT_NEGATIVE = {
-    "k_e", "k_b", "tau", "delay", "k_s", "k_l", "k_m", "k_g", "creep", "dead_band", "damping",
+    "k_e", "k_b", "tau", "delay", "k_s", "k_l", "k_m", "k_g", "k_mm", "creep", "dead_band",
+    "damping",
 }  # fmt: skip
 POSITIVE = {"k_a", "w_s", "reach", "limit", "k_q"}
 EXPONENTS = (0.5, 3.0)
 """Exponents of Stribeck's fall that were measured (Armstrong-Helouvry 1994, Automatica 30)."""
 ITERATIONS, ENOUGH = 30, 1.0
+FLOOR = 1e-3
+"""Least part of a start that a positive parameter keeps."""
 SETTLED = 1e-2
 """Squared distances to the minimum in standard errors, at which a descent and the last one end."""
-NEARBY, NEAR = 4, 0.02
+NEARBY, NEAR = 6, 0.02
 """Starts around the fit, and their relative distance: of 6 MuJoCo joints two had a lower minimum
 nearby, with errors of reach and delay a tenth as large (.01 and .08 found the same)."""
 GLANCE, FINALISTS = 3, 3
-"""Iterations of each start of a term, and starts that are fitted further."""
+"""Iterations of each start of a term, and terms that are fitted further."""
 PIECES = 4
 """Pieces of the last fit, beside which the drift of a whole record is another error."""
 SHORTEST, FIRST = 50, 30
@@ -127,7 +131,7 @@ def fitted(
     found = fit.settled(found)
     known: tuple[Any, Any] = (None, None)
     if covariance:
-        known = found.core.covariance(_arrays(fit.pieces), found.states)
+        known = fit.covariance(found, terms)
     return JointFit(found.core, terms, missing, *known)
 
 
@@ -148,6 +152,8 @@ class _Fit:
         self.unit, self.command_unit = factor(data.output_unit), factor(data.input_units[0])
         self.is_angle = radians(data.output_unit) is not None
         self.pieces: Sequence[Experiment] = data.experiments
+        self.least: dict[str, float] = {}
+        """Least inertia: of the start, since bounds relative to each fit would compound."""
 
     def cut(self, share: int) -> None:
         """Each experiment in as many pieces as belong to it."""
@@ -187,6 +193,7 @@ class _Fit:
                 cost = squares(core, self.pieces, core.first_states(_arrays(self.pieces)))
                 if cost < least:
                     best, least = core, cost
+                    self.least = {"k_a": FLOOR * k_a}
         if best is None:
             raise FitError(
                 name="data", expected="a position that follows its command as a joint does",
@@ -223,7 +230,9 @@ class _Fit:
         self, core: _core.GreyBox, iterations: int = ITERATIONS, enough: float = ENOUGH
     ) -> Descent:
         """The least squares over the pieces, whose states are fitted with the core."""
-        return descended(core, core.theta, self.pieces, self.look, iterations, enough=enough)
+        return descended(
+            core, core.theta, self.pieces, self.look, iterations, enough=enough, least=self.least
+        )
 
     def without_delay(self, found: Descent) -> Descent:
         """The fit, or the one that a descent without a delay finds: stops of dry friction give the
@@ -241,37 +250,65 @@ class _Fit:
         samples that the residuals' correlation leaves).
         """
         own, taken = plain, list[str]()
-        tried = [t for t in TERMS if self._may_have(t, plain.core)]
-        while tried:
-            found = []
-            for term in tried:
-                for begun in self._begun(own.core, term):
-                    try:
-                        found.append((term, self.descended(begun, GLANCE)))
-                    except (FitError, SettingError):
-                        continue
-            if not found:
-                break
-            found.sort(key=lambda f: f[1].cost)
-            best = [(term, self.descended(f.core, 12)) for term, f in found[:FINALISTS]]
-            term, one = min(best, key=lambda f: f[1].cost)
+        while found := self._more(own, taken, FINALISTS):
+            term, one = found[0]
             if not self._explains(own, one, term, self.independent(own)):
                 break
             own = one
-            tried = [t for t in tried if t != term]
             taken.append(term)
         own = self.descended(own.core)
         # one that another has made superfluous goes again
         for term in taken[:-1]:
-            try:
-                fewer = self.descended(_without(own.core, term))
-            except FitError:
-                continue
-            if not self._explains(fewer, own, term, self.independent(own)):
+            fewer = self._tried(_without(own.core, term, taken), ITERATIONS)
+            if fewer and not self._explains(fewer, own, term, self.independent(own)):
                 own = fewer
                 taken.remove(term)
-        missing = tuple(t for t in TERMS if t not in taken and self._may_have(t, plain.core))
+        missing = tuple(t for t in TERMS if t not in taken and self._may_have(t, own.core))
         return own, tuple(t for t in TERMS if t in taken), missing
+
+    def _more(
+        self, own: Descent, taken: Sequence[str], most: int | None = None
+    ) -> list[tuple[str, Descent]]:
+        """Fits with one more term, at `most` so many, the best one first."""
+        found: dict[str, Descent] = {}
+        for term in TERMS:
+            if term in taken or not self._may_have(term, own.core):
+                continue
+            for begun in self._begun(own.core, term):
+                if one := self._tried(begun, GLANCE):
+                    found[term] = min(found.get(term, one), one, key=lambda f: f.cost)
+        first = sorted(found.items(), key=lambda f: f[1].cost)[:most]
+        best = [(term, f) for term, one in first if (f := self._tried(one.core, 12))]
+        return sorted(best, key=lambda f: f[1].cost)
+
+    def _tried(self, core: _core.GreyBox, iterations: int) -> Descent | None:
+        """A descent; None from where a free run does not stay finite."""
+        try:
+            return self.descended(core, iterations)
+        except (FitError, SettingError):
+            return None
+
+    def covariance(self, own: Descent, taken: Sequence[str]) -> tuple[FloatArray, Any]:
+        """Covariance of the free parameters, and which of them are determined.
+
+        Beside the fit stand others that the record hardly tells from it: with one more term, or
+        integrated in half the steps. Each counts by its Akaike weight, with the number of
+        independent samples (unconditional variance: Burnham and Anderson 2002, section 4.3).
+        """
+        found, determined = own.core.covariance(_arrays(self.pieces), own.states)
+        n, p = self.independent(own), len(own.core.theta)
+        finer = changed(own.core, steps=2 * own.core.settings["steps"])
+        others = [(len(TERMS[term]), f) for term, f in self._more(own, taken)]
+        if one := self._tried(finer, 12):
+            others.append((0, one))
+        total, apart = 1.0, np.zeros((p, p))
+        for more, other in others:
+            gain = n * math.log(max(own.cost, 1e-300) / max(other.cost, 1e-300))
+            weight = math.exp(min(0.5 * gain - more, 9.0))
+            off = other.core.theta[:p] - own.core.theta
+            total += weight
+            apart += weight * np.outer(off, off)
+        return found + apart / total, determined
 
     def settled(self, found: Descent) -> Descent:
         """The least of descents from around the fit: where dry friction stops and a controller
@@ -296,8 +333,9 @@ class _Fit:
         if term == "gravity":
             return self.is_angle
         # behind a controller inside, a lag of the current is a part of the delay
+        integrates: bool = core.settings["integrator"]
         only = {"lag": True, "reach": False, "dead_band": False}
-        return only.get(term, core.settings["integrator"]) == core.settings["integrator"]
+        return only.get(term, integrates) == integrates
 
     def _begun(self, core: _core.GreyBox, term: str) -> Iterator[_core.GreyBox]:
         """Starts of a core with one more term."""
@@ -314,14 +352,16 @@ class _Fit:
             ],
             "gravity": [{"load_1c": 0.0, "load_1s": 0.0}],
             "loaded": [{"k_l": 0.05, "k_b": 0.0}],
-            "directional": [{"k_m": 0.03, "k_g": 0.03}],
+            "directional": [{"k_m": 0.03, "k_g": 0.03, "k_b": 0.0}],
+            "quadratic": [{"k_mm": 0.03 / scale}],
             "creep": [{"creep": 0.1 * s["Ts"]}],
             "reach": [{"reach": part * scale, "damping": 0.0} for part in (1.0, 2.0, 3.0)],
             "dead_band": [{"dead_band": part * size} for part in (0.3, 0.8)],
         }
         for values in starts[term]:
-            names = [*s["free"], *(PLACES[n] for n in values)]
-            yield changed(core, free=names, theta=np.array([*core.theta, *values.values()]))
+            more = {PLACES[n]: v for n, v in values.items() if PLACES[n] not in s["free"]}
+            theta = np.array([*core.theta, *more.values()])
+            yield changed(core, free=[*s["free"], *more], theta=theta)
 
     def independent(self, found: Descent) -> float:
         """Number of samples that are as good as independent, by the residuals' correlation."""
@@ -335,9 +375,10 @@ def squares(core: _core.GreyBox, pieces: Sequence[Experiment], states: FloatArra
     return total
 
 
-def _without(core: _core.GreyBox, term: str) -> _core.GreyBox:
-    """The core without a term."""
-    s, gone = core.settings, [PLACES[n] for n in TERMS[term]]
+def _without(core: _core.GreyBox, term: str, taken: Sequence[str]) -> _core.GreyBox:
+    """The core without a term, with the parameters that others of those taken share with it."""
+    others = {n for t in taken if t != term for n in TERMS[t]}
+    s, gone = core.settings, [PLACES[n] for n in TERMS[term] if n not in others]
     kept = [j for j, place in enumerate(s["free"]) if place not in gone]
     values, own = s["values"].copy(), list(s["joint"])
     for place in gone:
@@ -357,10 +398,11 @@ def descended(
     iterations: int,
     prior: FloatArray | None = None,
     enough: float = ENOUGH,
+    least: Mapping[str, float] | None = None,
 ) -> Descent:
     """The least sum of squares from `start` (p,). The initial speed and position of
     each piece are fitted too. `prior` (p,) are inverse standard deviations about 0, in units of the
-    residuals.
+    residuals; `least` bounds parameters that would else have a thousandth of their start.
     """
     names = {place: name for name, place in PLACES.items()}
     low, high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
@@ -370,7 +412,7 @@ def descended(
         elif names[place] == "exponent":
             low[j], high[j] = EXPONENTS
         elif names[place] in POSITIVE:
-            low[j] = 1e-3 * start[j]
+            low[j] = (least or {}).get(names[place], FLOOR * start[j])
     known = np.zeros(len(start)) if prior is None else prior
     best, cost, states = changed(core, theta=start).descended(
         _arrays(pieces), prior=known, low=low, high=high, enough=enough, iterations=iterations,

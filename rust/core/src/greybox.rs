@@ -20,7 +20,7 @@
 //! position command, and the loop gain of the controller is the unit of everything:
 //!
 //! ```text
-//! friction += k_l |x g(th) + offset + load(th)| + k_m |x g(th)| + k_g |offset + load(th)|
+//! friction += k_l |x g(th) + offset + load(th)| + k_m |x g(th)| + k_g |offset + load(th)| + k_mm (x g(th))^2
 //! 1 / (1 + (w / w_s)^2) becomes exp(-|w / w_s|^exponent) if the exponent is not 0
 //! v = (e - dead_band sign e) - damping w, |v| <= reach,    e = u - k_q q, 0 if |e| <= dead_band
 //! ```
@@ -324,8 +324,8 @@ struct Equations<const N: usize> {
     waves: [Option<Wave<N>>; ORDERS],
     /// Friction of gears per load that they carry.
     k_l: Option<Dual<N>>,
-    /// The same per drive, and per load from outside.
-    directional: Option<[Dual<N>; 2]>,
+    /// The same per drive, per load from outside, and per square of the drive.
+    directional: Option<[Dual<N>; 3]>,
     creep: Option<Dual<N>>,
     /// Exponent of the fall of the friction with speed.
     exponent: Option<Dual<N>>,
@@ -558,10 +558,11 @@ impl<const N: usize> Equations<N> {
             let carried = torque.plus(1.0, &turn.load);
             dry = dry.plus(carried.value.signum(), &k_l.times(&carried));
         }
-        if let Some([k_m, k_g]) = &self.directional {
+        if let Some([k_m, k_g, k_mm]) = &self.directional {
             dry = dry
                 .plus(torque.value.signum(), &k_m.times(&torque))
-                .plus(turn.load.value.signum(), &k_g.times(&turn.load));
+                .plus(turn.load.value.signum(), &k_g.times(&turn.load))
+                .plus(1.0, &k_mm.times(&torque.times(&torque)));
         }
         let most = dry.times(&turn.per_inertia).scaled(time);
         if let Some(creep) = &self.creep {

@@ -28,7 +28,7 @@ use crate::{Error, Result};
 use nalgebra::{DMatrix, DVector};
 
 /// Names of the parameters of a joint beyond those of a motor, in their order after [`PARAMETERS`]; 0 for none.
-pub const JOINT: [&str; 9] = [
+pub const JOINT: [&str; 10] = [
     "k_l",
     "k_q",
     "damping",
@@ -38,6 +38,7 @@ pub const JOINT: [&str; 9] = [
     "k_g",
     "creep",
     "exponent",
+    "k_mm",
 ];
 const K_L: usize = 0;
 const K_Q: usize = 1;
@@ -48,6 +49,7 @@ const K_M: usize = 5;
 const K_G: usize = 6;
 const CREEP: usize = 7;
 const EXPONENT: usize = 8;
+const K_MM: usize = 9;
 
 /// Most states: speed, drive, previous command, and the position if it is the output.
 const STATES: usize = 4;
@@ -385,7 +387,11 @@ impl<const N: usize> Stepper<N> {
         };
         let some = |j: usize| frame.joint[j] != 0.0 || run.free.contains(&(OF_JOINT + j));
         equations.k_l = some(K_L).then(|| joint(K_L));
-        equations.directional = (some(K_M) || some(K_G)).then(|| [joint(K_M), joint(K_G)]);
+        let directional = [K_M, K_G, K_MM];
+        equations.directional = directional
+            .iter()
+            .any(|&j| some(j))
+            .then(|| directional.map(joint));
         equations.creep = some(CREEP).then(|| joint(CREEP));
         equations.exponent = some(EXPONENT).then(|| joint(EXPONENT));
         equations.inner = some(K_Q).then(|| Inner {

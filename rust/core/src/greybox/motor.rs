@@ -25,7 +25,7 @@ pub(crate) struct Motor {
     uneven: Option<f64>,
     sag: Option<f64>,
     k_l: Option<f64>,
-    directional: Option<[f64; 2]>,
+    directional: Option<[f64; 3]>,
     creep: Option<f64>,
     exponent: Option<f64>,
     inner: Option<Inner>,
@@ -269,10 +269,11 @@ impl Motor {
         if let Some(k_l) = self.k_l {
             dry = dry.add(all(k_l).mul(drive.add(load)).abs());
         }
-        if let Some([k_m, k_g]) = self.directional {
+        if let Some([k_m, k_g, k_mm]) = self.directional {
             dry = dry
                 .add(all(k_m).mul(drive).abs())
-                .add(all(k_g).mul(load).abs());
+                .add(all(k_g).mul(load).abs())
+                .add(all(k_mm).mul(drive.mul(drive)));
         }
         let most = dry.mul(all(self.per_inertia)).mul(all(time));
         let moved = free.sub(direction.mul(most));

@@ -358,7 +358,7 @@ proptest! {
         let mut frame = base.frame().clone();
         frame.position = true;
         frame.joint[0] = with(given[0], k_l);
-        frame.joint[5..].copy_from_slice(&[with(given[4], 0.03), with(given[4], 0.02), with(given[5], 0.01), with(given[5], 1.5)]);
+        frame.joint[5..].copy_from_slice(&[with(given[4], 0.03), with(given[4], 0.02), with(given[5], 0.01), with(given[5], 1.5), with(given[4], 0.01)]);
         frame.values[8] = with(given[5], 0.1);
         if inside {
             frame.joint[1..5].copy_from_slice(&[1.0, 0.02, with(given[1], dead), with(given[2], reach)]);

@@ -143,7 +143,7 @@ fn joint(inside: bool, units: usize) -> GreyBox {
     (frame.position, frame.unit, frame.speed_scale) = (true, 0.5, 3.0);
     frame.values[..3].copy_from_slice(&[0.4, 0.0, 0.05]);
     (frame.values[10], frame.values[11]) = (0.3, -0.4);
-    frame.joint = [0.05, 2.0, 0.02, 0.05, 1.5, 0.03, 0.02, 1e-3, 1.4];
+    frame.joint = [0.05, 2.0, 0.02, 0.05, 1.5, 0.03, 0.02, 1e-3, 1.4, 0.01];
     frame.free = vec![0, 2, 6, 7, 8, 9, 10, 11, DELAY];
     frame.free.extend(OF_JOINT..OF_JOINT + JOINT.len());
     if !inside {
