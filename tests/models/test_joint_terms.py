@@ -49,6 +49,7 @@ def _joint() -> Joint:
     return physics(_rubbing(3000, 1, creep=2e-3), structure="joint")
 
 
+@pytest.mark.slow("a fit with all terms")
 def test_friction_that_falls_with_speed_and_creeps_is_found() -> None:
     joint = _joint()
     assert {"stribeck", "creep", "gravity"} <= set(joint.terms)
@@ -60,6 +61,7 @@ def test_friction_that_falls_with_speed_and_creeps_is_found() -> None:
     assert joint.model.validate(fresh).simulation.rmse < 2.0 * STEP
 
 
+@pytest.mark.slow("a fit with all terms")
 def test_friction_per_drive_is_told_from_friction_per_load() -> None:
     joint = physics(_rubbing(3000, 2, share=0.15), structure="joint")
     assert {"loaded", "directional"} & set(joint.terms)

@@ -62,8 +62,8 @@ SETTLED = 1e-2
 NEARBY, NEAR = 6, 0.02
 """Starts around the fit, and their relative distance: of 6 MuJoCo joints two had a lower minimum
 nearby, with errors of reach and delay a tenth as large (.01 and .08 found the same)."""
-GLANCE, FINALISTS = 3, 3
-"""Iterations of each start of a term, and terms that are fitted further."""
+GLANCE = 3
+"""Iterations of each start of a term; the best start is fitted further."""
 PIECES = 4
 """Pieces of the last fit, beside which the drift of a whole record is another error."""
 SHORTEST, FIRST = 50, 30
@@ -178,7 +178,7 @@ class _Fit:
         for width in WIDTHS:
             self.look()
             starts = _core.greybox_regressed(
-                _arrays(self.pieces), width=width, delays=DELAYS, Ts=self.data.Ts,
+                _arrays(self.data.experiments), width=width, delays=DELAYS, Ts=self.data.Ts,
                 unit=self.unit, k_q=k_q,
             )  # fmt: skip
             for delay, start in zip(DELAYS, starts, strict=True):
@@ -246,11 +246,11 @@ class _Fit:
 
     def with_terms(self, plain: Descent) -> tuple[Descent, tuple[str, ...], tuple[str, ...]]:
         """The fit with those of the terms that lower the cost by more than their number explains:
-        one after the other, the one that lowers it most first (Schwarz 1978, with the number of
-        samples that the residuals' correlation leaves).
+        one after the other, the best one first (Schwarz 1978, with the number of samples that the
+        residuals' correlation leaves).
         """
         own, taken = plain, list[str]()
-        while found := self._more(own, taken, FINALISTS):
+        while found := self._more(own, taken):
             term, one = found[0]
             if not self._explains(own, one, term, self.independent(own)):
                 break
@@ -266,10 +266,13 @@ class _Fit:
         missing = tuple(t for t in TERMS if t not in taken and self._may_have(t, own.core))
         return own, tuple(t for t in TERMS if t in taken), missing
 
-    def _more(
-        self, own: Descent, taken: Sequence[str], most: int | None = None
-    ) -> list[tuple[str, Descent]]:
-        """Fits with one more term, at `most` so many, the best one first."""
+    def _more(self, own: Descent, taken: Sequence[str]) -> list[tuple[str, Descent]]:
+        """Fits with one more term, the best one first (Schwarz 1978)."""
+        n = self.independent(own)
+
+        def schwarz(of: tuple[str, Descent]) -> float:
+            return n * math.log(max(of[1].cost, 1e-300)) + len(TERMS[of[0]]) * math.log(n)
+
         found: dict[str, Descent] = {}
         for term in TERMS:
             if term in taken or not self._may_have(term, own.core):
@@ -277,9 +280,8 @@ class _Fit:
             for begun in self._begun(own.core, term):
                 if one := self._tried(begun, GLANCE):
                     found[term] = min(found.get(term, one), one, key=lambda f: f.cost)
-        first = sorted(found.items(), key=lambda f: f[1].cost)[:most]
-        best = [(term, f) for term, one in first if (f := self._tried(one.core, 12))]
-        return sorted(best, key=lambda f: f[1].cost)
+        best = [(term, f) for term, one in found.items() if (f := self._tried(one.core, 12))]
+        return sorted(best, key=schwarz)
 
     def _tried(self, core: _core.GreyBox, iterations: int) -> Descent | None:
         """A descent; None from where a free run does not stay finite."""
