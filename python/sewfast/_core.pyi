@@ -138,7 +138,7 @@ def minimised(
     exception that ended the descent after its start.
     """
 def sandwich_covariance(
-    jacobian: _F, residuals: _F, lengths: Sequence[int], windows: Sequence[int], channels: int = 1,
+    jacobian: _F, residuals: _F, lengths: Sequence[int], windows: Sequence[int], *, channels: int = 1,
     known: _F | None = None,
 ) -> _F:
     """Covariance (n, n) of an estimate from sums of scores over windows; rows by piece, then channel."""
