@@ -69,6 +69,8 @@ PIECES = 4
 SHORTEST, FIRST = 50, 30
 """Least samples of a piece, and those of its first outputs that give its state. A piece with fewer
 measured ones is left out."""
+LEAD = 10
+"""Samples before a piece whose commands may still act in it. They count as not measured."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
 """Factor from each unit of a length to m."""
 STEPS_PER_RADIAN = 100.0
@@ -451,7 +453,12 @@ def _cut(e: Experiment, length: float) -> list[Experiment]:
     for a, b in itertools.pairwise(edges.tolist()):
         measured = np.flatnonzero(np.isfinite(e.y[a:b]))
         if len(measured) >= min(FIRST, len(e)):
-            pieces.append(e.cut(a + int(measured[0]), a + int(measured[-1]) + 1))
+            first = a + int(measured[0])
+            lead = min(LEAD, first)
+            piece = e.cut(first - lead, a + int(measured[-1]) + 1)
+            y = piece.y.copy()
+            y[:lead] = np.nan
+            pieces.append(replace(piece, y=y))
     return pieces
 
 

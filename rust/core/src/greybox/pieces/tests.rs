@@ -33,8 +33,9 @@ fn joint(theta: &[f64; 6]) -> GreyBox {
 /// Commands and positions of the true joint, at random levels and with noise.
 fn recorded(noise: f64, seed: u64) -> (Vec<f64>, Vec<f64>) {
     let mut random = Random::new(seed);
-    let levels: Vec<f64> = (0..20).map(|_| 1.6 * random.uniform() - 0.8).collect();
-    let u: Vec<f64> = (0..1200).map(|k| levels[k / 60]).collect();
+    let levels: Vec<f64> = (0..21).map(|_| 1.6 * random.uniform() - 0.8).collect();
+    // a piece does not know the commands before it: none changes where one begins
+    let u: Vec<f64> = (0..1200).map(|k| levels[(k + 30) / 60]).collect();
     let model = joint(&TRUE);
     let mut y = model.simulate(&u, 1, &[0.0, 0.0, 0.0, u[0]]).unwrap();
     y.iter_mut().for_each(|y| *y += noise * random.normal());
