@@ -123,6 +123,28 @@ def greybox_normal(
     ``current``: samples [A], filter and resistance [command/A].
     """
 
+def greybox_regressed(
+    experiments: _Experiments, *, width: float, delays: Sequence[float], Ts: float,
+    unit: float, k_q: float,
+) -> list[tuple[float, float, float, float] | None]:
+    """What drives a joint per speed, acceleration, sign of the speed and at all, of signals smoothed over ``width``
+    samples, for each delay [samples]; None with too few samples.
+    """
+def minimised(
+    normal: Callable[[_F], tuple[float, _F, _F]], cost: Callable[[_F], float], start: _F, low: _F, high: _F, *,
+    count: float, enough: float, iterations: int,
+) -> tuple[_F, float, float, BaseException | None]:
+    """Least squares within bounds: parameters, cost, squared distance to the minimum in standard errors, and the
+    exception that ended the descent after its start.
+    """
+def sandwich_covariance(
+    jacobian: _F, residuals: _F, lengths: Sequence[int], windows: Sequence[int], *, channels: int = 1,
+    known: _F | None = None,
+) -> _F:
+    """Covariance (n, n) of an estimate from sums of scores over windows; rows by piece, then channel."""
+def inverse_root(matrix: _F) -> tuple[_F, _F]:
+    """Root of the inverse, (n, determined directions), and a huge covariance of the other directions, (n, n)."""
+
 @final
 class Tracker:
     """Motor parameters followed online: ``k_v``, ``k_a``, ``k_s``, ``offset``."""
@@ -293,6 +315,24 @@ class GreyBox(Model):
         """Every constructor argument but theta; nx, nk, n_inputs, hidden, integrator."""
     def states(self, u: _F, state: _F) -> _F:
         """States of the free run, (N, 3), of a position (N, 4)."""
+    def descended(
+        self, experiments: _Experiments, *, prior: _F, low: _F, high: _F, enough: float, iterations: int,
+        progress: _Progress = None,
+    ) -> tuple[GreyBox, float, _F]:
+        """Least squares of a position over pieces from theta: the model, its cost and the initial states (pieces, nx).
+
+        ``prior``: inverse standard deviations of theta about 0, in units of the residuals.
+        """
+    def first_states(self, experiments: _Experiments) -> _F:
+        """States at which pieces begin, from their first outputs, (pieces, nx)."""
+    def squares(self, experiments: _Experiments, states: _F) -> float:
+        """Weighted squared errors of free runs over pieces; infinite if one diverges."""
+    def covariance(
+        self, experiments: _Experiments, states: _F
+    ) -> tuple[_F, NDArray[np.bool_]]:
+        """Covariance of theta at the pieces' least squares, (p, p), and which of it is determined, (p,)."""
+    def independent(self, experiments: _Experiments, states: _F) -> float:
+        """Number of samples that are as good as independent."""
 
 @final
 class HammersteinWiener(Model):

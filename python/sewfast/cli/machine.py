@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -379,7 +380,17 @@ def add_physics(commands: Commands) -> None:
     )
     parser.add_argument(
         "--export", nargs=2, metavar=("TARGET", "FILE"),
-        help="write settings for wpilib, mujoco, urdf, odrive, moteus or simplefoc",
+        help="write settings for wpilib, mujoco, urdf, odrive, moteus or simplefoc; of a joint for "
+        "mujoco, urdf or json",
+    )  # fmt: skip
+    parser.add_argument(
+        "--inertia", type=float, metavar="N",
+        help="for --export of a joint: known inertia [kg m^2; kg if it slides], for forces in N m",
+    )  # fmt: skip
+    parser.add_argument(
+        "--check", choices=("mujoco",),
+        help="of a joint: build the simulator from its export, replay the record, and say how they "
+        "differ",
     )  # fmt: skip
     parser.add_argument(
         "--winding", choices=("line", "q"),
@@ -404,18 +415,25 @@ def physics_command(args: argparse.Namespace) -> None:
     from ..dataset.faults import sound
     from ..greybox import physics
     from ..greybox.exports import BOARDS, Target
+    from ..greybox.joint_exports import JointTarget
 
     require_place(args.out, (".json",))
     _require_place_of_model(args.model)
     require_plot(args.plot)
     target, place = args.export or (None, "")
-    if args.structure == "joint" and (args.export or args.plot):
+    is_joint = args.structure == "joint"
+    if is_joint and args.plot:
         raise SettingError(
-            name="--export" if args.export else "--plot", expected="none with --structure joint",
-            received="a file", remedy="write the joint (-o), or it as a model (--model)",
+            name="--plot", expected="none with --structure joint", received="a file",
+            remedy="write the joint (-o), or it as a model (--model)",
         )  # fmt: skip
-    if target not in (None, *get_args(Target)):
-        names = ", ".join(get_args(Target))
+    if not is_joint and (args.check or args.inertia is not None):
+        raise SettingError(
+            name="--check" if args.check else "--inertia", expected="--structure joint",
+            received=args.structure, remedy="leave it out for a motor",
+        )  # fmt: skip
+    if target not in (None, *get_args(JointTarget if is_joint else Target)):
+        names = ", ".join(get_args(JointTarget if is_joint else Target))
         raise SettingError(f"--export: expected one of {names}, received {target!r}")
     if target in BOARDS and args.winding is None:
         raise SettingError(
@@ -427,7 +445,7 @@ def physics_command(args: argparse.Namespace) -> None:
     data, found = sound(_motor_data(args))
     for fault in found:
         note(fault.warning)
-    motor = physics(
+    motor: Any = physics(
         data,
         structure=args.structure.split(","),
         current=args.current,
@@ -435,7 +453,9 @@ def physics_command(args: argparse.Namespace) -> None:
         speed_unit=args.speed_unit,
         intervals=args.intervals,
     )
-    text = "" if target is None else motor.export(target, winding=args.winding, gear=args.gear)
+    own = {"inertia": args.inertia} if is_joint else {"winding": args.winding, "gear": args.gear}
+    text = "" if target is None else motor.export(target, **own)
+    replay = motor.check(data, inertia=args.inertia) if args.check else None
     if args.out is not None:
         motor.save(args.out)
     if text:
@@ -445,9 +465,13 @@ def physics_command(args: argparse.Namespace) -> None:
     if args.plot is not None:
         motor.plot(file=args.plot)
     if args.json:
-        print_json({**motor.to_dict(), "notes": [*data.notes, *(f.warning for f in found)]})
+        shown = {} if replay is None else {"check": asdict(replay)}
+        notes = [*data.notes, *(f.warning for f in found)]
+        print_json({**motor.to_dict(), **shown, "notes": notes})
         return
     print(motor)
+    if replay is not None:
+        print(replay)
     for path in (args.out, place, args.model, args.plot):
         if path:
             print(f"written to {path}")

@@ -21,6 +21,7 @@ from ..models.grey_box import GreyBox
 from ..motorfit.estimation import CONFIDENCE
 from ..motorfit.joint import fitted, is_commanded
 from ..tables import html_of
+from .joint_exports import JointTarget, Replay, checked, export
 from .motor import APART, VAGUE, Findings, stored_parameters
 
 FORMAT, VERSION = "sewfast-joint", 1
@@ -48,9 +49,12 @@ class Joint(Findings):
     parameters : mapping of Parameter by name
         Value, 95 % interval and unit, in units of the command, or if `inside`, of the position
         command: `inertia` (per acceleration), `viscous` (per speed), `friction` (against dry
-        friction), `offset`, `delay`; of the terms that the record shows `lag`, `stribeck` and
-        `stribeck_speed`, `gravity`, `load_friction` (per load), `dead_band`, `reach` (largest
-        output of the controller) and `damping` (k_d / k_p); if `inside`, `stiffness` (k_p / J).
+        friction), `offset`, `delay`; of the terms that the record shows `lag`, `stribeck`,
+        `stribeck_speed` and `stribeck_exponent`, `gravity`, `load_friction` (per load that the
+        gears carry), `drive_friction` and `outer_friction` (per drive, and per load from outside),
+        `quadratic_friction` (per square of the drive), `creep` (time constant with which friction
+        holds), `dead_band`, `reach` (largest output of the controller) and `damping` (k_d / k_p);
+        if `inside`, `stiffness` (k_p / J).
     undetermined : mapping of str by name
         Parameters that the record does not determine, and why.
     terms : tuple of str
@@ -75,6 +79,46 @@ class Joint(Findings):
     def to_model(self) -> GreyBox:
         """The joint as a model for loops and free runs."""
         return self.model
+
+    def export(self, target: JointTarget, *, inertia: float | None = None) -> str:
+        """The joint as a part of a simulator.
+
+        Parameters
+        ----------
+        target : "mujoco", "urdf" or "json"
+            A MuJoCo model of joint and actuator; the `dynamics` of a URDF joint; or all parameters
+            by the names of Rhoban's better actuator models.
+        inertia : float, optional
+            Known inertia of the joint with its load and motor [kg m^2; kg of an axis], for forces
+            in N m (or N). Without it they are in units of the command.
+
+        Raises
+        ------
+        SettingError
+            For another target, or an inertia that is not above 0.
+        """
+        return export(self, target, inertia)
+
+    def check(self, data: Dataset, *, inertia: float | None = None) -> Replay:
+        """Replay a record in MuJoCo on the exported model, and say how its free run differs.
+
+        Parameters
+        ----------
+        data : Dataset
+            A record of the same joint.
+        inertia : float, optional
+            As for `export`.
+
+        Returns
+        -------
+        Replay
+
+        Raises
+        ------
+        SettingError
+            If the package mujoco is not installed.
+        """
+        return checked(self, export(self, "mujoco", inertia), in_effect(data))
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, as JSON values."""
@@ -155,8 +199,12 @@ def joint_of(data: Dataset) -> Joint:
     spread = math.sqrt(np.average((y - np.average(y, weights=w)) ** 2, weights=w))
     rmse = math.sqrt(core.settings["residual_variance"])
     d = data
+    training = {
+        "input_range": [list(r) for r in d.input_range],
+        "output_range": list(d.output_range),
+    }
     model = GreyBox(
-        core, d.Ts, d.input_names, d.output_name, d.input_units, d.output_unit, d.counts, {}
+        core, d.Ts, d.input_names, d.output_name, d.input_units, d.output_unit, d.counts, training
     )
     return Joint(
         parameters, undetermined, fit.terms, inside,
@@ -187,9 +235,16 @@ def _quantities(
         "stribeck": [
             ("stribeck", u, lambda p: p["k_t"]),
             ("stribeck_speed", f"{y}/s", lambda p: p["w_s"] / unit),
+            ("stribeck_exponent", "1", lambda p: p["exponent"]),
         ],
         "gravity": [("gravity", u, lambda p: math.hypot(p["load_1c"], p["load_1s"]))],
         "loaded": [("load_friction", "1", lambda p: p["k_l"])],
+        "directional": [
+            ("drive_friction", "1", lambda p: p["k_m"]),
+            ("outer_friction", "1", lambda p: p["k_g"]),
+        ],
+        "quadratic": [("quadratic_friction", f"1/{u}", lambda p: p["k_mm"])],
+        "creep": [("creep", "s", lambda p: p["creep"])],
         "reach": [("reach", u, lambda p: p["reach"]), ("damping", "s", lambda p: p["damping"])],
         "dead_band": [("dead_band", u, lambda p: p["dead_band"])],
     }

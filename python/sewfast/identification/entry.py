@@ -273,7 +273,11 @@ def _in_effect(data: Dataset, what: str) -> Dataset:
 
 
 def _unstable(task: Task) -> Model:
-    """The plant that a loop held, or what the search finds if its poles are stable."""
+    """The plant that a loop held, or what the search finds: if its poles are stable, or if the
+    record is that of a joint, whose friction a linear model can take for an unstable pole.
+    """
+    if grey_box.is_joint(task):
+        return mixture.searched(task)
     return linear.held_by_a_loop(task) or mixture.searched(task)
 
 

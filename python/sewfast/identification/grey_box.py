@@ -47,6 +47,8 @@ WORTH_IT = math.log(0.98)
 """Least reduction of the logarithm of that error."""
 NOISES = tuple(10.0**e for e in range(-10, -1))
 """Process noises to try, in squares of the scales."""
+UNEXPLAINED = 0.01
+"""Most of the variance that the equations of a joint may leave, to rule out an unstable plant."""
 PROBED = 20_000
 """Samples used to choose the process noise."""
 
@@ -108,6 +110,21 @@ def require_equations(data: Dataset) -> None:
             received=repr(unit),
             remedy="name the unit of the output, or identify another kind of model",
         ) from None  # fmt: skip
+
+
+def is_joint(task: Task) -> bool:
+    """Whether a joint that nothing pulls explains the output as a position, in free run."""
+    data = thinned(task.data, SEARCHED)
+    if data.n_inputs != 1 or not (is_position(data.output_unit) or not data.output_unit):
+        return False
+    look = task.clock.limited(task.progress, 0.3, "the equations of a joint")
+    try:
+        fit = joint.fitted(data, _at_any_time(look), integrates=True)
+    except (DataError, FitError, SettingError, TimeUp):
+        return False
+    spread = np.nanvar(np.concatenate([e.y for e in data.experiments]))
+    left: float = fit.core.settings["residual_variance"]
+    return "gravity" not in fit.terms and left < UNEXPLAINED * spread
 
 
 # --- Motors with and without a network ------------------------------------------------------------
@@ -246,7 +263,7 @@ def _is_better(more: MotorCandidate, alone: MotorCandidate) -> bool:
 # --- Their fits -----------------------------------------------------------------------------------
 
 
-def _at_any_time(look: Look | None) -> Callable[[], None]:
+def _at_any_time(look: Callable[[int, int, float], object] | None) -> Callable[[], object]:
     """`look` without arguments: it checks for the end but shows no progress."""
     return (lambda: None) if look is None else lambda: look(0, 0, math.inf)
 
@@ -319,7 +336,9 @@ def trained_from(
         own = at(x)
         if own is None:
             return math.inf
-        return float((prior * x) @ (prior * x)) + joint.squares(own, data.experiments, states)
+        return float((prior * x) @ (prior * x)) + joint.squares(
+            own, data.experiments, np.stack(states)
+        )
 
     count = sum(int(np.isfinite(e.y).sum()) for e in data.experiments)
     bounds = (low, np.full(len(start), np.inf))

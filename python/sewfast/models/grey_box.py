@@ -117,7 +117,7 @@ class GreyBox(SingleModel):
         limit = fields.optional_number("limit")
         return _core.GreyBox(
             values=_completed(fields.vector("values"), math.inf if limit is None else limit),
-            joint=[0.0 if own is None else own.number(name) for name in JOINT],
+            joint=[_own(own, name) for name in JOINT],
             position=position,
             free=[known.index(name) for name in free],
             steps=fields.integer("steps"),
@@ -142,7 +142,9 @@ class GreyBox(SingleModel):
             of |= {"gravity": gravity, "stribeck": of["k_t"]}
             named |= {
                 "gravity": ("gravity", u), "stribeck": ("Stribeck friction", u),
-                "k_l": ("friction per load", ""), "dead_band": ("dead band", u),
+                "k_l": ("friction per load", ""), "k_m": ("friction per drive", ""),
+                "k_g": ("friction per load from outside", ""), "creep": ("creep", "s"),
+                "dead_band": ("dead band", u),
                 "reach": ("largest output of the controller", u), "damping": ("k_d / k_p", "s"),
             }  # fmt: skip
         parts += [
@@ -167,6 +169,13 @@ class GreyBox(SingleModel):
         ]
 
 
+def _own(joint: Fields | None, name: str) -> float:
+    """A parameter of a joint; 0 for a motor, and for a term that older files do not know."""
+    if joint is None or (name in _LATER and name not in joint.values):
+        return 0.0
+    return joint.number(name)
+
+
 def _completed(values: FloatArray, limit: float) -> FloatArray:
     """All parameters; older files end before `limit`, without the later terms."""
     at = NAMES.index("limit")
@@ -175,6 +184,7 @@ def _completed(values: FloatArray, limit: float) -> FloatArray:
     return np.insert(values, min(at, len(values)), limit)
 
 
+_LATER = ("k_m", "k_g", "creep", "exponent", "k_mm")
 _NUMBERS = (
     "Ts", "unit", "speed_scale", "command_scale", "residual_variance", "process_noise",
 )  # fmt: skip

@@ -11,9 +11,10 @@ per acceleration) and friction the position error that breaks it loose.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,11 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import _core
-from ..arrays import FloatArray, gram
+from ..arrays import FloatArray
 from ..dataset import Dataset, Experiment
 from ..errors import DataError, FitError, SettingError
 from ..units import is_position, radians, spelled
-from .estimation import SINGULAR, Normal, covariance_of, minimised
 from .problem import NOTHING, PARAMETERS, PLACE
 
 JOINT = {name: len(PARAMETERS) + j for j, name in enumerate(_core.GREYBOX_JOINT)}
@@ -33,9 +33,12 @@ JOINT = {name: len(PARAMETERS) + j for j, name in enumerate(_core.GREYBOX_JOINT)
 PLACES = {**PLACE, **JOINT}
 TERMS: dict[str, tuple[str, ...]] = {
     "lag": ("tau",),
-    "stribeck": ("k_t", "w_s"),
+    "stribeck": ("k_t", "w_s", "exponent"),
     "gravity": ("load_1c", "load_1s"),
-    "loaded": ("k_l",),
+    "loaded": ("k_l", "k_b"),
+    "directional": ("k_m", "k_g", "k_b"),
+    "quadratic": ("k_mm",),
+    "creep": ("creep",),
     "reach": ("reach", "damping"),
     "dead_band": ("dead_band",),
 }
@@ -44,21 +47,33 @@ WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the bells that smooth a start's signals [samples]."""
 DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Delays of a start [samples]."""
-NOT_NEGATIVE = {"k_e", "tau", "delay", "k_s", "k_l", "dead_band", "damping"}
+NOT_NEGATIVE = {
+    "k_e", "k_b", "tau", "delay", "k_s", "k_l", "k_m", "k_g", "k_mm", "creep", "dead_band",
+    "damping",
+}  # fmt: skip
 POSITIVE = {"k_a", "w_s", "reach", "limit", "k_q"}
+EXPONENTS = (0.5, 3.0)
+"""Exponents of Stribeck's fall that were measured (Armstrong-Helouvry 1994, Automatica 30)."""
 ITERATIONS, ENOUGH = 30, 1.0
-LEAK = 1e-3
-"""Least part of a parameter in a direction without information, for it to be undetermined."""
+FLOOR = 1e-3
+"""Least part of a start that a positive parameter keeps."""
+SETTLED = 1e-2
+"""Squared distances to the minimum in standard errors, at which a descent and the last one end."""
+NEARBY, NEAR = 6, 0.02
+"""Starts around the fit, and their relative distance: of 6 MuJoCo joints two had a lower minimum
+nearby, with errors of reach and delay a tenth as large (.01 and .08 found the same)."""
+GLANCE = 3
+"""Iterations of each start of a term; the best start is fitted further."""
 PIECES = 4
 """Pieces of the last fit, beside which the drift of a whole record is another error."""
 SHORTEST, FIRST = 50, 30
 """Least samples of a piece, and those of its first outputs that give its state. A piece with fewer
 measured ones is left out."""
-BRIDGED = 3
-"""Longest gap that a start interpolates [samples], if its bells are not wider."""
+LEAD = 10
+"""Samples before a piece whose commands may still act in it. They count as not measured."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
 """Factor from each unit of a length to m."""
-STEPS_PER_RADIAN = 50.0
+STEPS_PER_RADIAN = 100.0
 """Integration steps while the fastest of the dynamics turns by one radian. With 12 a limit of the
 controller was seen as a lag besides (benches/joints.py, servos 0, 3 and 5)."""
 
@@ -87,7 +102,7 @@ def is_commanded(data: Dataset) -> bool:
     return is_position(unit) and (both_angles or both_lengths or spelled(given) == spelled(unit))
 
 
-def _factor(unit: str) -> float:
+def factor(unit: str) -> float:
     """Factor from a unit to rad or m; 1 for any other."""
     return radians(unit) or METRES.get(spelled(unit), 1.0)
 
@@ -115,7 +130,10 @@ def fitted(
         found = fit.descended(core)
         core = found.core
     found, terms, missing = fit.with_terms(fit.without_delay(found))
-    known = fit.covariance(found) if covariance else (None, None)
+    found = fit.settled(found)
+    known: tuple[Any, Any] = (None, None)
+    if covariance:
+        known = fit.covariance(found, terms)
     return JointFit(found.core, terms, missing, *known)
 
 
@@ -125,7 +143,7 @@ class Descent:
 
     cost: float
     core: _core.GreyBox
-    states: Sequence[FloatArray]
+    states: FloatArray
 
 
 class _Fit:
@@ -133,9 +151,11 @@ class _Fit:
 
     def __init__(self, data: Dataset, look: Callable[[], object]) -> None:
         self.data, self.look = data, look
-        self.unit, self.command_unit = _factor(data.output_unit), _factor(data.input_units[0])
+        self.unit, self.command_unit = factor(data.output_unit), factor(data.input_units[0])
         self.is_angle = radians(data.output_unit) is not None
         self.pieces: Sequence[Experiment] = data.experiments
+        self.least: dict[str, float] = {}
+        """Least inertia: of the start, since bounds relative to each fit would compound."""
 
     def cut(self, share: int) -> None:
         """Each experiment in as many pieces as belong to it."""
@@ -158,19 +178,24 @@ class _Fit:
         best, least = None, math.inf
         k_q = 0.0 if integrates else 1.0 / self.command_unit
         for width in WIDTHS:
-            for delay in DELAYS:
-                k_v, k_a, k_s, offset = self._regressed(width, delay, k_q)
+            self.look()
+            starts = _core.greybox_regressed(
+                _arrays(self.data.experiments), width=width, delays=DELAYS, Ts=self.data.Ts,
+                unit=self.unit, k_q=k_q,
+            )  # fmt: skip
+            for delay, start in zip(DELAYS, starts, strict=True):
+                k_v, k_a, k_s, offset = start or 4 * (math.nan,)
                 if not (k_a > 0.0 and math.isfinite(k_v)):
                     continue
-                self.look()
                 known = {
                     "k_e": max(k_v, 0.0), "k_a": k_a, "k_s": max(k_s, 0.0), "offset": offset,
                     "delay": delay * self.data.Ts,
                 }  # fmt: skip
                 core = self.core(known, k_q, list(known))
-                cost = squares(core, self.pieces, self.states(core))
+                cost = squares(core, self.pieces, core.first_states(_arrays(self.pieces)))
                 if cost < least:
                     best, least = core, cost
+                    self.least = {"k_a": FLOOR * k_a}
         if best is None:
             raise FitError(
                 name="data", expected="a position that follows its command as a joint does",
@@ -201,48 +226,15 @@ class _Fit:
             theta=np.array([known[n] for n in free]),
         )  # fmt: skip
 
-    def _regressed(self, width: float, delay: float, k_q: float) -> FloatArray:
-        """Regress what drives on acceleration, speed, its sign and 1."""
-        half = math.ceil(3.5 * width)
-        k = np.arange(-half, half + 1)
-        bell = np.exp(-0.5 * (k / width) ** 2)
-        bell /= bell.sum()
-        Ts = self.data.Ts
-        slope = -k / width**2 * bell / Ts
-        bend = (k**2 / width**4 - 1.0 / width**2) * bell
-        bend = (bend - bend.sum() * bell) / Ts**2
-        rows, drives = [], []
-        for e in self.pieces:
-            if len(e) <= 2 * half + 4:
-                continue
-            y, known = _bridged(e.y, max(width, BRIDGED))
-            whole = np.convolve(~known, np.ones(len(k)), "valid") < 0.5
-            if not whole.any():
-                continue
-            q = self.unit * y
-            at = np.arange(len(e)) - 0.5 - delay
-            u = np.interp(at, np.arange(len(e)), e.u[:, 0])
-            q_s, v, a = (np.convolve(q, taps, "valid") for taps in (bell, slope, bend))
-            clear = whole & (np.abs(v) > 0.05 * max(float(np.abs(v[whole]).max()), 1e-300))
-            rows.append(np.stack([v, a, np.sign(v), np.ones_like(v)], axis=1)[clear])
-            drives.append((np.convolve(u, bell, "valid") - k_q * q_s)[clear])
-        if not rows or sum(map(len, rows)) < 20:
-            return np.full(4, math.nan)
-        A, b = np.concatenate(rows), np.concatenate(drives)
-        scale = np.sqrt(np.einsum("ij,ij->j", A, A))
-        scale[scale == 0.0] = 1.0
-        found: FloatArray = np.linalg.lstsq(A / scale, b, rcond=None)[0] / scale
-        return found
-
     # --- the fit --------------------------------------------------------------------------------
 
-    def states(self, core: _core.GreyBox) -> list[FloatArray]:
-        """Initial states of the pieces, from their first outputs."""
-        return [begun(core, p) for p in self.pieces]
-
-    def descended(self, core: _core.GreyBox, iterations: int = ITERATIONS) -> Descent:
+    def descended(
+        self, core: _core.GreyBox, iterations: int = ITERATIONS, enough: float = ENOUGH
+    ) -> Descent:
         """The least squares over the pieces, whose states are fitted with the core."""
-        return descended(core, core.theta, self.pieces, self.look, iterations)
+        return descended(
+            core, core.theta, self.pieces, self.look, iterations, enough=enough, least=self.least
+        )
 
     def without_delay(self, found: Descent) -> Descent:
         """The fit, or the one that a descent without a delay finds: stops of dry friction give the
@@ -256,39 +248,84 @@ class _Fit:
 
     def with_terms(self, plain: Descent) -> tuple[Descent, tuple[str, ...], tuple[str, ...]]:
         """The fit with those of the terms that lower the cost by more than their number explains:
-        one after the other, the one that lowers it most first (Schwarz 1978, with the number of
-        samples that the residuals' correlation leaves).
+        one after the other, the best one first (Schwarz 1978, with the number of samples that the
+        residuals' correlation leaves).
         """
         own, taken = plain, list[str]()
-        tried = [t for t in TERMS if self._may_have(t, plain.core)]
-        while tried:
-            found = []
-            for term in tried:
-                for begun in self._begun(own.core, term):
-                    try:
-                        found.append((term, self.descended(begun, 12)))
-                    except (FitError, SettingError):
-                        continue
-            if not found:
-                break
-            term, one = min(found, key=lambda f: f[1].cost)
+        while found := self._more(own, taken):
+            term, one = found[0]
             if not self._explains(own, one, term, self.independent(own)):
                 break
             own = one
-            tried = [t for t in tried if t != term]
             taken.append(term)
         own = self.descended(own.core)
         # one that another has made superfluous goes again
         for term in taken[:-1]:
-            try:
-                fewer = self.descended(_without(own.core, term))
-            except FitError:
-                continue
-            if not self._explains(fewer, own, term, self.independent(own)):
+            fewer = self._tried(_without(own.core, term, taken), ITERATIONS)
+            if fewer and not self._explains(fewer, own, term, self.independent(own)):
                 own = fewer
                 taken.remove(term)
-        missing = tuple(t for t in TERMS if t not in taken and self._may_have(t, plain.core))
+        missing = tuple(t for t in TERMS if t not in taken and self._may_have(t, own.core))
         return own, tuple(t for t in TERMS if t in taken), missing
+
+    def _more(self, own: Descent, taken: Sequence[str]) -> list[tuple[str, Descent]]:
+        """Fits with one more term, the best one first (Schwarz 1978)."""
+        n = self.independent(own)
+
+        def schwarz(of: tuple[str, Descent]) -> float:
+            return n * math.log(max(of[1].cost, 1e-300)) + len(TERMS[of[0]]) * math.log(n)
+
+        found: dict[str, Descent] = {}
+        for term in TERMS:
+            if term in taken or not self._may_have(term, own.core):
+                continue
+            for begun in self._begun(own.core, term):
+                if one := self._tried(begun, GLANCE):
+                    found[term] = min(found.get(term, one), one, key=lambda f: f.cost)
+        best = [(term, f) for term, one in found.items() if (f := self._tried(one.core, 12))]
+        return sorted(best, key=schwarz)
+
+    def _tried(self, core: _core.GreyBox, iterations: int) -> Descent | None:
+        """A descent; None from where a free run does not stay finite."""
+        try:
+            return self.descended(core, iterations)
+        except (FitError, SettingError):
+            return None
+
+    def covariance(self, own: Descent, taken: Sequence[str]) -> tuple[FloatArray, Any]:
+        """Covariance of the free parameters, and which of them are determined.
+
+        Beside the fit stand others that the record hardly tells from it: with one more term, or
+        integrated in half the steps. Each counts by its Akaike weight, with the number of
+        independent samples (unconditional variance: Burnham and Anderson 2002, section 4.3).
+        """
+        found, determined = own.core.covariance(_arrays(self.pieces), own.states)
+        n, p = self.independent(own), len(own.core.theta)
+        finer = changed(own.core, steps=2 * own.core.settings["steps"])
+        others = [(len(TERMS[term]), f) for term, f in self._more(own, taken)]
+        if one := self._tried(finer, 12):
+            others.append((0, one))
+        total, apart = 1.0, np.zeros((p, p))
+        for more, other in others:
+            gain = n * math.log(max(own.cost, 1e-300) / max(other.cost, 1e-300))
+            weight = math.exp(min(0.5 * gain - more, 9.0))
+            off = other.core.theta[:p] - own.core.theta
+            total += weight
+            apart += weight * np.outer(off, off)
+        return found + apart / total, determined
+
+    def settled(self, found: Descent) -> Descent:
+        """The least of descents from around the fit: where dry friction stops and a controller
+        reaches its limit the cost has kinks, and a descent ends at one of several minima.
+        """
+        best = self.descended(found.core, enough=SETTLED)
+        rng = np.random.default_rng(0)
+        for _ in range(NEARBY):
+            start = best.core.theta * (1.0 + NEAR * rng.standard_normal(len(best.core.theta)))
+            with contextlib.suppress(FitError, SettingError):
+                other = self.descended(changed(best.core, theta=start), enough=SETTLED)
+                best = min(best, other, key=lambda f: f.cost)
+        return best
 
     @staticmethod
     def _explains(fewer: Descent, more: Descent, term: str, n: float) -> bool:
@@ -296,32 +333,13 @@ class _Fit:
         gain = n * math.log(max(fewer.cost, 1e-300) / max(more.cost, 1e-300))
         return gain >= len(TERMS[term]) * math.log(n)
 
-    def covariance(self, found: Descent) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Covariance of the free parameters, (n, n), with the pieces' states estimated beside them,
-        from sums of scores over a window (`covariance_of`); and which of them are determined, (n,).
-        """
-        core, states, n = found.core, found.states, len(found.core.theta)
-        places = [n, n + core.settings["nx"] - 1]
-        rows, residuals, lengths = [], [], []
-        for i, (p, state) in enumerate(zip(self.pieces, states, strict=True)):
-            run, by = core.jacobian(p.u, state)
-            w = weights(p)
-            own = np.zeros((len(p), n + 2 * len(states)))
-            own[:, :n] = w[:, None] * by[:, :n]
-            own[:, n + 2 * i : n + 2 * i + 2] = w[:, None] * by[:, places]
-            rows.append(own)
-            residuals.append(w * (run - np.nan_to_num(p.y)))
-            lengths.append(len(p))
-        windows = [max(1, min(round(math.sqrt(m)), m // 15)) for m in lengths]
-        J = np.concatenate(rows)
-        whole = covariance_of(J, np.concatenate(residuals), lengths, windows)
-        return whole[:n, :n], _determined(J)[:n]
-
     def _may_have(self, term: str, core: _core.GreyBox) -> bool:
         if term == "gravity":
             return self.is_angle
         # behind a controller inside, a lag of the current is a part of the delay
-        return (term == "lag") == core.settings["integrator"] or term in ("stribeck", "loaded")
+        integrates: bool = core.settings["integrator"]
+        only = {"lag": True, "reach": False, "dead_band": False}
+        return only.get(term, integrates) == integrates
 
     def _begun(self, core: _core.GreyBox, term: str) -> Iterator[_core.GreyBox]:
         """Starts of a core with one more term."""
@@ -332,61 +350,39 @@ class _Fit:
         starts: dict[str, list[dict[str, float]]] = {
             "lag": [{"tau": s["Ts"]}],
             "stribeck": [
-                {"k_t": share * k_s, "w_s": part * fast}
+                {"k_t": share * k_s, "w_s": part * fast, "exponent": 1.5}
                 for share in (0.3, -0.8)
                 for part in (0.01, 0.05, 0.3)
             ],
             "gravity": [{"load_1c": 0.0, "load_1s": 0.0}],
-            "loaded": [{"k_l": 0.05}],
+            "loaded": [{"k_l": 0.05, "k_b": 0.0}],
+            "directional": [{"k_m": 0.03, "k_g": 0.03, "k_b": 0.0}],
+            "quadratic": [{"k_mm": 0.03 / scale}],
+            "creep": [{"creep": 0.1 * s["Ts"]}],
             "reach": [{"reach": part * scale, "damping": 0.0} for part in (1.0, 2.0, 3.0)],
             "dead_band": [{"dead_band": part * size} for part in (0.3, 0.8)],
         }
         for values in starts[term]:
-            names = [*s["free"], *(PLACES[n] for n in values)]
-            yield changed(core, free=names, theta=np.array([*core.theta, *values.values()]))
+            more = {PLACES[n]: v for n, v in values.items() if PLACES[n] not in s["free"]}
+            theta = np.array([*core.theta, *more.values()])
+            yield changed(core, free=[*s["free"], *more], theta=theta)
 
     def independent(self, found: Descent) -> float:
         """Number of samples that are as good as independent, by the residuals' correlation."""
-        total = spread = 0.0
-        for p, state in zip(self.pieces, found.states, strict=True):
-            error = weights(p) * np.nan_to_num(found.core.simulate(p.u, state) - p.y)
-            power = np.abs(np.fft.rfft(error, 2 * len(error))) ** 2
-            r = np.fft.irfft(power)[: len(error) // 4]
-            positive = np.flatnonzero(r <= 0.0)
-            end = int(positive[0]) if len(positive) else len(r)
-            spread += 2.0 * float(r[:end].sum()) - float(r[0])
-            total += float(r[0])
-        n = sum(int(np.isfinite(p.y).sum()) for p in self.pieces)
-        return max(n * total / max(spread, 1e-300), 3.0)
+        n: float = found.core.independent(_arrays(self.pieces), found.states)
+        return n
 
 
-def squares(
-    core: _core.GreyBox, experiments: Sequence[Experiment], states: Sequence[FloatArray]
-) -> float:
+def squares(core: _core.GreyBox, pieces: Sequence[Experiment], states: FloatArray) -> float:
     """Weighted squared errors of free runs from these states; infinite if one diverges."""
-    total = 0.0
-    try:
-        for e, state in zip(experiments, states, strict=True):
-            error = weights(e) * (core.simulate(e.u, state) - np.nan_to_num(e.y))
-            total += float(error @ error)
-    except FitError:
-        return math.inf
-    return total if math.isfinite(total) else math.inf
+    total: float = core.squares(_arrays(pieces), np.ascontiguousarray(states))
+    return total
 
 
-def _determined(jacobian: FloatArray) -> NDArray[np.bool_]:
-    """Which parameters are in no direction without information, (n,)."""
-    d = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
-    d[d == 0.0] = 1.0
-    size, along = np.linalg.eigh(gram(jacobian / d))
-    share = np.sum(along[:, size <= SINGULAR * size[-1]] ** 2, axis=1)
-    found: NDArray[np.bool_] = share < LEAK**2
-    return found
-
-
-def _without(core: _core.GreyBox, term: str) -> _core.GreyBox:
-    """The core without a term."""
-    s, gone = core.settings, [PLACES[n] for n in TERMS[term]]
+def _without(core: _core.GreyBox, term: str, taken: Sequence[str]) -> _core.GreyBox:
+    """The core without a term, with the parameters that others of those taken share with it."""
+    others = {n for t in taken if t != term for n in TERMS[t]}
+    s, gone = core.settings, [PLACES[n] for n in TERMS[term] if n not in others]
     kept = [j for j, place in enumerate(s["free"]) if place not in gone]
     values, own = s["values"].copy(), list(s["joint"])
     for place in gone:
@@ -405,86 +401,28 @@ def descended(
     look: Callable[[], object],
     iterations: int,
     prior: FloatArray | None = None,
+    enough: float = ENOUGH,
+    least: Mapping[str, float] | None = None,
 ) -> Descent:
     """The least sum of squares from `start` (p,). The initial speed and position of
     each piece are fitted too. `prior` (p,) are inverse standard deviations about 0, in units of the
-    residuals.
+    residuals; `least` bounds parameters that would else have a thousandth of their start.
     """
-    p, known = len(start), np.zeros(len(start)) if prior is None else prior
-    places = [0, core.settings["nx"] - 1]
-    first = changed(core, theta=start)
-    starts = [begun(first, e) for e in pieces]
-    x0 = np.concatenate([start, *(state[places] for state in starts)])
-
-    def parts(x: FloatArray) -> tuple[_core.GreyBox | None, list[FloatArray]]:
-        states = []
-        for i, state in enumerate(starts):
-            one = state.copy()
-            one[places] = x[p + 2 * i : p + 2 * i + 2]
-            states.append(one)
-        try:
-            return changed(core, theta=x[:p]), states
-        except SettingError:
-            return None, states
-
-    @np.errstate(over="ignore", invalid="ignore")
-    def normal(x: FloatArray) -> Normal:
-        look()
-        own, states = parts(x)
-        assert own is not None
-        cost = float((known * x[:p]) @ (known * x[:p]))
-        slope, total = np.zeros(len(x)), np.zeros((len(x), len(x)))
-        slope[:p], total[:p, :p] = known**2 * x[:p], np.diag(known**2)
-        for i, (e, state) in enumerate(zip(pieces, states, strict=True)):
-            y, rows = own.jacobian(e.u, state)
-            w = weights(e)
-            error = w * (y - np.nan_to_num(e.y))
-            columns = [*range(p), *(p + j for j in places)]
-            rows = w[:, None] * rows[:, columns]
-            at = np.array([*range(p), p + 2 * i, p + 2 * i + 1])
-            cost += float(error @ error)
-            slope[at] += rows.T @ error
-            total[np.ix_(at, at)] += rows.T @ rows
-        if not np.isfinite(total).all():
-            raise FitError(
-                name="data", expected="a free run that changes with the parameters by finite "
-                "amounts", received="infinite ones", remedy="record more moves in both directions",
-            )  # fmt: skip
-        return cost, slope, total
-
-    def cost(x: FloatArray) -> float:
-        look()
-        own, states = parts(x)
-        if own is None:
-            return math.inf
-        return float((known * x[:p]) @ (known * x[:p])) + squares(own, pieces, states)
-
     names = {place: name for name, place in PLACES.items()}
-    low = np.full(len(x0), -np.inf)
+    low, high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
     for j, place in enumerate(core.settings["free"]):
         if names[place] in NOT_NEGATIVE:
             low[j] = 0.0
+        elif names[place] == "exponent":
+            low[j], high[j] = EXPONENTS
         elif names[place] in POSITIVE:
-            low[j] = 1e-3 * start[j]
-    count = sum(int(np.isfinite(e.y).sum()) for e in pieces)
-    bounds = (low, np.full(len(x0), np.inf))
-    found = minimised(normal, cost, x0, bounds, count, enough=ENOUGH, iterations=iterations)
-    total = sum(float(np.sum(weights(e) ** 2)) for e in pieces)
-    variance = max(found.cost / max(total, 1e-300), 1e-300)
-    best = changed(core, theta=found.x[:p], residual_variance=variance)
-    return Descent(found.cost, best, parts(found.x)[1])
-
-
-def begun(core: _core.GreyBox, piece: Experiment) -> FloatArray:
-    """The state at the beginning of a piece, from its first outputs. They are taken in rad or m:
-    what holds the state near them depends on the unit.
-    """
-    unit, measured = core.settings["unit"], np.flatnonzero(np.isfinite(piece.y))
-    n = int(measured[:FIRST][-1]) + 1 if len(measured) else FIRST
-    y = unit * piece.y[:n]
-    state: FloatArray = changed(core, unit=1.0).estimate_initial_state(piece.u[:n], y)
-    state[-1] /= unit
-    return state
+            low[j] = (least or {}).get(names[place], FLOOR * start[j])
+    known = np.zeros(len(start)) if prior is None else prior
+    best, cost, states = changed(core, theta=start).descended(
+        _arrays(pieces), prior=known, low=low, high=high, enough=enough, iterations=iterations,
+        progress=lambda *_: look(),
+    )  # fmt: skip
+    return Descent(cost, best, states)
 
 
 def changed(core: _core.GreyBox, **values: Any) -> _core.GreyBox:
@@ -502,16 +440,9 @@ def weights(e: Experiment) -> FloatArray:
     return np.where(np.isfinite(e.y), root, 0.0)
 
 
-def _bridged(y: FloatArray, longest: float) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Outputs with interpolated gaps, and where they are measured or in a short gap, both (N,)."""
-    at, known = np.arange(len(y)), np.isfinite(y)
-    if known.all() or not known.any():
-        return np.nan_to_num(y), known
-    i = np.searchsorted(at[known], at)
-    edges = np.concatenate([[-np.inf], at[known], [np.inf]])
-    gap = edges[i + 1] - edges[i] - 1.0
-    bridged: FloatArray = np.interp(at, at[known], y[known])
-    return bridged, known | (gap <= longest)
+def _arrays(pieces: Sequence[Experiment]) -> list[tuple[FloatArray, ...]]:
+    """Command, position and weights of each piece."""
+    return [(e.u, e.y) if e.weights is None else (e.u, e.y, e.weights) for e in pieces]
 
 
 def _cut(e: Experiment, length: float) -> list[Experiment]:
@@ -522,7 +453,12 @@ def _cut(e: Experiment, length: float) -> list[Experiment]:
     for a, b in itertools.pairwise(edges.tolist()):
         measured = np.flatnonzero(np.isfinite(e.y[a:b]))
         if len(measured) >= min(FIRST, len(e)):
-            pieces.append(e.cut(a + int(measured[0]), a + int(measured[-1]) + 1))
+            first = a + int(measured[0])
+            lead = min(LEAD, first)
+            piece = e.cut(first - lead, a + int(measured[-1]) + 1)
+            y = piece.y.copy()
+            y[:lead] = np.nan
+            pieces.append(replace(piece, y=y))
     return pieces
 
 

@@ -20,9 +20,14 @@
 //! position command, and the loop gain of the controller is the unit of everything:
 //!
 //! ```text
-//! friction += k_l |x g(th) + offset + load(th)|
+//! friction += k_l |x g(th) + offset + load(th)| + k_m |x g(th)| + k_g |offset + load(th)| + k_mm (x g(th))^2
+//! 1 / (1 + (w / w_s)^2) becomes exp(-|w / w_s|^exponent) if the exponent is not 0
 //! v = (e - dead_band sign e) - damping w, |v| <= reach,    e = u - k_q q, 0 if |e| <= dead_band
 //! ```
+//!
+//! Friction of a joint need not hold it quite: at standstill the speed that the other forces would give falls off with the
+//! time constant `creep`, so that a constant force below the friction makes it creep at `creep` times the acceleration that
+//! the force alone would give.
 //!
 //! With a resistance R \[command/A\], a motor constant K and G volts per unit of command, `k_e = K/G`, `k_a = J R/K`,
 //! `k_b = B R/K`, `k_s = T R/K`. Derivatives are carried along as dual numbers (Griewank and Walther 2008, chapter 3):
@@ -31,10 +36,14 @@
 mod model;
 mod motor;
 mod normal;
+mod pieces;
+mod start;
 
 pub use model::{Frame, GreyBox, JOINT, MOST_UNITS};
 pub(crate) use motor::{Motor, Moving, tanh_of_one};
 pub use normal::{Current, Measured, Normal, normal};
+pub use pieces::{Descent, Fit, Pieces};
+pub use start::{Smoothing, regressed};
 
 use crate::simd::{self, F64x8, Kernel};
 use crate::{Error, Monitor, Result};
@@ -315,6 +324,11 @@ struct Equations<const N: usize> {
     waves: [Option<Wave<N>>; ORDERS],
     /// Friction of gears per load that they carry.
     k_l: Option<Dual<N>>,
+    /// The same per drive, per load from outside, and per square of the drive.
+    directional: Option<[Dual<N>; 3]>,
+    creep: Option<Dual<N>>,
+    /// Exponent of the fall of the friction with speed.
+    exponent: Option<Dual<N>>,
     inner: Option<Inner<N>>,
     /// Fraction of the way to its goal that the drive covers in a step, `1 - exp(-h / tau)`.
     share: Dual<N>,
@@ -443,6 +457,9 @@ impl<const N: usize> Equations<N> {
                 })
             }),
             k_l: None,
+            directional: None,
+            creep: None,
+            exponent: None,
             inner: None,
             share,
             memory,
@@ -507,10 +524,13 @@ impl<const N: usize> Equations<N> {
             None => self.k_t,
         };
         let ratio = speed.times(&self.per_w_s);
-        let shape = ratio
-            .times(&ratio)
-            .plus(1.0, &Dual::constant(1.0))
-            .inverse();
+        let shape = match &self.exponent {
+            Some(exponent) => fall(&ratio, exponent),
+            None => ratio
+                .times(&ratio)
+                .plus(1.0, &Dual::constant(1.0))
+                .inverse(),
+        };
         self.k_s.plus(1.0, &bump.times(&shape))
     }
 
@@ -538,8 +558,20 @@ impl<const N: usize> Equations<N> {
             let carried = torque.plus(1.0, &turn.load);
             dry = dry.plus(carried.value.signum(), &k_l.times(&carried));
         }
+        if let Some([k_m, k_g, k_mm]) = &self.directional {
+            dry = dry
+                .plus(torque.value.signum(), &k_m.times(&torque))
+                .plus(turn.load.value.signum(), &k_g.times(&turn.load))
+                .plus(1.0, &k_mm.times(&torque.times(&torque)));
+        }
         let most = dry.times(&turn.per_inertia).scaled(time);
-        if free.value.abs() <= most.value {
+        if let Some(creep) = &self.creep {
+            let whole = creep.value + time;
+            if free.value.abs() * time <= most.value * whole {
+                let share = creep.through(creep.value / whole, time / (whole * whole));
+                return free.times(&share);
+            }
+        } else if free.value.abs() <= most.value {
             return Dual::ZERO;
         }
         free.plus(-free.value.signum(), &most)
@@ -620,6 +652,21 @@ impl<const N: usize> Equations<N> {
         let (after, mean) = self.driven(x, &goal, &change);
         (after, self.moved(turn, w, &mean, &middle, self.step))
     }
+}
+
+/// `exp(-|ratio|^exponent)`.
+#[inline(always)]
+fn fall<const N: usize>(ratio: &Dual<N>, exponent: &Dual<N>) -> Dual<N> {
+    let size = ratio.value.abs();
+    let power = size.powf(exponent.value);
+    let value = (-power).exp();
+    if size == 0.0 || value == 0.0 {
+        return Dual::constant(value);
+    }
+    let slope = -value * power;
+    ratio
+        .through(value, slope * exponent.value / ratio.value)
+        .plus(slope * size.ln(), &exponent.through(0.0, 1.0))
 }
 
 /// Samples between two checks for a stop request: a few milliseconds.

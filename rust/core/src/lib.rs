@@ -5,6 +5,7 @@
 //! [`machine`]. Times are in seconds; outputs and inputs carry the caller's units.
 
 pub mod arx;
+pub mod bounded;
 pub mod causes;
 pub mod changes;
 pub mod closed_loop;
@@ -50,6 +51,7 @@ pub mod random;
 mod regression;
 pub mod residuals;
 pub mod rules;
+pub mod sandwich;
 pub mod search;
 pub mod sensor;
 pub mod shaft;

@@ -7,10 +7,14 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::{Listening, TRACKED, Tracker as Core};
 use sewfast_core::Error;
-use sewfast_core::greybox::{self, Current, Frame, JOINT, Measured, ORDERS, PARAMETERS, Run};
+use sewfast_core::greybox::{
+    self, Current, Fit, Frame, JOINT, Measured, ORDERS, PARAMETERS, Pieces, Run, Smoothing,
+};
 
 use crate::models::{Kind, Model, Rows, Values};
-use crate::seam::{array1, array2, raise, rows, slice, watched_over};
+use crate::seam::{
+    Experiments, array1, array2, raise, rows, samples, slice, watched, watched_over,
+};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("GREYBOX_PARAMETERS", PARAMETERS)?;
@@ -18,6 +22,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Tracker>()?;
     module.add_function(wrap_pyfunction!(greybox_run, module)?)?;
     module.add_function(wrap_pyfunction!(greybox_normal, module)?)?;
+    module.add_function(wrap_pyfunction!(greybox_regressed, module)?)?;
     module.add("GREYBOX_UNITS", greybox::MOST_UNITS)?;
     module.add_class::<GreyBox>()
 }
@@ -349,4 +354,124 @@ impl GreyBox {
         let found = py.detach(|| self.inner.states(u, channels, state));
         array2(py, found.map_err(|e| raise(py, e))?, self.inner.order())
     }
+
+    /// The least squares over pieces from theta as it is: the model there, its cost and the pieces' initial states.
+    #[pyo3(signature = (experiments, *, prior, low, high, enough, iterations, progress=None))]
+    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+    fn descended<'py>(
+        &self,
+        py: Python<'py>,
+        experiments: Experiments<'py>,
+        prior: Values<'py>,
+        low: Values<'py>,
+        high: Values<'py>,
+        enough: f64,
+        iterations: usize,
+        progress: Option<Bound<'py, PyAny>>,
+    ) -> PyResult<(Py<Self>, f64, Bound<'py, PyArray2<f64>>)> {
+        let samples = samples(py, &experiments)?;
+        let fit = Fit {
+            prior: slice(&prior, "prior")?,
+            low: slice(&low, "low")?,
+            high: slice(&high, "high")?,
+            enough,
+            iterations,
+        };
+        let found = watched(py, progress.as_ref(), |monitor| {
+            Pieces::new(&samples)?.descend(&self.inner, &fit, monitor)
+        })?;
+        let order = found.model.order();
+        Ok((
+            Py::new(py, Self::wrapped(found.model))?,
+            found.cost,
+            array2(py, found.states.concat(), order)?,
+        ))
+    }
+
+    /// States at which pieces begin, from their first outputs, (pieces, nx).
+    fn first_states<'py>(
+        &self,
+        py: Python<'py>,
+        experiments: Experiments<'py>,
+    ) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let samples = samples(py, &experiments)?;
+        let found = py.detach(|| Pieces::new(&samples)?.states(&self.inner));
+        let found = found.map_err(|e| raise(py, e))?;
+        array2(py, found.concat(), self.inner.order())
+    }
+
+    /// Weighted squared errors of free runs over pieces from these states; infinite if one diverges.
+    fn squares<'py>(
+        &self,
+        py: Python<'py>,
+        experiments: Experiments<'py>,
+        states: Rows<'py>,
+    ) -> PyResult<f64> {
+        let (samples, states) = (samples(py, &experiments)?, self.states_of(&states)?);
+        py.detach(|| Ok(Pieces::new(&samples)?.squares(&self.inner, &states)))
+            .map_err(|e| raise(py, e))
+    }
+
+    /// Covariance of theta at the pieces' least squares, (p, p), and which parameters are determined, (p,).
+    fn covariance<'py>(
+        &self,
+        py: Python<'py>,
+        experiments: Experiments<'py>,
+        states: Rows<'py>,
+    ) -> PyResult<Estimate<'py>> {
+        let (samples, states) = (samples(py, &experiments)?, self.states_of(&states)?);
+        let found = py.detach(|| Pieces::new(&samples)?.covariance(&self.inner, &states));
+        let (covariance, determined) = found.map_err(|e| raise(py, e))?;
+        let columns = determined.len();
+        Ok((
+            array2(py, covariance, columns)?,
+            PyArray1::from_vec(py, determined),
+        ))
+    }
+
+    /// Number of samples of the pieces that are as good as independent.
+    fn independent<'py>(
+        &self,
+        py: Python<'py>,
+        experiments: Experiments<'py>,
+        states: Rows<'py>,
+    ) -> PyResult<f64> {
+        let (samples, states) = (samples(py, &experiments)?, self.states_of(&states)?);
+        py.detach(|| Pieces::new(&samples)?.independent(&self.inner, &states))
+            .map_err(|e| raise(py, e))
+    }
+}
+
+impl GreyBox {
+    fn states_of(&self, states: &Rows<'_>) -> PyResult<Vec<Vec<f64>>> {
+        let (states, columns) = rows(states, "states")?;
+        Ok(states.chunks(columns.max(1)).map(<[f64]>::to_vec).collect())
+    }
+}
+
+/// A covariance, and which parameters are determined.
+type Estimate<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray1<bool>>);
+
+#[pyfunction]
+#[pyo3(signature = (experiments, *, width, delays, Ts, unit, k_q))]
+#[allow(non_snake_case)]
+fn greybox_regressed(
+    py: Python<'_>,
+    experiments: Experiments<'_>,
+    width: f64,
+    delays: Vec<f64>,
+    Ts: f64,
+    unit: f64,
+    k_q: f64,
+) -> PyResult<Vec<Option<[f64; 4]>>> {
+    let samples = samples(py, &experiments)?;
+    let how = Smoothing {
+        width,
+        delays: &delays,
+        sample_time: Ts,
+        unit,
+        k_q,
+    };
+    py.detach(|| greybox::regressed(&samples, &how))
+        .map_err(|e| raise(py, e))
 }

@@ -3,6 +3,7 @@
 mod causes;
 mod control;
 mod device;
+mod estimation;
 mod evidence;
 mod frequency;
 mod greybox;
@@ -28,6 +29,7 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     host_loop::register(module)?;
     models::register(module)?;
     greybox::register(module)?;
+    estimation::register(module)?;
     control::register(module)?;
     loop_transfer::register(module)?;
     frequency::register(module)?;

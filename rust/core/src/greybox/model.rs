@@ -28,12 +28,28 @@ use crate::{Error, Result};
 use nalgebra::{DMatrix, DVector};
 
 /// Names of the parameters of a joint beyond those of a motor, in their order after [`PARAMETERS`]; 0 for none.
-pub const JOINT: [&str; 5] = ["k_l", "k_q", "damping", "dead_band", "reach"];
+pub const JOINT: [&str; 10] = [
+    "k_l",
+    "k_q",
+    "damping",
+    "dead_band",
+    "reach",
+    "k_m",
+    "k_g",
+    "creep",
+    "exponent",
+    "k_mm",
+];
 const K_L: usize = 0;
 const K_Q: usize = 1;
 const DAMPING: usize = 2;
 const DEAD_BAND: usize = 3;
 const REACH: usize = 4;
+const K_M: usize = 5;
+const K_G: usize = 6;
+const CREEP: usize = 7;
+const EXPONENT: usize = 8;
+const K_MM: usize = 9;
 
 /// Most states: speed, drive, previous command, and the position if it is the output.
 const STATES: usize = 4;
@@ -371,6 +387,13 @@ impl<const N: usize> Stepper<N> {
         };
         let some = |j: usize| frame.joint[j] != 0.0 || run.free.contains(&(OF_JOINT + j));
         equations.k_l = some(K_L).then(|| joint(K_L));
+        let directional = [K_M, K_G, K_MM];
+        equations.directional = directional
+            .iter()
+            .any(|&j| some(j))
+            .then(|| directional.map(joint));
+        equations.creep = some(CREEP).then(|| joint(CREEP));
+        equations.exponent = some(EXPONENT).then(|| joint(EXPONENT));
         equations.inner = some(K_Q).then(|| Inner {
             k_q: joint(K_Q),
             damping: joint(DAMPING),
@@ -641,10 +664,11 @@ impl Model for GreyBox {
         let first = &known[..known.len().min(3)];
         let level = frame.unit * first.iter().sum::<f64>() / first.len() as f64;
         // a step of one scale weighs as much as the output change it makes
-        let mut weight = PRIOR * (frame.speed_scale / frame.unit).powi(2);
+        let mut weight = [PRIOR * (frame.speed_scale / frame.unit).powi(2); STATES];
         let mut prior = [level, v[0] - frame.values[0] * level, v[0], 0.0];
         if frame.position {
-            weight *= frame.sample_time.powi(2);
+            weight = weight.map(|w| w * frame.sample_time.powi(2));
+            weight[3] = PRIOR;
             let voltage = v[0] - frame.joint[K_Q] * level;
             let reach = match frame.joint[REACH] {
                 0.0 => f64::INFINITY,
@@ -664,21 +688,24 @@ impl Model for GreyBox {
         let off = |z: &[f64; STATES]| {
             places
                 .iter()
-                .map(|&j| (z[j] - prior[j]).powi(2))
+                .map(|&j| weight[j] * (z[j] - prior[j]).powi(2))
                 .sum::<f64>()
         };
         let cost = |z: &[f64; STATES]| -> f64 {
             let run = plain.carried::<0>(&v, &z[..self.order()]).0;
             let errors = run.iter().zip(y).filter(|(_, y)| !y.is_nan());
-            errors.map(|(run, y)| (y - run).powi(2)).sum::<f64>() + weight * off(z)
+            errors.map(|(run, y)| (y - run).powi(2)).sum::<f64>() + off(z)
         };
         let (mut z, mut damping) = (prior, 0.0);
         let mut now = cost(&z);
         let n = places.len();
         for _ in 0..STATE_STEPS {
             let (run, rows) = plain.slopes(&v, &z[..self.order()]);
-            let mut matrix = DMatrix::from_diagonal_element(n, n, weight);
-            let mut slope = DVector::from_fn(n, |i, _| weight * (prior[places[i]] - z[places[i]]));
+            let mut matrix =
+                DMatrix::from_fn(n, n, |i, j| if i == j { weight[places[i]] } else { 0.0 });
+            let mut slope = DVector::from_fn(n, |i, _| {
+                weight[places[i]] * (prior[places[i]] - z[places[i]])
+            });
             for ((run, y), row) in run.iter().zip(y).zip(rows.chunks_exact(plain.columns())) {
                 let row = &row[row.len() - self.order()..];
                 if y.is_nan() {
@@ -778,8 +805,9 @@ impl GreyBox {
     fn slopes(&self, v: &[f64], state: &[f64]) -> RunAndRows {
         match self.columns() {
             0..=4 => self.carried::<4>(v, state),
-            5..=16 => self.carried::<16>(v, state),
-            17..=28 => self.carried::<28>(v, state),
+            5..=12 => self.carried::<12>(v, state),
+            13..=20 => self.carried::<20>(v, state),
+            21..=28 => self.carried::<28>(v, state),
             _ => self.carried::<48>(v, state),
         }
     }

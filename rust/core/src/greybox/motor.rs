@@ -25,6 +25,9 @@ pub(crate) struct Motor {
     uneven: Option<f64>,
     sag: Option<f64>,
     k_l: Option<f64>,
+    directional: Option<[f64; 3]>,
+    creep: Option<f64>,
+    exponent: Option<f64>,
     inner: Option<Inner>,
     gravity: Option<[f64; 2]>,
     network: Vec<[f64; 4]>,
@@ -100,6 +103,9 @@ impl Motor {
             uneven: is.uneven.map(|uneven| uneven.value),
             sag: is.sag.map(|sag| sag.value),
             k_l: is.k_l.map(|k_l| k_l.value),
+            directional: is.directional.map(|both| both.map(|one| one.value)),
+            creep: is.creep.map(|creep| creep.value),
+            exponent: is.exponent.map(|exponent| exponent.value),
             inner: is.inner.map(|inner| Inner {
                 k_q: inner.k_q.value,
                 damping: inner.damping.value,
@@ -263,8 +269,20 @@ impl Motor {
         if let Some(k_l) = self.k_l {
             dry = dry.add(all(k_l).mul(drive.add(load)).abs());
         }
+        if let Some([k_m, k_g, k_mm]) = self.directional {
+            dry = dry
+                .add(all(k_m).mul(drive).abs())
+                .add(all(k_g).mul(load).abs())
+                .add(all(k_mm).mul(drive.mul(drive)));
+        }
         let most = dry.mul(all(self.per_inertia)).mul(all(time));
         let moved = free.sub(direction.mul(most));
+        if let Some(creep) = self.creep {
+            let whole = creep + time;
+            let (held, least) = (free.abs().mul(all(time)), most.mul(all(whole)));
+            let creeping = free.mul(all(creep / whole));
+            return least.if_less(held, moved, creeping);
+        }
         // friction that could take more than all of the speed stops the shaft; NaN is neither less nor equal, and stays
         let stopped = free.abs().if_less(most, all(0.0), moved);
         free.abs().if_equal(most, all(0.0), stopped)
@@ -282,7 +300,10 @@ impl Motor {
             None => all(self.k_t),
         };
         let ratio = speed.mul(all(self.per_w_s));
-        let shape = all(1.0).div(ratio.mul(ratio).add(all(1.0)));
+        let shape = match self.exponent {
+            Some(exponent) => ratio.each(|r| (-r.abs().powf(exponent)).exp()),
+            None => all(1.0).div(ratio.mul(ratio).add(all(1.0))),
+        };
         all(self.k_s).add(bump.mul(shape))
     }
 

@@ -143,12 +143,14 @@ fn joint(inside: bool, units: usize) -> GreyBox {
     (frame.position, frame.unit, frame.speed_scale) = (true, 0.5, 3.0);
     frame.values[..3].copy_from_slice(&[0.4, 0.0, 0.05]);
     (frame.values[10], frame.values[11]) = (0.3, -0.4);
-    frame.joint = [0.05, 2.0, 0.02, 0.05, 1.5];
+    frame.joint = [0.05, 2.0, 0.02, 0.05, 1.5, 0.03, 0.02, 1e-3, 1.4, 0.01];
     frame.free = vec![0, 2, 6, 7, 8, 9, 10, 11, DELAY];
     frame.free.extend(OF_JOINT..OF_JOINT + JOINT.len());
     if !inside {
-        frame.joint = [0.05, 0.0, 0.0, 0.0, 0.0];
-        frame.free.truncate(10);
+        frame.joint[K_Q..K_M].fill(0.0);
+        frame
+            .free
+            .retain(|&j| !(OF_JOINT + K_Q..OF_JOINT + K_M).contains(&j));
     }
     let mut random = Random::new(7);
     let all: Vec<f64> = frame.values.iter().chain(&frame.joint).copied().collect();
@@ -197,7 +199,8 @@ fn a_controller_without_an_integral_sags() {
     let mut model = joint(true, 0);
     model.frame.values[4] = 0.0;
     model.frame.values[6..12].copy_from_slice(&[0.0, 0.0, 0.0, 1.0, 0.25, 0.0]);
-    model.frame.joint = [0.0, 2.0, 0.05, 0.0, 0.0];
+    model.frame.joint = [0.0; JOINT.len()];
+    model.frame.joint[K_Q..=DAMPING].copy_from_slice(&[2.0, 0.05]);
     let run = model.simulate(&[0.8; 4000], 1, &[0.0; 4]).unwrap();
     let q = model.frame.unit * run[3999];
     assert!((0.8 - 2.0 * q - 0.25 * q.cos()).abs() < 1e-6, "{q}");
