@@ -236,22 +236,45 @@ fn each<T: Sync, R: Send>(all: &[T], threads: usize, work: impl Fn(&T) -> R + Sy
     found.into_iter().flatten().collect()
 }
 
+/// Which hats there are: those around which a member moves. A shaft that stands does nothing until friction lets go, and a correction
+/// there would wind up from repetition to repetition: machines with a quarter less inertia or more gain than the model then diverge.
+fn moving(ran: &[Ran], knots: Knots, probe: f64) -> Vec<bool> {
+    let moves = |j: usize| {
+        let knot = knots.preview + j * KNOT;
+        let span = knot.saturating_sub(KNOT)..(knot + 3 * KNOT).min(knots.samples);
+        let off = |ran: &Ran| {
+            ran.y[span.clone()]
+                .iter()
+                .any(|y| (y - ran.y[0]).abs() > probe)
+        };
+        ran.iter().any(off)
+    };
+    (0..knots.count()).map(moves).collect()
+}
+
 /// The answers of one member to all hats along a run; none after a stop request.
 fn columns(
     member: &Member<'_>,
     knots: Knots,
     table: &[f64],
     ran: &Ran,
-    probe: f64,
+    (probe, moving): (f64, &[bool]),
     monitor: &Monitor,
 ) -> Vec<Column> {
     let mut walker = Loop::new(member);
     let (mut at, mut found) = (0, Vec::with_capacity(knots.count()));
-    for j in 0..knots.count() {
+    for (j, moves) in moving.iter().enumerate() {
         if monitor.stopped() {
             return Vec::new();
         }
         let start = knots.start(j);
+        if !moves {
+            found.push(Column {
+                start,
+                ..Column::default()
+            });
+            continue;
+        }
         while at < start {
             walker.step(table[knots.early(at)]);
             at += 1;
@@ -484,6 +507,8 @@ fn mean<'a>(all: impl ExactSizeIterator<Item = &'a [f64]>) -> Vec<f64> {
 /// The answers along a move, and the factor of their normal equations.
 struct Equations {
     members: Vec<Vec<Column>>,
+    /// The hats that there are.
+    moving: Vec<bool>,
     matrix: Banded,
     factor: Factor,
     /// Of the squared change of the command.
@@ -501,15 +526,19 @@ impl Equations {
         threads: usize,
         monitor: &Monitor,
     ) -> Result<Option<Self>> {
+        let moving = moving(ran, knots, probe);
         let pairs: Vec<_> = members.iter().zip(ran).collect();
         let members = each(&pairs, threads, |(member, ran)| {
-            columns(member, knots, table, ran, probe, monitor)
+            columns(member, knots, table, ran, (probe, &moving), monitor)
         });
         if monitor.stopped() {
             return Ok(None);
         }
         let (mut of_y, of_u) = normal(&members, threads);
         let (power, effort) = (of_y.trace(), of_u.trace());
+        if !moving.contains(&true) {
+            return Ok(None);
+        }
         if !(power > 0.0 && power.is_finite() && effort.is_finite()) {
             return Err(Error::fit(
                 "expected a loop that answers its reference, got one without any answer; check the controller's gains and limits",
@@ -521,8 +550,10 @@ impl Equations {
             0.0
         };
         of_y.add(weight, &of_u);
-        of_y.ridge(DAMPING * power / knots.count() as f64);
+        let count = moving.iter().filter(|moves| **moves).count();
+        of_y.ridge(DAMPING * power / count.max(1) as f64);
         Ok(Some(Self {
+            moving,
             factor: of_y.clone().factor()?,
             matrix: of_y,
             members,
@@ -552,8 +583,8 @@ impl Equations {
 
 /// Repetitions on each member by which the convergence is known before a machine moves.
 const REHEARSED: usize = 8;
-/// A change of the correction below this part of the first one is none.
-const SETTLED: f64 = 0.02;
+/// A change of the correction below this part of the largest first one is none.
+const SETTLED: f64 = 0.05;
 
 /// Improves a table from the measured error of a repetition.
 ///
@@ -567,6 +598,7 @@ const SETTLED: f64 = 0.02;
 #[derive(Clone, Debug)]
 pub struct Learner {
     knots: Knots,
+    moving: Vec<bool>,
     mean: Vec<Column>,
     equations: Banded,
     factor: Factor,
@@ -605,10 +637,19 @@ impl Learner {
         let probe = probe(reference);
         let made = Equations::new(members, knots, table, &ran, probe, threads, monitor)?;
         let interrupted = || Error::fit("the work was interrupted");
-        let equations = made.ok_or_else(interrupted)?;
+        let stands = || {
+            Error::fit(
+                "expected a move, got a reference along which the models stand; there is nothing to learn",
+            )
+        };
+        let equations = made.ok_or_else(|| match monitor.stopped() {
+            true => interrupted(),
+            false => stands(),
+        })?;
         let mut learner = Self {
             mean: mean_columns(&equations.members),
             knots,
+            moving: equations.moving,
             equations: equations.matrix,
             factor: equations.factor,
             low_pass: Banded::low_pass(knots.count(), 0.0).factor()?,
@@ -627,7 +668,7 @@ impl Learner {
             let rehearsed = each(members, threads, |member| {
                 learner.rehearse(member, reference, table)
             });
-            learner.contraction = rehearsed.into_iter().fold(0.0, f64::max);
+            learner.contraction = contraction(&rehearsed);
             if learner.contraction < 1.0 {
                 return Ok(learner);
             }
@@ -640,37 +681,26 @@ impl Learner {
         )))
     }
 
-    /// The largest ratio of a change of the correction to the one before while a member learns; infinite if an error grows beyond the first.
-    fn rehearse(&self, member: &Member<'_>, reference: &[f64], table: &[f64]) -> f64 {
+    /// Errors and changes of the correction while a member learns; `None` if its loop diverges.
+    fn rehearse(
+        &self,
+        member: &Member<'_>,
+        reference: &[f64],
+        table: &[f64],
+    ) -> Option<Vec<(f64, f64)>> {
         let mut c = vec![0.0; self.size()];
-        let (mut first, mut before, mut worst) = (None, f64::INFINITY, 0.0_f64);
-        let mut largest = f64::INFINITY;
+        let mut found = Vec::with_capacity(REHEARSED);
         for _ in 0..REHEARSED {
             let played = added(table, &self.knots.signal(&c));
-            let Some(ran) = Ran::new(member, self.knots, &played) else {
-                return f64::INFINITY;
-            };
-            let error = ran.error(reference);
-            if rms(&error) > largest {
-                return f64::INFINITY;
-            }
-            if first.is_none() {
-                largest = rms(&error);
-            }
-            let Ok((next, _)) = self.next(&c, &error, 1.0) else {
-                return f64::INFINITY;
-            };
+            let error = Ran::new(member, self.knots, &played)?.error(reference);
+            let (next, _) = self.next(&c, &error, 1.0).ok()?;
             let moved: Vec<f64> = next.iter().zip(&c).map(|(n, c)| n - c).collect();
             // its answer counts, not the sum of squares: the last hats would count as much as all others
             let change = dot(&moved, &self.equations.times(&moved)).max(0.0).sqrt();
-            let whole = *first.get_or_insert(change);
-            if change <= SETTLED * whole {
-                break;
-            }
-            worst = worst.max(change / before);
-            (before, c) = (change, next);
+            found.push((rms(&error), change));
+            c = next;
         }
-        worst
+        Some(found)
     }
 
     /// Numbers of a correction.
@@ -727,11 +757,35 @@ impl Learner {
             .map(|(c, d)| c + gain * d)
             .collect();
         self.low_pass.solve(&mut next);
+        for (next, moves) in next.iter_mut().zip(&self.moving) {
+            *next *= f64::from(u8::from(*moves));
+        }
         let moved: Vec<f64> = next.iter().zip(correction).map(|(n, c)| n - c).collect();
         let answer = answered(&self.mean, &moved, self.knots.samples);
         let left = error.iter().zip(&answer).map(|(e, y)| e - y).collect();
         Ok((next, left))
     }
+}
+
+/// The largest ratio of a change of the correction to the one before, as long as that is not none; infinite if a loop
+/// diverges or an error grows beyond the largest first one.
+fn contraction(rehearsed: &[Option<Vec<(f64, f64)>>]) -> f64 {
+    let Some(all) = rehearsed.iter().cloned().collect::<Option<Vec<_>>>() else {
+        return f64::INFINITY;
+    };
+    let first = all.iter().filter_map(|one| one.first());
+    let (largest, whole) = first.fold((0.0_f64, 0.0_f64), |(e, d), (error, change)| {
+        (e.max(*error), d.max(*change))
+    });
+    let ratios = all.iter().flat_map(|one| one.windows(2)).map(|pair| {
+        let ((_, before), (error, change)) = (pair[0], pair[1]);
+        match () {
+            () if error > largest || error.is_nan() => f64::INFINITY,
+            () if before.max(change) <= SETTLED * whole => 0.0,
+            () => change / before,
+        }
+    });
+    ratios.fold(0.0, f64::max)
 }
 
 /// The mean of the members' answers, over the samples that any of them covers.

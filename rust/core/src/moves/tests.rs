@@ -253,6 +253,7 @@ fn what_no_table_can_be_made_of_is_refused() {
     );
     let r = trapezoid(100.0);
     assert!(Learner::new(&one, &r, &r[1..], 0, 1, &monitor).is_err());
+    assert!(Learner::new(&one, &[0.0; 99], &[0.0; 99], 0, 1, &monitor).is_err());
     let learner = Learner::new(&one, &r, &r, 0, 1, &monitor).unwrap();
     let zero = vec![0.0; learner.size()];
     assert!(learner.next(&zero, &[0.0; 3], 1.0).is_err());
@@ -270,6 +271,16 @@ fn a_stop_request_keeps_what_there_is() {
     monitor.request_stop();
     let found = plan(&one, &r, 0, 1, &monitor).unwrap();
     assert!(found.interrupted && found.setpoint == r);
+}
+
+#[test]
+fn a_rehearsal_contracts_if_its_changes_shrink_and_no_error_grows() {
+    let good = Some(vec![(9.0, 4.0), (5.0, 2.0), (4.0, 1.5)]);
+    let small = Some(vec![(1.0, 0.1), (1.2, 0.15)]);
+    assert_eq!(contraction(&[good.clone(), small]), 0.75);
+    let grown = Some(vec![(9.0, 4.0), (9.5, 2.0)]);
+    assert_eq!(contraction(&[good.clone(), grown]), f64::INFINITY);
+    assert_eq!(contraction(&[good, None]), f64::INFINITY);
 }
 
 #[test]
