@@ -21,12 +21,28 @@ from typing import Any
 import numpy as np
 
 import sewfast
-from sewfast import Controller, MoveTable, VirtualMachine, learn, plan, run
+from sewfast import Controller, MoveTable, VirtualMachine, learn, plan, run, signals
 from sewfast.commissioning import SteppedBench
 from sewfast.models import Model
-from tracking import error, recorded
 
 Drive = tuple[Model, Controller, Controller]
+
+
+def recorded(machine: VirtualMachine) -> sewfast.Dataset:
+    """The training record of the README's example."""
+    parts = []
+    for name in ("chirp_lo_hi", "saturating"):
+        machine.reset()
+        u = signals.excitation(name)
+        y = sewfast.speed_from_counts(machine.run(u).counts, machine.Ts, machine.counts_per_rev)
+        parts.append(
+            sewfast.Dataset.from_arrays(u, y, machine.Ts, input_units="V", output_unit="RPM")
+        )
+    return sewfast.Dataset.concat(parts)
+
+
+def error(loop: sewfast.ClosedLoopRun) -> float:
+    return float(np.sqrt(np.mean((loop.y - loop.r) ** 2)))
 
 
 def drive_of(seed: int, machine: VirtualMachine, kept: Path | None) -> Drive:

@@ -41,7 +41,8 @@ def test_from_a_step_to_a_learned_move(folder: Path) -> None:
     assert played["reference"] == "r"
     assert played["rmse"] < 0.5 * found["without"]
     learn = ("learn", "c.json", "m.json", "--on", "virtual", "-o", "l.json")
-    told = sewfast(folder, *learn, "--table", "t.json", "--repetitions", "3", "--json").json()
+    ramp = ("--reference", "ramp.csv", "--repetitions", "3")
+    told = sewfast(folder, *learn, *ramp, "--json").json()
     assert [one["number"] for one in told["repetitions"]] == [1, 2, 3]
     assert told["repetitions"][-1]["error"] < told["repetitions"][0]["error"]
     again = sewfast(folder, *learn, "--resume", "--repetitions", "1").out
@@ -52,8 +53,8 @@ def test_from_a_step_to_a_learned_move(folder: Path) -> None:
 
 def test_within_reach_plans_a_step(folder: Path) -> None:
     plan = ("plan", "c.json", "m.json", "--reference", "step.csv", "-o", "t.json", "--json")
-    assert sewfast(folder, *plan).json()["limited"] > 0.0
-    assert sewfast(folder, *plan, "--within-reach").json()["limited"] == 0.0
+    asked = sewfast(folder, *plan).json()["limited"]
+    assert sewfast(folder, *plan, "--within-reach").json()["limited"] < 0.5 * asked
 
 
 def test_what_does_not_belong_together_is_refused(folder: Path) -> None:

@@ -71,7 +71,8 @@ def test_a_machine_that_is_a_quarter_off_is_learned(table: MoveTable, gain: floa
     found = learn(table, drive(), bench(gain=gain, noise=0.05), repetitions=6)
     assert found.contraction < 1.0
     assert found.repetitions[0].outcome == "first"
-    assert min(errors(found)) == pytest.approx(rms(found.best.recording.y - RAMP), rel=1e-9)
+    np.testing.assert_array_equal(found.best.r, RAMP)
+    assert min(errors(found)) <= errors(found)[0]
     if gain != 490.0:
         assert min(errors(found)) < 0.35 * errors(found)[0]
     played = run(LED, bench(gain=gain), table=found.table)
@@ -92,17 +93,21 @@ def test_a_changed_load_is_told_from_a_bad_table(table: MoveTable) -> None:
 
 def test_what_does_not_repeat_is_not_learned(table: MoveTable) -> None:
     found = learn(table, drive(), bench(noise=3.0), repetitions=12)
-    assert found.reason in ("noise", "converged", "repetitions")
-    assert max(errors(found)) < 1.6 * errors(found)[0]
+    assert found.reason == "noise"
+    assert "undone" in [one.outcome for one in found.repetitions]
+    assert max(errors(found)) < 2.5 * errors(found)[0]
+    again = [run(LED, bench(noise=3.0), table=one) for one in (table, found.table)]
+    assert error(again[1]) < 1.3 * error(again[0])
 
 
 class Wild(SteppedBench):
-    """It answers a correction with the wrong sign: no model says so."""
+    """Its counts answer a correction with the wrong sign: no model says so."""
 
     def follow(self, controller: Any, r: FloatArray, name: str, **options: Any) -> Any:
         found = super().follow(controller, r, name, **options)
-        wrong = found.recording.y - 3.0 * (r - self.planned)  # type: ignore[attr-defined]
-        return replace(found, recording=replace(found.recording, y=wrong))
+        wrong = np.cumsum(r - self.planned) * -3.0  # type: ignore[attr-defined]
+        counts = np.floor(found.recording.counts + wrong * self.Ts * self.counts_per_rev / 60.0)
+        return replace(found, recording=replace(found.recording, counts=counts))
 
 
 def test_a_machine_that_turns_a_correction_round_keeps_the_plan(table: MoveTable) -> None:
@@ -111,7 +116,7 @@ def test_a_machine_that_turns_a_correction_round_keeps_the_plan(table: MoveTable
     found = learn(table, drive(), machine, repetitions=8)
     assert rms(found.table.setpoint - table.planned) < 100.0
     assert errors(found)[-1] < 4.0 * errors(found)[0]
-    assert rms(found.best.recording.y - RAMP) <= errors(found)[0] * 1.01
+    assert {"undone", "repeated"} <= {one.outcome for one in found.repetitions}
 
 
 def test_the_file_has_the_best_so_far_and_is_gone_on_from(table: MoveTable, tmp_path: Path) -> None:
@@ -159,9 +164,10 @@ def test_it_learns_on_a_device(table: MoveTable) -> None:
     assert "repetition  3" in str(found)
 
 
-def test_models_that_say_nothing_in_common_are_refused(table: MoveTable) -> None:
-    with pytest.raises(FitError, match="agree"):
-        learn(table, [drive(), drive(gain=-400.0)], bench())
+def test_what_cannot_be_learned_is_refused(table: MoveTable) -> None:
+    still = plan(LED, drive(), np.zeros(200))
+    with pytest.raises(FitError, match="nothing to learn"):
+        learn(still, drive(), bench())
     with pytest.raises(SettingError, match="repetitions"):
         learn(table, drive(), bench(), repetitions=0)
     slow = SteppedBench(Lag(), Ts=0.002, counts_per_rev=1572.0, volt=20.0)

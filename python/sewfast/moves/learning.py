@@ -19,6 +19,8 @@ from ..control.move import MoveTable, Repetition, repetition_lines, table_of
 from ..errors import DataError, Interrupted, SettingError
 from ..gains import whole
 from ..machine import VirtualMachine
+from ..recording import Recording
+from ..speed import speed_from_counts
 from ..tables import html_of
 from ..threads import available
 from .planning import cores, plants_of
@@ -180,13 +182,11 @@ def learn(
     )  # fmt: skip
     learning = _Learning(table, learner, machine, file, cancel)
     for done in range(total):
-        if progress is not None:
-            progress(done, total, learning.status)
         try:
+            if progress is not None:
+                progress(done, total, learning.status)
             is_over = learning.repeat()
-        except Interrupted as stop:
-            raise Interrupted(learning.result("interrupted")) from stop
-        except KeyboardInterrupt as stop:
+        except KeyboardInterrupt as stop:  # of which an `Interrupted` run is one
             raise Interrupted(learning.result("interrupted")) from stop
         if is_over:
             break
@@ -208,6 +208,8 @@ class _Learning:
         self.first: _Played | None = None
         self.best: _Played | None = None
         self.gain, self.reason = 1.0, ""
+        bends = [np.var(np.diff(x, 2)) for x in (table.reference, table.y) if len(x) > 2]
+        self.jerk = float(max(bends, default=0.0)) / table.Ts**3
         self.undone: _Played | None = None
         """The last repetition, if it was worse than the best, which is then played again."""
         self.noise: FloatArray | None = None
@@ -251,7 +253,7 @@ class _Learning:
         if self.cancel is not None and self.cancel.is_set():
             raise KeyboardInterrupt
         run = self.machine.follow(table.controller, setpoint, table.name, **options)
-        y = run.recording.y
+        y = self._measured(run.recording)
         if len(y) != len(setpoint):
             raise DataError(
                 name=self.machine.name, expected=f"a run of {len(setpoint)} samples",
@@ -260,6 +262,17 @@ class _Learning:
         # samples that a link lost count as no error
         error = np.nan_to_num(table.reference - y, nan=0.0)
         return _Played(correction, replace(run, r=table.reference.copy()), error)
+
+    def _measured(self, recording: Recording) -> FloatArray:
+        """The speed from the counts [RPM], by a smoother that is the same for all repetitions: it
+        expects the jerk of the move, where that of a recording estimates it, and ripple, anew.
+        """
+        if not (self.jerk > 0.0 and np.isfinite(recording.counts).all()):
+            return recording.y
+        return speed_from_counts(
+            recording.counts, self.table.Ts, recording.counts_per_rev, process_noise=self.jerk,
+            ripple_orders=(),
+        )  # fmt: skip
 
     def _verdict(self, played: _Played) -> str:
         """What a repetition was: the best so far, undone, or the best played again."""

@@ -282,11 +282,3 @@ fn a_rehearsal_contracts_if_its_changes_shrink_and_no_error_grows() {
     assert_eq!(contraction(&[good.clone(), grown]), f64::INFINITY);
     assert_eq!(contraction(&[good, None]), f64::INFINITY);
 }
-
-#[test]
-fn members_of_opposite_signs_are_refused_before_a_machine_moves() {
-    let (one, other, r, monitor) = (lag(1.0), lag(-0.9), trapezoid(500.0), Monitor::default());
-    let controller = pid(settings(), Feedforward::NONE);
-    let members = [member(&one, &controller), member(&other, &controller)];
-    assert!(Learner::new(&members, &r, &r, 0, 1, &monitor).is_err());
-}
