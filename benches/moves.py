@@ -115,7 +115,7 @@ def shaken(table: MoveTable, model: Model, machine: VirtualMachine, seed: int) -
     factor = (0.75, 1.25, 1.0, random.uniform(0.75, 1.25))[seed % 4]
     changed = VirtualMachine(parameters={**own, "inertia": own["inertia"] * factor})
     # torques in parts of the dry friction
-    noise, late = (random.uniform(0.0, m) * own["coulomb_torque"] for m in (0.5, 1.0))
+    noise, late = (random.uniform(0.0, m) * own["coulomb_torque"] for m in (1.0, 4.0))
     moving = Shaken(changed, noise, late if seed % 2 else 0.0, seed)
     bench = SteppedBench(
         moving, Ts=machine.Ts, counts_per_rev=machine.counts_per_rev, volt=own["u_limit"],
