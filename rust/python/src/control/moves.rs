@@ -20,6 +20,8 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(profile, module)?)
 }
 
+type Samples<'py> = Bound<'py, numpy::PyArray1<f64>>;
+
 fn models(plants: &[Bound<'_, PyAny>]) -> PyResult<Vec<Model>> {
     plants.iter().map(Model::of).collect()
 }
@@ -125,11 +127,7 @@ impl MoveLearner {
         self.core.contraction
     }
 
-    fn signal<'py>(
-        &self,
-        py: Python<'py>,
-        correction: Values<'py>,
-    ) -> PyResult<Bound<'py, numpy::PyArray1<f64>>> {
+    fn signal<'py>(&self, py: Python<'py>, correction: Values<'py>) -> PyResult<Samples<'py>> {
         let found = self.core.signal(slice(&correction, "correction")?);
         Ok(array1(py, found.map_err(|e| raise(py, e))?))
     }
@@ -141,10 +139,7 @@ impl MoveLearner {
         correction: Values<'py>,
         error: Values<'py>,
         gain: f64,
-    ) -> PyResult<(
-        Bound<'py, numpy::PyArray1<f64>>,
-        Bound<'py, numpy::PyArray1<f64>>,
-    )> {
+    ) -> PyResult<(Samples<'py>, Samples<'py>)> {
         let (correction, error) = (slice(&correction, "correction")?, slice(&error, "error")?);
         let found = py.detach(|| self.core.next(correction, error, gain));
         let (next, left) = found.map_err(|e| raise(py, e))?;
@@ -206,7 +201,7 @@ fn profile<'py>(
     high: f64,
     rate: f64,
     jerk: f64,
-) -> PyResult<(Bound<'py, numpy::PyArray1<f64>>, [bool; 3])> {
+) -> PyResult<(Samples<'py>, [bool; 3])> {
     let reference = slice(&reference, "reference")?;
     let (least, most, levels, up, down, own) = reach;
     let found = watched(py, None, |_| {
