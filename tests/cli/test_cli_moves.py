@@ -67,3 +67,22 @@ def test_what_does_not_belong_together_is_refused(folder: Path) -> None:
     assert "one of them" in refused(folder, *learn, "--table", "t.json", "--resume")
     assert "sewfast.table" in refused(folder, *learn, "--table", "c.json")
     assert "repetitions" in refused(folder, *learn, "--table", "t.json", "--repetitions", "0")
+
+
+def test_a_useless_model_is_refused_unless_by_force(folder: Path) -> None:
+    from dataclasses import replace
+
+    known = {**drive().training, "verdict": {"grade": "useless", "text": "it explains nothing"}}
+    replace(drive(), training=known).save(folder / "bad.json")
+    for command in ("plan", "profile"):
+        files = ("c.json",) * (command == "plan") + ("bad.json",)
+        asked = (
+            command,
+            *files,
+            "--reference",
+            "ramp.csv",
+            "-o",
+            "t.json" if len(files) > 1 else "r.csv",
+        )
+        assert "it explains nothing" in refused(folder, *asked)
+        assert "warning" in sewfast(folder, *asked, "--force").err

@@ -21,6 +21,7 @@ from .arguments import (
 )
 from .drive import add_drive, is_port, machine_of, opened, require_no_drive_options
 from .output import INTERRUPTED, print_json, suggested, write_columns
+from .tune import useful_models
 
 if TYPE_CHECKING:
     from ..control.controller import SampledController
@@ -93,16 +94,22 @@ def add_profile(commands: Commands) -> None:
         ("--share", "PART", "part of what the models can do that is used (.9)"),
     ):
         parser.add_argument(option, type=float, metavar=unit, help=text)
+    _add_force(parser)
     add_output(parser, "OUT", "CSV, .npz, .mat or Parquet; default: CSV to standard output")
 
 
+def _add_force(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--force", action="store_true", help="even with a model that identify called useless"
+    )
+
+
 def profile_command(args: argparse.Namespace) -> None:
-    from ..models import load_model
     from ..moves import profile
     from .control import reference_of
 
     require_place(args.out, TABLES)
-    models = [load_model(path) for path in args.model]
+    models = useful_models(args.model, force=args.force)
     asked: Any = reference_of(args.reference, models[0].Ts, models[0].output_unit)
     if isinstance(asked, str):
         from .. import signals
@@ -135,6 +142,7 @@ def _add_files(parser: argparse.ArgumentParser) -> None:
         "--within-reach", action="store_true",
         help="make it one that the models can follow first, as sewfast profile does",
     )  # fmt: skip
+    _add_force(parser)
 
 
 def add_plan(commands: Commands) -> None:
@@ -177,9 +185,8 @@ def plan_command(args: argparse.Namespace) -> int | None:
 
 def _files(args: argparse.Namespace) -> tuple[SampledController, list[Model]]:
     from ..control.files import load_controller
-    from ..models import load_model
 
-    return load_controller(args.controller), [load_model(path) for path in args.model]
+    return load_controller(args.controller), useful_models(args.model, force=args.force)
 
 
 def _planned(

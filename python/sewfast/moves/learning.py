@@ -203,7 +203,12 @@ class _Learning:
         self.table, self.learner, self.machine = table, learner, machine
         self.file, self.cancel = file, cancel
         known = table.correction
-        self.next = known if len(known) == learner.size else np.zeros(learner.size)
+        if len(known) not in (0, learner.size):
+            raise DataError(
+                name="table", expected=f"a correction of {learner.size} numbers, or none",
+                received=f"{len(known)}", remedy="plan the move again",
+            )  # fmt: skip
+        self.next = known if len(known) else np.zeros(learner.size)
         self.predicted: float | None = None
         self.first: _Played | None = None
         self.best: _Played | None = None
