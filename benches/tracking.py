@@ -23,6 +23,7 @@ import numpy as np
 from simple_pid import PID
 
 import sewfast
+from moves import error, recorded
 from sewfast import Controller, VirtualMachine, run, signals
 from sewfast.control.margins import operating_point
 from sewfast.errors import SettingError
@@ -43,23 +44,6 @@ ALTERED = {
     for share in (0.75, 1.25)
 }
 """Changes of the machine after identification: factors on its parameters."""
-
-
-def recorded(machine: VirtualMachine) -> sewfast.Dataset:
-    """The training record of the README's example."""
-    parts = []
-    for name in ("chirp_lo_hi", "saturating"):
-        machine.reset()
-        u = signals.excitation(name)
-        y = sewfast.speed_from_counts(machine.run(u).counts, machine.Ts, machine.counts_per_rev)
-        parts.append(
-            sewfast.Dataset.from_arrays(u, y, machine.Ts, input_units="V", output_unit="RPM")
-        )
-    return sewfast.Dataset.concat(parts)
-
-
-def error(loop: sewfast.ClosedLoopRun) -> float:
-    return float(np.sqrt(np.mean((loop.y - loop.r) ** 2)))
 
 
 def stepped(

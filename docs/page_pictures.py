@@ -270,6 +270,23 @@ def feedforward(file: Path) -> None:
     loop_drawing(loops, "RPM", "V", (-20.0, 20.0)).plot(file=file)
 
 
+def moves(file: Path) -> None:
+    """A move of the README's drive: PID alone, planned, learned in five repetitions."""
+    machine = sewfast.VirtualMachine()
+    record = runpy.run_path(str(DOCS / "free_run.py"))["record"]
+    training = sewfast.Dataset.concat(map(record, ("chirp_lo_hi", "saturating")))
+    model = sewfast.identify(training, model="grey_box", seed=0)
+    found = sewfast.tune(model, counts_per_rev=machine.counts_per_rev)
+    table = sewfast.plan(found.controller, model, "trapezoid")
+    learned = sewfast.learn(table, model, machine, repetitions=5).table
+    alone = sewfast.run(found.lead.alone, machine, "trapezoid")
+    loops = [Trace.of(alone.columns(), "model", "PID alone")]
+    for one, look, label in ((table, "oe", "planned"), (learned, "measured", "learned")):
+        played = sewfast.run(found.controller, machine, table=one)
+        loops.append(Trace.of(played.columns(), look, label))
+    loop_drawing(loops, "RPM", "V", (-20.0, 20.0)).plot(file=file)
+
+
 def live(file: Path) -> None:
     """The speed of a view, from the counts of the last 20 ms, and that of the recording."""
     machine = sewfast.VirtualMachine()
@@ -296,6 +313,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "speed": speed,
     "state-feedback": state_feedback,
     "feedforward": feedforward,
+    "moves": moves,
     "live": live,
 }
 

@@ -768,6 +768,50 @@ def pareto(
 ) -> dict[str, Any]:
     """Returns controllers (values of the variables), values (of the objectives), variables, evaluations, termination."""
 
+# --- moves.rs ---------------------------------------------------------------------------------------------
+
+def plan_move(
+    plants: Sequence[Any], controller: _Controller, reference: _F, *, counted: bool, threads: int, progress: _Progress = None
+) -> dict[str, Any]:
+    """setpoint, y, u (means), errors (rms of each plant without and with), limited, interrupted."""
+
+@final
+class MoveLearner:
+    """Improves the table of a move from the errors of its repetitions."""
+
+    def __new__(
+        cls, plants: Sequence[Any], controller: _Controller, reference: _F, table: _F, *, variations: Sequence[tuple[float, int]],
+        counted: bool, threads: int, progress: _Progress = None,
+    ) -> MoveLearner: ...
+    @property
+    def size(self) -> int:
+        """Numbers of a correction."""
+    @property
+    def period(self) -> float:
+        """Of a swing of which half passes the low-pass [samples]."""
+    @property
+    def contraction(self) -> float:
+        """The largest ratio of a change of the correction to the one before, on plants and variations; below 1."""
+    def signal(self, correction: _F) -> _F:
+        """A correction as samples."""
+    def next(self, correction: _F, error: _F, gain: float) -> tuple[_F, _F]:
+        """The next correction after one with this error, and the error that it should leave."""
+
+_Reach: TypeAlias = tuple[float, float, list[float], list[float], list[float], float]
+
+def reach(
+    plants: Sequence[Any], *, Ts: float, u: tuple[float, float], levels: tuple[float, float], share: float
+) -> _Reach:
+    """Least and largest level, levels, rates up and down at each, jerk: what all plants can do."""
+
+def constant_reach(*, low: float, high: float, rate: float, jerk: float) -> _Reach:
+    """The same bounds at every level."""
+
+def profile(
+    reference: _F, reach: _Reach, *, Ts: float, low: float, high: float, rate: float, jerk: float
+) -> tuple[_F, list[bool]]:
+    """The reference within a reach; whether levels, rate and jerk were at their bounds."""
+
 # --- rules.rs ---------------------------------------------------------------------------------------------
 
 def fit_fopdt(u: _F, y: _F, *, Ts: float) -> dict[str, Any]:

@@ -21,7 +21,7 @@ ORDER = """
     recordfile dataset readers benchmarks gains machine live recording
     causes equilibrium dynamic_model validation comparison evidence models
     motorfit identification
-    rules control tuning trust analysis frequency
+    rules control moves tuning trust analysis frequency
     link greybox report commissioning cli __main__
 """
 

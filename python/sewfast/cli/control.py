@@ -54,6 +54,7 @@ examples:
   sewfast run controller.json --on drive.json --reference random -o predicted.csv --plot loop.png
   sewfast run controller.json --on virtual --reference trapezoid -o measured.csv
   sewfast run controller.json --on virtual:7 --reference cycle.csv --json
+  sewfast run controller.json --on virtual --table seam.json -o measured.csv
   sewfast run controller.json --on /dev/ttyUSB0 --reference trapezoid -o measured.mcap \\
       --limits volt=10,speed=3500,acceleration=30000,current=15
   sewfast run controller.json --on /dev/ttyUSB0 --reference cycle.csv -o measured.csv \\
@@ -81,6 +82,10 @@ def add(commands: Commands) -> None:
         help="reference to track; default: a trapezoid over the recorded range of the model (none "
         "for a drive)",
     )  # fmt: skip
+    parser.add_argument(
+        "--table", metavar="TABLE.json",
+        help="the table of a known move that plan or learn wrote, in place of a reference",
+    )  # fmt: skip
     add_output(
         parser, "OUT",
         "CSV, .npz, .mat or Parquet, for a drive also .mcap; default: CSV to standard output",
@@ -93,7 +98,7 @@ def add(commands: Commands) -> None:
 
 def run_command(args: argparse.Namespace) -> int | None:
     from ..commissioning.fmu import is_fmu
-    from ..control.files import load_controller, load_pid
+    from ..control.files import load_controller, load_pid, load_table
     from ..control.loop import noise_in_loop, run
 
     _settle_plant(args)
@@ -104,26 +109,28 @@ def run_command(args: argparse.Namespace) -> int | None:
     require_place(args.out, RECORDINGS if is_port(args.on) else TABLES)
     controller = load_controller(args.controller)
     name = None if args.reference is None else Path(args.reference).stem
+    table = None if args.table is None else load_table(args.table)
     if not is_port(args.on):
         require_no_drive_options(args)
         if is_fmu(args.on):
-            found = run(controller, machine_of(args.on), _wanted(args, controller), name=name)
+            machine = machine_of(args.on)
+            found = run(controller, machine, _wanted(args, controller), table=table, name=name)
             _show_run(args, found, None)
             return None
         plant = plant_of(args.on)
         reference = _wanted(args, controller)
-        found = run(controller, plant, reference, name=name)
+        found = run(controller, plant, reference, table=table, name=name)
         calm = None
         if noise_in_loop(controller, plant) > 0.0:
             # noise is no oscillation, so that a run without it is judged
-            calm = run(controller, plant, reference, noise=0.0, name=name)
+            calm = run(controller, plant, reference, table=table, noise=0.0, name=name)
         _show_run(args, found, None, plant, calm)
         return None
     place = recording_place(args.out, overwrite=args.overwrite)
     reference = _wanted(args, controller)
     with opened(args) as drive:
         found = run(
-            controller, drive, reference, name=name, file=place, live=args.live,
+            controller, drive, reference, table=table, name=name, file=place, live=args.live,
             overwrite=args.overwrite,
         )  # fmt: skip
     _show_run(args, found, place)
@@ -154,7 +161,14 @@ def _settle_plant(args: argparse.Namespace) -> None:
                 f"drive is given by --on {args.plant}"
             )
         args.on = args.plant
-    if args.reference is None and (is_port(args.on) or args.host_loop is not None):
+    if args.table is not None and (args.reference is not None or args.host_loop is not None):
+        raise SettingError(
+            name="--table", expected="neither --reference nor --host-loop beside it",
+            received="one of them",
+            remedy="leave it out; a loop on this computer has no table, run it on the device",
+        )  # fmt: skip
+    needed = is_port(args.on) or args.host_loop is not None
+    if args.reference is None and args.table is None and needed:
         raise SettingError("--reference: expected a reference to track, received nothing")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from ..control.biquad import Biquad
     from ..control.controller import Controller, SampledController
     from ..gains import Gains
+    from ..models import Model
     from ..tuning.front import ParetoFront
     from ..tuning.objective import Constraints, Cost, LoadStep
     from ..tuning.search import TuningResult
@@ -205,8 +207,6 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
 
 
 def tune_command(args: argparse.Namespace) -> int | None:
-    from ..models import load_model
-
     require_place(args.out, (".json",))
     require_plot(args.plot)
     if args.front is not None and args.pareto is None:
@@ -222,17 +222,7 @@ def tune_command(args: argparse.Namespace) -> int | None:
             received="both", remedy="leave one of them out",
         )  # fmt: skip
     require_place(args.front, (*TABLES, *FIGURES), option="--front")
-    models = [load_model(path) for path in args.model]
-    for path, model in zip(args.model, models, strict=True):
-        verdict = model.training.get("verdict") or {}
-        if verdict.get("grade") == "useless" and not args.force:
-            raise SettingError(
-                name=str(path), expected="a model that a controller can be tuned on",
-                received=verdict["text"],
-                remedy="record as identify said, or tune on it all the same with --force",
-            )  # fmt: skip
-        if verdict.get("grade") in ("poor", "useless"):
-            print(f"warning: {path}: {verdict['text']}", file=sys.stderr)
+    models = useful_models(args.model, force=args.force)
     first = models[0]
     references = [
         reference_of(text, first.Ts, first.output_unit) for text in args.reference or ()
@@ -364,6 +354,24 @@ def _loop(args: argparse.Namespace) -> dict[str, Any]:
         "output_unit": args.unit,
         "controller": args.controller.replace("-", "_"),
     }
+
+
+def useful_models(paths: Sequence[str], *, force: bool) -> list[Model]:
+    """The models of files; one that identify called useless is refused unless by force."""
+    from ..models import load_model
+
+    models = [load_model(path) for path in paths]
+    for path, model in zip(paths, models, strict=True):
+        verdict = model.training.get("verdict") or {}
+        if verdict.get("grade") == "useless" and not force:
+            raise SettingError(
+                name=str(path), expected="a model that a controller can be tuned on",
+                received=verdict["text"],
+                remedy="record as identify said, or tune on it all the same with --force",
+            )  # fmt: skip
+        if verdict.get("grade") in ("poor", "useless"):
+            print(f"warning: {path}: {verdict['text']}", file=sys.stderr)
+    return models
 
 
 def _tuned(

@@ -1,4 +1,4 @@
-"""Controller files: `load_controller`, and the table of the kinds."""
+"""Files of controllers and of tables of moves: `load_controller`, `load_table`; the kinds."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from .. import storage
 from ..errors import ModelFileError, SewfastError, located
 from ..storage import Fields
 from .controller import FORMAT, Controller, SampledController
+from .move import COLUMNS, MoveTable, Repetition
+from .move import FORMAT as TABLE
+from .move import VERSION as TABLE_VERSION
 from .state_feedback import StateFeedback
 
 KINDS: dict[str, type[SampledController]] = {
@@ -26,15 +29,20 @@ def load_controller(path: str | os.PathLike[str]) -> SampledController:
         setting outside its range; the message names the file and the field.
     """
     fields = Fields(os.fspath(path), storage.read(path, FORMAT, (1, 2, 3, 4, 5)))
-    kind = fields.text("kind") if fields.integer("version") > 3 else Controller.KIND
-    if kind not in KINDS:
-        raise fields.refuse("kind", ", ".join(KINDS), kind)
     try:
-        return KINDS[kind].read(fields)
+        return read_controller(fields)
     except ModelFileError:
         raise
     except SewfastError as error:
         raise located(ModelFileError, path, error) from error
+
+
+def read_controller(fields: Fields) -> SampledController:
+    """The controller of any kind in a file or a part of one."""
+    kind = fields.text("kind") if fields.integer("version") > 3 else Controller.KIND
+    if kind not in KINDS:
+        raise fields.refuse("kind", ", ".join(KINDS), kind)
+    return KINDS[kind].read(fields)
 
 
 def load_pid(path: str | os.PathLike[str]) -> Controller:
@@ -46,3 +54,41 @@ def load_pid(path: str | os.PathLike[str]) -> Controller:
             remedy="this is for PIDs only; run the other kinds on a model or a drive (sewfast run)",
         )  # fmt: skip
     return found
+
+
+def load_table(path: str | os.PathLike[str]) -> MoveTable:
+    """Read a table that `MoveTable.save` wrote; nothing in the file is executed.
+
+    Raises
+    ------
+    ModelFileError
+        If the file is missing, damaged, of another format or of an unknown version, or holds a
+        setting outside its range; the message names the file and the field.
+    """
+    fields = Fields(os.fspath(path), storage.read(path, TABLE, (TABLE_VERSION,)))
+    fields.require_only(
+        ("version", "name", "controller", "errors", "limited", *COLUMNS, "correction",
+         "repetitions")
+    )  # fmt: skip
+    columns = {name: fields.vector(name) for name in COLUMNS}
+    lengths = {len(column) for column in columns.values()}
+    if len(lengths) != 1 or 0 in lengths:
+        raise fields.refuse("setpoint", "as many samples as the reference, at least one", lengths)
+    errors = fields.objects("errors")
+    for part in errors:
+        part.require_only(("without", "with"))
+    try:
+        controller = read_controller(fields.object("controller"))
+        return MoveTable(
+            **columns,
+            controller=controller,
+            name=fields.text("name"),
+            errors=tuple((part.number("without"), part.number("with")) for part in errors),
+            limited=fields.number("limited"),
+            correction=fields.vector("correction"),
+            repetitions=tuple(map(Repetition.read, fields.objects("repetitions"))),
+        )
+    except ModelFileError:
+        raise
+    except SewfastError as error:
+        raise located(ModelFileError, path, error) from error

@@ -24,6 +24,7 @@ from ..tables import Table, percent, significant
 from ..units import duration, spelled
 from .controller import Controller, SampledController, pid_of
 from .defaults import default_references, drive_references
+from .move import MoveTable, table_of
 
 if TYPE_CHECKING:
     from ..live import ViewKind
@@ -226,6 +227,7 @@ def run(
     on: Plant | Machine,
     reference: str | ArrayLike | None = None,
     *,
+    table: MoveTable | None = None,
     feedforward: ArrayLike | None = None,
     disturbance: ArrayLike | None = None,
     noise: float | None = None,
@@ -252,6 +254,9 @@ def run(
         Name of a reference (`sewfast.signals`) or its samples at the controller's sample time [y].
         On a model that is not in RPM at 1 ms a name is the same shape over the model's recorded
         range. By default a trapezoid that suits the plant; a drive needs an explicit one.
+    table : MoveTable, optional
+        In place of a reference, the table of a known move for this controller: its setpoint is
+        played, and the run is compared with its reference.
     feedforward : array, shape (N,), optional
         A command added before the limits [u]; not for a drive.
     disturbance : array, shape (N,), optional
@@ -295,6 +300,14 @@ def run(
         On Ctrl-C or `cancel` with a drive; the motor is stopped, `best` is the run so far.
     """
     require_controller(controller, on, "run(controller, plant, reference)", SampledController)
+    if table is not None:
+        played = _setpoint(table, controller, reference)
+        found = run(
+            controller, on, played, feedforward=feedforward, disturbance=disturbance, noise=noise,
+            seed=seed, name=name or table.name, file=file, live=live, overwrite=overwrite,
+            cancel=cancel,
+        )  # fmt: skip
+        return replace(found, r=table.reference[: len(found.t)].copy())
     if reference is None:
         reference, name = _usual_reference(on, controller), name or "trapezoid"
     r = reference_samples(reference, controller, seed, plant=on)
@@ -326,6 +339,17 @@ def run(
         plant=plant_name(on),
         reference=title,
     )
+
+
+def _setpoint(table: MoveTable, controller: SampledController, reference: Any) -> FloatArray:
+    """What the controller gets in place of the reference of a table."""
+    if reference is not None:
+        raise SettingError(
+            name="table", expected="no other reference beside it", received="one",
+            remedy="leave one of them out",
+        )  # fmt: skip
+    table_of(table).require(controller)
+    return table.setpoint
 
 
 def _usual_reference(on: Any, controller: SampledController) -> str | FloatArray:

@@ -5,6 +5,7 @@
 //! [`machine`]. Times are in seconds; outputs and inputs carry the caller's units.
 
 pub mod arx;
+mod banded;
 pub mod bounded;
 pub mod causes;
 pub mod changes;
@@ -41,11 +42,13 @@ pub mod machine;
 pub mod metrics;
 pub mod model;
 pub mod monitor;
+pub mod moves;
 pub mod neural;
 pub mod neural_ss;
 pub mod oe;
 pub mod orders;
 pub mod output_error;
+pub mod profile;
 pub mod proposal;
 pub mod random;
 mod regression;

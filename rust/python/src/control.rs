@@ -2,6 +2,7 @@
 //! tuning rules; controller and tuning have their own files.
 
 pub mod controller;
+mod moves;
 mod tuning;
 
 use std::sync::Arc;
@@ -35,6 +36,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(step_metrics, module)?)?;
     module.add_function(wrap_pyfunction!(effort, module)?)?;
     tuning::register(module)?;
+    moves::register(module)?;
     module.add_function(wrap_pyfunction!(fit_fopdt, module)?)?;
     module.add_function(wrap_pyfunction!(table_1, module)?)?;
     module.add_function(wrap_pyfunction!(eq_12, module)?)?;

@@ -1,0 +1,227 @@
+//! Bindings of known moves: their tables, learning from repetitions, and references within the reach of a drive.
+
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use sewfast_control::AnyDesign;
+use sewfast_core::closed_loop::Varied;
+use sewfast_core::moves::{self, Member};
+use sewfast_core::profile::Reach;
+use sewfast_core::{Error, Result};
+
+use super::controller::AnyGiven;
+use super::{AnyPlant, Model, Values};
+use crate::seam::{array1, raise, slice, watched};
+
+pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<MoveLearner>()?;
+    module.add_function(wrap_pyfunction!(plan_move, module)?)?;
+    module.add_function(wrap_pyfunction!(reach, module)?)?;
+    module.add_function(wrap_pyfunction!(constant_reach, module)?)?;
+    module.add_function(wrap_pyfunction!(profile, module)?)
+}
+
+type Samples<'py> = Bound<'py, numpy::PyArray1<f64>>;
+
+fn models(plants: &[Bound<'_, PyAny>]) -> PyResult<Vec<Model>> {
+    plants.iter().map(Model::of).collect()
+}
+
+/// Each model in each variation, with the controller of its loop.
+fn members<'a>(
+    models: &'a [Model],
+    design: &AnyDesign<f64>,
+    counted: bool,
+    variations: &[(f64, usize)],
+) -> Result<Vec<Member<'a>>> {
+    let mut made = Vec::with_capacity(models.len() * variations.len());
+    for model in models {
+        let plant = model.plant(design.ts())?;
+        for &(gain, delay) in variations {
+            made.push(Member {
+                plant: Box::new(Varied::new(plant.clone(), gain, delay)?),
+                controller: design.controller()?,
+                counted,
+            });
+        }
+    }
+    Ok(made)
+}
+
+/// Samples by which a controller gets its reference early.
+fn preview(design: &AnyDesign<f64>) -> usize {
+    design.pid().map_or(0, |pid| pid.feedforward.preview())
+}
+
+/// The table of a move for a controller on these plants.
+#[pyfunction]
+#[pyo3(signature = (plants, controller, reference, *, counted, threads, progress=None))]
+fn plan_move<'py>(
+    py: Python<'py>,
+    plants: Vec<Bound<'py, PyAny>>,
+    controller: AnyGiven<'py>,
+    reference: Values<'py>,
+    counted: bool,
+    threads: usize,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let (models, design) = (models(&plants)?, controller.design());
+    let reference = slice(&reference, "reference")?;
+    let found = watched(py, progress, |monitor| {
+        let members = members(&models, &design, counted, &[(1.0, 0)])?;
+        moves::plan(&members, reference, preview(&design), threads, monitor)
+    })?;
+    let dict = PyDict::new(py);
+    dict.set_item("setpoint", array1(py, found.setpoint))?;
+    dict.set_item("y", array1(py, found.y))?;
+    dict.set_item("u", array1(py, found.u))?;
+    dict.set_item("errors", found.errors)?;
+    dict.set_item("limited", found.limited)?;
+    dict.set_item("interrupted", found.interrupted)?;
+    Ok(dict)
+}
+
+/// Improves the table of a move from the errors of its repetitions.
+#[pyclass(module = "sewfast._core")]
+struct MoveLearner {
+    core: moves::Learner,
+}
+
+#[pymethods]
+impl MoveLearner {
+    #[new]
+    #[pyo3(signature = (plants, controller, reference, table, *, variations, counted, threads, progress=None))]
+    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+    fn new(
+        py: Python<'_>,
+        plants: Vec<Bound<'_, PyAny>>,
+        controller: AnyGiven<'_>,
+        reference: Values<'_>,
+        table: Values<'_>,
+        variations: Vec<(f64, usize)>,
+        counted: bool,
+        threads: usize,
+        progress: Option<&Bound<'_, PyAny>>,
+    ) -> PyResult<Self> {
+        let (models, design) = (models(&plants)?, controller.design());
+        let (reference, table) = (slice(&reference, "reference")?, slice(&table, "table")?);
+        let core = watched(py, progress, |monitor| {
+            let members = members(&models, &design, counted, &variations)?;
+            let ahead = preview(&design);
+            moves::Learner::new(&members, reference, table, ahead, threads, monitor)
+        })?;
+        Ok(Self { core })
+    }
+
+    #[getter]
+    fn size(&self) -> usize {
+        self.core.size()
+    }
+
+    #[getter]
+    fn period(&self) -> f64 {
+        self.core.period
+    }
+
+    #[getter]
+    fn contraction(&self) -> f64 {
+        self.core.contraction
+    }
+
+    fn signal<'py>(&self, py: Python<'py>, correction: Values<'py>) -> PyResult<Samples<'py>> {
+        let found = self.core.signal(slice(&correction, "correction")?);
+        Ok(array1(py, found.map_err(|e| raise(py, e))?))
+    }
+
+    /// The next correction, and the error that is left by it.
+    fn next<'py>(
+        &self,
+        py: Python<'py>,
+        correction: Values<'py>,
+        error: Values<'py>,
+        gain: f64,
+    ) -> PyResult<(Samples<'py>, Samples<'py>)> {
+        let (correction, error) = (slice(&correction, "correction")?, slice(&error, "error")?);
+        let found = py.detach(|| self.core.next(correction, error, gain));
+        let (next, left) = found.map_err(|e| raise(py, e))?;
+        Ok((array1(py, next), array1(py, left)))
+    }
+}
+
+// --- References within the reach of a drive ---
+
+/// Least and largest level, levels, rates up and down at each, jerk.
+type Reached = (f64, f64, Vec<f64>, Vec<f64>, Vec<f64>, f64);
+
+fn told(of: Reach) -> Reached {
+    (of.low, of.high, of.levels, of.up, of.down, of.jerk)
+}
+
+/// What all of these plants can do by a share of their rates.
+#[pyfunction]
+#[pyo3(signature = (plants, *, Ts, u, levels, share))]
+#[expect(non_snake_case, reason = "the field's name for the sample time")]
+fn reach(
+    py: Python<'_>,
+    plants: Vec<Bound<'_, PyAny>>,
+    Ts: f64,
+    u: (f64, f64),
+    levels: (f64, f64),
+    share: f64,
+) -> PyResult<Reached> {
+    let models = models(&plants)?;
+    let found = watched(py, None, |_| {
+        let each = models.iter().map(|model| {
+            let mut plant: AnyPlant<'_> = model.plant(Ts)?;
+            Reach::of(&mut plant, Ts, u, levels)
+        });
+        Reach::common(&each.collect::<Result<Vec<_>>>()?, share)
+    })?;
+    Ok(told(found))
+}
+
+/// The same bounds at every level.
+#[pyfunction]
+#[pyo3(signature = (*, low, high, rate, jerk))]
+fn constant_reach(py: Python<'_>, low: f64, high: f64, rate: f64, jerk: f64) -> PyResult<Reached> {
+    let made = Reach::constant(low, high, rate, jerk);
+    made.map(told).map_err(|e| raise(py, e))
+}
+
+/// A reference within a reach and further bounds of levels, rate and jerk, and whether levels, rate and jerk were at their bounds.
+#[pyfunction]
+#[pyo3(signature = (reference, reach, *, Ts, low, high, rate, jerk))]
+#[expect(non_snake_case, reason = "the field's name for the sample time")]
+#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+fn profile<'py>(
+    py: Python<'py>,
+    reference: Values<'py>,
+    reach: Reached,
+    Ts: f64,
+    low: f64,
+    high: f64,
+    rate: f64,
+    jerk: f64,
+) -> PyResult<(Samples<'py>, [bool; 3])> {
+    let reference = slice(&reference, "reference")?;
+    let (least, most, levels, up, down, own) = reach;
+    let found = watched(py, None, |_| {
+        if levels.is_empty() || up.len() != levels.len() || down.len() != levels.len() {
+            return Err(Error::setting(format!(
+                "expected rates at one or more levels, got {} and {} at {}; take those of a reach",
+                up.len(),
+                down.len(),
+                levels.len()
+            )));
+        }
+        let reach = Reach {
+            low: least,
+            high: most,
+            levels,
+            up,
+            down,
+            jerk: own,
+        };
+        reach.within(low, high, rate, jerk).profile(reference, Ts)
+    })?;
+    Ok((array1(py, found.r), found.bounds))
+}
