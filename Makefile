@@ -307,7 +307,7 @@ battery: $(VENV)/bench.stamp ## identify on simulated systems of known truth (SP
 	  $(if $(FAMILIES),--families $(FAMILIES)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(RUNS),--runs $(RUNS)) \
 	  $(if $(QUICK),--quick) $(if $(JSON),--json $(JSON))
 
-assumptions: $(DEV) ## unstable plants in loops, single steps, coloured noise, seeds (COUNT=20)
+assumptions: $(DEV) ## unstable plants in loops, single steps, coloured noise, seeds, shifts (COUNT=20)
 	$(BIN)/python benches/assumptions.py $(if $(COUNT),--count $(COUNT))
 
 strangers: $(DEV) ## takes twelve files in users' formats to a controller with three commands (SEEDS="0 1", ONLY=counts,iso)

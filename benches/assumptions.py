@@ -1,6 +1,6 @@
 """Records that break assumptions: unstable plants in loops, steps, coloured noise, sound records.
 
-    python benches/assumptions.py [loops|gaps|steps|coloured|accused|seeds ..] [--count 20]
+    python benches/assumptions.py [loops|gaps|steps|coloured|accused|seeds|shifts ..] [--count 20]
     make assumptions
 
 loops: an unstable plant (first order, with a lag, a falling body), recorded under a controller with
@@ -19,6 +19,9 @@ accused: single steps, whole records of the battery and 100 to 500 samples of th
 record is said to change or its columns to be exchanged.
 
 seeds: heaters and axes, output error, six seeds of `tune` each: cost of the worst over the best.
+
+shifts: heaters, axes, tanks and positions, output error, with 0, 24.5 and 293.15 added to the
+output. It counts if a gain of `tune` moves by more than 2 %.
 """
 
 from __future__ import annotations
@@ -51,7 +54,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parts = {
         "loops": loops, "gaps": lambda drawn: loops(drawn, missing=9), "steps": steps,
-        "coloured": coloured, "accused": accused, "seeds": seeds,
+        "coloured": coloured, "accused": accused, "seeds": seeds, "shifts": shifts,
     }  # fmt: skip
     parser.add_argument("parts", nargs="*", metavar="|".join(parts), choices=[*parts, []])
     parser.add_argument("--count", type=int, default=20, help="systems of each part")
@@ -335,6 +338,59 @@ def seeds(drawn: range) -> int:
         print(f"  {name}: worst over best {worst[-1]:.3f}")
     print(f"seeds: {len(worst)} plants, six seeds each; worst over best at most {max(worst):.3f}")
     return sum(w > 1.2 for w in worst)
+
+
+# --- The same plant at another level --------------------------------------------------------------
+
+
+def resting_plants(drawn: range) -> Iterator[tuple[str, Dataset]]:
+    """The slow plants at rest at 0, tanks (which drain by the root of their level), positions."""
+    for name, data in slow_plants(drawn):
+        yield name, moved(data, -24.5 if name.startswith("heater") else 0.0)
+    for seed in drawn:
+        rng = np.random.default_rng(seed)
+        u = np.repeat(rng.uniform(1.0, 6.0, 30), 100)
+        u[:60] = 3.0
+        drain, area = rng.uniform(0.4, 0.8), rng.uniform(15.0, 40.0)
+        level, y = (1.5 / drain) ** 2, np.zeros(len(u))
+        for k in range(10 * len(u)):
+            level += 0.1 / area * (u[k // 10] - 2.0 * drain * math.sqrt(max(level, 0.0)))
+            y[k // 10] = level
+        y += 0.01 * rng.standard_normal(len(y))
+        units = {"input_units": ("V",), "output_unit": "cm"}
+        yield f"tank {seed}", Dataset.from_arrays(u, y, 1.0, **units)
+        u = np.repeat(rng.uniform(-5.0, 5.0, 50), 80)
+        u[:100] = 0.0
+        a = math.exp(-0.005 / rng.uniform(0.03, 0.1))
+        v = lfilter([rng.uniform(5.0, 20.0) * (1.0 - a)], [1.0, -a], u)
+        y = 0.005 * np.cumsum(v) + 0.003 * rng.standard_normal(len(u))
+        units = {"input_units": ("V",), "output_unit": "mm"}
+        yield f"position {seed}", Dataset.from_arrays(u, y, 0.005, **units)
+
+
+def moved(data: Dataset, by: float) -> Dataset:
+    """The record with a constant added to its output."""
+    (e,) = data.experiments
+    units = {"input_units": data.input_units, "output_unit": data.output_unit}
+    return Dataset.from_arrays(e.u, e.y + by, data.Ts, **units)
+
+
+def shifts(drawn: range) -> int:
+    """Plants whose tuned gains depend on the level of the output."""
+    apart = []
+    for name, data in resting_plants(drawn):
+        gains = []
+        for by in (0.0, 24.5, 293.15):
+            model = identify(moved(data, by), model="oe", threads=1, seed=0)
+            found = tune(model, threads=1, feedforward="none", seed=0).pid.gains
+            gains.append((found.Kp, found.integral, found.derivative))
+        of = np.array(gains)
+        apart.append(float(np.max(np.abs(of / of[0] - 1.0))))
+        print(f"  {name}: gains {100.0 * apart[-1]:.2g} % apart")
+    over = sum(a > 0.02 for a in apart)
+    middle = 100.0 * np.median(apart)
+    print(f"shifts: {len(apart)} plants, {over} over 2 % apart, median {middle:.2g} %")
+    return over
 
 
 if __name__ == "__main__":
