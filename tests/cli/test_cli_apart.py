@@ -82,3 +82,14 @@ def test_a_recording_is_no_place_for_a_log(
     kept.write_bytes(b"what a drive did")
     assert "which is kept" in refused(capsys, "device", option, str(kept), "--for", "0.1")
     assert kept.read_bytes() == b"what a drive did"
+
+
+def test_an_export_is_not_written_over_the_recording(
+    ramp: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = ramp.read_bytes()
+    said = refused(
+        capsys, "physics", str(ramp), "--structure", "joint", "--export", "mujoco", str(ramp)
+    )
+    assert "a separate file" in said
+    assert ramp.read_bytes() == before

@@ -67,6 +67,27 @@ def test_what_does_not_belong_together_is_refused(folder: Path) -> None:
     assert "one of them" in refused(folder, *learn, "--table", "t.json", "--resume")
     assert "sewfast.table" in refused(folder, *learn, "--table", "c.json")
     assert "repetitions" in refused(folder, *learn, "--table", "t.json", "--repetitions", "0")
+    assert "--within-reach" in refused(folder, *learn, "--table", "t.json", "--within-reach")
+    port = ("learn", "c.json", "m.json", "--on", "/dev/none", "-o", "l.json")
+    assert "a slip must not move a motor" in refused(folder, *port)
+    assert "share" in refused(
+        folder, "profile", "m.json", "--reference", "ramp.csv", "--share", "2", "-o", "r.csv"
+    )
+
+
+def test_a_learned_table_is_not_replaced_unasked(folder: Path) -> None:
+    from dataclasses import replace
+
+    from sewfast.control.files import load_table
+    from sewfast.control.move import Repetition
+
+    plan = ("plan", "c.json", "m.json", "--reference", "ramp.csv", "-o", "t.json")
+    sewfast(folder, *plan)
+    known = (Repetition(1, 2.0, 5.0, None, "first"),)
+    replace(load_table(folder / "t.json"), repetitions=known).save(folder / "t.json")
+    assert "no table that was learned" in refused(folder, *plan)
+    sewfast(folder, *plan, "--overwrite")
+    assert not load_table(folder / "t.json").repetitions
 
 
 def test_a_useless_model_is_refused_unless_by_force(folder: Path) -> None:

@@ -154,6 +154,21 @@ def test_ctrl_c_keeps_the_best_so_far(table: MoveTable) -> None:
     assert again.repetitions[-1].error == pytest.approx(best.repetitions[-1].error, rel=0.2)
 
 
+def test_lost_samples_do_not_undo_a_table(table: MoveTable) -> None:
+    class Lossy(SteppedBench):
+        def follow(self, *args: Any, **options: Any) -> Any:
+            run = super().follow(*args, **options)
+            known = run.recording
+            counts, y = known.counts.astype(float), known.y.copy()
+            counts[40::97] = y[40::97] = np.nan
+            return replace(run, recording=replace(known, counts=counts, y=y))
+
+    whole = learn(table, drive(), bench(gain=390.0), repetitions=3)
+    lossy = Lossy(Lag(gain=390.0), Ts=0.001, counts_per_rev=1572.0, volt=20.0)
+    found = learn(table, drive(), lossy, repetitions=3)
+    np.testing.assert_allclose(errors(found), errors(whole), rtol=0.3)
+
+
 def test_it_learns_on_a_device(table: MoveTable) -> None:
     with VirtualDevice(fast=True) as device, connect(device.port) as drive_:
         drive_.set_limits(volt=20.0, speed_rpm=4000.0)

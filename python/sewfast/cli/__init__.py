@@ -142,6 +142,8 @@ def _written(args: argparse.Namespace) -> Iterator[tuple[str, Path]]:
         path = getattr(args, name, None)
         if isinstance(path, Path):
             yield option, path
+    if export := getattr(args, "export", None):
+        yield "--export", Path(export[1])
     out = getattr(args, "out", None)
     if isinstance(out, Path) and out.suffix not in ("", ".mcap") and _is_recorded(args):
         # the recording of a drive goes into the same folder as the table
@@ -155,7 +157,7 @@ def _is_recorded(args: argparse.Namespace) -> bool:
 
 def _read(args: argparse.Namespace) -> Iterator[Path]:
     for name, value in vars(args).items():
-        if name in _WRITTEN:
+        if name in (*_WRITTEN, "export"):
             continue
         for text in value if isinstance(value, (list, tuple)) else (value,):
             if isinstance(text, (str, Path)):

@@ -415,7 +415,7 @@ def physics_command(args: argparse.Namespace) -> None:
     from ..dataset.faults import sound
     from ..greybox import physics
     from ..greybox.exports import BOARDS, Target
-    from ..greybox.joint_exports import JointTarget
+    from ..greybox.joint_exports import JointTarget, simulator
 
     require_place(args.out, (".json",))
     _require_place_of_model(args.model)
@@ -442,6 +442,8 @@ def physics_command(args: argparse.Namespace) -> None:
         )  # fmt: skip
     if target is not None:
         storage.require_writable(place)
+    if args.check:
+        simulator()
     data, found = sound(_motor_data(args))
     for fault in found:
         note(fault.warning)
@@ -455,11 +457,11 @@ def physics_command(args: argparse.Namespace) -> None:
     )
     own = {"inertia": args.inertia} if is_joint else {"winding": args.winding, "gear": args.gear}
     text = "" if target is None else motor.export(target, **own)
-    replay = motor.check(data, inertia=args.inertia) if args.check else None
     if args.out is not None:
         motor.save(args.out)
     if text:
         storage.replace(place, text)
+    replay = motor.check(data, inertia=args.inertia) if args.check else None
     if args.model is not None:
         motor.to_model().save(args.model)
     if args.plot is not None:

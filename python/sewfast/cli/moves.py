@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import Interrupted, SettingError
 from ..progress import Progress
+from ..units import spelled
 from .arguments import (
     TABLES,
     Commands,
@@ -114,6 +116,12 @@ def profile_command(args: argparse.Namespace) -> None:
     if isinstance(asked, str):
         from .. import signals
 
+        if spelled(models[0].output_unit) != "rpm" or not math.isclose(models[0].Ts, signals.TS):
+            raise SettingError(
+                name="--reference", expected=f"a file for a model in {models[0].output_unit} at "
+                f"{models[0].Ts:g} s",
+                received=asked, remedy="names are for models in RPM at 1 ms",
+            )  # fmt: skip
         asked = signals.reference(asked)
     names = ("u_min", "u_max", "low", "high", "rate", "jerk", "share")
     given = {name: getattr(args, name) for name in names}
@@ -153,11 +161,13 @@ def add_plan(commands: Commands) -> None:
     _add_files(parser)
     add_output(parser, "TABLE.json", "table to write", required=True)
     add_plot(parser, "draw reference, expected output, error and command")
+    add_overwrite(parser)
 
 
 def plan_command(args: argparse.Namespace) -> int | None:
     require_plot(args.plot)
     require_place(args.out, (".json",))
+    _require_not_learned(args)
     controller, models = _files(args)
     try:
         table = _planned(args, controller, models)
@@ -181,6 +191,17 @@ def plan_command(args: argparse.Namespace) -> int | None:
         print(f"written to {place}")
     print(suggested("run", args.controller, "--table", args.out, "--on", "virtual"))
     return None
+
+
+def _require_not_learned(args: argparse.Namespace) -> None:
+    """Refuse to write over a table that was learned: on a drive it cannot be made again."""
+    from ..control.files import load_table
+
+    if args.out.exists() and not args.overwrite and load_table(args.out).repetitions:
+        raise SettingError(
+            name=f"-o {args.out}", expected="no table that was learned", received="one",
+            remedy="choose another name, go on with learn --resume, or replace it with --overwrite",
+        )  # fmt: skip
 
 
 def _files(args: argparse.Namespace) -> tuple[SampledController, list[Model]]:
@@ -242,15 +263,20 @@ def learn_command(args: argparse.Namespace) -> int | None:
         )  # fmt: skip
     if not is_port(args.on):
         require_no_drive_options(args)
+    elif not any(starts):
+        raise SettingError(
+            name="--reference", expected="the move for a drive", received="none",
+            remedy="name one: a slip must not move a motor",
+        )  # fmt: skip
     controller, models = _files(args)
     start = args.out if args.resume else args.table
-    is_kept = args.out.exists() and not args.resume and not args.overwrite
-    # what was learned on a drive cannot be made again
-    if is_kept and load_table(args.out).repetitions:
+    if start is not None and args.within_reach:
         raise SettingError(
-            name=f"-o {args.out}", expected="no table that was learned", received="one",
-            remedy="go on with --resume, or replace it with --overwrite",
+            name="--within-reach", expected="--reference beside it", received="a table",
+            remedy="its move is planned already",
         )  # fmt: skip
+    if not args.resume:
+        _require_not_learned(args)
     table = _planned(args, controller, models) if start is None else load_table(start)
     table.require(controller)
     code = None

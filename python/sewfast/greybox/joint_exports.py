@@ -180,7 +180,7 @@ def _mujoco(parts: _Parts) -> str:
     missing = parts.missing()
     note = f"; not in it: {', '.join(missing)}" if missing else ""
     return f"""<mujoco model="joint">
-  <!-- forces in {parts.unit}; the point mass carries gravity{note} -->
+  <!-- forces in {parts.unit.replace("--", "- -")}; the point mass carries gravity{note} -->
   <compiler angle="radian"/>
   <option timestep="{step:.9g}" integrator="implicitfast" gravity="0 0 -{GRAVITY}"/>
   <worldbody>
@@ -200,15 +200,20 @@ def _mujoco(parts: _Parts) -> str:
 """
 
 
+def simulator() -> Any:
+    """The package mujoco; `SettingError` without it."""
+    try:
+        return importlib.import_module("mujoco")
+    except ImportError as error:
+        raise not_installed("mujoco", "a check in MuJoCo", "mujoco") from error
+
+
 def checked(joint: Joint, text: str, data: Dataset) -> Replay:
     """Build MuJoCo's model from an export, replay a record, and say how it differs.
 
     Raises `SettingError` without the package mujoco.
     """
-    try:
-        mujoco: Any = importlib.import_module("mujoco")
-    except ImportError as error:
-        raise not_installed("mujoco", "a check in MuJoCo", "mujoco") from error
+    mujoco = simulator()
     model = mujoco.MjModel.from_xml_string(text)
     off: list[FloatArray] = []
     apart: list[FloatArray] = []

@@ -181,6 +181,8 @@ def learn(
         threads=whole("threads", available() if threads is None else threads),
     )  # fmt: skip
     learning = _Learning(table, learner, machine, file, cancel)
+    if file is not None:
+        table.save(file)  # the first repetition may trip
     for done in range(total):
         try:
             if progress is not None:
@@ -259,23 +261,27 @@ class _Learning:
             raise KeyboardInterrupt
         run = self.machine.follow(table.controller, setpoint, table.name, **options)
         y = self._measured(run.recording)
-        if len(y) != len(setpoint):
+        if len(y) != len(setpoint) or not np.isfinite(y).any():
             raise DataError(
                 name=self.machine.name, expected=f"a run of {len(setpoint)} samples",
-                received=f"{len(y)}", remedy="repeat the move",
+                received=f"{np.isfinite(y).sum()}", remedy="repeat the move",
             )  # fmt: skip
-        # samples that a link lost count as no error
-        error = np.nan_to_num(table.reference - y, nan=0.0)
+        error = table.reference - y
+        known = np.isfinite(error)
+        # samples that a link lost have the error of those beside them
+        error = np.interp(np.arange(len(error)), np.flatnonzero(known), error[known])
         return _Played(correction, replace(run, r=table.reference.copy()), error)
 
     def _measured(self, recording: Recording) -> FloatArray:
         """The speed from the counts [RPM], by a smoother that is the same for all repetitions: it
         expects the jerk of the move, where that of a recording estimates it, and ripple, anew.
         """
-        if not (self.jerk > 0.0 and np.isfinite(recording.counts).all()):
+        counts, known = recording.counts, np.isfinite(recording.counts)
+        if not (self.jerk > 0.0 and known.any()):
             return recording.y
+        counts = np.interp(np.arange(len(counts)), np.flatnonzero(known), counts[known])
         return speed_from_counts(
-            recording.counts, self.table.Ts, recording.counts_per_rev, process_noise=self.jerk,
+            counts, self.table.Ts, recording.counts_per_rev, process_noise=self.jerk,
             ripple_orders=(),
         )  # fmt: skip
 

@@ -78,12 +78,16 @@ class Reach:
             For a model that does not move both ways under these commands.
         """
         plants = each_plant(models)
+        if not 0.0 < real("share", share) <= 1.0:
+            raise SettingError(
+                name="share", expected="a part above 0, at most 1", received=f"{share:g}"
+            )
         low, high, _ = command_limits(plants, u_min, u_max)
         if not plants or any(isinstance(p, Model) and moves_on(p, low, high) for p in plants):
             raise SettingError(
                 name="models", expected="models of a speed, or another output that settles",
                 received="one that moves on as long as a command acts" if plants else "none",
-                remedy="give rate and jerk yourself",
+                remedy="in Python, profile(reference, Ts=, rate=, jerk=) needs no model",
             )  # fmt: skip
         rest = common_rest(plants)
         known = [recorded_outputs(p) for p in plants if isinstance(p, Model)]
