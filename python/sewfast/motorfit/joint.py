@@ -156,6 +156,10 @@ class _Fit:
         self.pieces: Sequence[Experiment] = data.experiments
         self.least: dict[str, float] = {}
         """Least inertia: of the start, since bounds relative to each fit would compound."""
+        u = np.concatenate([e.u[:, 0] for e in data.experiments])
+        # friction that grows faster than the drive would lock a joint that is driven more
+        self.most = {"k_l": 1.0, "k_m": 1.0, "k_mm": 0.5 / max(float(np.ptp(u)), 1e-300)}
+        """Largest friction per drive, within the range of the commands."""
 
     def cut(self, share: int) -> None:
         """Each experiment in as many pieces as belong to it."""
@@ -233,8 +237,9 @@ class _Fit:
     ) -> Descent:
         """The least squares over the pieces, whose states are fitted with the core."""
         return descended(
-            core, core.theta, self.pieces, self.look, iterations, enough=enough, least=self.least
-        )
+            core, core.theta, self.pieces, self.look, iterations, enough=enough, least=self.least,
+            most=self.most,
+        )  # fmt: skip
 
     def without_delay(self, found: Descent) -> Descent:
         """The fit, or the one that a descent without a delay finds: stops of dry friction give the
@@ -283,7 +288,7 @@ class _Fit:
                 if one := self._tried(begun, GLANCE):
                     found[term] = min(found.get(term, one), one, key=lambda f: f.cost)
         best = [(term, f) for term, one in found.items() if (f := self._tried(one.core, 12))]
-        return sorted(best, key=schwarz)
+        return sorted((of for of in best if _holds(of[1].core)), key=schwarz)
 
     def _tried(self, core: _core.GreyBox, iterations: int) -> Descent | None:
         """A descent; None from where a free run does not stay finite."""
@@ -373,6 +378,15 @@ class _Fit:
         return n
 
 
+def _holds(core: _core.GreyBox) -> bool:
+    """Whether the controller can hold the joint's weight at any angle."""
+    s = core.settings
+    reach = s["joint"][JOINT["reach"] - len(PARAMETERS)]
+    turned = s["values"][[PLACE["load_1c"], PLACE["load_1s"]]]
+    weight = math.hypot(*turned) + abs(s["values"][PLACE["offset"]])
+    return not 0.0 < reach <= weight
+
+
 def squares(core: _core.GreyBox, pieces: Sequence[Experiment], states: FloatArray) -> float:
     """Weighted squared errors of free runs from these states; infinite if one diverges."""
     total: float = core.squares(_arrays(pieces), np.ascontiguousarray(states))
@@ -403,10 +417,12 @@ def descended(
     prior: FloatArray | None = None,
     enough: float = ENOUGH,
     least: Mapping[str, float] | None = None,
+    most: Mapping[str, float] | None = None,
 ) -> Descent:
     """The least sum of squares from `start` (p,). The initial speed and position of
     each piece are fitted too. `prior` (p,) are inverse standard deviations about 0, in units of the
-    residuals; `least` bounds parameters that would else have a thousandth of their start.
+    residuals; `least` bounds parameters that would else have a thousandth of their start, `most`
+    those that would else have no upper bound.
     """
     names = {place: name for name, place in PLACES.items()}
     low, high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
@@ -417,6 +433,7 @@ def descended(
             low[j], high[j] = EXPONENTS
         elif names[place] in POSITIVE:
             low[j] = (least or {}).get(names[place], FLOOR * start[j])
+        high[j] = min(high[j], (most or {}).get(names[place], math.inf))
     known = np.zeros(len(start)) if prior is None else prior
     best, cost, states = changed(core, theta=start).descended(
         _arrays(pieces), prior=known, low=low, high=high, enough=enough, iterations=iterations,

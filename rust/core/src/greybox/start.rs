@@ -33,6 +33,9 @@ pub struct Smoothing<'a> {
 
 /// For each delay what drives per speed, per acceleration, per sign of the speed, and in any case; `None` with too few samples.
 ///
+/// Slow moves do not show the inertia, and noise then makes it negative. Such a start has the inertia with which the joint follows
+/// within about a sample, as one that is faster cannot be told from it.
+///
 /// # Errors
 /// Data errors for records that cannot be used.
 pub fn regressed(pieces: &[Samples<'_>], how: &Smoothing<'_>) -> Result<Vec<Option<[f64; 4]>>> {
@@ -50,8 +53,14 @@ pub fn regressed(pieces: &[Samples<'_>], how: &Smoothing<'_>) -> Result<Vec<Opti
             return None;
         }
         let goal = r.column(4).into_owned();
-        let found = solve_scaled(r.columns(0, 4).into_owned(), &goal, 1e-13).theta;
-        Some(std::array::from_fn(|j| found[j]))
+        let all = r.columns(0, 4).into_owned();
+        let found = solve_scaled(all.clone(), &goal, 1e-13).theta;
+        if found[1] > 0.0 {
+            return Some(std::array::from_fn(|j| found[j]));
+        }
+        let found = solve_scaled(all.remove_column(1), &goal, 1e-13).theta;
+        let fast = how.sample_time * (found[0].max(0.0) + how.k_q * how.sample_time);
+        Some([found[0], fast, found[1], found[2]])
     };
     Ok(rows.into_iter().map(found).collect())
 }
@@ -199,6 +208,24 @@ mod tests {
                 assert!((found - true_).abs() < 0.01, "{found:?} for {true_}");
             }
         }
+    }
+
+    #[test]
+    fn slow_moves_start_with_an_inertia_of_about_a_sample() {
+        let (_, y) = moved(2000, 0.0);
+        // a controller inside that holds a position error of .2 against friction, and moves no mass
+        let u: Vec<f64> = y
+            .windows(2)
+            .map(|q| q[1] + 0.2 * (q[1] - q[0]).signum())
+            .collect();
+        let piece = Samples::new(&u, 1, &y[..u.len()]).unwrap();
+        let inside = Smoothing {
+            k_q: 1.0,
+            ..how(&[0.0])
+        };
+        let [_, inertia, friction, _] = regressed(&[piece], &inside).unwrap()[0].unwrap();
+        assert!((1e-5..1e-3).contains(&inertia), "{inertia}");
+        assert!((friction - 0.2).abs() < 0.01, "{friction}");
     }
 
     #[test]
