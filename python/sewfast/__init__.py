@@ -60,7 +60,7 @@ if TYPE_CHECKING:
         plan,
         profile,
     )
-    from .readers import read, read_table
+    from .readers import read, read_joints, read_table
     from .recording import Recording
     from .rules import fit_fopdt, table_1
     from .speed import speed_from_counts
@@ -150,6 +150,7 @@ __all__ = [
     "plan",
     "profile",
     "read",
+    "read_joints",
     "read_table",
     "record",
     "rules",
@@ -188,7 +189,7 @@ _HOMES = {
     "machine": "VirtualMachine",
     "models": "ARX IV Ensemble LinearOE Model NeuralOE NeuralSS load_model",
     "identification.order_table": "OrderTable orders",
-    "readers": "read read_table",
+    "readers": "read read_joints read_table",
     "recording": "Recording",
     "moves": "Learned MoveTable Profile Reach Repetition learn load_table plan profile",
     "control.margins": "Margins margins operating_point",

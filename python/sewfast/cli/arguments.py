@@ -56,6 +56,15 @@ def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
         help=f"column of the input; repeat it for several inputs{default}",
     )  # fmt: skip
     parser.add_argument("--output", metavar="COL", help=f"column of the output{default}")
+    if not from_model:
+        parser.add_argument(
+            "--joint", metavar="NAME",
+            help="of a robot's record: the columns of this joint's command and position",
+        )  # fmt: skip
+        parser.add_argument(
+            "--unit", metavar="UNIT",
+            help="for --joint: unit of both, if the file has none (rad, deg, m, mm, counts)",
+        )  # fmt: skip
     parser.add_argument(
         "--ts", "--Ts", type=float, metavar="S",
         help="sample time [s]; default: from the time column; even time stamps must agree within "

@@ -31,20 +31,29 @@ def shifted(data: Dataset, args: argparse.Namespace) -> Dataset:
 
 
 def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) -> Dataset:
-    from ..readers import left_out, parse_source, read_columns, read_table
+    from ..readers import columns_of, left_out, parse_source, read_columns, read_table
 
     path, inputs, output = parse_source(source)
     table = with_units(read_table(path), args)
     inputs, output = inputs or tuple(args.input or ()), output or args.output
     counts = args.counts
+    if (joint := getattr(args, "joint", None)) is not None:
+        if inputs or output or counts:
+            raise SettingError(
+                name="--joint", expected="no other names of columns", received=", ".join(
+                    filter(None, (*inputs, output, counts))
+                ), remedy="leave one of them out",
+            )  # fmt: skip
+        command, output = columns_of(table, joint)
+        inputs = (command,)
+        table = _in_unit(table, (command, output), args.unit)
     if not inputs or not (output or counts):
         found = _recognised(table, args, inputs, output)
         if found is None:
             raise SettingError(
                 name=str(table.path), expected="columns that show which is the input and which "
                 "the output", received=", ".join(table.names),
-                remedy="name them: --input COL, --output COL, or --counts COL --counts-per-rev N"
-                + left_out(table),
+                remedy=_how_to_name(table) + left_out(table),
             )  # fmt: skip
         inputs = inputs or (found.input,)
         if not output and not counts:
@@ -64,6 +73,22 @@ def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) 
             weights=getattr(args, "weights", None),
         )
     )
+
+
+def _how_to_name(table: Table) -> str:
+    from ..readers import joint_columns
+
+    if joints := joint_columns(table):
+        return f"name a joint: --joint NAME, of {', '.join(joints)}"
+    return "name them: --input COL, --output COL, or --counts COL --counts-per-rev N"
+
+
+def _in_unit(table: Table, names: Sequence[str], unit: str | None) -> Table:
+    """A table with a unit for columns that have none."""
+    from dataclasses import replace
+
+    more = {n: unit for n in names if unit and not table.units.get(n)}
+    return replace(table, units={**table.units, **more}) if more else table
 
 
 def _recognised(
@@ -327,7 +352,7 @@ def _in_doubt(args: argparse.Namespace) -> list[Table] | None:
     from ..readers import parse_source, read_table
 
     sources = [parse_source(source) for source in args.data]
-    named = args.input or args.output or args.counts
+    named = args.input or args.output or args.counts or args.joint
     if named or any(inputs or output for _, inputs, output in sources):
         return None
     tables = [with_units(read_table(path), args) for path, _, _ in sources]
@@ -353,7 +378,7 @@ def _show_columns(tables: list[Table], args: argparse.Namespace) -> None:
         print_rows([header, *map(_row, found)])
         for name, reason in table.unusable.items():
             print(f"not a column of numbers: {name}, {reason}")
-    print("name the input and the output to see more: --input COL --output COL")
+    print(f"to see more, {_how_to_name(tables[0])}")
 
 
 def _columns(table: Table) -> list[ColumnSummary]:

@@ -21,6 +21,8 @@ from ..units import split_unit, unit_in_name
 
 
 MAX_COLUMNS = 10_000
+ELEMENTS = 64
+"""Most elements of an array in a message or a cell that become columns."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -132,6 +134,23 @@ def freeze(values: np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> FloatAr
         array = np.array(values, dtype=np.float64, order="C")
     array.flags.writeable = False
     return array
+
+
+# --- Arrays with a label for each element, such as the joints of a robot: columns `field.LABEL` ---
+
+
+def label(name: str) -> str:
+    """A joint's name without the dots and slashes that part the names of columns."""
+    return printable(name.removesuffix(".pos")).replace(".", "_").replace("/", "_")
+
+
+def labels_of(fields: Mapping[str, Any]) -> tuple[str, ...]:
+    """The labels that a message has for its arrays, in `name`, `names` or `joint_names`."""
+    for key in ("name", "names", "joint_names"):
+        found = fields.get(key)
+        if isinstance(found, (list, tuple)) and found and all(isinstance(n, str) for n in found):
+            return tuple(map(label, found))
+    return ()
 
 
 # --- Files of named arrays (.mat, HDF5, .npz) -> Table --------------------------------------------
@@ -254,8 +273,12 @@ def _table(path: Path, values: Mapping[str, Value]) -> Table:
     columns: dict[str, Any] = {}
     unusable: dict[str, str] = {}
     stated: dict[str, float] = {}
+    texts = {
+        n: v.tolist() for n, v in values.items() if getattr(v, "dtype", np.dtype("f8")).kind == "U"
+    }
+    labels = labels_of(texts)
     for name, value in values.items():
-        _flatten(printable(name), value, columns, unusable, stated, 0)
+        _flatten(printable(name), value, columns, unusable, stated, 0, labels)
     if len(columns) > MAX_COLUMNS:
         raise DataError(f"{path}: expected at most {MAX_COLUMNS} columns, received {len(columns)}")
     if not columns:
@@ -294,6 +317,7 @@ def _flatten(
     unusable: dict[str, str],
     stated: dict[str, float],
     depth: int,
+    labels: Sequence[str] = (),
 ) -> None:
     if isinstance(value, (dict, list)) and depth <= _MAX_DEPTH:
         items = value.items() if isinstance(value, dict) else enumerate(value)
@@ -308,7 +332,8 @@ def _flatten(
     elif value.ndim == 1 or 1 in value.shape:
         columns[name] = value.ravel()
     else:
-        columns.update({f"{name}.{k}": column for k, column in enumerate(value.T)})
+        known = labels if len(labels) == value.shape[1] else range(value.shape[1])
+        columns.update({f"{name}.{k}": column for k, column in zip(known, value.T, strict=True)})
         unusable[name] = (
             f"variable {name!r} is a matrix of shape {value.shape}; name one of its columns, "
             f"{name}.0 to {name}.{value.shape[1] - 1}"

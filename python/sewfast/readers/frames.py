@@ -6,7 +6,7 @@ NaT) become NaN; moments and durations become seconds from the first one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray
 from ..errors import DataError, SettingError, not_installed
-from .containers import Table, from_headers
+from .containers import ELEMENTS, Table, from_headers
 from .timebase import seconds_of_objects
 
 _NUMBER = (int, float, np.number, Decimal)
@@ -83,12 +83,18 @@ def collected(path: Path, found: Iterator[Found]) -> Table:
     return Table(path, table.columns, known, table.unusable)
 
 
-def of_arrow(table: Any) -> Iterator[Found]:
-    """Columns of a pyarrow table; columns of text only if they hold numbers or moments."""
+def of_arrow(table: Any, labels: Mapping[str, Sequence[str]] | None = None) -> Iterator[Found]:
+    """Columns of a pyarrow table; columns of text only if they hold numbers or moments. A column of
+    lists of one length becomes `NAME.LABEL` of its `labels`, or `NAME.0` and so on.
+    """
     import pyarrow as pa
 
+    lists = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
     for i, entry in enumerate(table.schema):
         column, metadata = table.column(i), entry.metadata or {}
+        if any(is_list(entry.type) for is_list in lists):
+            yield from _of_lists(entry.name, column.to_pylist(), (labels or {}).get(entry.name, ()))
+            continue
         unit = metadata.get(b"unit", b"").decode("utf-8", "replace")
         try:
             if pa.types.is_temporal(entry.type):
@@ -101,6 +107,19 @@ def of_arrow(table: Any) -> Iterator[Found]:
                 yield entry.name, *_numbers(np.array(column.to_pylist(), dtype=object))
             else:
                 yield entry.name, None, "", f"holds {entry.type}"
+
+
+def _of_lists(name: str, rows: list[Any], labels: Sequence[str]) -> Iterator[Found]:
+    try:
+        array = np.array(rows, dtype=np.float64)
+    except (ValueError, TypeError):
+        array = np.empty(0)
+    if array.ndim != 2 or array.shape[1] > ELEMENTS:
+        yield name, None, "", f"holds lists that are not of one length up to {ELEMENTS}"
+        return
+    known = len(labels) == array.shape[1]
+    for k, column in enumerate(array.T):
+        yield f"{name}.{labels[k] if known else k}", column, "", ""
 
 
 def _arrow(frame: Any) -> Any:

@@ -29,14 +29,12 @@ from ..errors import DataError, not_installed, printable
 from ..recordfile.format import LIBRARY, MAGIC
 from ..storage import file_bytes
 from .blackbox import BLACKBOX, SALEAE, blackbox_series, saleae_series
-from .containers import MAX_COLUMNS, Table, freeze
+from .containers import ELEMENTS, MAX_COLUMNS, Table, freeze, labels_of
 
 PATIENCE, PATIENCE_PER_MB = 20.0, 5.0
 """Time limit of a reader, and addition per megabyte of the file [s]."""
 _DEPTH = 8
 """Deepest nesting of messages that is read."""
-_ELEMENTS = 64
-"""Most elements of an array in a message that become columns."""
 
 
 @dataclass(frozen=True)
@@ -297,19 +295,28 @@ def _mcap(path: Path, raw: bytes) -> Iterator[Signal]:
         yield Signal(name, None, np.array("no JSON"))
 
 
-def _numbers(name: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
+def _numbers(
+    name: str, value: Any, depth: int, labels: tuple[str, ...] = ()
+) -> Iterator[tuple[str, float]]:
+    """The numbers of a message by name; those of an array by its labels, if it has as many."""
     if isinstance(value, (bool, int, float, np.number, np.bool_)):
         yield name, float(value)
+    elif depth >= _DEPTH:
+        return
     elif isinstance(value, (list, tuple, np.ndarray)):
-        for k, item in enumerate(value[:_ELEMENTS] if depth < _DEPTH else ()):
-            yield from _numbers(f"{name}.{k}", item, depth + 1)
-    elif isinstance(value, dict) and depth < _DEPTH:
-        for field, item in value.items():
-            yield from _numbers(f"{name}.{field}", item, depth + 1)
-    elif hasattr(value, "__dataclass_fields__") and depth < _DEPTH:
-        for field in value.__dataclass_fields__:
-            if not field.startswith("__"):
-                yield from _numbers(f"{name}.{field}", getattr(value, field), depth + 1)
+        known = labels if len(labels) == len(value) else range(len(value))
+        for k, item in zip(known, value[:ELEMENTS], strict=False):
+            yield from _numbers(f"{name}.{k}", item, depth + 1, labels)
+    else:
+        fields = value if isinstance(value, dict) else _fields(value)
+        own = labels_of(fields) or labels
+        for field, item in fields.items():
+            yield from _numbers(f"{name}.{field}", item, depth + 1, own)
+
+
+def _fields(message: Any) -> dict[str, Any]:
+    names = getattr(message, "__dataclass_fields__", ())
+    return {name: getattr(message, name) for name in names if not name.startswith("__")}
 
 
 _FORMATS = {"double": "<f8", "float": "<f4", "int64": "<i8", "boolean": "?"}
@@ -342,7 +349,7 @@ def _wpilog(path: Path, raw: bytes) -> Iterator[Signal]:
             name, dtype, many = kinds[entry]
             if len(payload) % dtype.itemsize or (len(payload) != dtype.itemsize and not many):
                 raise DataError(f"{path}: expected {dtype} in {name!r}, got {len(payload)} bytes")
-            values = np.frombuffer(payload, dtype)[:_ELEMENTS].tolist()
+            values = np.frombuffer(payload, dtype)[:ELEMENTS].tolist()
             for k, value in enumerate(values):
                 times, column = series.setdefault(f"{name}.{k}" if many else name, ([], []))
                 times.append(stamp)

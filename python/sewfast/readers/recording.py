@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import logging
 import os
 from collections.abc import Iterable, Sequence
@@ -27,12 +28,13 @@ from ..recordfile.format import MAGIC
 from ..recordfile.reader import decode_recording
 from ..speed import speed_between_gaps
 from ..storage import file_bytes
-from .containers import Table, freeze, read_mat, read_npz
+from .containers import Table, freeze, labels_of, read_mat, read_npz
 from .delimited import read_delimited
 from .frames import collected, of_arrow, table_of
 from .jsonlog import is_json, read_json
 from .logs import is_log, read_log
 from .roles import recognised
+from .sage import read_folder
 from .timebase import TOLERANCE, Grid, time_base
 
 LOG = logging.getLogger("sewfast")
@@ -53,7 +55,22 @@ def read_parquet(path: Path, raw: bytes) -> Table:
         raise DataError(f"{path}: expected a Parquet file, but it cannot be read: {e}") from e
     if found.num_rows == 0:
         raise DataError(f"{path}: expected rows of numbers, received none")
-    return collected(path, of_arrow(found))
+    return collected(path, of_arrow(found, _lerobot_labels(path)))
+
+
+def _lerobot_labels(path: Path) -> dict[str, tuple[str, ...]]:
+    """Labels of LeRobot's list columns, from `meta/info.json` in a folder above an episode."""
+    for folder in list(path.absolute().parents)[:4]:
+        try:
+            features = json.loads((folder / "meta" / "info.json").read_text("utf-8"))["features"]
+            named = {str(column): of.get("names") for column, of in features.items()}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            continue
+        for column, names in named.items():
+            # version 2.0 has {"motors": [...]}
+            named[column] = next(iter(names.values()), ()) if isinstance(names, dict) else names
+        return {column: labels_of({"names": names}) for column, names in named.items()}
+    return {}
 
 
 # --- MCAP recordings of the package -> Table ------------------------------------------------------
@@ -132,6 +149,8 @@ def read_table(path: Any) -> Table:
         the signal with most samples gives the rows, others are held. JSON is an object of numbers
         on each line (JSON lines), a list of such objects, or an object of columns. If an installed
         package handles the file's ending (entry point `sewfast.readers`), that package reads it.
+        A folder is a motion as SAGE records it. Arrays with labels, in messages of ROS, episodes of
+        LeRobot, archives with `joint_names`, become columns `field.LABEL`.
 
     Returns
     -------
@@ -149,8 +168,7 @@ def read_table(path: Any) -> Table:
     if not isinstance(path, (str, os.PathLike)):
         return table_of(path)
     path = Path(path)
-    raw = _bytes(path)
-    table = _table(path, raw)
+    table = read_folder(path) if path.is_dir() else _table(path, _bytes(path))
     rows = max(map(len, table.columns.values()), default=0)
     LOG.info("%s: read, %d rows of %s", path, rows, printable(", ".join(table.names)))
     return table

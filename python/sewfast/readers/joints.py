@@ -1,0 +1,149 @@
+"""Joints of a robot in one record: which columns are the command and the position of each.
+
+Readers give a column to each element of an array of joints, `field.JOINT` (`containers.label`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+from ..dataset import Dataset
+from ..errors import SettingError
+from ..units import is_position
+from .containers import Table, freeze
+from .recording import read_columns, read_table
+
+_COMMAND = frozenset(
+    re.split(" ", "action cmd command commanded control desired goal reference setpoint target")
+)
+_POSITION = frozenset(
+    re.split(" ", "actual angle feedback observation pos position positions q state")
+)
+_OTHER = frozenset(
+    re.split(
+        " ",
+        "acceleration accelerations current effort load speed temperature torque torques vel "
+        "velocities velocity voltage",
+    )
+)
+"""Words in names of columns; one of the last sort says that it is no position."""
+_EPISODE = "episode_index"
+_WORD = re.compile(r"[A-Za-z]+")
+
+
+def joint_columns(table: Table) -> dict[str, tuple[str, str]]:
+    """Columns of the position command and of the position of each joint, by the joint's name.
+
+    A column belongs to the joint that its last part names (`control.positions.Elbow`), or its first
+    (`elbow/command`). Only joints with one command and one position count.
+    """
+    for last in (True, False):
+        found: dict[str, dict[str, list[str]]] = {}
+        for name in table.names:
+            parts = [p for p in re.split(r"[./]" if last else r"[./_ ]", name) if p]
+            if len(parts) < 2:
+                continue
+            joint, rest = (parts[-1], parts[:-1]) if last else (parts[0], parts[1:])
+            if (kind := _kind(rest)) and not joint.isdigit():
+                found.setdefault(joint, {}).setdefault(kind, []).append(name)
+        whole = {
+            joint: (of["command"][0], of["position"][0]) for joint, of in found.items()
+            if len(of.get("command", ())) == 1 == len(of.get("position", ()))
+        }  # fmt: skip
+        if whole:
+            return whole
+    return {}
+
+
+def _kind(parts: Sequence[str]) -> str | None:
+    words = {w.lower() for part in parts for w in _WORD.findall(part)}
+    if words & _OTHER:
+        return None
+    if words & _COMMAND:
+        return "command"
+    return "position" if words & _POSITION else None
+
+
+def columns_of(table: Table, joint: str) -> tuple[str, str]:
+    """Columns of command and position of one joint; raises `SettingError` for an unknown one."""
+    found = joint_columns(table)
+    if joint not in found:
+        raise SettingError(
+            name="joint", expected=f"one of {', '.join(found)}" if found else
+            "columns of a joint's command and position, such as elbow.command, elbow.position",
+            received=repr(joint) if found else f"{table.path} with {', '.join(table.names[:20])}",
+            remedy="choose one of them" if found else "name both columns: --input, --output",
+        )  # fmt: skip
+    return found[joint]
+
+
+def read_joints(
+    path: Any, *, joints: Sequence[str] = (), unit: str = "", Ts: float | None = None
+) -> dict[str, Dataset]:
+    """Position command and position of each joint of a robot's record.
+
+    Parameters
+    ----------
+    path : path or table, or a sequence of them
+        A SAGE folder (`control.csv`, `state_motor.csv`), LeRobot's Parquet episodes, MCAP or ROS
+        bags with `JointState` and a commanded position, or any table whose columns are named
+        `JOINT.command` and `JOINT.position`, in either order. Of several records each is an
+        experiment, and so is each episode.
+    joints : sequence of str
+        Names of the wanted joints; all by default.
+    unit : str
+        Unit of command and position, if the file has none: rad, deg, rev, m, mm, counts.
+    Ts : float, optional
+        Sample time [s], as for `read`.
+
+    Returns
+    -------
+    dict of Dataset by name
+        Input: position command, output: position. `physics` takes all of them.
+
+    Raises
+    ------
+    DataError
+        If a file cannot be read, or has no joints.
+    SettingError
+        For a joint or unit that there is none of.
+
+    Notes
+    -----
+    SAGE states rad. Messages of ROS are in rad or m by the kind of joint (REP 103), which they do
+    not state; LeRobot's are in degrees or in percent of a range.
+    """
+    if unit and not is_position(unit):
+        raise SettingError(
+            name="unit", expected="an angle or a length: rad, deg, rev, m, mm, counts",
+            received=repr(unit), remedy="name the unit of command and position",
+        )  # fmt: skip
+    several = isinstance(path, Sequence) and not isinstance(path, str)
+    tables = [p if isinstance(p, Table) else read_table(p) for p in (path if several else [path])]
+    names = list(joints or joint_columns(tables[0])) or [""]
+    return {
+        name: Dataset.concat([_dataset(part, name, unit, Ts) for t in tables for part in _parts(t)])
+        for name in names
+    }
+
+
+def _dataset(table: Table, joint: str, unit: str, Ts: float | None) -> Dataset:
+    command, position = columns_of(table, joint)
+    data = read_columns(table, inputs=command, output=position, Ts=Ts)
+    units = {"input_units": (data.input_units[0] or unit,), "output_unit": data.output_unit or unit}
+    return replace(data, **units)  # type: ignore[arg-type]
+
+
+def _parts(table: Table) -> Iterator[Table]:
+    """The episodes of a table; time begins anew in each."""
+    if _EPISODE not in table:
+        yield table
+        return
+    of = table[_EPISODE]
+    for number in dict.fromkeys(of.tolist()):
+        columns = {n: freeze(c[of == number]) for n, c in table.columns.items() if n != _EPISODE}
+        path = table.path.with_name(f"{table.path.name} episode {number:g}")
+        yield replace(table, path=path, columns=columns, lines=None)
