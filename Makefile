@@ -335,8 +335,8 @@ tracking: $(VENV)/bench.stamp ## what a feedforward is worth, beside simple-pid 
 moves: $(VENV)/bench.stamp ## what a table of a known move brings, and what repetitions add (SEEDS=5 MACHINES=8, RUNS=200 on changed machines)
 	$(BIN)/python benches/moves.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES)) $(if $(RUNS),--runs $(RUNS))
 
-joints: $(VENV)/bench.stamp ## positions: drives like EMPS, smart servos and MuJoCo joints (KIND=servos SEEDS="0 1" PHYSICS=1 HELD=1)
-	$(BIN)/python benches/joints.py $(if $(KIND),--kind $(KIND)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(PHYSICS),--physics) $(if $(HELD),--held)
+joints: $(VENV)/bench.stamp ## positions: drives like EMPS, smart servos and MuJoCo joints (KIND=servos SEEDS="0 1" PHYSICS=1 HELD=1; SAGE=folder of real motions, TRAIN=multisine)
+	$(BIN)/python benches/joints.py $(if $(SAGE),--sage $(SAGE)) $(if $(TRAIN),--train $(TRAIN)) $(if $(KIND),--kind $(KIND)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(PHYSICS),--physics) $(if $(HELD),--held)
 
 drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONLY="shaft60 lash", SEEDS=)
 	$(BIN)/python benches/drives.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))

@@ -15,6 +15,11 @@ mujoco   the same at 200 Hz on MuJoCo's integrator (at 4 kHz, so that its parame
     python benches/joints.py --held                 seeds 100 to 109, on which nothing is decided
     python benches/joints.py --kind servos --seeds 3 4
     python benches/joints.py --physics              parameters and intervals only, without a search
+    python benches/joints.py --sage FOLDER --train multisine random_waypoints
+
+The last one takes real joints: a folder of motions as SAGE records them, such as
+`output/real/so101/custom` of https://github.com/isaac-sim2real/sage (50 motions of six STS3215 at
+50 Hz). Each joint is fitted to one motion and judged on all others in which it moves.
 """
 
 from __future__ import annotations
@@ -26,6 +31,7 @@ import sys
 import time
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +40,7 @@ from numpy.typing import NDArray
 sys.path.insert(0, __file__.rpartition("/")[0] or ".")
 
 from battery.simulators import compiled
-from sewfast import Dataset, identify, physics
+from sewfast import Dataset, identify, physics, read_joints
 
 F = NDArray[np.float64]
 SUBSTEPS = 10
@@ -361,6 +367,46 @@ def parameters(kind: str, seed: int) -> None:
     )
 
 
+# --- real joints, as SAGE records them ------------------------------------------------------------
+
+
+LEAST_SPAN = 0.1
+"""Least span of a command [rad] with which a joint counts as moved in a motion."""
+
+
+def motions(folder: Path, training: list[str], whole: bool) -> None:
+    """Print for each joint and training motion the error on each other motion, and its share of the
+    better of a linear model and the delayed command."""
+    known = {f.name: read_joints(f) for f in sorted(folder.iterdir()) if f.is_dir()}
+    shares: list[float] = []
+    for train in training:
+        for name, data in known[train].items():
+            if not _moves(data):
+                continue
+            began = time.process_time()
+            model = identify(data) if whole else physics(data).to_model()
+            seconds, linear = time.process_time() - began, identify(data, model="oe")
+            own = []
+            for other, joints in known.items():
+                if other == train or not _moves(joints[name]):
+                    continue
+                case = Case(data, joints[name], joints[name].experiments[0].y)
+                rivals = judged(case, linear), delayed(case)
+                own.append(judged(case, model) / min(rivals))
+            shares += own
+            print(
+                f"{train} {name}: {np.median(own):.2f} of the better of oe and the delayed command "
+                f"(median of {len(own)} motions; quarter {np.quantile(own, 0.75):.2f}, worst "
+                f"{max(own):.2f}); processor {seconds:.1f} s",
+                flush=True,
+            )
+    print(f"all: median {np.median(shares):.2f}, worst {max(shares):.2f}, of {len(shares)}")
+
+
+def _moves(data: Dataset) -> bool:
+    return float(np.ptp(data.experiments[0].u)) >= LEAST_SPAN
+
+
 def main() -> None:
     """Print one row for each joint."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -368,7 +414,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="*")
     parser.add_argument("--physics", action="store_true", help="parameters only")
     parser.add_argument("--held", action="store_true", help="seeds 100 to 109")
+    parser.add_argument("--sage", type=Path, help="folder of real motions")
+    parser.add_argument("--train", nargs="*", default=["multisine", "random_waypoints"])
     given = parser.parse_args()
+    if given.sage:
+        motions(given.sage, given.train, whole=not given.physics)
+        return
     seeds = given.seeds if given.seeds else range(100, 110) if given.held else range(10)
     for kind in given.kind:
         for seed in seeds:

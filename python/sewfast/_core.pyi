@@ -983,6 +983,9 @@ _Experiment = tuple[_F, _F, _F, NDArray[np.bool_], _F]
 _Tested = tuple[list[int], list[list[int]], _F, _F, float, float, int, float, float]
 """Lags, series, correlations, limits, statistic, p-value, degrees of freedom, threshold, explained share."""
 
+def explained(x: _F, y: _F, *, own: int, parts: int) -> list[float]:
+    """Share of what the first `own` columns of x (N, n) leave of y (N,) that all explain, a part."""
+
 def residual_tests(experiments: list[_Experiment], *, memory: int, one_step: bool) -> list[_Tested]:
     """Tests of residuals, in the order of `sewfast.evidence.residual_tests`. A series is a product of inputs."""
 

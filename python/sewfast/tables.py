@@ -49,6 +49,13 @@ def milliseconds(value: float | None) -> str:
     return NONE if value is None else f"{value:.0f}{_SPACE}ms"
 
 
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows of cells as lines with aligned columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    cells = (map(str.ljust, row, widths) for row in rows)
+    return ["  ".join(row).rstrip() for row in cells]
+
+
 def html_of(text: str) -> str:
     """Lines of text, `name: value` or `name   value`, as a table; the first line is its caption."""
     caption, *lines = text.splitlines()
@@ -77,6 +84,12 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     best: frozenset[tuple[int, int]] = frozenset()
     words: bool = False
+
+    def to_text(self) -> str:
+        """As lines with aligned columns."""
+        return "\n".join(
+            [self.caption, *("  " + row for row in aligned([self.header, *self.rows]))]
+        )
 
     def to_html(self, notes: Sequence[str] = ()) -> str:
         """As HTML for a notebook, escaped, without style or script; `notes` are lines below."""

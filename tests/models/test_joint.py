@@ -92,6 +92,30 @@ def test_a_force_and_a_position_tell_inertia_and_friction() -> None:
 def test_a_limit_that_is_reached_is_found() -> None:
     joint = physics(_servo(1500, 2, reach=0.3), structure="joint")
     assert joint.value("reach") == pytest.approx(0.3, rel=0.05)
+    gains = joint.inner_gains(5.0)
+    assert gains.reach == pytest.approx(0.3 / gains.kp_factor, rel=0.05)
+    assert "at its limit from an error" in str(gains)
+
+
+def test_gains_of_the_controller_inside_for_a_bandwidth() -> None:
+    gains = _joint("servo").inner_gains(5.0, damping_ratio=0.8)
+    # k_p / J = 400 1/s^2 and .07 s of damping with the gain that was recorded
+    w = 2.0 * math.pi * 5.0
+    assert gains.kp_factor == pytest.approx(w * w / 400.0, rel=0.05)
+    assert gains.kd_change == pytest.approx(2.0 * 0.8 * w / 400.0 - 0.07, abs=0.005)
+    assert gains.stick == pytest.approx(0.02 / gains.kp_factor, rel=0.05)
+    assert gains.sag == pytest.approx(0.06 / gains.kp_factor, rel=0.1)
+    s = 2j * math.pi * np.geomspace(0.1, 100.0, 20_000)
+    loop = (w * w + 1.6 * w * s) / s**2
+    at = np.argmin(np.abs(np.abs(loop) - 1.0))
+    assert gains.phase_margin == pytest.approx(180.0 + np.degrees(np.angle(loop[at])), abs=0.1)
+    turned = math.radians(gains.phase_margin) / s[at].imag
+    assert gains.delay_margin == pytest.approx(turned, rel=0.01)
+    assert "kp times 2.4" in str(gains)
+    with pytest.raises(SettingError, match="command that drives the joint"):
+        _joint("axis").inner_gains(5.0)
+    with pytest.raises(SettingError, match="above 0"):
+        _joint("servo").inner_gains(0.0)
 
 
 @pytest.mark.parametrize("kind", ["servo", "axis"])

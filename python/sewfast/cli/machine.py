@@ -20,7 +20,7 @@ from .arguments import (
     require_plot,
 )
 from .drive import add_drive, is_port, machine_of, opened, require_no_drive_options
-from .output import REFUSED, note, print_json
+from .output import REFUSED, note, print_json, print_result
 
 if TYPE_CHECKING:
     from ..control.controller import Controller
@@ -366,10 +366,11 @@ def add_physics(commands: Commands) -> None:
         "--volts", type=float, metavar="N", help="volts on the winding per unit of command"
     )
     parser.add_argument(
-        "--structure", default="dcmotor", metavar="LIST",
-        help="dcmotor (the usual terms that the record shows), or terms: lag,delay,coulomb,"
+        "--structure", metavar="LIST",
+        help="default: joint if the output is a position, else dcmotor (the usual terms that the "
+        "record shows); or terms: lag,delay,coulomb,"
         "offset,drop,stribeck,load_1,load_2,inertia_2,cogging,torque_ripple,limit; dcmotor,sag "
-        "adds one of stribeck_difference,sag,eccentricity; joint: the output is a position",
+        "adds one of stribeck_difference,sag,eccentricity",
     )  # fmt: skip
     parser.add_argument(
         "--intervals", choices=("curvature", "profile"), default="curvature",
@@ -391,6 +392,11 @@ def add_physics(commands: Commands) -> None:
         "--check", choices=("mujoco",),
         help="of a joint: build the simulator from its export, replay the record, and say how they "
         "differ",
+    )  # fmt: skip
+    parser.add_argument(
+        "--bandwidth", type=float, metavar="HZ",
+        help="of a joint with a controller inside: its gains for this bandwidth of the position, "
+        "and what they cannot do",
     )  # fmt: skip
     parser.add_argument(
         "--winding", choices=("line", "q"),
@@ -416,21 +422,42 @@ def physics_command(args: argparse.Namespace) -> None:
     from ..greybox import physics
     from ..greybox.exports import BOARDS, Target
     from ..greybox.joint_exports import JointTarget, simulator
+    from ..units import is_position
 
     require_place(args.out, (".json",))
     _require_place_of_model(args.model)
     require_plot(args.plot)
     target, place = args.export or (None, "")
-    is_joint = args.structure == "joint"
+    if args.structure in (None, "joint") and (joints := _joints(args)):
+        for name, wanted in (
+            ("--plot", args.plot), ("--export", target), ("--check", args.check),
+            ("--model", args.model), ("-o", args.out),
+        ):  # fmt: skip
+            if wanted:
+                raise SettingError(
+                    name=name, expected="one joint", received=f"{len(joints)}: {', '.join(joints)}",
+                    remedy="choose one of them: --joint NAME",
+                )  # fmt: skip
+        print_result(physics(joints), args)
+        return
+    data, found = sound(_motor_data(args))
+    for fault in found:
+        note(fault.warning)
+    is_joint = args.structure == "joint" or (
+        args.structure is None and args.speed_unit is None and is_position(data.output_unit)
+    )
     if is_joint and args.plot:
         raise SettingError(
-            name="--plot", expected="none with --structure joint", received="a file",
+            name="--plot", expected="none for a joint", received="a file",
             remedy="write the joint (-o), or it as a model (--model)",
         )  # fmt: skip
-    if not is_joint and (args.check or args.inertia is not None):
+    of_joints = {"--check": args.check, "--inertia": args.inertia, "--bandwidth": args.bandwidth}
+    given = [name for name, value in of_joints.items() if value is not None]
+    if not is_joint and given:
         raise SettingError(
-            name="--check" if args.check else "--inertia", expected="--structure joint",
-            received=args.structure, remedy="leave it out for a motor",
+            name=given[0], expected="a position as output",
+            received=data.output_unit or "an output without a unit", remedy="leave it out for a "
+            "motor, or name the unit of the position",
         )  # fmt: skip
     if target not in (None, *get_args(JointTarget if is_joint else Target)):
         names = ", ".join(get_args(JointTarget if is_joint else Target))
@@ -444,12 +471,9 @@ def physics_command(args: argparse.Namespace) -> None:
         storage.require_writable(place)
     if args.check:
         simulator()
-    data, found = sound(_motor_data(args))
-    for fault in found:
-        note(fault.warning)
     motor: Any = physics(
         data,
-        structure=args.structure.split(","),
+        structure="joint" if is_joint else (args.structure or "dcmotor").split(","),
         current=args.current,
         volts=args.volts,
         speed_unit=args.speed_unit,
@@ -462,21 +486,39 @@ def physics_command(args: argparse.Namespace) -> None:
     if text:
         storage.replace(place, text)
     replay = motor.check(data, inertia=args.inertia) if args.check else None
+    gains = None if args.bandwidth is None else motor.inner_gains(args.bandwidth)
     if args.model is not None:
         motor.to_model().save(args.model)
     if args.plot is not None:
         motor.plot(file=args.plot)
     if args.json:
         shown = {} if replay is None else {"check": asdict(replay)}
+        shown |= {} if gains is None else {"inner_gains": gains.to_dict()}
         notes = [*data.notes, *(f.warning for f in found)]
         print_json({**motor.to_dict(), **shown, "notes": notes})
         return
     print(motor)
-    if replay is not None:
-        print(replay)
+    for told in (replay, gains):
+        if told is not None:
+            print(told)
     for path in (args.out, place, args.model, args.plot):
         if path:
             print(f"written to {path}")
+
+
+def _joints(args: argparse.Namespace) -> dict[str, Dataset]:
+    """All joints of a robot's records, unless a column or one of them is named."""
+    from ..readers import joint_columns, parse_source, read_joints, read_table
+
+    named = args.input or args.output or args.counts or args.joint or args.speed_unit
+    sources = [parse_source(source) for source in args.data]
+    if named or any(inputs or output for _, inputs, output in sources):
+        return {}
+    tables = [read_table(path) for path, _, _ in sources]
+    if len(joint_columns(tables[0])) < 2:
+        return {}
+    joints = read_joints(tables, unit=args.unit or "", Ts=args.ts)
+    return {name: data.shift_inputs(args.shift_input) for name, data in joints.items()}
 
 
 def _motor_data(args: argparse.Namespace) -> Dataset:

@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..tables import aligned
+
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
@@ -90,10 +92,7 @@ def print_result(result: Any, args: Any, *, plot: Path | None = None) -> None:
 
 
 def print_rows(rows: Sequence[Sequence[str]]) -> None:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (cell.ljust(w) for cell, w in zip(row, widths, strict=True))
-        print("  ".join(cells).rstrip())
+    print("\n".join(aligned(rows)))
 
 
 def write_columns(

@@ -16,6 +16,7 @@ from ..recording import Recording
 from ..units import is_position
 from .equations import EquationFit, Equations, fit_equations
 from .joint import Joint, joint_of
+from .joints import Joints, joints_of
 from .motor import Motor, motor_of
 
 Intervals: TypeAlias = Literal["curvature", "profile"]
@@ -28,6 +29,12 @@ STRUCTURES = {
 
 
 @overload
+def physics(
+    data: Mapping[str, Dataset], *, structure: Literal["joint"] | None = None
+) -> Joints: ...
+
+
+@overload
 def physics(  # type: ignore[overload-overlap]
     data: Dataset, *, structure: Literal["joint"]
 ) -> Joint: ...
@@ -37,7 +44,7 @@ def physics(  # type: ignore[overload-overlap]
 def physics(
     data: Recording | Dataset,
     *,
-    structure: str | Sequence[str] = "dcmotor",
+    structure: str | Sequence[str] | None = None,
     current: str | ArrayLike | None = None,
     volts: float | None = None,
     speed_unit: str | None = None,
@@ -58,9 +65,9 @@ def physics(
 
 
 def physics(
-    data: Recording | Dataset,
+    data: Recording | Dataset | Mapping[str, Dataset],
     *,
-    structure: str | Sequence[str] = "dcmotor",
+    structure: str | Sequence[str] | None = None,
     current: str | ArrayLike | None = None,
     volts: float | None = None,
     speed_unit: str | None = None,
@@ -69,7 +76,7 @@ def physics(
     parameters: Mapping[str, float | Sequence[float]] | None = None,
     states: int = 1,
     substeps: int = 1,
-) -> Motor | EquationFit | Joint:
+) -> Motor | EquationFit | Joint | Joints:
     """Friction, inertia and electrical constants of a motor from one record, with 95 % intervals.
 
     Command and speed alone determine the command per speed `k_v` and per acceleration `k_a`, dry
@@ -78,21 +85,23 @@ def physics(
     resistance [command/A] and separates k_v into back-EMF and viscous friction; with `volts` as
     well, all are in SI units.
 
-    With ``structure="joint"`` the output is a position, and the command drives the joint or, if it
-    has the output's unit, is a position command to a controller inside; see docs/joints.md.
+    If the output is a position (``structure="joint"``), the command drives the joint or, if it has
+    the output's unit, is a position command to a controller inside; see docs/joints.md.
 
     Parameters
     ----------
-    data : Recording or Dataset
+    data : Recording or Dataset, or mapping of Dataset by name
         One input; of a `Recording` the counts are fitted. Random steps in both directions for 10 s
-        show most; several experiments are fitted together.
-    structure : "dcmotor", "joint" or sequence of str
-        Possible terms, of `lag`, `delay`, `coulomb`, `offset`, `drop`, `stribeck`, `load_1`,
-        `load_2`, `inertia_2` (varying once, twice per turn), `cogging` and `torque_ripple` (whose
-        orders per turn are searched), `limit`, `stribeck_difference` (by direction), `sag` (of the
-        supply) and `eccentricity` (of the encoder). "dcmotor" means all of them, the last three
-        only if they stand out clearly; ``["dcmotor", "sag"]`` tries one of these in any case. A
-        term that the record does not show is omitted.
+        show most; several experiments are fitted together. A mapping, as of `read_joints`, is one
+        of joints.
+    structure : "dcmotor", "joint" or sequence of str, optional
+        By default "joint" if the output is an angle or a length, else "dcmotor". Possible terms, of
+        `lag`, `delay`, `coulomb`, `offset`, `drop`, `stribeck`, `load_1`, `load_2`, `inertia_2`
+        (varying once, twice per turn), `cogging` and `torque_ripple` (whose orders per turn are
+        searched), `limit`, `stribeck_difference` (by direction), `sag` (of the supply) and
+        `eccentricity` (of the encoder). "dcmotor" means all of them, the last three only if they
+        stand out clearly; ``["dcmotor", "sag"]`` tries one of these in any case. A term that the
+        record does not show is omitted.
     current : str or array, shape (N,), optional
         Motor current [A]: a channel of the data set, or its samples.
     volts : float, optional
@@ -117,7 +126,7 @@ def physics(
 
     Returns
     -------
-    Motor or, with `equations`, EquationFit, with the structure "joint" a Joint
+    Motor or, with `equations`, EquationFit, of a position Joint, of several joints Joints
         Parameters with intervals, and the names of those that the record does not determine.
 
     Raises
@@ -138,8 +147,10 @@ def physics(
     Equations: `rust/core/src/greybox.rs`; conventions of kS, kV, kA as in WPILib's system
     identification. Errors are those of the free run.
     """
+    if isinstance(data, Mapping):
+        return joints_of({name: _positions(one) for name, one in data.items()})
     if equations is not None or parameters is not None:
-        if equations is None or parameters is None or structure != "dcmotor" or current is not None:
+        if equations is None or parameters is None or structure is not None or current is not None:
             raise SettingError(
                 name="equations", expected="equations with parameters, and neither current nor "
                 "structure", received="other arguments beside them, or one of the two",
@@ -147,6 +158,11 @@ def physics(
             )  # fmt: skip
         records = records_of(data, None, speed_unit)
         return fit_equations(records, equations, parameters, states=states, substeps=substeps)
+    if structure is None:
+        is_joint = (
+            isinstance(data, Dataset) and speed_unit is None and is_position(data.output_unit)
+        )
+        structure = "joint" if is_joint else "dcmotor"
     if structure in ("joint", ["joint"]):
         return _joint(data, current, volts, speed_unit, intervals)
     if intervals not in get_args(Intervals):
@@ -178,6 +194,11 @@ def _joint(
                 name=name, expected="none for a joint, which is fitted to command and position",
                 received=repr(value), remedy="leave it out",
             )  # fmt: skip
+    return joint_of(sound(_positions(data))[0])
+
+
+def _positions(data: object) -> Dataset:
+    """The data, whose output is a position."""
     if not isinstance(data, Dataset):
         raise SettingError(
             name="data", expected="a Dataset whose output is a position",
@@ -189,7 +210,7 @@ def _joint(
             name="output_unit", expected="an angle or a length: rad, deg, rev, m, mm, counts",
             received=repr(data.output_unit), remedy="name the unit of the position",
         )  # fmt: skip
-    return joint_of(sound(data)[0])
+    return data
 
 
 def _terms(structure: str | Sequence[str]) -> tuple[str, ...]:

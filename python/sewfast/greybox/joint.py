@@ -21,6 +21,7 @@ from ..models.grey_box import GreyBox
 from ..motorfit.estimation import CONFIDENCE
 from ..motorfit.joint import fitted, is_commanded
 from ..tables import html_of
+from .inner_gains import InnerGains, inner_gains
 from .joint_exports import JointTarget, Replay, checked, export
 from .motor import APART, VAGUE, Findings, stored_parameters
 
@@ -119,6 +120,31 @@ class Joint(Findings):
             If the package mujoco is not installed.
         """
         return checked(self, export(self, "mujoco", inertia), in_effect(data))
+
+    def inner_gains(self, bandwidth: float, *, damping_ratio: float = 1.0) -> InnerGains:
+        """Gains of the drive's own controller for a wanted bandwidth, and what they cannot do.
+
+        Parameters
+        ----------
+        bandwidth : float
+            Natural frequency of the position loop [Hz].
+        damping_ratio : float
+            Of the closed loop; 1 is the least without overshoot.
+
+        Raises
+        ------
+        SettingError
+            If no controller is inside, or for numbers that are not above 0.
+        DataError
+            If the record does not determine the inertia.
+
+        Notes
+        -----
+        A rigid joint under PD: Franklin, Powell and Emami-Naeini, *Feedback Control of Dynamic
+        Systems*, section 3.4. kp is proportional to the square of the bandwidth, which is its
+        stiffness.
+        """
+        return inner_gains(self, bandwidth, damping_ratio)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, as JSON values."""

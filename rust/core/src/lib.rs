@@ -18,6 +18,7 @@ mod descent;
 pub mod embedded;
 pub mod error;
 pub mod excitation;
+pub mod explained;
 pub mod faults;
 pub mod feedback;
 pub mod fopdt;

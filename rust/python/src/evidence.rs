@@ -28,6 +28,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(unstable_pole, module)?)?;
     module.add_function(wrap_pyfunction!(delay, module)?)?;
     module.add_function(wrap_pyfunction!(order_table, module)?)?;
+    module.add_function(wrap_pyfunction!(explained, module)?)?;
     module.add_function(wrap_pyfunction!(residual_tests, module)?)?;
     module.add_function(wrap_pyfunction!(parameter_test, module)?)?;
     module.add_function(wrap_pyfunction!(coloured_information, module)?)
@@ -319,6 +320,20 @@ fn handed_over(py: Python<'_>, test: Test) -> PyResult<Tested<'_>> {
         test.threshold,
         test.explained,
     ))
+}
+
+#[pyfunction]
+#[pyo3(signature = (x, y, *, own, parts))]
+fn explained(
+    py: Python<'_>,
+    x: PyReadonlyArray2<'_, f64>,
+    y: PyReadonlyArray1<'_, f64>,
+    own: usize,
+    parts: usize,
+) -> PyResult<Vec<f64>> {
+    let ((x, width), y) = (rows(&x, "x")?, slice(&y, "y")?);
+    py.detach(|| sewfast_core::explained::explained(x, width, y, own, parts))
+        .map_err(|e| raise(py, e))
 }
 
 #[pyfunction]
