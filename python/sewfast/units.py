@@ -29,6 +29,9 @@ _WRITTEN = {
     "a": "amp amps ampere amperes",
     "s": "sec second seconds",
     "%": "percent pct",
+    "deg": "° degree degrees",
+    "rad": "radian radians",
+    "°c": "degc celsius",
 }
 """Other spellings of a unit, in lower case; `u` is German for turns, `tr` French."""
 _SPELLINGS = {other: unit for unit, others in _WRITTEN.items() for other in others.split()}

@@ -453,9 +453,9 @@ def test_refusals_are_documented(tmp_path: Path) -> None:
         assert f"  {code} " in text
 
 
-def test_a_reference_in_another_unit_of_speed(folder: Path) -> None:
+def test_a_reference_in_another_unit(folder: Path) -> None:
     columns = {"t": 0.001 * np.arange(400), "r": np.zeros(400)}
-    for unit, done in (("rad/s", 2), ("rpm", 0), ("", 0)):
+    for unit, done in (("rad/s", 2), ("mm", 2), ("rpm", 0), ("", 0)):
         api.write_table(folder / "r.csv", columns, units={"t": "s", "r": unit})
         given = ("run", "c.json", "--on", "drive.json", "--reference", "r.csv", "-o", "out.csv")
         assert ("expected r in RPM" in sewfast(folder, *given, done=done).err) == (done == 2)

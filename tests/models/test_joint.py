@@ -97,6 +97,12 @@ def test_a_limit_that_is_reached_is_found() -> None:
     assert "at its limit from an error" in str(gains)
 
 
+def test_counts_do_not_say_what_a_simulator_needs() -> None:
+    model = replace(_joint("servo").model, output_unit="counts")
+    with pytest.raises(SettingError, match="turns or slides"):
+        replace(_joint("servo"), model=model).export("mujoco")
+
+
 def test_gains_of_the_controller_inside_for_a_bandwidth() -> None:
     gains = _joint("servo").inner_gains(5.0, damping_ratio=0.8)
     # k_p / J = 400 1/s^2 and .07 s of damping with the gain that was recorded

@@ -221,7 +221,7 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
     """The name of a reference, or the samples of a file with columns t, r."""
     from ..readers import read_columns
     from ..signals import REFERENCES
-    from ..units import ANGULAR_SPEEDS, spelled
+    from ..units import spelled
 
     if text.replace("-", "_").lower() in REFERENCES:
         return text
@@ -238,8 +238,7 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
             remedy="resample the reference",
         )  # fmt: skip
     given = data.input_units[0]
-    speeds = {spelled(given), spelled(unit)}
-    if len(speeds) > 1 and speeds <= ANGULAR_SPEEDS:
+    if given and unit and spelled(given) != spelled(unit):
         raise DataError(
             f"{text}: expected r in {unit}, the loop's unit, got {given}; convert the column"
         )

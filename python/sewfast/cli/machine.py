@@ -459,6 +459,11 @@ def physics_command(args: argparse.Namespace) -> None:
             received=data.output_unit or "an output without a unit", remedy="leave it out for a "
             "motor, or name the unit of the position",
         )  # fmt: skip
+    if args.inertia is not None and not (target or args.check):
+        raise SettingError(
+            name="--inertia", expected="--export or --check, whose forces are then in N m",
+            received="neither", remedy="leave it out, or add --export mujoco joint.xml",
+        )  # fmt: skip
     if target not in (None, *get_args(JointTarget if is_joint else Target)):
         names = ", ".join(get_args(JointTarget if is_joint else Target))
         raise SettingError(f"--export: expected one of {names}, received {target!r}")

@@ -19,6 +19,7 @@ from ..arrays import FloatArray
 from ..dataset import Dataset, Experiment
 from ..errors import SettingError, not_installed
 from ..motorfit.joint import factor, is_commanded
+from ..units import spelled
 
 if TYPE_CHECKING:
     from .joint import Joint
@@ -81,6 +82,12 @@ def export(joint: Joint, target: str, inertia: float | None) -> str:
         raise SettingError(
             name="inertia", expected="an inertia of the joint above 0, in kg m^2 (kg of an axis)",
             received=repr(inertia), remedy="leave it out to get forces in units of the command",
+        )  # fmt: skip
+    if spelled(joint.model.output_unit) == "counts":
+        raise SettingError(
+            name="joint", expected="positions in rad, deg, rev, m or mm",
+            received="counts, which do not say whether it turns or slides",
+            remedy="convert command and position: counts * 2 pi / counts of a turn",
         )  # fmt: skip
     parts = _Parts(joint, inertia)
     if target == "mujoco":
