@@ -262,6 +262,14 @@ def tune(
     return Project(folder).tuning(model, controller, notches).search(values, search, report)
 
 
+def front(
+    folder: Path, report: Report, model: str, controller: str | None, notches: Any,
+    values: dict[str, Any], search: Search,
+) -> dict[str, Any]:  # fmt: skip
+    """The trade-offs around the present values."""
+    return Project(folder).tuning(model, controller, notches).front(values, search, report)
+
+
 def commission(folder: Path, report: Report, asked: Commission) -> dict[str, Any]:
     """The commissioning of a virtual machine into the folder `commissioned`."""
     from sewfast.machine import VirtualMachine
@@ -285,7 +293,7 @@ def write_report(folder: Path, report: Report) -> dict[str, Any]:
 
 
 STEPS: dict[str, Callable[..., Any]] = {
-    step.__name__: step for step in (identify, bode, tune, commission, write_report)
+    step.__name__: step for step in (identify, bode, tune, front, commission, write_report)
 }
 """The long steps by name."""
 
@@ -366,22 +374,28 @@ class Steps:
             return tuning.move(values)
         if name == "tune_costs":
             return {"costs": tuning.costs([{}, values], fields.get("weights"))}
-        if name == "tune_search":
-            return self._search(tuning, values, fields)
+        if name in ("tune_search", "tune_front"):
+            return self._search(tuning, name, values, fields)
         file = checked_name(fields.get("file"))
         if name == "tune_save":
             self.project.save_controller(tuning, values, file)
         return {"python": tuning.python(values, file), "commands": tuning.commands(values, file)}
 
-    def _search(self, tuning: Tuning, values: dict[str, Any], fields: dict[str, Any]) -> None:
+    def _search(
+        self, tuning: Tuning, name: str, values: dict[str, Any], fields: dict[str, Any]
+    ) -> None:
         names = ("evaluations", "seed", "seconds", "weights", "constraints")
         search = Search(**{k: fields[k] for k in names if fields.get(k) is not None})
         tuning.check(search)
         tuning.controller(values)
-        self.jobs.start(
-            "searched", "tune", fields["model"], fields.get("controller"),
-            _notches(fields.get("notches", [])), values, search, finish=tuning.keep,
+        task = (
+            fields["model"], fields.get("controller"), _notches(fields.get("notches", [])), values,
+            search,
         )  # fmt: skip
+        if name == "tune_search":
+            self.jobs.start("searched", "tune", *task, finish=tuning.keep)
+        else:
+            self.jobs.start("traded", "front", *task)
 
     def _copies(self, step: Step, name: str) -> dict[str, str]:
         return {

@@ -41,14 +41,17 @@ FAREWELL = 0.2
 """Time for the pages to confirm the end of their sockets [s]."""
 
 WRITES = (
-    "identify", "bode", "commission", "report", "cancel", "tune_search", "tune_save", "upload",
+    "identify", "bode", "commission", "report", "cancel", "tune_search", "tune_front", "tune_save",
+    "upload",
     "upload_end", "drive_connect",
     "drive_disconnect", "drive_limits", "drive_arm", "drive_disarm", "drive_clear", "drive_go",
     "drive_record", "drive_run", "drive_commission",
 )  # fmt: skip
 """Messages that only the page in control can send; every page can send a stop."""
 
-RESULTS = ("identified", "responded", "searched", "commissioned", "reported", "driven")
+RESULTS = (
+    "identified", "responded", "searched", "traded", "commissioned", "reported", "driven",
+)  # fmt: skip
 """Events at the end of a step."""
 
 BEAT = 0.1

@@ -190,6 +190,21 @@ _SIGNAL = {
     "file": NAME,
 }
 
+_SEARCH = (
+    {
+        **_TUNE,
+        "evaluations": {"type": "integer", "minimum": 10, "maximum": 20_000},
+        "seed": SEED,
+        "seconds": {"type": ["number", "null"], "exclusiveMinimum": 0, "maximum": 3600},
+        "constraints": {
+            "type": "object",
+            "additionalProperties": {"type": "number", "exclusiveMinimum": 0},
+            "propertyNames": {"enum": ["Ms", "overshoot", "u"]},
+            "maxProperties": 3,
+        },
+    },
+    ("model", "values", "evaluations", "seed"),
+)
 # name: (fields, required fields)
 _MESSAGES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "take": ({"over": {"type": "boolean"}}, ()),
@@ -199,21 +214,7 @@ _MESSAGES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "tune_open": (_TUNE, ("model",)),
     "tune_move": (_TUNE, ("model", "values")),
     "tune_costs": (_TUNE, ("model", "values")),
-    "tune_search": (
-        {
-            **_TUNE,
-            "evaluations": {"type": "integer", "minimum": 10, "maximum": 20_000},
-            "seed": SEED,
-            "seconds": {"type": ["number", "null"], "exclusiveMinimum": 0, "maximum": 3600},
-            "constraints": {
-                "type": "object",
-                "additionalProperties": {"type": "number", "exclusiveMinimum": 0},
-                "propertyNames": {"enum": ["Ms", "overshoot", "u"]},
-                "maxProperties": 3,
-            },
-        },
-        ("model", "values", "evaluations", "seed"),
-    ),
+    **dict.fromkeys(("tune_search", "tune_front"), _SEARCH),
     "loop": ({**_TUNE, "response": {"type": ["integer", "null"]}}, ("model", "values")),
     "bode": (
         {

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from sewfast.tuning import Constraints, Cost
 
 MOST_MEMBERS = 16
+FRONT = ("cost", "Ms")
+"""What the sliders of the trade-off weigh: response with its effort, and robustness."""
 READABLE_DB = -60.0
 """Gain below which the phase is left out: it jumps at the zeros of a mean over samples."""
 
@@ -306,6 +308,36 @@ class Tuning:
             None if result.termination == "time" else replace(search, seconds=None),
             result.cost, result.start_cost, result.termination, str(result.verdict),
         )  # fmt: skip
+
+    def front(
+        self,
+        values: Mapping[str, Any],
+        search: Search,
+        progress: Callable[[int, int, float], None],
+    ) -> dict[str, Any]:
+        """`sewfast.pareto` from these values, the calmest controller first; as `search`."""
+        from sewfast.tuning import pareto
+        from sewfast.tuning.front import ParetoFront
+
+        try:
+            found = pareto(
+                self.model, objectives=FRONT, start=self.controller(values), cost=search.cost(),
+                constraints=search.limits(), evaluations=search.evaluations,
+                time_budget=search.seconds, seed=search.seed, progress=progress,
+            )  # fmt: skip
+        except Interrupted as stopped:
+            if not isinstance(stopped.best, ParetoFront):
+                raise
+            found = stopped.best
+        rows = zip(found.controllers, found.values.tolist(), strict=True)
+        calmest_first = sorted(rows, key=lambda row: -row[1][0])
+        return {
+            "front": [
+                {"values": self._values_of(c), **dict(zip(FRONT, numbers, strict=True))}
+                for c, numbers in calmest_first
+            ],
+            "unit": found.units[FRONT[0]],
+        }
 
     def keep(self, found: Found) -> dict[str, Any]:
         """Store a search, so that its copy repeats it; return its result for the page."""

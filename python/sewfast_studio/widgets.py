@@ -33,6 +33,7 @@ ALLOWED = (
     "tune_move",
     "tune_costs",
     "tune_search",
+    "tune_front",
     "tune_save",
     "tune_copy",
     "cancel",

@@ -26,7 +26,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
     phase: new Chart($("phase-plot"), { x: "frequency [Hz]", y: "phase of L [deg]", log: true, marks: [-180] }),
     sensitivity: new Chart($("sens-plot"), { x: "frequency [Hz]", y: "|S|, |T| [dB]", log: true, marks: [0], floor: -60 }),
   };
-  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, saving = false, notches = [], failed = "";
+  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, saving = false, notches = [], failed = "", front = [];
 
   const question = more => ({ model: $("tune-model").value, controller: $("tune-start").value || null, values, notches, ...more });
   const given = pairs => Object.fromEntries(pairs.map(([name, id]) => [name, $(id).valueAsNumber]).filter(([, v]) => Number.isFinite(v)));
@@ -40,7 +40,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
       opened = await ask("tune_open", question({ values: {} }));
       const start = Object.fromEntries(opened.knobs.map(k => [k.name, k.value]));
       values = { ...start, ...Object.fromEntries(Object.entries(kept).filter(([name]) => name in start)) };
-      history = []; pins = {}; first = null; now = null;
+      history = []; pins = {}; first = null; now = null; front = []; $("front").hidden = true;
       if (Object.keys(kept).length) first = { ...await ask("tune_move", question({ values: start })), values: start };
       $("tune-members").textContent = opened.members > 1 ? `${opened.members} members: median and band` : "one model"; $("limit-unit").textContent = `[${opened.u_unit}]`;
       sliders(); move(); listNotches();
@@ -71,6 +71,22 @@ export function mount(root, { ask, on, mark = () => {} }) {
       return { show, nodes: [label, slider, field] };
     });
     $("knobs").replaceChildren(...knobs.flatMap(k => k.nodes));
+  }
+
+  /** The sliders of the trade-off: one front, and either end of it; the calmest controller is the first. */
+  function trade(k) {
+    const most = front.length - 1, of = front[k];
+    $("front-response").value = k; $("front-robust").value = most - k;
+    $("front-cost").value = `cost ${text(of.cost)} ${opened.y_unit}`; $("front-Ms").value = `Ms ${text(of.Ms)}`;
+    return of.values;
+  }
+  let traded = null;  // values when a drag began
+  for (const [id, at] of [["front-response", v => v], ["front-robust", v => front.length - 1 - v]]) {
+    $(id).oninput = event => {
+      if (!traded) { traded = { ...values }; keep(traded); }
+      values = { ...values, ...trade(at($(id).valueAsNumber)) }; knobs.forEach(k => k.show()); move(event.timeStamp);
+    };
+    $(id).onchange = () => { traded = null; };
   }
 
   /** The notches that were put into the start, each with the way to take it out again. */
@@ -188,7 +204,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
 
   function enable() {
     $("undo").disabled = !history.length; $("reset").disabled = !opened;
-    $("search").disabled = !opened || busy || !writes; $("tune-cancel").disabled = $("tune-cancel").hidden = !busy || !writes; $("tune-bar").hidden = !busy;
+    $("search").disabled = $("trade").disabled = !opened || busy || !writes; $("tune-cancel").disabled = $("tune-cancel").hidden = !busy || !writes; $("tune-bar").hidden = !busy;
     $("save").disabled = !opened || !writes; $("add-notch").disabled = !opened || notches.length >= MOST_NOTCHES;
     for (const p of PINS) { $(`pin-${p}`).disabled = !opened; $(`take-${p}`).disabled = !pins[p]; }
   }
@@ -219,12 +235,14 @@ export function mount(root, { ask, on, mark = () => {} }) {
     $(`take-${p}`).onclick = () => set(pins[p].values);
   }
   for (const id of ["limit-Ms", "limit-overshoot", "limit-u"]) $(id).oninput = () => { if (now) lights(); };
-  $("search").onclick = async () => {
+  $("search").onclick = () => search("tune_search");
+  $("trade").onclick = () => search("tune_front");
+  async function search(what) {
     tell(null);
     const constraints = $("tune-within").checked ? given([["Ms", "limit-Ms"], ["overshoot", "limit-overshoot"], ["u", "limit-u"]]) : {};
     const seconds = $("tune-seconds").valueAsNumber, effort = { evaluations: $("evaluations").valueAsNumber, seed: $("tune-seed").valueAsNumber, seconds: seconds > 0 ? seconds : null };
-    try { await ask("tune_search", question({ ...effort, weights: weights(), constraints })); busy = true; enable(); } catch (error) { tell(error); }
-  };
+    try { await ask(what, question({ ...effort, weights: weights(), constraints })); busy = true; enable(); } catch (error) { tell(error); }
+  }
   $("tune-cancel").onclick = () => ask("cancel").catch(tell);
   $("save").onclick = async () => {
     tell(null);
@@ -244,7 +262,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
     if (event.key === "z" || event.key === "Z") { event.preventDefault(); undo(); }
   });
   on("progress", p => {
-    if (p.of !== "searched") return;
+    if (p.of !== "searched" && p.of !== "traded") return;
     busy = true; $("tune-bar").value = p.done / Math.max(p.total, 1); $("tune-progress").textContent = `${p.done} of ${p.total}`; enable();
   });
   on("searched", m => {
@@ -253,6 +271,18 @@ export function mount(root, { ask, on, mark = () => {} }) {
     if (!opened) return;
     $("tune-progress").textContent = m.found.interrupted ? "cancelled: the best so far" : `${m.found.ended === "time" ? "time is up; found" : "found"}: cost ${m.found.cost.toPrecision(4)}, began at ${m.found.start_cost.toPrecision(4)}; ${m.found.verdict}`;
     set(m.found.values);
+  });
+  on("traded", m => {
+    busy = false; $("tune-progress").textContent = ""; enable();
+    if (m.error) return tell(new Error(m.error));
+    if (!opened || !m.found.front.length) return;
+    front = m.found.front; const most = front.length - 1;
+    for (const id of ["front-response", "front-robust"]) $(id).max = most;
+    $("front").hidden = false; $("knobs-fold").open = false;
+    $("tune-progress").textContent = `${front.length} controllers, none better than another in both`;
+    // where it begins: the fastest that keeps the limit
+    const limit = parseFloat($("limit-Ms").value) || 1.8, kept = front.map((f, k) => f.Ms <= limit ? k : 0);
+    set({ ...values, ...trade(Math.max(...kept)) });
   });
   on("state", s => {
     writes = s.writes; enable();

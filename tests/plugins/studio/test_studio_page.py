@@ -458,6 +458,35 @@ def test_a_notch_is_put_in_and_taken_out(tuned: Studio, browser: Any) -> None:
 
 @pytest.mark.nightly("searches from a browser")
 @pytest.mark.alone
+def test_two_sliders_move_along_the_trade_off(tuned: Studio, browser: Any) -> None:
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    from selenium.webdriver.common.keys import Keys
+
+    browser.set_window_size(1280, 900)
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    browser.execute_script(FOLDS)
+    at("evaluations").clear()
+    at("evaluations").send_keys("80")
+    at("trade").send_keys(Keys.ENTER)
+    until(lambda: at("front").is_displayed())
+    assert not at("knobs").is_displayed()  # gains are the second layer
+    at("front-response").send_keys(Keys.HOME)
+    robust = at("front-robust")
+    until(lambda: robust.get_attribute("value") == robust.get_attribute("max"))
+    peak = at("front-Ms").text
+    until(lambda: f"Ms {browser.execute_script(NUMBER, 'Ms')}" == peak)
+    at("front-robust").send_keys(Keys.HOME)
+    until(lambda: at("front-Ms").text != peak)
+    assert float(at("front-Ms").text.split()[1]) > float(peak.split()[1])
+    if "STUDIO_PICTURES" in os.environ:
+        browser.save_screenshot(str(Path(os.environ["STUDIO_PICTURES"]) / "trade.png"))
+
+
+@pytest.mark.nightly("searches from a browser")
+@pytest.mark.alone
 def test_a_search_has_the_limits_weights_and_seconds_of_the_page(
     tuned: Studio, browser: Any
 ) -> None:

@@ -91,6 +91,20 @@ def test_a_search_that_ran_out_of_time_is_copied_as_what_it_found(tuned: Studio)
     assert _run(folder, said["python"], said["commands"], "controller.json") == [written] * 2
 
 
+def test_the_trade_off_is_a_front_from_calm_to_quick(tuned: Studio) -> None:
+    with Page(tuned) as page:
+        page.ask("tune_front", evaluations=80, seed=3, **MOVE)
+        found = page.event("traded")["found"]
+        front = found["front"]
+        assert len(front) > 2
+        assert found["unit"] == "RPM"
+        errors, peaks = ([f[name] for f in front] for name in ("cost", "Ms"))
+        assert errors == sorted(errors, reverse=True)
+        assert peaks == sorted(peaks)
+        shown = page.ask("tune_move", **{**MOVE, "values": front[0]["values"]})["found"]
+        assert shown["stable"]
+
+
 def test_weights_change_the_cost(tuned: Studio) -> None:
     with Page(tuned) as page:
         usual = page.ask("tune_costs", **MOVE)["found"]["costs"]
