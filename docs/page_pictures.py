@@ -287,6 +287,35 @@ def moves(file: Path) -> None:
     loop_drawing(loops, "RPM", "V", (-20.0, 20.0)).plot(file=file)
 
 
+def joints(file: Path) -> None:
+    """The joint of joints.md on moves that it has not seen, beside a linear model."""
+
+    def recorded(seed: int) -> sewfast.Dataset:
+        u = np.repeat(np.random.default_rng(seed).uniform(-3.0, 3.0, 40), 150)
+        made = sewfast.record(sewfast.VirtualMachine(3), u)
+        angle = made.counts / made.counts_per_rev
+        return sewfast.Dataset.from_arrays(u, angle, made.Ts, input_units=("V",), output_unit="rev")
+
+    train, fresh = recorded(1), recorded(2)
+    models = {
+        "linear model": (sewfast.identify(train, model="oe"), SECOND),
+        "joint": (sewfast.physics(train, structure="joint").to_model(), FIRST),
+    }
+    (e,) = fresh.experiments
+    with axes(file, rows=2, height=4.4, sharex=True) as (top, bottom):
+        t = fresh.Ts * np.arange(len(e))
+        top.plot(t, e.y, color=MUTED, lw=3, label="measured")
+        for name, (model, colour) in models.items():
+            state = model.core.estimate_initial_state(e.u[:50], e.y[:50])
+            run = model.core.simulate(e.u, state)
+            top.plot(t, run, color=colour, lw=1.2, label=f"{name}, free run")
+            bottom.plot(t, run - e.y, color=colour, lw=1.2)
+        top.set_ylabel("angle [rev]")
+        top.legend(frameon=False)
+        bottom.set_ylabel("error [rev]")
+        bottom.set_xlabel("time [s]")
+
+
 def live(file: Path) -> None:
     """The speed of a view, from the counts of the last 20 ms, and that of the recording."""
     machine = sewfast.VirtualMachine()
@@ -314,6 +343,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "state-feedback": state_feedback,
     "feedforward": feedforward,
     "moves": moves,
+    "joints": joints,
     "live": live,
 }
 
