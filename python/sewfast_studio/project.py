@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from .tuning import Tuning
 
 
+SHOWN_ROWS, SHOWN_COLUMNS = 5, 40
+"""Rows and columns of a file that are shown before anything is chosen."""
 RECORDINGS = (
     ".csv", ".tsv", ".txt", ".log", ".jsonl", ".ndjson", ".json", ".npz", ".mat", ".parquet",
     ".mcap",
@@ -261,12 +263,17 @@ class Project:
         from sewfast.readers import read_table, roles
 
         table = read_table(self.path_of(step.file))
-        found = roles(table)
+        found, shown = roles(table), table.names[:SHOWN_COLUMNS]
         return {
             "names": list(table.names),
             "inputs": [] if found is None else [found.input],
             "output": None if found is None else found.output,
             "encoder": table.counts_per_rev is not None and "counts" in table,
+            "units": [table.unit(name) for name in shown],
+            "rows": [
+                [float(table[name][k]) if k < len(table[name]) else None for name in shown]
+                for k in range(SHOWN_ROWS)
+            ],
         }
 
     def look(self, step: Step) -> dict[str, Any]:

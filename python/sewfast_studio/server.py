@@ -61,6 +61,7 @@ PAGE = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/studio.js": ("studio.js", "text/javascript; charset=utf-8"),
     "/curves.js": ("curves.js", "text/javascript; charset=utf-8"),
+    "/tell.js": ("tell.js", "text/javascript; charset=utf-8"),
     "/commission.js": ("commission.js", "text/javascript; charset=utf-8"),
     "/bode.js": ("bode.js", "text/javascript; charset=utf-8"),
     "/model.js": ("model.js", "text/javascript; charset=utf-8"),

@@ -97,7 +97,7 @@ def tune_view(model: Model | str | Path, start: Controller | None = None) -> Any
     first = START if start is not None else None
     project.tuning(place.name, first)  # refuses before anything is drawn
 
-    view = _widget(_source(("curves", "tune", "widget"), _TUNE, _fragment("tune")))
+    view = _widget(_source(("curves", "tell", "tune", "widget"), _TUNE, _fragment("tune")))
     latest: dict[str, Any] = {"model": place.name, "controller": first}
 
     def tell(event: dict[str, Any]) -> None:

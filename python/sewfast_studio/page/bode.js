@@ -1,5 +1,6 @@
 // The frequency response of a recording with its bands, in Look; and the tuned loop beside it, in Tune.
 import { ask, on } from "/server.js";
+import { teller } from "/tell.js";
 import { Chart } from "/curves.js";
 import { copies } from "/copies.js";
 import { chosen, columns, open } from "/data.js";
@@ -16,7 +17,7 @@ let tune = null, view = null, response = null, notch = null, busy = false, write
 
 /** The step Tune, whose controller is drawn, and the way to it. */
 export function connect(tuning, viewing) { tune = tuning; view = viewing; }
-function tell(error) { $("bode-error").textContent = error ? error.message : ""; $("bode-error").hidden = !error; }
+const tell = teller(document, "bode-error");
 
 function curve(c, at, name, label, style, dots = false) {
   return c[name] ? [{ name: label, x: c[at], y: c[name], low: c[`${name}_low`], high: c[`${name}_high`], style, dots }] : [];

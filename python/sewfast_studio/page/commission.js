@@ -1,12 +1,13 @@
 // The step Verify: the stages of a commissioning as they are entered, predictions before the machine runs along them, then what it did.
 import { ask, on, mark } from "/server.js";
+import { teller } from "/tell.js";
 import { draw } from "/curves.js";
 import { copies } from "/copies.js";
 
 const $ = id => document.getElementById(id);
 let writes = false, busy = false, stages = [];
 
-function tell(error) { $("commission-error").textContent = error ? error.message : ""; $("commission-error").hidden = !error; }
+const tell = teller(document, "commission-error");
 function enable() { $("commission-start").disabled = busy || !writes; $("commission-cancel").disabled = $("commission-cancel").hidden = !busy || !writes; }
 
 $("commission-start").onclick = async () => {

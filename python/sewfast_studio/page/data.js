@@ -1,5 +1,6 @@
 // The step Look: which recording and columns; its signals; files that are dropped or chosen.
 import { ask as send, on, mark, sendBytes } from "/server.js";
+import { teller } from "/tell.js";
 import { copies } from "/copies.js";
 import { showLook } from "/look.js";
 
@@ -19,7 +20,7 @@ export function chosen() {
 /** Names of the columns, for other steps. */
 export const columns = () => [...$("inputs").options].map(o => o.value);
 
-function tell(error) { $("error").textContent = error ? error.message : ""; $("error").hidden = !error; }
+const tell = teller(document, "error");
 function enable() { $("upload").disabled = !writes || uploading; }
 
 export function fill(select, pairs, kept) {
@@ -56,8 +57,20 @@ export async function open() {
     fill($("inputs"), names, c.inputs);
     fill($("output"), [["", c.encoder ? "speed from counts" : "speed from the counts below"], ...names], [c.output ?? ""]);
     fill($("counts"), [["", c.encoder ? "counts" : "none"], ...names], [""]);
+    rows(c);
     document.dispatchEvent(new CustomEvent("columns"));
   } catch (error) { tell(error); }
+}
+
+/** The first rows of a file, under names and units, so that a person sees which column is which. */
+function rows(c) {
+  const cell = (row, tag, text, scope) => { const td = document.createElement(tag); td.textContent = text; if (scope) td.scope = scope; row.append(td); };
+  const head = document.createElement("tr");
+  c.names.slice(0, c.units.length).forEach((name, k) => cell(head, "th", c.units[k] ? `${name} [${c.units[k]}]` : name, "col"));
+  $("rows").replaceChildren(head, ...c.rows.filter(r => r.some(v => v !== null)).map(r => {
+    const tr = document.createElement("tr"); for (const v of r) cell(tr, "td", v === null ? "" : Number(v.toPrecision(6)).toString()); return tr;
+  }));
+  $("rows-fold").hidden = false; $("rows-fold").open = true;
 }
 
 /** After a look, the way on is the step's action. */
@@ -67,6 +80,7 @@ async function look() {
   tell(null); $("look").disabled = true;
   try {
     const f = await send("look", chosen());
+    $("rows-fold").open = false;  // the signals say more
     showLook($("data"), f); copies($("look-copy"), f); $("no-look").hidden = true; next(true);
     $("looked").textContent = f.advice.length ? `${f.advice.length} thing${f.advice.length > 1 ? "s" : ""} to improve` : "Good to identify a model from";
     mark("data", f.advice.length ? `${f.advice.length} to improve` : "good", f.advice.length ? "warn" : "good");

@@ -1,5 +1,6 @@
 // The step Record: connect, limits, arming, live curves, and a STOP that goes ahead of everything else.
 import { ask, on, mark } from "/server.js";
+import { teller } from "/tell.js";
 import { Chart } from "/curves.js";
 import { copies } from "/copies.js";
 import { titleOf } from "/tune.js";
@@ -8,7 +9,7 @@ const $ = id => document.getElementById(id);
 const LIMITS = ["volt", "speed_rpm", "acceleration", "current"], SAID = ["command", "V", "speed", "RPM", "acceleration", "RPM/s", "current", "A"], MOST_COLUMNS = 1200;
 let writes = false, drive = { connected: false, armed: false }, prompt = 0, paused = false, looping = false, charts = new Map(), run = -1, asking = false;
 
-function tell(error) { $("drive-error").textContent = error ? error.message : ""; $("drive-error").hidden = !error; }
+const tell = teller(document, "drive-error");
 const seconds = value => Math.min(30, Math.max(.5, value || 5));
 
 // --- STOP: no question, no confirmation, from every view and every page ---

@@ -1,5 +1,6 @@
 // The step Model: identify from the recording of Look, then judge on a recording that the model has not seen.
 import { ask, on, mark } from "/server.js";
+import { teller } from "/tell.js";
 import { copies } from "/copies.js";
 import { panels } from "/look.js";
 import { chosen, fill, open } from "/data.js";
@@ -9,7 +10,7 @@ let writes = false, busy = false, tune = null, view = null;
 
 /** The step Tune, and the way to a step. */
 export function connect(tuning, viewing) { tune = tuning; view = viewing; }
-function tell(error) { $("model-error").textContent = error ? error.message : ""; $("model-error").hidden = !error; }
+const tell = teller(document, "model-error");
 function enable() {
   $("identify").disabled = busy || !writes; $("cancel").disabled = $("cancel").hidden = !busy || !writes; $("bar").hidden = !busy;
   $("model-what").textContent = $("file").value || "no recording";

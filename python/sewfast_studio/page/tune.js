@@ -1,5 +1,6 @@
 // The step Tune: sliders whose every move is a question to the server, and at most one under way; the latest wins.
 import { Chart } from "/curves.js";
+import { teller } from "/tell.js";
 
 const PINS = ["A", "B"], MOST_NOTCHES = 4;
 const WEIGHTS = [["tracking", "per y"], ["chatter", "per u"], ["effort", "per u"], ["overshoot", "per %"], ["rise", "per ms"], ["lag", "per ms"], ["saturation", "per share"]];
@@ -31,7 +32,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
   const question = more => ({ model: $("tune-model").value, controller: $("tune-start").value || null, values, notches, ...more });
   const given = pairs => Object.fromEntries(pairs.map(([name, id]) => [name, $(id).valueAsNumber]).filter(([, v]) => Number.isFinite(v)));
   const weights = () => given(WEIGHTS.map(([name]) => [name, `weight-${name}`]));
-  function tell(error) { $("tune-error").textContent = error ? error.message : ""; $("tune-error").hidden = !error; }
+  const tell = teller(root, "tune-error");
 
   async function open(kept = {}) {
     tell(null);

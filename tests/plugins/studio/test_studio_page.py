@@ -456,6 +456,45 @@ def test_a_notch_is_put_in_and_taken_out(tuned: Studio, browser: Any) -> None:
     until(lambda: browser.execute_script(NUMBER, "noise gain") == before)
 
 
+@pytest.mark.nightly("a browser")
+@pytest.mark.alone
+def test_the_first_rows_of_a_file_are_shown(studio: Studio, browser: Any) -> None:
+    browser.set_window_size(1280, 900)
+    browser.get(studio.address)
+    until(lambda: browser.find_element("id", "rows").is_displayed())
+    assert len(browser.find_elements("css selector", "#rows tr")) == 6
+    if "STUDIO_PICTURES" in os.environ:
+        browser.save_screenshot(str(Path(os.environ["STUDIO_PICTURES"]) / "rows.png"))
+
+
+@pytest.mark.nightly("a browser")
+@pytest.mark.alone
+def test_a_refusal_stands_at_its_field(tuned: Studio, browser: Any) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    browser.set_window_size(1280, 900)
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    browser.execute_script(FOLDS)
+    at("evaluations").clear()
+    at("evaluations").send_keys("5")
+    at("search").send_keys(Keys.ENTER)
+    until(lambda: browser.find_elements("css selector", ".refused"))
+    assert not at("tune-error").is_displayed()
+    assert at("evaluations").get_attribute("aria-invalid") == "true"
+    assert at(at("evaluations").get_attribute("aria-describedby")).text.startswith("expected")
+    if "STUDIO_PICTURES" in os.environ:
+        browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", at("evaluations"))
+        browser.save_screenshot(str(Path(os.environ["STUDIO_PICTURES"]) / "refused.png"))
+    at("evaluations").clear()
+    at("evaluations").send_keys("20")
+    at("search").send_keys(Keys.ENTER)
+    until(lambda: not browser.find_elements("css selector", ".refused"))
+
+
 @pytest.mark.nightly("searches from a browser")
 @pytest.mark.alone
 def test_two_sliders_move_along_the_trade_off(tuned: Studio, browser: Any) -> None:

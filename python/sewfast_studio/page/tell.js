@@ -1,0 +1,20 @@
+// What a step says where it is refused: below the field that the message names, else in the step's toast.
+
+/** A function that shows an error, or takes it away; `root` holds the step's fields, `id` is its toast's. */
+export function teller(root, id) {
+  let beside = null;
+  return error => {
+    const toast = root.querySelector(`[id="${id}"]`);
+    if (beside) { beside.text.remove(); beside.field.removeAttribute("aria-invalid"); beside.field.removeAttribute("aria-describedby"); beside = null; }
+    const named = error && /^([\w[\]]+)(?:, [\w[\]]+)*: /.exec(error.message), name = named && named[1];
+    const field = named && toast.parentNode.querySelector(`[id="${name}"], [id="knob-${name}-value"], [data-name="${name}"]`);
+    if (field && field.checkVisibility()) {
+      const text = document.createElement("small");
+      text.className = "refused"; text.id = `${id}-beside`; text.setAttribute("role", "alert"); text.textContent = error.message.slice(named[0].length);
+      (field.closest("label") ?? field).after(text);
+      field.setAttribute("aria-invalid", "true"); field.setAttribute("aria-describedby", text.id);
+      beside = { field, text }; text.scrollIntoView({ block: "nearest" });
+    }
+    toast.textContent = error ? error.message : ""; toast.hidden = !error || beside !== null;
+  };
+}
