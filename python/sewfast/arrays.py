@@ -142,6 +142,14 @@ def runs(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
     return tuple((int(a), int(b - a)) for a, b in edges.reshape(-1, 2))
 
 
+def bridged(column: FloatArray, known: NDArray[np.bool_] | None = None) -> FloatArray:
+    """The column with straight lines over what is not known, by default what is not finite; level
+    beyond its ends.
+    """
+    at = np.flatnonzero(np.isfinite(column) if known is None else known)
+    return np.interp(np.arange(len(column)), at, column[at])
+
+
 # --- Products of tall matrices --------------------------------------------------------------------
 
 

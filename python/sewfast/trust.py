@@ -9,6 +9,7 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
+from .arrays import bridged
 from .control.controller import SampledController
 from .control.defaults import default_references
 from .control.loop import (
@@ -575,10 +576,9 @@ def _outside(found: ClosedLoopRun, model: Model | None) -> tuple[float, float]:
     if model is None or not len(found.u):
         return math.nan, math.nan
     check_fits(found.controller, model)
-    known = np.isfinite(found.u)
-    u = np.interp(np.arange(len(known)), np.flatnonzero(known), found.u[known])
     data = Dataset.from_arrays(
-        u, None, model.Ts, input_names=model.input_names, input_units=model.input_units,
+        bridged(found.u), None, model.Ts,
+        input_names=model.input_names, input_units=model.input_units,
         output_name=model.output_name, output_unit=model.output_unit, name=found.reference,
     )  # fmt: skip
     try:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..errors import SettingError
 
@@ -27,9 +28,18 @@ class Help(argparse.RawDescriptionHelpFormatter):
 
 
 def add_command(
-    commands: Commands, name: str, command: Command, *, summary: str, text: str, examples: str
+    commands: Commands,
+    name: str,
+    command: Command,
+    *,
+    summary: str,
+    text: str,
+    examples: str,
+    options: str = "",
 ) -> argparse.ArgumentParser:
-    """Add a command: a summary for the list, a text above and examples below its options."""
+    """Add a command: a summary for the list, a text above and examples below its options, which
+    are those common to all commands and those of its table (`add_options`).
+    """
     parser = commands.add_parser(
         name, help=summary, description=text, epilog=examples, formatter_class=Help
     )
@@ -44,7 +54,59 @@ def add_command(
     )  # fmt: skip
     parser.add_argument("--debug", action="store_true", help="show the traceback of a fault")
     parser.set_defaults(command=command, out_of=None)
+    add_options(parser, options)
     return parser
+
+
+def whole(text: str) -> int:
+    """The kind of a number of samples."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if value < 0:
+        raise argparse.ArgumentTypeError(
+            f"expected a whole number of samples, 0 or more, received {text!r}"
+        )
+    return value
+
+
+_KINDS: dict[str, Any] = {"text": str, "float": float, "int": int, "whole": whole, "path": Path}
+_ROW = re.compile(
+    r"(?P<names>\S+)(?: (?P<metavar>\S+))?\s{2,}(?P<kind>\w+|{.*?})(?P<count>\.\.\.|\?|!)?"
+    r"(?:=(?P<default>\S+))?\s{2,}(?P<help>.+)",
+    re.DOTALL,
+)
+
+
+def add_options(parser: argparse._ActionsContainer, table: str, **kinds: Any) -> None:
+    """Arguments and options from a table with a row each: `--name METAVAR  kind  help`.
+
+    Two spaces or more separate the columns; further lines of a help are indented. A kind is text,
+    float, int, whole, path, flag, one of {these,values} or a key of `kinds`, which has a type or a
+    list of choices. After it `...` means one or several, `?` none or one, `!` required, and
+    `=value` is the default.
+    """
+    for text in re.findall(r"^\S.*(?:\n .*)*", table, re.MULTILINE):
+        row = _ROW.fullmatch(text)
+        assert row is not None, text
+        names, kind, count = row["names"].split(","), row["kind"], row["count"]
+        option: dict[str, Any] = {"help": " ".join(row["help"].split())}
+        if kind == "flag":
+            option["action"] = "store_true"
+        else:
+            of = kind[1:-1].split(",") if kind[0] == "{" else {**_KINDS, **kinds}[kind]
+            of_one = of if callable(of) else str
+            option |= {"metavar": row["metavar"], "type": of_one if of_one is not str else None}
+            option["choices"] = None if callable(of) else of
+            option["default"] = None if row["default"] is None else of_one(row["default"])
+        if names[0][0] != "-":
+            option["nargs"] = {"...": "+", "?": "?", None: None}[count]
+        elif count == "...":
+            option["action"] = "append"
+        elif count == "!":
+            option["required"] = True
+        parser.add_argument(*names, **option)
 
 
 def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:

@@ -17,7 +17,6 @@ from .arguments import (
 )
 from .control import plant_of, reference_of
 from .data import add_preparation, masked, prepared, read_for_model
-from .identify import whole
 from .output import print_json, print_result
 
 CHECK = """\
@@ -37,30 +36,22 @@ examples:
 """
 
 
+OPTIONS = """\
+model MODEL.json  text  model file that identify wrote
+data DATA  text  recording: FILE or FILE:IN:OUT
+--init N  whole=20  first samples, which set the initial state and are not judged (20); 0: from rest
+--range A:B  text  samples to judge, 0-based, end excluded; default: all
+--training DATA  text  recording that the model was identified from
+--training-range A:B  text  samples of it that it was identified from
+--plot FILE  path  draw measured output, free run and its band: PNG, SVG or PDF; a folder takes a
+    PNG per question
+"""
+
+
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "check", check_command,
-        summary="whether a model can be trusted", text=CHECK, examples=EXAMPLES,
-    )  # fmt: skip
-    parser.add_argument("model", metavar="MODEL.json", help="model file that identify wrote")
-    parser.add_argument("data", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
-    parser.add_argument(
-        "--init", type=whole, default=20, metavar="N",
-        help="first samples, which set the initial state and are not judged (20); 0: from rest",
-    )  # fmt: skip
-    parser.add_argument(
-        "--range", metavar="A:B", help="samples to judge, 0-based, end excluded; default: all"
-    )
-    parser.add_argument(
-        "--training", metavar="DATA", help="recording that the model was identified from"
-    )
-    parser.add_argument(
-        "--training-range", metavar="A:B", help="samples of it that it was identified from"
-    )
-    parser.add_argument(
-        "--plot", metavar="FILE", type=Path,
-        help="draw measured output, free run and its band: PNG, SVG or PDF; a folder takes a PNG "
-        "per question",
+        summary="whether a model can be trusted", text=CHECK, options=OPTIONS, examples=EXAMPLES,
     )  # fmt: skip
     add_columns(parser, from_model=True)
     add_weights(parser)
@@ -120,34 +111,26 @@ examples:
 """
 
 
+ANALYSE_OPTIONS = """\
+controller CONTROLLER.json  text  file that tune wrote
+plants MODEL.json|virtual[:SEED]  text...  plants to analyse it on
+--speed Y  float...  output about which the plants are linearised; may repeat (three over the
+    training data)
+--step Y  float  size of the reference step
+--disturbance U  float  size of the step at the plant's input
+--seconds S  float  duration of the steps
+--reference FILE|NAME  text...  reference of the cost; may repeat (trapezoid, random)
+--out DIR  path  folder for analysis.json and the figures
+"""
+
+
 def add_analyse(commands: Commands) -> None:
     parser = add_command(
         commands, "analyse", analyse_command,
-        summary="margins, steps, sensitivities of a controller", text=ANALYSE,
-        examples=ANALYSE_EXAMPLES,
-    )  # fmt: skip
-    parser.add_argument("controller", metavar="CONTROLLER.json", help="file that tune wrote")
-    parser.add_argument(
-        "plants", metavar="MODEL.json|virtual[:SEED]", nargs="+", help="plants to analyse it on"
-    )
-    parser.add_argument(
-        "--speed", action="append", type=float, metavar="Y",
-        help="output about which the plants are linearised; may repeat (three over the training "
-        "data)",
-    )  # fmt: skip
-    parser.add_argument("--step", type=float, metavar="Y", help="size of the reference step")
-    parser.add_argument(
-        "--disturbance", type=float, metavar="U", help="size of the step at the plant's input"
-    )
-    parser.add_argument("--seconds", type=float, metavar="S", help="duration of the steps")
-    parser.add_argument(
-        "--reference", action="append", metavar="FILE|NAME",
-        help="reference of the cost; may repeat (trapezoid, random)",
+        summary="margins, steps, sensitivities of a controller",
+        text=ANALYSE, options=ANALYSE_OPTIONS, examples=ANALYSE_EXAMPLES,
     )  # fmt: skip
     add_plot(parser, "draw steps, loop transfer and sensitivities")
-    parser.add_argument(
-        "--out", metavar="DIR", type=Path, help="folder for analysis.json and the figures"
-    )
 
 
 def analyse_command(args: argparse.Namespace) -> None:
@@ -196,22 +179,20 @@ examples:
 """
 
 
+COMPARE_OPTIONS = """\
+models MODEL.json  text...  model file that identify wrote
+data DATA  text  recording: FILE or FILE:IN:OUT
+--init N  whole=20  first samples, which set the initial state and are not scored (20); 0: from rest
+--range A:B  text  samples to score, 0-based, end excluded; default: all
+"""
+
+
 def add_compare(commands: Commands) -> None:
     parser = add_command(
         commands, "compare", compare_command,
-        summary="several models on a recording", text=COMPARE, examples=COMPARE_EXAMPLES,
+        summary="several models on a recording",
+        text=COMPARE, options=COMPARE_OPTIONS, examples=COMPARE_EXAMPLES,
     )  # fmt: skip
-    parser.add_argument(
-        "models", nargs="+", metavar="MODEL.json", help="model file that identify wrote"
-    )
-    parser.add_argument("data", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
-    parser.add_argument(
-        "--init", type=whole, default=20, metavar="N",
-        help="first samples, which set the initial state and are not scored (20); 0: from rest",
-    )  # fmt: skip
-    parser.add_argument(
-        "--range", metavar="A:B", help="samples to score, 0-based, end excluded; default: all"
-    )
     add_plot(parser, "draw measured output, free runs and errors")
     add_columns(parser, from_model=True)
     add_weights(parser)

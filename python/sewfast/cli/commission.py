@@ -38,54 +38,30 @@ examples:
 """
 
 
+OPTIONS = """\
+--on virtual[:SEED]|FILE.fmu?volt=V|PORT  text!  machine to commission: virtual machine, FMU of
+    another tool, or drive
+--out DIR  path!  folder to fill
+--u-max V  float  largest command in either direction (the machine's)
+--speed RPM  float  top of the working range (the largest reference, else 2000)
+--reference NAME  text...  a named reference for tuning and verification (`sewfast signals`); may
+    repeat
+--members N  int=4  networks (4)
+--evaluations N  int=3000  controllers tried (3000)
+--load V  float  load in volts of command, from which the loop must recover as fast as Eq. 12's (a
+    tenth of --u-max; 0: not required)
+--Ms MS  float  largest sensitivity allowed (1.8; inf: no limit)
+--time-budget S  float  time of the search for gains (no limit)
+--seed N  int=0  seed of the random signals, the networks and the search (0)
+--resume  flag  continue from the recordings of an attempt with the same settings in DIR
+"""
+
+
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "commission", command,
-        summary="from a machine at rest to a verified controller", text=TEXT, examples=EXAMPLES,
-    )  # fmt: skip
-    parser.add_argument(
-        "--on",
-        required=True,
-        metavar="virtual[:SEED]|FILE.fmu?volt=V|PORT",
-        help="machine to commission: virtual machine, FMU of another tool, or drive",
-    )
-    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder to fill")
-    parser.add_argument(
-        "--u-max",
-        type=float,
-        metavar="V",
-        help="largest command in either direction (the machine's)",
-    )
-    parser.add_argument(
-        "--speed", type=float, metavar="RPM",
-        help="top of the working range (the largest reference, else 2000)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--reference", action="append", metavar="NAME",
-        help="a named reference for tuning and verification (`sewfast signals`); may repeat",
-    )  # fmt: skip
-    parser.add_argument("--members", type=int, default=4, metavar="N", help="networks (4)")
-    parser.add_argument(
-        "--evaluations", type=int, default=3000, metavar="N", help="controllers tried (3000)"
-    )
-    parser.add_argument(
-        "--load", type=float, metavar="V",
-        help="load in volts of command, from which the loop must recover as fast as Eq. 12's "
-        "(a tenth of --u-max; 0: not required)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--Ms", type=float, metavar="MS", help="largest sensitivity allowed (1.8; inf: no limit)"
-    )
-    parser.add_argument(
-        "--time-budget", type=float, metavar="S", help="time of the search for gains (no limit)"
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, metavar="N",
-        help="seed of the random signals, the networks and the search (0)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--resume", action="store_true",
-        help="continue from the recordings of an attempt with the same settings in DIR",
+        summary="from a machine at rest to a verified controller",
+        text=TEXT, options=OPTIONS, examples=EXAMPLES,
     )  # fmt: skip
     add_overwrite(parser)
     add_drive(parser)

@@ -62,29 +62,22 @@ examples:
 """
 
 
+OPTIONS = """\
+controller CONTROLLER.json  text  file that tune wrote
+plant MODEL.json|virtual[:SEED]  text?  model or virtual machine to run on; both files in any order
+--on MODEL.json|virtual[:SEED]|FILE.fmu?volt=V|PORT  text  plant or drive to run on
+--reference FILE|NAME  text  reference to track; default: a trapezoid over the recorded range of the
+    model (none for a drive)
+--table TABLE.json  text  the table of a known move that plan or learn wrote, in place of a
+    reference
+"""
+
+
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "run", run_command,
-        summary="a closed loop on a model, a machine or a drive", text=RUN, examples=RUN_EXAMPLES,
-    )  # fmt: skip
-    parser.add_argument("controller", metavar="CONTROLLER.json", help="file that tune wrote")
-    parser.add_argument(
-        "plant", nargs="?", metavar="MODEL.json|virtual[:SEED]",
-        help="model or virtual machine to run on; both files in any order",
-    )  # fmt: skip
-    parser.add_argument(
-        "--on",
-        metavar="MODEL.json|virtual[:SEED]|FILE.fmu?volt=V|PORT",
-        help="plant or drive to run on",
-    )
-    parser.add_argument(
-        "--reference", metavar="FILE|NAME",
-        help="reference to track; default: a trapezoid over the recorded range of the model (none "
-        "for a drive)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--table", metavar="TABLE.json",
-        help="the table of a known move that plan or learn wrote, in place of a reference",
+        summary="a closed loop on a model, a machine or a drive",
+        text=RUN, options=OPTIONS, examples=RUN_EXAMPLES,
     )  # fmt: skip
     add_output(
         parser, "OUT",

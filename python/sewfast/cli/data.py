@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError, SettingError
-from .arguments import Commands, add_columns, add_command, add_plot, require_plot
+from .arguments import Commands, add_columns, add_command, add_options, add_plot, require_plot
 from .output import note, print_json, print_result
 from .project import with_units
 
@@ -224,6 +224,14 @@ def _require_apart(train: Dataset, held: Dataset) -> None:
 # --- Options that prepare data, in the order in which they are applied ----------------------------
 
 
+PREPARATION_OPTIONS = """\
+--differentiate  flag  the output is a position: take its speed, [deg] becomes [deg/s]
+--resample TS  float  new sample time [s]; the output is filtered, inputs are averaged
+--detrend  {0,1,steady}  remove 0: the mean, 1: a straight line, steady: the level before inputs
+    move
+"""
+
+
 def add_preparation(parser: argparse.ArgumentParser) -> None:
     """`--mask`, `--hold-inputs`, `--differentiate`, `--resample` and `--detrend`."""
     group = parser.add_argument_group("preparation, in this order")
@@ -233,18 +241,7 @@ def add_preparation(parser: argparse.ArgumentParser) -> None:
         "ranges; outliers: those that stand out from their neighbours",
     )  # fmt: skip
     add_hold(group)
-    group.add_argument(
-        "--differentiate", action="store_true",
-        help="the output is a position: take its speed, [deg] becomes [deg/s]",
-    )  # fmt: skip
-    group.add_argument(
-        "--resample", type=float, metavar="TS",
-        help="new sample time [s]; the output is filtered, inputs are averaged",
-    )  # fmt: skip
-    group.add_argument(
-        "--detrend", choices=("0", "1", "steady"),
-        help="remove 0: the mean, 1: a straight line, steady: the level before inputs move",
-    )  # fmt: skip
+    add_options(group, PREPARATION_OPTIONS)
 
 
 def add_hold(parser: argparse._ActionsContainer) -> None:

@@ -95,19 +95,19 @@ examples:
 """
 
 
+DOCTOR_OPTIONS = """\
+--baud N  int=115200  bits/s of a serial port (115200)
+--echoes N  int=200  short messages to send back and forth, and as many long ones (200)
+"""
+
+
 def add_doctor(commands: Commands) -> None:
     parser = add_command(
         commands, "doctor", doctor_command,
-        summary="diagnosis of a port", text=DOCTOR, examples=DOCTOR_EXAMPLES,
+        summary="diagnosis of a port",
+        text=DOCTOR, options=DOCTOR_OPTIONS, examples=DOCTOR_EXAMPLES,
     )  # fmt: skip
     parser.add_argument("port", metavar="PORT", help=PORT_HELP)
-    parser.add_argument(
-        "--baud", type=int, default=115_200, metavar="N", help="bits/s of a serial port (115200)"
-    )
-    parser.add_argument(
-        "--echoes", type=int, default=200, metavar="N",
-        help="short messages to send back and forth, and as many long ones (200)",
-    )  # fmt: skip
 
 
 def doctor_command(args: argparse.Namespace) -> int | None:
@@ -346,10 +346,24 @@ device reboots), unplug (the port vanishes, .3 s)
 """
 
 
+DEVICE_OPTIONS = """\
+--anyone  flag  allow --tcp an address that other computers can reach: they can start the motor
+--machine virtual[:SEED]|MOTOR.json  text=virtual  the machine (virtual), or the twin of a motor in
+    a file of `sewfast physics -o`
+--fast  flag  as fast as the port allows: time advances only by the host's credit
+--baud N  int  limit to N bits a second in each direction, 10 per byte
+--seed N  int=0  seed of the faults (0)
+--once  flag  end when the first host has disconnected
+--fault-log FILE  path  a line of JSON for each fault
+--trace FILE  path  a line of JSON for each change of the output and of the connection
+"""
+
+
 def add_device(commands: Commands) -> None:
     parser = add_command(
         commands, "device", device_command,
-        summary="the virtual machine behind a port", text=DEVICE, examples=DEVICE_EXAMPLES,
+        summary="the virtual machine behind a port",
+        text=DEVICE, options=DEVICE_OPTIONS, examples=DEVICE_EXAMPLES,
     )  # fmt: skip
     place = parser.add_mutually_exclusive_group()
     place.add_argument(
@@ -360,39 +374,10 @@ def add_device(commands: Commands) -> None:
         "--tcp", nargs="?", const="127.0.0.1:0", metavar="HOST:PORT",
         help="serve on TCP instead; port 0 takes a free one (127.0.0.1:0)",
     )  # fmt: skip
-    parser.add_argument(
-        "--anyone", action="store_true",
-        help="allow --tcp an address that other computers can reach: they can start the motor",
-    )  # fmt: skip
-    parser.add_argument(
-        "--machine", default="virtual", metavar="virtual[:SEED]|MOTOR.json",
-        help="the machine (virtual), or the twin of a motor in a file of `sewfast physics -o`",
-    )  # fmt: skip
-    parser.add_argument(
-        "--fast", action="store_true",
-        help="as fast as the port allows: time advances only by the host's credit",
-    )  # fmt: skip
-    parser.add_argument(
-        "--baud",
-        type=int,
-        metavar="N",
-        help="limit to N bits a second in each direction, 10 per byte",
-    )
     parser.add_argument("--faults", default="", metavar="LIST", help=FAULTS)
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the faults (0)")
-    parser.add_argument(
-        "--once", action="store_true", help="end when the first host has disconnected"
-    )
     parser.add_argument(
         "--for", dest="duration", type=float, metavar="S", help="end after S seconds"
     )
-    parser.add_argument(
-        "--fault-log", type=Path, metavar="FILE", help="a line of JSON for each fault"
-    )
-    parser.add_argument(
-        "--trace", type=Path, metavar="FILE",
-        help="a line of JSON for each change of the output and of the connection",
-    )  # fmt: skip
 
 
 def device_command(args: argparse.Namespace) -> int | None:

@@ -9,15 +9,13 @@ from ..errors import SettingError
 from .arguments import Commands, add_columns, add_command, add_output, require_place
 from .data import read_training
 from .output import print_json, print_rows
-from .tune import FORMS, forms_of, gain_row
+from .tune import forms_of, gain_row
 
 if TYPE_CHECKING:
     from ..control.controller import Controller
     from ..control.margins import Margins
     from ..rules import Fopdt, Rule
 
-RULES = ("eq-12", "table-1", "simc", "simc-pid", "amigo")
-N = 10.0
 
 TEXT = """\
 First gains for a drive, from a recorded step response or from K, T and L of K e^(-sL)/(1 + sT).
@@ -36,45 +34,29 @@ examples:
 """
 
 
+OPTIONS = """\
+data DATA  text?  recording of one step: FILE or FILE:IN:OUT
+--rule  {eq-12,table-1,simc,simc-pid,amigo}=eq-12  tuning rule (eq-12)
+--Ms MS  float  eq-12: largest allowed sensitivity (2.0); inf: the paper's optimum
+--tau-c S  float  simc: time constant of the closed loop [s]
+--nearest  flag  table-1: use the end row for L/T outside .1 to 1
+--filter N  int=8  moving average over N samples of the feedback (8); 1: none
+--N N  float=10.0  the derivative is filtered with Td/N (10); inf: not
+--form  {standard,parallel,per-sample}=standard  form of the gains in the controller's
+    file (standard)
+--u-min U  float=-20.0  least command (-20)
+--u-max U  float=20.0  largest command (20)
+"""
+
+
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "gains", gains_command,
-        summary="first gains by a tuning rule, with margins", text=TEXT, examples=EXAMPLES,
+        summary="first gains by a tuning rule, with margins",
+        text=TEXT, options=OPTIONS, examples=EXAMPLES,
     )  # fmt: skip
-    parser.add_argument(
-        "data", nargs="?", metavar="DATA", help="recording of one step: FILE or FILE:IN:OUT"
-    )
     for name, unit in (("K", "output/command"), ("T", "s"), ("L", "s")):
         parser.add_argument(f"--{name}", type=float, metavar=name, help=f"of the plant [{unit}]")
-    parser.add_argument("--rule", choices=RULES, default="eq-12", help="tuning rule (eq-12)")
-    parser.add_argument(
-        "--Ms", type=float, metavar="MS",
-        help="eq-12: largest allowed sensitivity (2.0); inf: the paper's optimum",
-    )  # fmt: skip
-    parser.add_argument(
-        "--tau-c", type=float, metavar="S", help="simc: time constant of the closed loop [s]"
-    )
-    parser.add_argument(
-        "--nearest", action="store_true", help="table-1: use the end row for L/T outside .1 to 1"
-    )
-    parser.add_argument(
-        "--filter", type=int, default=8, metavar="N",
-        help="moving average over N samples of the feedback (8); 1: none",
-    )  # fmt: skip
-    parser.add_argument(
-        "--N", type=float, default=N, metavar="N",
-        help="the derivative is filtered with Td/N (10); inf: not",
-    )  # fmt: skip
-    parser.add_argument(
-        "--u-min", type=float, default=-20.0, metavar="U", help="least command (-20)"
-    )
-    parser.add_argument(
-        "--u-max", type=float, default=20.0, metavar="U", help="largest command (20)"
-    )
-    parser.add_argument(
-        "--form", choices=[f.replace("_", "-") for f in FORMS], default="standard",
-        help="form of the gains in the controller's file (standard)",
-    )  # fmt: skip
     add_columns(parser, from_model=False)
     add_output(parser, "CONTROLLER.json", "controller file to write")
 

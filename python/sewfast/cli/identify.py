@@ -18,6 +18,7 @@ from .arguments import (
     add_columns,
     add_command,
     add_named_output,
+    add_options,
     add_output,
     add_plot,
     add_split,
@@ -62,24 +63,24 @@ then: sewfast identify run.csv --input u --output speed --na 2 --nb 2 --nk 3 -o 
 """
 
 
+ORDERS_OPTIONS = """\
+data DATA  text...  recording: FILE or FILE:IN:OUT
+--na N  int=4  past outputs up to (4)
+--nb N  int=4  past inputs up to (4)
+--nk N  int  delay [samples]; default: 1 and plausible ones
+--held-out PART  float=0.3  last part of each recording, which the models are judged on (0.3)
+"""
+
+
 def add_orders(commands: Commands) -> None:
     parser = add_command(
         commands, "orders", orders_command,
-        summary="orders and delay for a model", text=ORDERS_TEXT, examples=ORDERS_EXAMPLES,
+        summary="orders and delay for a model",
+        text=ORDERS_TEXT, options=ORDERS_OPTIONS, examples=ORDERS_EXAMPLES,
     )  # fmt: skip
-    parser.add_argument("data", nargs="+", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
     add_columns(parser, from_model=False)
     add_split(parser)
     add_preparation(parser)
-    parser.add_argument("--na", type=int, default=4, metavar="N", help="past outputs up to (4)")
-    parser.add_argument("--nb", type=int, default=4, metavar="N", help="past inputs up to (4)")
-    parser.add_argument(
-        "--nk", type=int, metavar="N", help="delay [samples]; default: 1 and plausible ones"
-    )
-    parser.add_argument(
-        "--held-out", type=float, default=0.3, metavar="PART",
-        help="last part of each recording, which the models are judged on (0.3)",
-    )  # fmt: skip
 
 
 def orders_command(args: argparse.Namespace) -> None:
@@ -158,28 +159,45 @@ examples:
 """
 
 
+OPTIONS = """\
+data DATA  text...  recording: FILE or FILE:IN:OUT
+--train A:B  text  samples of each file to train on, 0-based, end excluded; default: all but
+    --validate
+--validate A:B  text  samples of each file to hold out, for the choice and the score; default: the
+    last fifth is held out for the choice, and used for training in the end
+"""
+
+
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "identify", identify_command,
-        summary="a model from recordings", text=TEXT, examples=EXAMPLES,
+        summary="a model from recordings", text=TEXT, options=OPTIONS, examples=EXAMPLES,
     )  # fmt: skip
-    parser.add_argument("data", nargs="+", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
     add_columns(parser, from_model=False)
     add_weights(parser)
     add_split(parser)
     add_preparation(parser)
     _add_model(parser)
-    parser.add_argument(
-        "--train", metavar="A:B",
-        help="samples of each file to train on, 0-based, end excluded; default: all but --validate",
-    )  # fmt: skip
-    parser.add_argument(
-        "--validate", metavar="A:B",
-        help="samples of each file to hold out, for the choice and the score; default: the last "
-        "fifth is held out for the choice, and used for training in the end",
-    )  # fmt: skip
     add_plot(parser, "draw the free run on the data held out, else on the training data")
     add_named_output(parser, "model", "data", "model file to write")
+
+
+MODEL_OPTIONS = """\
+--preset  {paper}  paper: 8 tanh and a saturated output, u/10, y/1000, random starts, as published
+--na N  int  past outputs of a lagged model (2)
+--nb N  int  past inputs of a lagged model (2)
+--nk N  int  delay [samples] (1; auto, neural-ss: from the data)
+--nx N  int  states of neural-ss (from the data)
+--hidden N  int  hidden units (from the data; neural-oe: 8)
+--output-function  {linear,saturation,abs}  output function of neural-ss: abs for a sensor without
+    the sign (from the data)
+--starts N  int  random starts (by the amount of data)
+--seed N  int=0  seed of the starts (0)
+--time-budget S  float  total time [s]; the best model until then is kept (no limit)
+--further MODEL.json  text  a model to train further
+--alternatives  flag  also write the next best models, to MODEL-alternative-1.json and so on, in
+    place of those of an earlier MODEL.json
+"""
 
 
 def _add_model(parser: argparse.ArgumentParser) -> None:
@@ -188,36 +206,10 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
         help="; ".join(f"{spelled(kind)}: {text}" for kind, text in TEXTS.items())
         + "; auto (default): oe or a network, whichever is better",
     )  # fmt: skip
+    add_options(parser, MODEL_OPTIONS)
     parser.add_argument(
-        "--preset", choices=("paper",),
-        help="paper: 8 tanh and a saturated output, u/10, y/1000, random starts, as published",
-    )  # fmt: skip
-    whole: dict[str, Any] = {"type": int, "metavar": "N"}
-    add_argument = parser.add_argument
-    add_argument("--na", **whole, help="past outputs of a lagged model (2)")
-    add_argument("--nb", **whole, help="past inputs of a lagged model (2)")
-    add_argument("--nk", **whole, help="delay [samples] (1; auto, neural-ss: from the data)")
-    add_argument("--nx", **whole, help="states of neural-ss (from the data)")
-    add_argument("--hidden", **whole, help="hidden units (from the data; neural-oe: 8)")
-    add_argument(
-        "--output-function", choices=("linear", "saturation", "abs"),
-        help="output function of neural-ss: abs for a sensor without the sign (from the data)",
-    )  # fmt: skip
-    add_argument("--starts", **whole, help="random starts (by the amount of data)")
-    add_argument("--seed", **whole, default=0, help="seed of the starts (0)")
-    add_argument(
-        "--time-budget", type=float, metavar="S",
-        help="total time [s]; the best model until then is kept (no limit)",
-    )  # fmt: skip
-    add_argument(
         "--no-select", dest="select", action="store_false",
         help="neural-oe: hold nothing out, train to the last iteration; to compare methods",
-    )  # fmt: skip
-    add_argument("--further", metavar="MODEL.json", help="a model to train further")
-    add_argument(
-        "--alternatives", action="store_true",
-        help="also write the next best models, to MODEL-alternative-1.json and so on, in place of "
-        "those of an earlier MODEL.json",
     )  # fmt: skip
 
 
@@ -369,6 +361,14 @@ examples:
 """
 
 
+MODEL_AND_DATA_OPTIONS = """\
+model MODEL.json  text  model file that identify wrote
+data DATA  text  recording: FILE or FILE:IN:OUT
+--init N  whole=20  first samples, which set the initial state and are not scored (20); 0: from rest
+"""
+SCORED_OPTIONS = "--range A:B  text  samples to score, 0-based, end excluded; default: all"
+
+
 def add_models(commands: Commands) -> None:
     parser = add_command(
         commands, "validate", validate_command,
@@ -378,9 +378,7 @@ def add_models(commands: Commands) -> None:
     add_split(parser)
     add_preparation(parser)
     add_plot(parser, "draw measured output, free run and errors")
-    parser.add_argument(
-        "--range", metavar="A:B", help="samples to score, 0-based, end excluded; default: all"
-    )
+    add_options(parser, SCORED_OPTIONS)
     parser = add_command(
         commands, "simulate", simulate_command,
         summary="free run of a model", text=SIMULATE, examples=SIMULATE_EXAMPLES,
@@ -391,26 +389,9 @@ def add_models(commands: Commands) -> None:
 
 
 def _add_model_and_data(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("model", metavar="MODEL.json", help="model file that identify wrote")
-    parser.add_argument("data", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
-    parser.add_argument(
-        "--init", type=whole, default=20, metavar="N",
-        help="first samples, which set the initial state and are not scored (20); 0: from rest",
-    )  # fmt: skip
+    add_options(parser, MODEL_AND_DATA_OPTIONS)
     add_columns(parser, from_model=True)
     add_weights(parser)
-
-
-def whole(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if value < 0:
-        raise argparse.ArgumentTypeError(
-            f"expected a whole number of samples, 0 or more, received {text!r}"
-        )
-    return value
 
 
 def validate_command(args: argparse.Namespace) -> None:

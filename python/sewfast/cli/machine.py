@@ -14,6 +14,7 @@ from .arguments import (
     Commands,
     add_columns,
     add_command,
+    add_options,
     add_output,
     add_plot,
     require_place,
@@ -66,68 +67,38 @@ _ON_A_MACHINE = (
 _OF_A_RECORD = ("reference", "method", "segment")
 
 
+OPTIONS = """\
+data DATA  text?  recording, or a response written by -o
+--on virtual[:SEED]|FILE.fmu?volt=V|PORT  text  excite this machine instead
+--speed RPM[,RPM...]  speeds  working speed of the machine, or several
+--amplitude V  float  peak of the multisine (six tenths of the command left at that speed); with
+    --controller of the reference [RPM] (a twentieth of the speed)
+--controller FILE.json  text  excite the reference of this loop; print its margins on the response
+--period S  float  period of the multisine (2)
+--realisations N  int  multisines with different phases (4)
+--periods N  int  repetitions of each (4)
+--f-min HZ  float  lowest frequency (1)
+--f-max HZ  float  highest frequency (four tenths of the sample rate)
+--seed N  int  seed of the phases (0)
+--reference COL  text  column of a record with the controller's reference
+--method  {segments,local}  for a record: spectra averaged over segments (the default), or local
+    polynomials, which remove the leakage of its beginning and end
+--segment N  int  samples of a record's segments (a ninth of it)
+--model FILE.json  path  write the fit as a model; keeps an identified one
+--propose FILE.json  path  write a controller for the machine: PID gains of the largest bandwidth,
+    with a notch if that pays; limits and filters of --controller, if given
+--Ms MS  float  largest sensitivity of --propose (1.7)
+--u-max V  float  limit of --propose's command
+"""
+
+
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "bode", command,
         summary="frequency response with error bars, resonance of the shaft",
         text=BODE, examples=EXAMPLES,
     )  # fmt: skip
-    parser.add_argument(
-        "data", metavar="DATA", nargs="?", help="recording, or a response written by -o"
-    )
-    parser.add_argument(
-        "--on", metavar="virtual[:SEED]|FILE.fmu?volt=V|PORT", help="excite this machine instead"
-    )
-    parser.add_argument(
-        "--speed",
-        type=_speeds,
-        metavar="RPM[,RPM...]",
-        help="working speed of the machine, or several",
-    )
-    parser.add_argument(
-        "--amplitude", type=float, metavar="V",
-        help="peak of the multisine (six tenths of the command left at that speed); with "
-        "--controller of the reference [RPM] (a twentieth of the speed)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--controller", metavar="FILE.json",
-        help="excite the reference of this loop; print its margins on the response",
-    )  # fmt: skip
-    parser.add_argument("--period", type=float, metavar="S", help="period of the multisine (2)")
-    parser.add_argument(
-        "--realisations", type=int, metavar="N", help="multisines with different phases (4)"
-    )
-    parser.add_argument("--periods", type=int, metavar="N", help="repetitions of each (4)")
-    parser.add_argument("--f-min", type=float, metavar="HZ", help="lowest frequency (1)")
-    parser.add_argument(
-        "--f-max", type=float, metavar="HZ",
-        help="highest frequency (four tenths of the sample rate)",
-    )  # fmt: skip
-    parser.add_argument("--seed", type=int, metavar="N", help="seed of the phases (0)")
-    parser.add_argument(
-        "--reference", metavar="COL", help="column of a record with the controller's reference"
-    )
-    parser.add_argument(
-        "--method", choices=("segments", "local"),
-        help="for a record: spectra averaged over segments (the default), or local polynomials, "
-        "which remove the leakage of its beginning and end",
-    )  # fmt: skip
-    parser.add_argument(
-        "--segment", type=int, metavar="N", help="samples of a record's segments (a ninth of it)"
-    )
-    parser.add_argument(
-        "--model", metavar="FILE.json", type=Path,
-        help="write the fit as a model; keeps an identified one",
-    )  # fmt: skip
-    parser.add_argument(
-        "--propose", metavar="FILE.json", type=Path,
-        help="write a controller for the machine: PID gains of the largest bandwidth, with a notch "
-        "if that pays; limits and filters of --controller, if given",
-    )  # fmt: skip
-    parser.add_argument(
-        "--Ms", type=float, metavar="MS", help="largest sensitivity of --propose (1.7)"
-    )
-    parser.add_argument("--u-max", type=float, metavar="V", help="limit of --propose's command")
+    add_options(parser, OPTIONS, speeds=_speeds)
     add_output(parser, "FILE.json", "write the response")
     add_plot(parser, "draw gain, phase and coherence")
     add_columns(parser, from_model=False)
@@ -354,62 +325,41 @@ examples:
 """
 
 
+PHYSICS_OPTIONS = """\
+data DATA  text...  recordings of the same motor
+--current COL  text  column of the motor current [A]
+--volts N  float  volts on the winding per unit of command
+--structure LIST  text  default: joint if the output is a position, else dcmotor (the usual terms
+    that the record shows); or terms: lag,delay,coulomb,offset,drop,stribeck,load_1,load_2,
+    inertia_2,cogging,torque_ripple,limit; dcmotor,sag adds one of
+    stribeck_difference,sag,eccentricity
+--intervals  {curvature,profile}=curvature  95 %% intervals by the curvature of the cost, or as
+    profile likelihood (seconds)
+--speed-unit UNIT  text  unit of the output: rpm, rad/s, rev/s, deg/s
+--inertia N  float  for --export of a joint: known inertia [kg m^2; kg if it slides], for forces in
+    N m
+--check  {mujoco}  of a joint: build the simulator from its export, replay the record, and say how
+    they differ
+--bandwidth HZ  float  of a joint with a controller inside: its gains for this bandwidth of the
+    position, and what they cannot do
+--winding  {line,q}  for --export: volts and amperes are between two terminals (line), or amplitudes
+    along the q axis, as logged by boards (q)
+--gear N  float=1.0  for --export wpilib, mujoco, urdf: turns of the motor per turn of the joint
+--model FILE.json  path  write the turning motor as a linear model for tuning; keeps an identified
+    one
+"""
+
+
 def add_physics(commands: Commands) -> None:
     parser = add_command(
         commands, "physics", physics_command,
-        summary="inertia, friction and electrical constants of a motor", text=PHYSICS,
-        examples=PHYSICS_EXAMPLES,
+        summary="inertia, friction and electrical constants of a motor",
+        text=PHYSICS, options=PHYSICS_OPTIONS, examples=PHYSICS_EXAMPLES,
     )  # fmt: skip
-    parser.add_argument("data", metavar="DATA", nargs="+", help="recordings of the same motor")
-    parser.add_argument("--current", metavar="COL", help="column of the motor current [A]")
-    parser.add_argument(
-        "--volts", type=float, metavar="N", help="volts on the winding per unit of command"
-    )
-    parser.add_argument(
-        "--structure", metavar="LIST",
-        help="default: joint if the output is a position, else dcmotor (the usual terms that the "
-        "record shows); or terms: lag,delay,coulomb,"
-        "offset,drop,stribeck,load_1,load_2,inertia_2,cogging,torque_ripple,limit; dcmotor,sag "
-        "adds one of stribeck_difference,sag,eccentricity",
-    )  # fmt: skip
-    parser.add_argument(
-        "--intervals", choices=("curvature", "profile"), default="curvature",
-        help="95 %% intervals by the curvature of the cost, or as profile likelihood (seconds)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--speed-unit", metavar="UNIT", help="unit of the output: rpm, rad/s, rev/s, deg/s"
-    )
     parser.add_argument(
         "--export", nargs=2, metavar=("TARGET", "FILE"),
         help="write settings for wpilib, mujoco, urdf, odrive, moteus or simplefoc; of a joint for "
         "mujoco, urdf or json",
-    )  # fmt: skip
-    parser.add_argument(
-        "--inertia", type=float, metavar="N",
-        help="for --export of a joint: known inertia [kg m^2; kg if it slides], for forces in N m",
-    )  # fmt: skip
-    parser.add_argument(
-        "--check", choices=("mujoco",),
-        help="of a joint: build the simulator from its export, replay the record, and say how they "
-        "differ",
-    )  # fmt: skip
-    parser.add_argument(
-        "--bandwidth", type=float, metavar="HZ",
-        help="of a joint with a controller inside: its gains for this bandwidth of the position, "
-        "and what they cannot do",
-    )  # fmt: skip
-    parser.add_argument(
-        "--winding", choices=("line", "q"),
-        help="for --export: volts and amperes are between two terminals (line), or amplitudes "
-        "along the q axis, as logged by boards (q)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--gear", type=float, default=1.0, metavar="N",
-        help="for --export wpilib, mujoco, urdf: turns of the motor per turn of the joint",
-    )  # fmt: skip
-    parser.add_argument(
-        "--model", metavar="FILE.json", type=Path,
-        help="write the turning motor as a linear model for tuning; keeps an identified one",
     )  # fmt: skip
     add_output(parser, "FILE.json", "write the motor")
     add_plot(parser, "draw the free run and the command over the speed")

@@ -15,6 +15,7 @@ from .arguments import (
     TABLES,
     Commands,
     add_command,
+    add_options,
     add_output,
     add_overwrite,
     add_plot,
@@ -137,19 +138,16 @@ def profile_command(args: argparse.Namespace) -> None:
     )  # fmt: skip
 
 
+FILES_OPTIONS = """\
+controller CONTROLLER.json  text  file that tune wrote
+model MODEL.json  text...  models of the drive, all of which count
+--reference FILE|NAME  text  the move; default: a trapezoid over the recorded range of the model
+--within-reach  flag  make it one that the models can follow first, as sewfast profile does
+"""
+
+
 def _add_files(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("controller", metavar="CONTROLLER.json", help="file that tune wrote")
-    parser.add_argument(
-        "model", nargs="+", metavar="MODEL.json", help="models of the drive, all of which count"
-    )
-    parser.add_argument(
-        "--reference", metavar="FILE|NAME",
-        help="the move; default: a trapezoid over the recorded range of the model",
-    )  # fmt: skip
-    parser.add_argument(
-        "--within-reach", action="store_true",
-        help="make it one that the models can follow first, as sewfast profile does",
-    )  # fmt: skip
+    add_options(parser, FILES_OPTIONS)
     _add_force(parser)
 
 
@@ -227,23 +225,21 @@ def _planned(
         )  # fmt: skip
 
 
+LEARN_OPTIONS = """\
+--table TABLE.json  text  begin with this table
+--on virtual[:SEED]|FILE.fmu?volt=V|PORT  text!  machine to repeat it on
+--repetitions N  int=8  at most so many (8)
+--resume  flag  go on from the table that an earlier call left in -o
+"""
+
+
 def add_learn(commands: Commands) -> None:
     parser = add_command(
         commands, "learn", learn_command,
-        summary="improve a known move on the machine", text=LEARN, examples=LEARN_EXAMPLES,
+        summary="improve a known move on the machine",
+        text=LEARN, options=LEARN_OPTIONS, examples=LEARN_EXAMPLES,
     )  # fmt: skip
     _add_files(parser)
-    parser.add_argument("--table", metavar="TABLE.json", help="begin with this table")
-    parser.add_argument(
-        "--on", required=True, metavar="virtual[:SEED]|FILE.fmu?volt=V|PORT",
-        help="machine to repeat it on",
-    )  # fmt: skip
-    parser.add_argument(
-        "--repetitions", type=int, default=8, metavar="N", help="at most so many (8)"
-    )
-    parser.add_argument(
-        "--resume", action="store_true", help="go on from the table that an earlier call left in -o"
-    )
     add_output(parser, "TABLE.json", "table to write after each repetition", required=True)
     add_plot(parser, "draw the best run over the first one")
     add_overwrite(parser)

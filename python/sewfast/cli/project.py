@@ -320,17 +320,18 @@ Recordings are in `recordings/`; settings common to all of them are in `sewfast.
 """
 
 
+OPTIONS = """\
+folder DIR  path?=.  folder (this one)
+--recording FILE  text  take names and units of the columns from this file
+"""
+
+
 def add(commands: Commands) -> None:
-    parser = add_command(
+    add_command(
         commands, "init", init_command,
-        summary="a folder for a drive, with its settings", text=INIT, examples=EXAMPLES,
+        summary="a folder for a drive, with its settings",
+        text=INIT, options=OPTIONS, examples=EXAMPLES,
     )  # fmt: skip
-    parser.add_argument(
-        "folder", nargs="?", type=Path, default=Path(), metavar="DIR", help="folder (this one)"
-    )
-    parser.add_argument(
-        "--recording", metavar="FILE", help="take names and units of the columns from this file"
-    )
 
 
 def init_command(args: argparse.Namespace) -> None:

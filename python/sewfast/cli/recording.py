@@ -60,28 +60,20 @@ List the named signals: excitations [V] for `record --signal`, references [RPM] 
 """
 
 
+OPTIONS = """\
+--on virtual[:SEED]|FILE.fmu?volt=V|PORT  text!  virtual machine, FMU of another tool, or drive
+--signal FILE|NAME  text!  an excitation; see `sewfast signals`
+--scale X  float=1.0  factor on the signal (1)
+--seed N  int=0  seed of a random signal (0)
+"""
+
+
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "record", record_command,
-        summary="a recording of a drive or of the virtual machine", text=RECORD,
+        summary="a recording of a drive or of the virtual machine", text=RECORD, options=OPTIONS,
         examples=RECORD_EXAMPLES,
     )  # fmt: skip
-    parser.add_argument(
-        "--on",
-        required=True,
-        metavar="virtual[:SEED]|FILE.fmu?volt=V|PORT",
-        help="virtual machine, FMU of another tool, or drive",
-    )
-    parser.add_argument(
-        "--signal", required=True, metavar="FILE|NAME",
-        help="an excitation; see `sewfast signals`",
-    )  # fmt: skip
-    parser.add_argument(
-        "--scale", type=float, default=1.0, metavar="X", help="factor on the signal (1)"
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="seed of a random signal (0)"
-    )
     add_output(parser, "OUT", "CSV, .npz, .mat, Parquet or .mcap; default: CSV to standard output")
     add_overwrite(parser)
     add_drive(parser)

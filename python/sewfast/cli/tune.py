@@ -16,6 +16,7 @@ from .arguments import (
     Commands,
     add_command,
     add_named_output,
+    add_options,
     add_plot,
     require_place,
     require_plot,
@@ -85,125 +86,71 @@ examples:
 """
 
 
+OPTIONS = """\
+model MODEL.json  text...  model file that identify wrote
+--reference FILE|NAME  text...  what to track; may repeat (trapezoid, trapezoids, random)
+--u-min V  float  least command (as recorded)
+--u-max V  float  largest command (as recorded)
+--limits-of RECORDING.mcap  text  take the volt limit of a recording's drive in both directions, for
+    those not given
+--counts-per-rev N  float  encoder in the loop; default: that of the counts that the output comes
+    from, if any
+--filter N  int  moving average over N samples of the feedback; 1: none; default: 8 ms, at most a
+    tenth of the time constant
+--unit UNIT  text  unit of the output, if the model has none: RPM, rad/s, ..
+--controller KIND  text=pid  kind of the controller without --start, such as state-feedback (pid)
+--start CONTROLLER.json  text  start of the search, with its limits, encoder and filters; default:
+    Table 1 on the first model's step response
+--feedforward  {preview,causal}=preview  add the command that the models need for the reference,
+    known ahead (preview) or only in time (causal), if following it then costs less
+--notch HZ[:DEPTH[:WIDTH]]  text...  a notch to start with, tuned together with the gains; may
+    repeat (depth .1, width .5; sewfast bode suggests one)
+--response RESPONSE.json  text  a response measured by sewfast bode, for whose bands Ms must hold as
+    well
+--rival MODEL.json  text  another kind of model of the same drive, for a second opinion on the
+    gains: a linear one for a network
+--force  flag  tune on a model that identify called useless, and write gains that are unfit, too
+"""
+
+
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "tune", tune_command,
-        summary="a controller for a model", text=TUNE, examples=TUNE_EXAMPLES,
-    )  # fmt: skip
-    parser.add_argument(
-        "model", nargs="+", metavar="MODEL.json", help="model file that identify wrote"
-    )
-    parser.add_argument(
-        "--reference", action="append", metavar="FILE|NAME",
-        help="what to track; may repeat (trapezoid, trapezoids, random)",
-    )  # fmt: skip
-    parser.add_argument("--u-min", type=float, metavar="V", help="least command (as recorded)")
-    parser.add_argument("--u-max", type=float, metavar="V", help="largest command (as recorded)")
-    parser.add_argument(
-        "--limits-of", metavar="RECORDING.mcap",
-        help="take the volt limit of a recording's drive in both directions, for those not given",
-    )  # fmt: skip
-    parser.add_argument(
-        "--counts-per-rev", type=float, metavar="N",
-        help="encoder in the loop; default: that of the counts that the output comes from, if any",
-    )  # fmt: skip
-    parser.add_argument(
-        "--filter", type=int, metavar="N",
-        help="moving average over N samples of the feedback; 1: none; default: 8 ms, at most a "
-        "tenth of the time constant",
-    )  # fmt: skip
-    parser.add_argument(
-        "--unit", metavar="UNIT", help="unit of the output, if the model has none: RPM, rad/s, .."
-    )
-    parser.add_argument(
-        "--controller", default="pid", metavar="KIND",
-        help="kind of the controller without --start, such as state-feedback (pid)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--start", metavar="CONTROLLER.json",
-        help="start of the search, with its limits, encoder and filters; default: Table 1 on the "
-        "first model's step response",
-    )  # fmt: skip
-    parser.add_argument(
-        "--feedforward", choices=("preview", "causal"), default="preview",
-        help="add the command that the models need for the reference, known ahead (preview) or "
-        "only in time (causal), if following it then costs less",
+        summary="a controller for a model", text=TUNE, options=OPTIONS, examples=TUNE_EXAMPLES,
     )  # fmt: skip
     parser.add_argument(
         "--no-feedforward", dest="feedforward", action="store_const", const="none",
         help="the PID alone",
-    )  # fmt: skip
-    parser.add_argument(
-        "--notch", action="append", metavar="HZ[:DEPTH[:WIDTH]]",
-        help="a notch to start with, tuned together with the gains; may repeat (depth .1, width "
-        ".5; sewfast bode suggests one)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--response", metavar="RESPONSE.json",
-        help="a response measured by sewfast bode, for whose bands Ms must hold as well",
-    )  # fmt: skip
-    parser.add_argument(
-        "--rival", metavar="MODEL.json",
-        help="another kind of model of the same drive, for a second opinion on the gains: a linear "
-        "one for a network",
-    )  # fmt: skip
-    parser.add_argument(
-        "--force", action="store_true",
-        help="tune on a model that identify called useless, and write gains that are unfit, too",
     )  # fmt: skip
     _add_search(parser)
     add_plot(parser, "draw the loops of the result and the start; with --pareto the front")
     add_named_output(parser, "controller", "model", "controller file to write")
 
 
+SEARCH_OPTIONS = """\
+--variables NAME[=LOW:HIGH],..  text  variables of the search (Kp,Ti,Td,alpha,beta,N; for state
+    feedback rho,integral,noise,weight,lead); also Tt, filter_samples, filter_time, observer_time,
+    r_rate, notches
+--cost NAME=WEIGHT  text...  weight of a term; may repeat
+--constraint NAME=LIMIT  text...  limit of Ms (1.8; inf: none), overshoot [%%], u, recovery [ms] or
+    load; may repeat
+--speed Y  float  output about which models are linearised for Ms (half way from rest to the ends of
+    the references)
+--load LEVEL:COMMAND  text...  a load step: the level held and the command added after the limiter,
+    as in 1500:-2; may repeat
+--aggregate  {mean,worst}=mean  over the plants (mean)
+--method  {genetic,cma-es}=genetic  search method (genetic)
+--evaluations N  int  controllers tried (3000)
+--time-budget S  float  time of the whole search, after which the best so far is used (no limit)
+--seed N  int=0  seed of the search (0)
+--pareto NAME,NAME  text  objectives of a front: tracking, chatter, effort, overshoot, rise, lag,
+    saturation, recovery, load, cost, Ms; -o is its knee
+--front FILE  path  the front as a table (.csv, .npz, .mat, .parquet) or a figure (.png, .svg, .pdf)
+"""
+
+
 def _add_search(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--variables", metavar="NAME[=LOW:HIGH],..",
-        help="variables of the search (Kp,Ti,Td,alpha,beta,N; for state feedback rho,integral,"
-        "noise,weight,lead); also Tt, filter_samples, filter_time, observer_time, r_rate, notches",
-    )  # fmt: skip
-    parser.add_argument(
-        "--cost", action="append", metavar="NAME=WEIGHT", help="weight of a term; may repeat"
-    )
-    parser.add_argument(
-        "--constraint", action="append", metavar="NAME=LIMIT",
-        help="limit of Ms (1.8; inf: none), overshoot [%%], u, recovery [ms] or load; may repeat",
-    )  # fmt: skip
-    parser.add_argument(
-        "--speed", type=float, metavar="Y",
-        help="output about which models are linearised for Ms (half way from rest to the ends of "
-        "the references)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--load", action="append", metavar="LEVEL:COMMAND",
-        help="a load step: the level held and the command added after the limiter, as in 1500:-2; "
-        "may repeat",
-    )  # fmt: skip
-    parser.add_argument(
-        "--aggregate", choices=("mean", "worst"), default="mean", help="over the plants (mean)"
-    )
-    parser.add_argument(
-        "--method", choices=("genetic", "cma-es"), default="genetic",
-        help="search method (genetic)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--evaluations", type=int, metavar="N",
-        help="controllers tried (3000)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--time-budget", type=float, metavar="S",
-        help="time of the whole search, after which the best so far is used (no limit)",
-    )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the search (0)")
-    parser.add_argument(
-        "--pareto", metavar="NAME,NAME",
-        help="objectives of a front: tracking, chatter, effort, overshoot, rise, lag, saturation, "
-        "recovery, load, cost, Ms; -o is its knee",
-    )  # fmt: skip
-    parser.add_argument(
-        "--front", type=Path, metavar="FILE",
-        help="the front as a table (.csv, .npz, .mat, .parquet) or a figure (.png, .svg, .pdf)",
-    )  # fmt: skip
+    add_options(parser, SEARCH_OPTIONS)
 
 
 def tune_command(args: argparse.Namespace) -> int | None:

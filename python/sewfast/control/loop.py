@@ -309,7 +309,7 @@ def run(
         )  # fmt: skip
         return replace(found, r=table.reference[: len(found.t)].copy())
     if reference is None:
-        reference, name = _usual_reference(on, controller), name or "trapezoid"
+        reference, name = usual_reference(on, controller), name or "trapezoid"
     r = reference_samples(reference, controller, seed, plant=on)
     title = name or (reference if isinstance(reference, str) else "reference")
     extra = _given(on, feedforward, disturbance)
@@ -352,7 +352,7 @@ def _setpoint(table: MoveTable, controller: SampledController, reference: Any) -
     return table.setpoint
 
 
-def _usual_reference(on: Any, controller: SampledController) -> str | FloatArray:
+def usual_reference(on: Any, controller: SampledController) -> str | FloatArray:
     """A trapezoid for a model or a virtual machine; a real motor needs an explicit reference."""
     if not isinstance(on, (Model, VirtualMachine)):
         raise SettingError(
@@ -503,6 +503,11 @@ def single_core(plant: Plant, rest: Rest) -> Any:
     if not isinstance(plant, Model):
         return plant.core
     return (plant.members[0] if isinstance(plant, Ensemble) else plant).about(rest)
+
+
+def cores_about(rest: Rest, plants: Sequence[Plant]) -> list[Any]:
+    """The compiled plants of single plants about a rest."""
+    return [p.about(rest) if isinstance(p, Model) else p.core for p in plants]
 
 
 def common_rest(plants: Sequence[Any]) -> Rest:

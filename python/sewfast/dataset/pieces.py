@@ -493,10 +493,3 @@ def _held(
                 "to be the last known value, held"
             )
     return replace(e, u=frozen(u))
-
-
-def interpolated(column: FloatArray) -> FloatArray:
-    """The column with straight lines over its gaps; level beyond its ends."""
-    known = np.isfinite(column)
-    index = np.arange(len(column), dtype=np.float64)
-    return np.interp(index, index[known], column[known])

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import _core
-from ..arrays import FloatArray, frozen, runs
+from ..arrays import FloatArray, bridged, frozen, runs
 from ..errors import DataError, SettingError, located
 from .experiment import without_weightless
 from .outliers import quantum, white_noise
-from .pieces import interpolated, require_sane
+from .pieces import require_sane
 from .trends import Trend
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ def _at_times(column: FloatArray, ratio: float, count: int, antialias: bool) -> 
     if not known.any():
         return np.full(count, np.nan)
     times = np.minimum(np.arange(count) * ratio, len(column) - 1.0)
-    filled = interpolated(column)
+    filled = bridged(column)
     if antialias:
         values = _low_passed(filled, times, max(1.0, ratio))
     else:
@@ -323,19 +323,19 @@ def rate_unit(unit: str) -> str:
 def _differentiated(e: Experiment, data: Dataset, method: Method) -> Experiment:
     e = without_weightless(e)
     known = np.isfinite(e.y)
-    bridged = known.copy()
+    joined = known.copy()
     for first, count in runs(~known):
         inside = first > 0 and first + count < len(e)
         # most missing samples that the smoother bridges
-        bridged[first : first + count] = inside and count <= 5 and method != "difference"
-    pieces = [(a, n) for a, n in runs(bridged) if n >= SHORTEST[method]]
+        joined[first : first + count] = inside and count <= 5 and method != "difference"
+    pieces = [(a, n) for a, n in runs(joined) if n >= SHORTEST[method]]
     if not pieces:
         raise DataError(
             f"{e.name} [{e.range_text}], output {data.output_name!r}: expected "
             f"{SHORTEST[method]} samples in a row to differentiate, received {e.counted}; leave "
             "this experiment out"
         )
-    filled, rate = interpolated(e.y), np.full(len(e), np.nan)
+    filled, rate = bridged(e.y), np.full(len(e), np.nan)
     for first, count in pieces:
         piece = filled[first : first + count]
         try:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import FloatArray, as_column, runs
+from ..arrays import FloatArray, as_column, bridged, runs
 from ..dataset import Dataset
 from ..errors import DataError, SettingError
 from ..recording import Recording
@@ -183,12 +183,11 @@ def _pieces(
             measured[0] = False  # a difference across the gap
         if n < SHORTEST or measured.sum() < SHORTEST:
             continue
-        k = np.arange(n)
-        speed = np.interp(k, k[measured], y[part][measured])
+        speed = bridged(y[part], measured)
         spiked = spikes_of(speed, quantum) & measured
         spikes += int(spiked.sum())
         good = measured & ~spiked
-        speed = np.interp(k, k[good], speed[good])
+        speed = bridged(speed, good)
         used = good.copy()
         used[0] = False  # the start of the simulation
         turned = _integral(speed, Ts, mean=mean) if angle is None else angle[part]

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from .. import _core
-from ..arrays import FloatArray
-from ..control.loop import Plants, common_rest
+from ..arrays import FloatArray, bridged
+from ..control.loop import Plants, common_rest, cores_about
 from ..control.machine import Machine, RecordedRun, cancelled_by, is_streaming, machine_of
 from ..control.move import MoveTable, Repetition, repetition_lines, table_of
 from ..errors import DataError, Interrupted, SettingError
@@ -23,7 +23,7 @@ from ..recording import Recording
 from ..speed import speed_from_counts
 from ..tables import html_of
 from ..threads import available
-from .planning import cores, plants_of
+from .planning import plants_of
 
 VARIATIONS = ((1.0, 0), (0.8, 0), (1.25, 0), (1.0, 1))
 """Gain and further delay [samples] of each model for which learning must converge, too."""
@@ -175,7 +175,7 @@ def learn(
         )  # fmt: skip
     rest = common_rest(plants)
     learner = _core.MoveLearner(
-        cores(plants, rest), controller.about(rest).core(), table.reference - rest.y,
+        cores_about(rest, plants), controller.about(rest).core(), table.reference - rest.y,
         table.planned - rest.y, variations=list(VARIATIONS),
         counted=controller.counts_per_unit > 0.0,
         threads=whole("threads", available() if threads is None else threads),
@@ -266,23 +266,19 @@ class _Learning:
                 name=self.machine.name, expected=f"a run of {len(setpoint)} samples",
                 received=f"{np.isfinite(y).sum()}", remedy="repeat the move",
             )  # fmt: skip
-        error = table.reference - y
-        known = np.isfinite(error)
         # samples that a link lost have the error of those beside them
-        error = np.interp(np.arange(len(error)), np.flatnonzero(known), error[known])
+        error = bridged(table.reference - y)
         return _Played(correction, replace(run, r=table.reference.copy()), error)
 
     def _measured(self, recording: Recording) -> FloatArray:
         """The speed from the counts [RPM], by a smoother that is the same for all repetitions: it
         expects the jerk of the move, where that of a recording estimates it, and ripple, anew.
         """
-        counts, known = recording.counts, np.isfinite(recording.counts)
-        if not (self.jerk > 0.0 and known.any()):
+        if not (self.jerk > 0.0 and np.isfinite(recording.counts).any()):
             return recording.y
-        counts = np.interp(np.arange(len(counts)), np.flatnonzero(known), counts[known])
         return speed_from_counts(
-            counts, self.table.Ts, recording.counts_per_rev, process_noise=self.jerk,
-            ripple_orders=(),
+            bridged(recording.counts), self.table.Ts, recording.counts_per_rev,
+            process_noise=self.jerk, ripple_orders=(),
         )  # fmt: skip
 
     def _verdict(self, played: _Played) -> str:

@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 from numpy.typing import ArrayLike
 
 from .. import _core
 from ..control.controller import SampledController
-from ..control.defaults import default_references
 from ..control.loop import (
     Plant,
     Plants,
     check_fits,
     common_rest,
+    cores_about,
     each_plant,
     reference_samples,
     require_controller,
+    usual_reference,
 )
 from ..control.move import MoveTable
 from ..errors import Interrupted, SettingError
 from ..gains import whole
-from ..models import Model
-from ..models.rest import Rest
 from ..progress import shown_in_notebooks
 from ..threads import available
 from .profiles import profile
@@ -92,16 +90,13 @@ def plan(
     require_controller(controller, models, "plan(controller, models, reference)", SampledController)
     plants = plants_of(controller, models)
     if reference is None:
-        (reference,), name = (
-            default_references(plants[0], controller, ("trapezoid",)),
-            (name or "trapezoid"),
-        )
+        reference, name = usual_reference(plants[0], controller), name or "trapezoid"
     r = reference_samples(reference, controller, seed, plant=plants[0])
     if within_reach:
         r = profile(r, plants, u_min=controller.u_min, u_max=controller.u_max).r
     rest = common_rest(plants)
     found = _core.plan_move(
-        cores(plants, rest), controller.about(rest).core(), r - rest.y,
+        cores_about(rest, plants), controller.about(rest).core(), r - rest.y,
         counted=controller.counts_per_unit > 0.0,
         threads=whole("threads", available() if threads is None else threads), progress=progress,
     )  # fmt: skip
@@ -134,8 +129,3 @@ def plants_of(controller: SampledController, models: Plants) -> list[Plant]:
             remedy="set r_rate to inf and give a reference within reach (sewfast profile)",
         )  # fmt: skip
     return plants
-
-
-def cores(plants: list[Plant], rest: Rest) -> list[Any]:
-    """The compiled plants about a rest."""
-    return [p.about(rest) if isinstance(p, Model) else p.core for p in plants]

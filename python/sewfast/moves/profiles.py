@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from .. import _core
 from ..arrays import FloatArray
 from ..control.defaults import command_limits, moves_on, recorded_outputs
-from ..control.loop import Plants, common_rest, each_plant
+from ..control.loop import Plants, common_rest, cores_about, each_plant
 from ..errors import DataError, FitError, SettingError
 from ..gains import real, vector
 from ..models import Model
@@ -99,7 +99,7 @@ class Reach:
             )  # fmt: skip
         span = (min(ends) - rest.y, max(ends) - rest.y)
         found = _core.reach(
-            [p.about(rest) if isinstance(p, Model) else p.core for p in plants], Ts=plants[0].Ts,
+            cores_about(rest, plants), Ts=plants[0].Ts,
             u=(low - rest.u[0], high - rest.u[0]), levels=span, share=real("share", share),
         )  # fmt: skip
         least, most, levels, up, down, jerk = found

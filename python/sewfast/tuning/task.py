@@ -30,6 +30,7 @@ from ..control.loop import (
     References,
     check_fits,
     common_rest,
+    cores_about,
     each_plant,
     each_reference,
     noise_in_loop,
@@ -138,7 +139,7 @@ class TuningTask:
             )  # fmt: skip
         rest = self.rest
         return {
-            "plants": [p.about(rest) if isinstance(p, Model) else p.core for p in self.plants],
+            "plants": cores_about(rest, self.plants),
             "references": [r - rest.y for r in self.references],
             "disturbances": self.disturbances,
             "noise": [noise_in_loop(self.start, p) for p in self.plants],

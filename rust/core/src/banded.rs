@@ -1,5 +1,6 @@
 //! Symmetric positive definite band matrices: products and Cholesky factors, which keep the band.
 
+use crate::column::dot;
 use crate::{Error, Result};
 
 /// The lower triangle of a symmetric matrix within `band` places of its diagonal.
@@ -145,25 +146,6 @@ impl Factor {
             }
         }
     }
-}
-
-/// Sum of the products, in eight interleaved sums, which the compiler keeps in one wide register.
-#[inline]
-pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let mut sums = [0.0; 8];
-    let (a, b) = (a.chunks_exact(8), b.chunks_exact(8));
-    let rest: f64 = a
-        .remainder()
-        .iter()
-        .zip(b.remainder())
-        .map(|(a, b)| a * b)
-        .sum();
-    for (a, b) in a.zip(b) {
-        for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
-            *sum += a * b;
-        }
-    }
-    rest + sums.iter().sum::<f64>()
 }
 
 #[cfg(test)]

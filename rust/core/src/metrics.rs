@@ -15,7 +15,8 @@ pub fn fit_percent(y: &[f64], model: &[f64]) -> f64 {
     100.0 * (1.0 - rmse(y, model) / spread)
 }
 
-fn rms(values: impl ExactSizeIterator<Item = f64>) -> f64 {
+/// Root mean square of values; 0 of none.
+pub(crate) fn rms(values: impl ExactSizeIterator<Item = f64>) -> f64 {
     let n = values.len().max(1) as f64;
     (values.map(|v| v * v).sum::<f64>() / n).sqrt()
 }

@@ -17,13 +17,13 @@
 //! Alleyne, A survey of iterative learning control, IEEE Control Systems 26, 2006), with a zero-phase low-pass `Q`, rehearsed on
 //! all members before a machine moves.
 
-use std::thread;
-
 use sewfast_control::{AnyController, Controller};
 
-use crate::banded::{Banded, Factor, dot};
+use crate::banded::{Banded, Factor};
+use crate::column::dot;
+use crate::metrics::{rms, rmse};
 use crate::model::ClonePlant;
-use crate::{Error, Monitor, Result};
+use crate::{Error, Monitor, Result, search};
 
 /// Samples from knot to knot.
 const KNOT: usize = 4;
@@ -208,32 +208,9 @@ impl Ran {
     }
 }
 
-fn squares(x: &[f64]) -> f64 {
-    dot(x, x)
-}
-
-fn rms(x: &[f64]) -> f64 {
-    (squares(x) / x.len().max(1) as f64).sqrt()
-}
-
 /// Applies `work` to all, over threads, in order.
 fn each<T: Sync, R: Send>(all: &[T], threads: usize, work: impl Fn(&T) -> R + Sync) -> Vec<R> {
-    let part = all
-        .len()
-        .div_ceil(threads.clamp(1, all.len().max(1)))
-        .max(1);
-    let mut found: Vec<Option<R>> = all.iter().map(|_| None).collect();
-    thread::scope(|scope| {
-        for (all, found) in all.chunks(part).zip(found.chunks_mut(part)) {
-            let work = &work;
-            scope.spawn(move || {
-                for (one, place) in all.iter().zip(found) {
-                    *place = Some(work(one));
-                }
-            });
-        }
-    });
-    found.into_iter().flatten().collect()
+    search::each(&mut vec![(); threads.max(1)], all, |(), one| work(one))
 }
 
 /// Which hats there are: those around which a member moves. A shaft that stands does nothing until friction lets go, and a correction
@@ -431,9 +408,10 @@ pub fn plan(
     let knots = Knots::new(reference.len(), preview);
     let (mut table, mut c) = (reference.to_vec(), vec![0.0; knots.count()]);
     let mut ran = runs(members, knots, &table, threads).ok_or_else(diverged)?;
-    let before: Vec<f64> = ran.iter().map(|ran| rms(&ran.error(reference))).collect();
+    let before: Vec<f64> = ran.iter().map(|ran| rmse(reference, &ran.y)).collect();
     let share = 1.0 / members.len() as f64;
     let cost = |ran: &[Ran], weight: f64| -> f64 {
+        let squares = |x: &[f64]| dot(x, x);
         let one = |ran: &Ran| squares(&ran.error(reference)) + weight * squares(&ran.change());
         share * ran.iter().map(one).sum::<f64>()
     };
@@ -471,7 +449,7 @@ pub fn plan(
             equations = None;
         }
     }
-    let after = ran.iter().map(|ran| rms(&ran.error(reference)));
+    let after = ran.iter().map(|ran| rmse(reference, &ran.y));
     let errors = before.into_iter().zip(after).collect();
     let limited = members.iter().zip(&ran).map(|(member, ran)| {
         let (low, high) = member.controller.limits();
@@ -697,7 +675,7 @@ impl Learner {
             let moved: Vec<f64> = next.iter().zip(&c).map(|(n, c)| n - c).collect();
             // its answer counts, not the sum of squares: the last hats would count as much as all others
             let change = dot(&moved, &self.equations.times(&moved)).max(0.0).sqrt();
-            found.push((rms(&error), change));
+            found.push((rms(error.iter().copied()), change));
             c = next;
         }
         Some(found)

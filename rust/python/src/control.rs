@@ -2,12 +2,11 @@
 //! tuning rules; controller and tuning have their own files.
 
 pub mod controller;
-mod moves;
-mod tuning;
+pub mod moves;
+pub mod tuning;
 
 use std::sync::Arc;
 
-use numpy::PyReadonlyArray1;
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -22,34 +21,22 @@ use sewfast_core::speed::Encoder;
 use sewfast_core::{Error, Record, Result};
 
 use crate::device::Machine;
-use crate::seam::{array1, raise, slice, watched, watched_over};
+use crate::seam::{Raised, Values, array1, slice, watched, watched_over};
 
 pub use controller::{AnyGiven, Controller};
 
-type Values<'py> = PyReadonlyArray1<'py, f64>;
 type Triple = (f64, f64, f64);
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    controller::register(module)?;
-    module.add_function(wrap_pyfunction!(convert_gains, module)?)?;
-    module.add_function(wrap_pyfunction!(closed_loop, module)?)?;
-    module.add_function(wrap_pyfunction!(step_metrics, module)?)?;
-    module.add_function(wrap_pyfunction!(effort, module)?)?;
-    tuning::register(module)?;
-    moves::register(module)?;
-    module.add_function(wrap_pyfunction!(fit_fopdt, module)?)?;
-    module.add_function(wrap_pyfunction!(table_1, module)?)?;
-    module.add_function(wrap_pyfunction!(eq_12, module)?)?;
-    module.add_function(wrap_pyfunction!(eq_12_costs, module)?)?;
-    module.add_function(wrap_pyfunction!(simc, module)?)?;
-    module.add_function(wrap_pyfunction!(amigo, module)?)
-}
 
 #[pyfunction]
 #[pyo3(signature = (gains, *, form, to, Ts))]
-#[expect(non_snake_case, reason = "the field's name for the sample time")]
-fn convert_gains(py: Python<'_>, gains: Triple, form: &str, to: &str, Ts: f64) -> PyResult<Triple> {
-    converted(gains, form, to, Ts).map_err(|e| raise(py, e))
+pub fn convert_gains(
+    py: Python<'_>,
+    gains: Triple,
+    form: &str,
+    to: &str,
+    Ts: f64,
+) -> PyResult<Triple> {
+    converted(gains, form, to, Ts).raised(py)
 }
 
 fn converted((p, i, d): Triple, form: &str, to: &str, ts: f64) -> Result<Triple> {
@@ -105,8 +92,7 @@ fn unknown_form(form: &str) -> Error {
 
 #[pyfunction]
 #[pyo3(signature = (plant, controller, reference, *, counts_per_unit, encoder_phase=0.5, feedforward=None, disturbance=None, noise=0.0, seed=0))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-fn closed_loop<'py>(
+pub fn closed_loop<'py>(
     py: Python<'py>,
     plant: &Bound<'py, PyAny>,
     controller: AnyGiven<'py>,
@@ -143,11 +129,9 @@ fn closed_loop<'py>(
         looped::closed_loop_with(&mut plant, &mut controller, signals, encoder, monitor)
             .and_then(|run| completed(run, ts))
     })?;
-    let record = PyDict::new(py);
-    record.set_item("u", array1(py, run.u))?;
-    record.set_item("y", array1(py, run.y))?;
-    record.set_item("feedback", array1(py, run.feedback))?;
-    Ok(record)
+    Ok(dict! { py;
+        "u" => array1(py, run.u), "y" => array1(py, run.y), "feedback" => array1(py, run.feedback),
+    })
 }
 
 fn completed(run: Run, ts: f64) -> Result<Run> {
@@ -164,8 +148,7 @@ fn completed(run: Run, ts: f64) -> Result<Run> {
 
 #[pyfunction]
 #[pyo3(signature = (y, reference, *, Ts, smoothing))]
-#[expect(non_snake_case, reason = "the field's name for the sample time")]
-fn step_metrics<'py>(
+pub fn step_metrics<'py>(
     py: Python<'py>,
     y: Values<'py>,
     reference: Values<'py>,
@@ -178,7 +161,7 @@ fn step_metrics<'py>(
         Ts,
         smoothing,
     )
-    .map_err(|e| raise(py, e))?;
+    .raised(py)?;
     named(
         py,
         [
@@ -191,7 +174,7 @@ fn step_metrics<'py>(
 
 #[pyfunction]
 #[pyo3(signature = (u, *, u_min, u_max))]
-fn effort<'py>(
+pub fn effort<'py>(
     py: Python<'py>,
     u: Values<'py>,
     u_min: f64,
@@ -291,14 +274,13 @@ impl Plant for AnyPlant<'_> {
 
 #[pyfunction]
 #[pyo3(signature = (u, y, *, Ts))]
-#[expect(non_snake_case, reason = "the field's name for the sample time")]
-fn fit_fopdt<'py>(
+pub fn fit_fopdt<'py>(
     py: Python<'py>,
     u: Values<'py>,
     y: Values<'py>,
     Ts: f64,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let record = Record::new(slice(&u, "u")?, 1, slice(&y, "y")?).map_err(|e| raise(py, e))?;
+    let record = Record::new(slice(&u, "u")?, 1, slice(&y, "y")?).raised(py)?;
     let found = watched(py, None, |monitor| fit(record, Ts, monitor))?;
     let dict = named(
         py,
@@ -323,8 +305,13 @@ fn fit_fopdt<'py>(
 
 #[pyfunction]
 #[pyo3(signature = (K, T, L, *, nearest=false))]
-#[expect(non_snake_case, reason = "the field's names")]
-fn table_1(py: Python<'_>, K: f64, T: f64, L: f64, nearest: bool) -> PyResult<Bound<'_, PyDict>> {
+pub fn table_1(
+    py: Python<'_>,
+    K: f64,
+    T: f64,
+    L: f64,
+    nearest: bool,
+) -> PyResult<Bound<'_, PyDict>> {
     let outside = if nearest {
         Outside::Nearest
     } else {
@@ -335,8 +322,7 @@ fn table_1(py: Python<'_>, K: f64, T: f64, L: f64, nearest: bool) -> PyResult<Bo
 
 #[pyfunction]
 #[pyo3(signature = (K, T, L, *, Ms))]
-#[expect(non_snake_case, reason = "the field's names")]
-fn eq_12(py: Python<'_>, K: f64, T: f64, L: f64, Ms: f64) -> PyResult<Bound<'_, PyDict>> {
+pub fn eq_12(py: Python<'_>, K: f64, T: f64, L: f64, Ms: f64) -> PyResult<Bound<'_, PyDict>> {
     let (rule, costs) = watched(py, None, |_| rules::eq_12(K, T, L, Ms))?;
     let dict = answered(py, Ok(rule))?;
     for (name, value) in by_name(costs) {
@@ -347,8 +333,7 @@ fn eq_12(py: Python<'_>, K: f64, T: f64, L: f64, Ms: f64) -> PyResult<Bound<'_, 
 
 #[pyfunction]
 #[pyo3(signature = (ratio, *, KpK, Ti, Td, alpha, beta))]
-#[expect(non_snake_case, reason = "the field's names")]
-fn eq_12_costs(
+pub fn eq_12_costs(
     py: Python<'_>,
     ratio: f64,
     KpK: f64,
@@ -368,8 +353,7 @@ fn eq_12_costs(
 
 #[pyfunction]
 #[pyo3(signature = (K, T, L, *, tau_c, derivative))]
-#[expect(non_snake_case, reason = "the field's names")]
-fn simc(
+pub fn simc(
     py: Python<'_>,
     K: f64,
     T: f64,
@@ -381,9 +365,7 @@ fn simc(
 }
 
 #[pyfunction]
-#[pyo3(signature = (K, T, L))]
-#[expect(non_snake_case, reason = "the field's names")]
-fn amigo(py: Python<'_>, K: f64, T: f64, L: f64) -> PyResult<Bound<'_, PyDict>> {
+pub fn amigo(py: Python<'_>, K: f64, T: f64, L: f64) -> PyResult<Bound<'_, PyDict>> {
     answered(py, rules::amigo(K, T, L))
 }
 
@@ -396,7 +378,7 @@ fn by_name(costs: Costs) -> [(&'static str, f64); 3] {
 }
 
 fn answered(py: Python<'_>, rule: Result<Rule>) -> PyResult<Bound<'_, PyDict>> {
-    let rule = rule.map_err(|e| raise(py, e))?;
+    let rule = rule.raised(py)?;
     named(
         py,
         [

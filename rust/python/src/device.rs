@@ -5,14 +5,12 @@ use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use numpy::{PyArray1, PyReadonlyArray1};
+use crate::seam::{Raised, Values, Vector, array1, slice, watched_over};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyType};
 use sewfast_core::machine::{Machine as Core, Parameters};
 use sewfast_core::{Error, Monitor, Result};
 use sewfast_link::server::{Direction, Endpoint, Entry, Fault, Faults, Server, Settings};
-
-use crate::seam::{array1, raise, slice, watched_over};
 
 /// A virtual device that is being served on a thread of its own.
 #[pyclass(module = "sewfast._core", frozen)]
@@ -36,12 +34,10 @@ fn seconds(value: Option<f64>) -> Option<Duration> {
 }
 
 fn entry<'py>(py: Python<'py>, entry: &Entry) -> PyResult<Bound<'py, PyDict>> {
-    let dict = PyDict::new(py);
-    dict.set_item("event", entry.happening.name())?;
-    dict.set_item("device_us", entry.device_us)?;
-    dict.set_item("seconds", entry.seconds)?;
-    dict.set_item("state", entry.state)?;
-    dict.set_item("late_us", entry.late_us)?;
+    let dict = dict! { py;
+        "event" => entry.happening.name(), "device_us" => entry.device_us, "seconds" => entry.seconds,
+        "state" => entry.state, "late_us" => entry.late_us,
+    };
     let heartbeat = entry.heartbeat;
     dict.set_item("heartbeat_us", heartbeat.map(|h| h.device_us))?;
     dict.set_item("heartbeat_seconds", heartbeat.map(|h| h.seconds))?;
@@ -55,10 +51,6 @@ impl DeviceServer {
     #[pyo3(signature = (
         machine, *, name, pty, link, address, anyone, fast, baud, faults, seed, once, duration, fault_log, trace
     ))]
-    #[allow(
-        clippy::too_many_arguments,
-        reason = "one keyword each, named in the Python layer"
-    )]
     fn new(
         py: Python<'_>,
         machine: &Machine,
@@ -87,7 +79,7 @@ impl DeviceServer {
             },
             fast,
             baud,
-            faults: Faults::parse(faults).map_err(|e| raise(py, e))?,
+            faults: Faults::parse(faults).raised(py)?,
             seed,
             once,
             duration: seconds(duration),
@@ -116,7 +108,7 @@ impl DeviceServer {
 
     #[pyo3(signature = (fault, seconds=None))]
     fn cause(&self, py: Python<'_>, fault: &str, seconds: Option<f64>) -> PyResult<()> {
-        let fault = Fault::named(fault).map_err(|e| raise(py, e))?;
+        let fault = Fault::named(fault).raised(py)?;
         let lasts = self::seconds(seconds);
         py.detach(|| self.server.cause(fault, lasts));
         Ok(())
@@ -137,14 +129,11 @@ impl DeviceServer {
 
     fn statistics<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let statistics = py.detach(|| self.server.statistics());
-        let dict = PyDict::new(py);
-        dict.set_item("samples", statistics.samples)?;
-        dict.set_item("late", statistics.late)?;
-        dict.set_item("latest_us", statistics.latest_us)?;
-        dict.set_item("set_back", statistics.set_back)?;
-        dict.set_item("bytes_to_host", statistics.bytes_to_host)?;
-        dict.set_item("refused", statistics.refused)?;
-        Ok(dict)
+        Ok(dict! { py;
+            "samples" => statistics.samples, "late" => statistics.late, "latest_us" => statistics.latest_us,
+            "set_back" => statistics.set_back, "bytes_to_host" => statistics.bytes_to_host,
+            "refused" => statistics.refused,
+        })
     }
 
     fn trace<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyDict>>> {
@@ -155,11 +144,6 @@ impl DeviceServer {
     fn problem(&self, py: Python<'_>) -> Option<String> {
         py.detach(|| self.server.problem())
     }
-}
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<DeviceServer>()?;
-    module.add_class::<Machine>()
 }
 
 /// Samples between two checks for a stop request: a few milliseconds of work.
@@ -195,7 +179,7 @@ fn run(machine: &mut Core, u: &[f64], monitor: &Monitor) -> Result<(Vec<f64>, Ve
     Ok((counts, speed))
 }
 
-type Pair<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>);
+type Pair<'py> = (Vector<'py>, Vector<'py>);
 
 #[pymethods]
 impl Machine {
@@ -205,7 +189,7 @@ impl Machine {
         let changes = parameters.unwrap_or_default();
         let changes = changes.iter().map(|(name, value)| (name.as_str(), *value));
         let core = Parameters::default().with(changes).and_then(Core::new);
-        core.map(|core| Self { core }).map_err(|e| raise(py, e))
+        core.map(|core| Self { core }).raised(py)
     }
 
     #[staticmethod]
@@ -233,15 +217,15 @@ impl Machine {
     }
 
     fn set_load(&mut self, py: Python<'_>, torque: f64) -> PyResult<()> {
-        self.core.set_load(torque).map_err(|e| raise(py, e))
+        self.core.set_load(torque).raised(py)
     }
 
     fn step(&mut self, py: Python<'_>, u: f64) -> PyResult<(f64, f64)> {
-        self.core.run(&[u]).map_err(|e| raise(py, e))?;
+        self.core.run(&[u]).raised(py)?;
         Ok((self.core.counts(), self.core.speed_rpm()))
     }
 
-    fn run<'py>(&mut self, py: Python<'py>, u: PyReadonlyArray1<'py, f64>) -> PyResult<Pair<'py>> {
+    fn run<'py>(&mut self, py: Python<'py>, u: Values<'py>) -> PyResult<Pair<'py>> {
         let u = slice(&u, "u")?;
         let mut machine = self.core.clone();
         let (machine, (counts, speed)) = watched_over(py, u.len(), |monitor| {
@@ -263,18 +247,15 @@ impl Machine {
     }
 
     fn __setstate__(&mut self, py: Python<'_>, memory: [f64; 11]) -> PyResult<()> {
-        self.core.recall(memory).map_err(|e| raise(py, e))
+        self.core.recall(memory).raised(py)
     }
 
     fn linearise<'py>(&self, py: Python<'py>, speed_rpm: f64) -> PyResult<Bound<'py, PyDict>> {
-        let small = self.core.linearise(speed_rpm).map_err(|e| raise(py, e))?;
-        let dict = PyDict::new(py);
-        dict.set_item("command", small.command)?;
-        dict.set_item("current", small.current)?;
-        dict.set_item("gain", small.gain)?;
-        dict.set_item("T1", small.time_constants[0])?;
-        dict.set_item("T2", small.time_constants[1])?;
-        Ok(dict)
+        let small = self.core.linearise(speed_rpm).raised(py)?;
+        Ok(dict! { py;
+            "command" => small.command, "current" => small.current, "gain" => small.gain,
+            "T1" => small.time_constants[0], "T2" => small.time_constants[1],
+        })
     }
 
     #[getter]

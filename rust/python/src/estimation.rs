@@ -1,18 +1,10 @@
 //! Bindings of estimation: the descent with a statistical end, and covariances.
 
+use crate::seam::{Matrix, Raised, Rows, Values, Vector, array1, array2, released, rows, slice};
 use nalgebra::{DMatrix, DVector};
-use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use sewfast_core::bounded::{self, Ends, Normal, Squares};
 use sewfast_core::sandwich::{self, Scores};
-
-use crate::seam::{array1, array2, raise, rows, slice};
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_function(wrap_pyfunction!(minimised, module)?)?;
-    module.add_function(wrap_pyfunction!(sandwich_covariance, module)?)?;
-    module.add_function(wrap_pyfunction!(inverse_root, module)?)
-}
 
 /// A problem of two Python functions.
 struct Called<'a, 'py> {
@@ -21,7 +13,7 @@ struct Called<'a, 'py> {
 }
 
 impl<'py> Called<'_, 'py> {
-    fn x(&self, x: &[f64]) -> Bound<'py, PyArray1<f64>> {
+    fn x(&self, x: &[f64]) -> Vector<'py> {
         array1(self.cost.py(), x.to_vec())
     }
 }
@@ -30,7 +22,7 @@ impl Squares for Called<'_, '_> {
     type Stop = PyErr;
 
     fn normal(&mut self, x: &[f64]) -> PyResult<Normal> {
-        type Found<'py> = (f64, PyReadonlyArray1<'py, f64>, PyReadonlyArray2<'py, f64>);
+        type Found<'py> = (f64, Values<'py>, Rows<'py>);
         let found = self.normal.call1((self.x(x),))?;
         let (cost, gradient, matrix): Found<'_> = found.extract()?;
         Ok(Normal {
@@ -46,18 +38,17 @@ impl Squares for Called<'_, '_> {
 }
 
 /// Where the descent ended: parameters, cost, squared distance to the minimum in standard errors, and the exception that ended it.
-type Minimum<'py> = (Bound<'py, PyArray1<f64>>, f64, f64, Option<PyErr>);
+type Minimum<'py> = (Vector<'py>, f64, f64, Option<PyErr>);
 
 #[pyfunction]
 #[pyo3(signature = (normal, cost, start, low, high, *, count, enough, iterations))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-fn minimised<'py>(
+pub fn minimised<'py>(
     py: Python<'py>,
     normal: &Bound<'py, PyAny>,
     cost: &Bound<'py, PyAny>,
-    start: PyReadonlyArray1<'py, f64>,
-    low: PyReadonlyArray1<'py, f64>,
-    high: PyReadonlyArray1<'py, f64>,
+    start: Values<'py>,
+    low: Values<'py>,
+    high: Values<'py>,
     count: f64,
     enough: f64,
     iterations: usize,
@@ -76,15 +67,15 @@ fn minimised<'py>(
 
 #[pyfunction]
 #[pyo3(signature = (jacobian, residuals, lengths, windows, *, channels=1, known=None))]
-fn sandwich_covariance<'py>(
+pub fn sandwich_covariance<'py>(
     py: Python<'py>,
-    jacobian: PyReadonlyArray2<'py, f64>,
-    residuals: PyReadonlyArray1<'py, f64>,
+    jacobian: Rows<'py>,
+    residuals: Values<'py>,
     lengths: Vec<usize>,
     windows: Vec<usize>,
     channels: usize,
-    known: Option<PyReadonlyArray2<'py, f64>>,
-) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    known: Option<Rows<'py>>,
+) -> PyResult<Matrix<'py>> {
     let (jacobian, n) = rows(&jacobian, "jacobian")?;
     let scores = Scores {
         jacobian,
@@ -97,22 +88,21 @@ fn sandwich_covariance<'py>(
         Some(known) => square(known),
         None => DMatrix::zeros(0, 0),
     };
-    let found = py.detach(|| sandwich::covariance(&scores, &known));
-    let found = found.map_err(|e| raise(py, e))?;
+    let found = released(py, || sandwich::covariance(&scores, &known))?;
     array2(py, found.iter().copied().collect(), n)
 }
 
-fn square(matrix: &PyReadonlyArray2<'_, f64>) -> DMatrix<f64> {
+fn square(matrix: &Rows<'_>) -> DMatrix<f64> {
     let view = matrix.as_array();
     DMatrix::from_fn(view.nrows(), view.ncols(), |i, j| view[[i, j]])
 }
 
 /// A root of the inverse, (n, determined directions), and a huge covariance for the other directions, (n, n).
-type Root<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>);
+type Root<'py> = (Matrix<'py>, Matrix<'py>);
 
 #[pyfunction]
-fn inverse_root<'py>(py: Python<'py>, matrix: PyReadonlyArray2<'py, f64>) -> PyResult<Root<'py>> {
-    let found = sandwich::root(&square(&matrix)).map_err(|e| raise(py, e))?;
+pub fn inverse_root<'py>(py: Python<'py>, matrix: Rows<'py>) -> PyResult<Root<'py>> {
+    let found = sandwich::root(&square(&matrix)).raised(py)?;
     let array = |matrix: &DMatrix<f64>| {
         array2(
             py,

@@ -1,6 +1,10 @@
 //! Bindings of what is seen in a record without a model, and of the tests of a model's residuals.
 
-use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use crate::seam::{
+    Experiments, Matrix, Raised, Rows, Values, Vector, array1, array2, released, rows, samples,
+    slice, watched,
+};
+use numpy::PyReadonlyArray1;
 use pyo3::prelude::*;
 use sewfast_core::Monitor;
 use sewfast_core::residuals::{self, Run, Test};
@@ -8,37 +12,11 @@ use sewfast_core::{
     changes, column, dead_time, excitation, faults, feedback as loops, orders, sensor,
 };
 
-use crate::seam::{Experiments, array1, array2, raise, rows, samples, slice, watched};
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_function(wrap_pyfunction!(changed, module)?)?;
-    module.add_function(wrap_pyfunction!(copied, module)?)?;
-    module.add_function(wrap_pyfunction!(computed, module)?)?;
-    module.add_function(wrap_pyfunction!(order_in_time, module)?)?;
-    module.add_function(wrap_pyfunction!(integration, module)?)?;
-    module.add_function(wrap_pyfunction!(feedback, module)?)?;
-    module.add_function(wrap_pyfunction!(quantum, module)?)?;
-    module.add_function(wrap_pyfunction!(dead, module)?)?;
-    module.add_function(wrap_pyfunction!(spikes, module)?)?;
-    module.add_function(wrap_pyfunction!(two_levels, module)?)?;
-    module.add_function(wrap_pyfunction!(limits, module)?)?;
-    module.add_function(wrap_pyfunction!(rests, module)?)?;
-    module.add_function(wrap_pyfunction!(period, module)?)?;
-    module.add_function(wrap_pyfunction!(wraps, module)?)?;
-    module.add_function(wrap_pyfunction!(unstable_pole, module)?)?;
-    module.add_function(wrap_pyfunction!(delay, module)?)?;
-    module.add_function(wrap_pyfunction!(order_table, module)?)?;
-    module.add_function(wrap_pyfunction!(explained, module)?)?;
-    module.add_function(wrap_pyfunction!(residual_tests, module)?)?;
-    module.add_function(wrap_pyfunction!(parameter_test, module)?)?;
-    module.add_function(wrap_pyfunction!(coloured_information, module)?)
-}
-
 /// Experiment, sample, gain, shift, and the share of the error that is left.
 type Change = (usize, usize, f64, isize, f64);
 
 #[pyfunction]
-fn changed(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Change>> {
+pub fn changed(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Change>> {
     let mut channels = 1;
     let borrowed = experiments.iter().map(|e| {
         let (u, width) = rows(&e.u, "u")?;
@@ -59,14 +37,14 @@ fn changed(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Chan
 type Copied = (usize, f64, f64, usize);
 
 #[pyfunction]
-fn copied(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Copied>> {
+pub fn copied(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Copied>> {
     let borrowed = samples(py, &experiments)?;
     let found = py.detach(|| faults::copied(&borrowed));
     Ok(found.map(|c| (c.input, c.gain, c.offset, c.delay)))
 }
 
 #[pyfunction]
-fn computed(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<&'static str>> {
+pub fn computed(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<&'static str>> {
     let borrowed = samples(py, &experiments)?;
     let found = py.detach(|| faults::computed(&borrowed));
     Ok(found.map(|sum| match sum {
@@ -80,7 +58,7 @@ fn computed(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<&'s
 type Order = (&'static str, usize, usize, f64);
 
 #[pyfunction]
-fn order_in_time(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Order>> {
+pub fn order_in_time(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Order>> {
     let borrowed = samples(py, &experiments)?;
     let work = |monitor: &Monitor| Ok(faults::order_in_time(&borrowed, monitor));
     Ok(watched(py, None, work)?.map(|o| {
@@ -98,8 +76,7 @@ type Integration = (bool, usize, f64, f64, f64, f64, f64);
 
 #[pyfunction]
 #[pyo3(signature = (experiments, *, Ts))]
-#[allow(non_snake_case)]
-fn integration(
+pub fn integration(
     py: Python<'_>,
     experiments: Experiments<'_>,
     Ts: f64,
@@ -124,7 +101,7 @@ fn integration(
 type Feedback = (usize, usize, f64, f64, f64);
 
 #[pyfunction]
-fn feedback(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Feedback>> {
+pub fn feedback(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Feedback>> {
     let borrowed = samples(py, &experiments)?;
     let work = |monitor: &Monitor| Ok(loops::feedback(&borrowed, monitor));
     Ok(
@@ -134,7 +111,7 @@ fn feedback(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<Fee
 }
 
 #[pyfunction]
-fn quantum(py: Python<'_>, column: PyReadonlyArray1<'_, f64>) -> PyResult<Option<f64>> {
+pub fn quantum(py: Python<'_>, column: Values<'_>) -> PyResult<Option<f64>> {
     let column = slice(&column, "column")?;
     Ok(py.detach(|| column::quantum(column)))
 }
@@ -143,19 +120,22 @@ fn quantum(py: Python<'_>, column: PyReadonlyArray1<'_, f64>) -> PyResult<Option
 type Stretches = Vec<Vec<(usize, usize)>>;
 
 #[pyfunction]
-fn dead(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Stretches> {
+pub fn dead(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Stretches> {
     let borrowed = samples(py, &experiments)?;
     Ok(py.detach(|| sensor::dead(&borrowed)))
 }
 
 #[pyfunction]
-fn spikes(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Stretches> {
+pub fn spikes(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Stretches> {
     let borrowed = samples(py, &experiments)?;
     Ok(py.detach(|| sensor::spikes(&borrowed)))
 }
 
 #[pyfunction]
-fn two_levels(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Vec<Option<(f64, f64)>>> {
+pub fn two_levels(
+    py: Python<'_>,
+    experiments: Experiments<'_>,
+) -> PyResult<Vec<Option<(f64, f64)>>> {
     let borrowed = samples(py, &experiments)?;
     Ok(py.detach(|| excitation::two_levels(&borrowed)))
 }
@@ -164,32 +144,32 @@ fn two_levels(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Vec<Opti
 type Limit = (usize, f64, usize, f64);
 
 #[pyfunction]
-fn limits(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Vec<Limit>> {
+pub fn limits(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Vec<Limit>> {
     let borrowed = samples(py, &experiments)?;
     Ok(py.detach(|| excitation::limits(&borrowed)))
 }
 
 #[pyfunction]
-fn rests(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Vec<(usize, usize)>> {
+pub fn rests(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Vec<(usize, usize)>> {
     let borrowed = samples(py, &experiments)?;
     Ok(py.detach(|| excitation::rests(&borrowed)))
 }
 
 #[pyfunction]
-fn period(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<(f64, f64)>> {
+pub fn period(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<(f64, f64)>> {
     let borrowed = samples(py, &experiments)?;
     Ok(py.detach(|| excitation::period(&borrowed)))
 }
 
 #[pyfunction]
-fn wraps(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<(f64, usize)>> {
+pub fn wraps(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<(f64, usize)>> {
     let borrowed = samples(py, &experiments)?;
     let found = py.detach(|| excitation::wraps(&borrowed));
     Ok(found.map(|w| (w.period, w.jumps)))
 }
 
 #[pyfunction]
-fn unstable_pole(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<f64>> {
+pub fn unstable_pole(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option<f64>> {
     let borrowed = samples(py, &experiments)?;
     Ok(py.detach(|| excitation::unstable_pole(&borrowed)))
 }
@@ -200,15 +180,15 @@ type Delay<'py> = (
     usize,
     (usize, usize),
     Option<usize>,
-    Bound<'py, PyArray1<f64>>,
-    Bound<'py, PyArray1<f64>>,
-    Bound<'py, PyArray1<f64>>,
+    Vector<'py>,
+    Vector<'py>,
+    Vector<'py>,
     f64,
 );
 
 #[pyfunction]
 #[pyo3(signature = (experiments, *, least, longest, confidence))]
-fn delay<'py>(
+pub fn delay<'py>(
     py: Python<'py>,
     experiments: Experiments<'py>,
     least: usize,
@@ -233,15 +213,14 @@ type Structure<'py> = (
     (usize, usize, usize),
     usize,
     f64,
-    Bound<'py, PyArray1<f64>>,
+    Vector<'py>,
     [f64; 4],
     f64,
 );
 
 #[pyfunction]
 #[pyo3(signature = (train, later, *, na, nb, nk, init, progress = None))]
-#[expect(clippy::too_many_arguments, reason = "settings of Python's function")]
-fn order_table<'py>(
+pub fn order_table<'py>(
     py: Python<'py>,
     train: Experiments<'py>,
     later: Experiments<'py>,
@@ -270,19 +249,19 @@ fn order_table<'py>(
 
 /// Inputs, computed output, residual, which samples count, and sensitivities of one experiment.
 type Experiment<'py> = (
-    PyReadonlyArray2<'py, f64>,
-    PyReadonlyArray1<'py, f64>,
-    PyReadonlyArray1<'py, f64>,
+    Rows<'py>,
+    Values<'py>,
+    Values<'py>,
     PyReadonlyArray1<'py, bool>,
-    PyReadonlyArray2<'py, f64>,
+    Rows<'py>,
 );
 
 /// Lags, series, correlations, limits, statistic, p-value, degrees of freedom, threshold, explained share.
 type Tested<'py> = (
     Vec<usize>,
     Vec<Vec<usize>>,
-    Bound<'py, PyArray2<f64>>,
-    Bound<'py, PyArray2<f64>>,
+    Matrix<'py>,
+    Matrix<'py>,
     f64,
     f64,
     usize,
@@ -324,21 +303,22 @@ fn handed_over(py: Python<'_>, test: Test) -> PyResult<Tested<'_>> {
 
 #[pyfunction]
 #[pyo3(signature = (x, y, *, own, parts))]
-fn explained(
+pub fn explained(
     py: Python<'_>,
-    x: PyReadonlyArray2<'_, f64>,
-    y: PyReadonlyArray1<'_, f64>,
+    x: Rows<'_>,
+    y: Values<'_>,
     own: usize,
     parts: usize,
 ) -> PyResult<Vec<f64>> {
     let ((x, width), y) = (rows(&x, "x")?, slice(&y, "y")?);
-    py.detach(|| sewfast_core::explained::explained(x, width, y, own, parts))
-        .map_err(|e| raise(py, e))
+    released(py, || {
+        sewfast_core::explained::explained(x, width, y, own, parts)
+    })
 }
 
 #[pyfunction]
 #[pyo3(signature = (experiments, *, memory, one_step))]
-fn residual_tests<'py>(
+pub fn residual_tests<'py>(
     py: Python<'py>,
     experiments: Vec<Experiment<'py>>,
     memory: usize,
@@ -354,26 +334,27 @@ fn residual_tests<'py>(
 
 #[pyfunction]
 #[pyo3(signature = (experiments, *, trained))]
-fn parameter_test<'py>(
+pub fn parameter_test<'py>(
     py: Python<'py>,
     experiments: Vec<Experiment<'py>>,
     trained: usize,
 ) -> PyResult<Tested<'py>> {
     let (runs, channels) = borrowed(&experiments)?;
     let test = py.detach(|| residuals::parameters(&runs, channels, trained));
-    handed_over(py, test.map_err(|e| raise(py, e))?)
+    handed_over(py, test.raised(py)?)
 }
 
 #[pyfunction]
 #[pyo3(signature = (experiments, *, spent))]
-fn coloured_information<'py>(
+pub fn coloured_information<'py>(
     py: Python<'py>,
     experiments: Vec<Experiment<'py>>,
     spent: f64,
-) -> PyResult<Bound<'py, PyArray2<f64>>> {
+) -> PyResult<Matrix<'py>> {
     let (runs, channels) = borrowed(&experiments)?;
-    let found = py.detach(|| residuals::coloured_information(&runs, channels, spent));
-    let found = found.map_err(|e| raise(py, e))?;
+    let found = released(py, || {
+        residuals::coloured_information(&runs, channels, spent)
+    })?;
     let width = found.ncols();
     array2(py, found.as_slice().to_vec(), width)
 }

@@ -1,6 +1,6 @@
 //! Bindings for measured frequency responses: a machine with shafts, and the search for gains and filters.
 
-use numpy::{Complex64, PyArray1, PyArray2, PyReadonlyArray1};
+use numpy::{Complex64, PyArray1, PyReadonlyArray1};
 use pyo3::prelude::*;
 use sewfast_core::local_polynomial;
 use sewfast_core::loop_transfer::Plant;
@@ -8,31 +8,20 @@ use sewfast_core::proposal::{self, Task};
 use sewfast_core::shaft;
 
 use crate::loop_transfer::{Lines, LoopPath, measured};
-use crate::seam::{array1, array2, raise, slice, watched};
-
-type Values<'py> = PyReadonlyArray1<'py, f64>;
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<ProposalTask>()?;
-    module.add_function(wrap_pyfunction!(record_response, module)?)?;
-    module.add_function(wrap_pyfunction!(shaft_response, module)?)?;
-    module.add_function(wrap_pyfunction!(shaft_fraction, module)?)?;
-    module.add_function(wrap_pyfunction!(fit_shaft, module)?)
-}
+use crate::seam::{Matrix, Raised, Values, Vector, array1, array2, slice, watched};
 
 /// Lines, values, variances, coherences, numbers of averaged values, and whether the reference is visible.
 type Response<'py> = (
-    Bound<'py, PyArray1<f64>>,
+    Vector<'py>,
     Bound<'py, PyArray1<Complex64>>,
-    Bound<'py, PyArray1<f64>>,
-    Bound<'py, PyArray1<f64>>,
-    Bound<'py, PyArray1<f64>>,
+    Vector<'py>,
+    Vector<'py>,
+    Vector<'py>,
     bool,
 );
 
 #[pyfunction]
-#[pyo3(signature = (u, y, r))]
-fn record_response<'py>(
+pub fn record_response<'py>(
     py: Python<'py>,
     u: Values<'py>,
     y: Values<'py>,
@@ -51,8 +40,7 @@ fn record_response<'py>(
 
 #[pyfunction]
 #[pyo3(signature = (theta, hertz, *, Ts, counted))]
-#[expect(non_snake_case, reason = "the field's names")]
-fn shaft_response<'py>(
+pub fn shaft_response<'py>(
     py: Python<'py>,
     theta: Values<'py>,
     hertz: Values<'py>,
@@ -60,33 +48,30 @@ fn shaft_response<'py>(
     counted: bool,
 ) -> PyResult<Bound<'py, PyArray1<Complex64>>> {
     let (theta, hertz) = (slice(&theta, "theta")?, slice(&hertz, "hertz")?);
-    let found = shaft::response(theta, hertz, Ts, counted).map_err(|e| raise(py, e))?;
+    let found = shaft::response(theta, hertz, Ts, counted).raised(py)?;
     Ok(PyArray1::from_vec(py, found))
 }
 
 /// Numerator and denominator in powers of z^-1.
-type Fraction<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>);
+type Fraction<'py> = (Vector<'py>, Vector<'py>);
 
 #[pyfunction]
 #[pyo3(signature = (theta, *, Ts))]
-#[expect(non_snake_case, reason = "the field's names")]
-fn shaft_fraction<'py>(py: Python<'py>, theta: Values<'py>, Ts: f64) -> PyResult<Fraction<'py>> {
-    let (num, den) = shaft::fraction(slice(&theta, "theta")?, Ts).map_err(|e| raise(py, e))?;
+pub fn shaft_fraction<'py>(
+    py: Python<'py>,
+    theta: Values<'py>,
+    Ts: f64,
+) -> PyResult<Fraction<'py>> {
+    let (num, den) = shaft::fraction(slice(&theta, "theta")?, Ts).raised(py)?;
     Ok((array1(py, num), array1(py, den)))
 }
 
 /// Sum of squares, parameters, covariance; frequency of a resonance above the lines.
-type Fitted<'py> = (
-    f64,
-    Bound<'py, PyArray1<f64>>,
-    Bound<'py, PyArray2<f64>>,
-    Option<f64>,
-);
+type Fitted<'py> = (f64, Vector<'py>, Matrix<'py>, Option<f64>);
 
 #[pyfunction]
 #[pyo3(signature = (hertz, value, sigma, *, Ts, counted, resonance))]
-#[expect(non_snake_case, reason = "the field's names")]
-fn fit_shaft<'py>(
+pub fn fit_shaft<'py>(
     py: Python<'py>,
     hertz: Values<'py>,
     value: PyReadonlyArray1<'py, Complex64>,
@@ -123,8 +108,6 @@ pub struct ProposalTask(Task);
 impl ProposalTask {
     #[new]
     #[pyo3(signature = (path, num, den, *, lines, above, Ms, quiet))]
-    #[expect(non_snake_case, reason = "the field's names")]
-    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
         py: Python<'_>,
         path: &LoopPath,
@@ -136,8 +119,7 @@ impl ProposalTask {
         quiet: f64,
     ) -> PyResult<Self> {
         Ok(Self(Task {
-            plant: Plant::new(slice(&num, "num")?, slice(&den, "den")?)
-                .map_err(|e| raise(py, e))?,
+            plant: Plant::new(slice(&num, "num")?, slice(&den, "den")?).raised(py)?,
             lines: measured(&lines, path.0.ts)?,
             above: measured(&above, path.0.ts)?,
             path: path.0,
@@ -146,12 +128,11 @@ impl ProposalTask {
         }))
     }
 
-    #[pyo3(signature = (starts))]
     fn best<'py>(
         &self,
         py: Python<'py>,
         starts: Vec<Vec<f64>>,
-    ) -> PyResult<(Option<f64>, Bound<'py, PyArray1<f64>>, Proposed)> {
+    ) -> PyResult<(Option<f64>, Vector<'py>, Proposed)> {
         let found = watched(py, None, |monitor| self.0.best(&starts, monitor))?;
         let proposal::Proposed {
             gains,

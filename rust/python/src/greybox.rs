@@ -11,43 +11,27 @@ use sewfast_core::greybox::{
     self, Current, Fit, Frame, JOINT, Measured, ORDERS, PARAMETERS, Pieces, Run, Smoothing,
 };
 
-use crate::models::{Kind, Model, Rows, Values};
+use crate::models::{Kind, Model};
 use crate::seam::{
-    Experiments, array1, array2, raise, rows, samples, slice, watched, watched_over,
+    Experiments, Matrix, Raised, Rows, Values, Vector, array1, array2, raise, released, rows,
+    samples, slice, watched, watched_over,
 };
 
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add("GREYBOX_PARAMETERS", PARAMETERS)?;
-    module.add("GREYBOX_JOINT", JOINT)?;
-    module.add_class::<Tracker>()?;
-    module.add_function(wrap_pyfunction!(greybox_run, module)?)?;
-    module.add_function(wrap_pyfunction!(greybox_normal, module)?)?;
-    module.add_function(wrap_pyfunction!(greybox_regressed, module)?)?;
-    module.add("GREYBOX_UNITS", greybox::MOST_UNITS)?;
-    module.add_class::<GreyBox>()
-}
-
 /// Speed, drive and their derivatives.
-type Found<'py> = (
-    Bound<'py, PyArray1<f64>>,
-    Bound<'py, PyArray1<f64>>,
-    Bound<'py, PyArray2<f64>>,
-    Bound<'py, PyArray2<f64>>,
-);
+type Found<'py> = (Vector<'py>, Vector<'py>, Matrix<'py>, Matrix<'py>);
 
 #[pyfunction]
 #[pyo3(signature = (theta, free, u, *, Ts, steps, speed=0.0, mean=false, angle=None, orders=[0; ORDERS]))]
-#[allow(non_snake_case, clippy::too_many_arguments)]
-fn greybox_run<'py>(
+pub fn greybox_run<'py>(
     py: Python<'py>,
-    theta: PyReadonlyArray1<'py, f64>,
+    theta: Values<'py>,
     free: Vec<usize>,
-    u: PyReadonlyArray1<'py, f64>,
+    u: Values<'py>,
     Ts: f64,
     steps: usize,
     speed: f64,
     mean: bool,
-    angle: Option<PyReadonlyArray1<'py, f64>>,
+    angle: Option<Values<'py>>,
     orders: [u32; ORDERS],
 ) -> PyResult<Found<'py>> {
     let u = slice(&u, "u")?;
@@ -87,27 +71,26 @@ fn all_of<'a>(py: Python<'_>, values: &'a [f64]) -> PyResult<&'a [f64; PARAMETER
 }
 
 /// Cost, gradient and Gram matrix.
-type Sums<'py> = (f64, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
+type Sums<'py> = (f64, Vector<'py>, Matrix<'py>);
 
 /// Currents, their filter and the resistance.
-type Amperes<'py> = (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>, f64);
+type Amperes<'py> = (Values<'py>, Values<'py>, f64);
 
 #[pyfunction]
 #[pyo3(signature = (theta, free, u, y, used, *, Ts, steps, filter, speed=0.0, mean=false, angle=None, orders=[0; ORDERS], current=None))]
-#[allow(non_snake_case, clippy::too_many_arguments)]
-fn greybox_normal<'py>(
+pub fn greybox_normal<'py>(
     py: Python<'py>,
-    theta: PyReadonlyArray1<'py, f64>,
+    theta: Values<'py>,
     free: Vec<usize>,
-    u: PyReadonlyArray1<'py, f64>,
-    y: PyReadonlyArray1<'py, f64>,
+    u: Values<'py>,
+    y: Values<'py>,
     used: PyReadonlyArray1<'py, bool>,
     Ts: f64,
     steps: usize,
-    filter: PyReadonlyArray1<'py, f64>,
+    filter: Values<'py>,
     speed: f64,
     mean: bool,
-    angle: Option<PyReadonlyArray1<'py, f64>>,
+    angle: Option<Values<'py>>,
     orders: [u32; ORDERS],
     current: Option<Amperes<'py>>,
 ) -> PyResult<Sums<'py>> {
@@ -150,13 +133,12 @@ fn greybox_normal<'py>(
 }
 
 /// Estimates, and which parameters have moved.
-type Followed<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<bool>>);
+type Followed<'py> = (Matrix<'py>, Bound<'py, PyArray2<bool>>);
 
 #[pyclass(module = "sewfast._core")]
 pub struct Tracker(Core<f64>);
 
 #[pymethods]
-#[allow(non_snake_case)]
 impl Tracker {
     #[new]
     #[pyo3(signature = (*, Ts, smoothing, lag, memory, speed))]
@@ -189,8 +171,8 @@ impl Tracker {
     fn run<'py>(
         &mut self,
         py: Python<'py>,
-        u: PyReadonlyArray1<'py, f64>,
-        y: PyReadonlyArray1<'py, f64>,
+        u: Values<'py>,
+        y: Values<'py>,
     ) -> PyResult<Followed<'py>> {
         let (u, y) = (slice(&u, "u")?, slice(&y, "y")?);
         if u.len() != y.len() {
@@ -268,14 +250,12 @@ impl Kind for GreyBox {
 }
 
 #[pymethods]
-#[allow(non_snake_case)]
 impl GreyBox {
     #[new]
     #[pyo3(signature = (
         *, values, free, Ts, steps, mean, unit, speed_scale, command_scale, residual_variance, process_noise, theta,
         position=false, joint=[0.0; JOINT.len()]
     ))]
-    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
         py: Python<'_>,
         values: Values<'_>,
@@ -317,31 +297,21 @@ impl GreyBox {
         };
         greybox::GreyBox::new(frame, slice(&theta, "theta")?)
             .map(Self::wrapped)
-            .map_err(|e| raise(py, e))
+            .raised(py)
     }
 
     #[getter]
     fn settings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let frame = self.inner.frame();
-        let settings = PyDict::new(py);
-        settings.set_item("nx", self.inner.order())?;
-        settings.set_item("nk", self.inner.nk())?;
-        settings.set_item("n_inputs", 1)?;
-        settings.set_item("integrator", self.inner.integrates())?;
-        settings.set_item("hidden", self.inner.units())?;
-        settings.set_item("values", array1(py, frame.values.to_vec()))?;
-        settings.set_item("joint", frame.joint)?;
-        settings.set_item("free", frame.free.clone())?;
-        settings.set_item("Ts", frame.sample_time)?;
-        settings.set_item("steps", frame.steps)?;
-        settings.set_item("mean", frame.mean)?;
-        settings.set_item("position", frame.position)?;
-        settings.set_item("unit", frame.unit)?;
-        settings.set_item("speed_scale", frame.speed_scale)?;
-        settings.set_item("command_scale", frame.command_scale)?;
-        settings.set_item("residual_variance", frame.residual_variance)?;
-        settings.set_item("process_noise", frame.process_noise)?;
-        Ok(settings)
+        Ok(dict! { py;
+            "nx" => self.inner.order(), "nk" => self.inner.nk(), "n_inputs" => 1,
+            "integrator" => self.inner.integrates(), "hidden" => self.inner.units(),
+            "values" => array1(py, frame.values.to_vec()), "joint" => frame.joint, "free" => frame.free.clone(),
+            "Ts" => frame.sample_time, "steps" => frame.steps, "mean" => frame.mean,
+            "position" => frame.position, "unit" => frame.unit, "speed_scale" => frame.speed_scale,
+            "command_scale" => frame.command_scale, "residual_variance" => frame.residual_variance,
+            "process_noise" => frame.process_noise,
+        })
     }
 
     fn states<'py>(
@@ -349,15 +319,14 @@ impl GreyBox {
         py: Python<'py>,
         u: Rows<'py>,
         state: Values<'py>,
-    ) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    ) -> PyResult<Matrix<'py>> {
         let ((u, channels), state) = (rows(&u, "u")?, slice(&state, "state")?);
         let found = py.detach(|| self.inner.states(u, channels, state));
-        array2(py, found.map_err(|e| raise(py, e))?, self.inner.order())
+        array2(py, found.raised(py)?, self.inner.order())
     }
 
     /// The least squares over pieces from theta as it is: the model there, its cost and the pieces' initial states.
     #[pyo3(signature = (experiments, *, prior, low, high, enough, iterations, progress=None))]
-    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn descended<'py>(
         &self,
         py: Python<'py>,
@@ -368,7 +337,7 @@ impl GreyBox {
         enough: f64,
         iterations: usize,
         progress: Option<Bound<'py, PyAny>>,
-    ) -> PyResult<(Py<Self>, f64, Bound<'py, PyArray2<f64>>)> {
+    ) -> PyResult<(Py<Self>, f64, Matrix<'py>)> {
         let samples = samples(py, &experiments)?;
         let fit = Fit {
             prior: slice(&prior, "prior")?,
@@ -393,10 +362,9 @@ impl GreyBox {
         &self,
         py: Python<'py>,
         experiments: Experiments<'py>,
-    ) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    ) -> PyResult<Matrix<'py>> {
         let samples = samples(py, &experiments)?;
-        let found = py.detach(|| Pieces::new(&samples)?.states(&self.inner));
-        let found = found.map_err(|e| raise(py, e))?;
+        let found = released(py, || Pieces::new(&samples)?.states(&self.inner))?;
         array2(py, found.concat(), self.inner.order())
     }
 
@@ -408,8 +376,9 @@ impl GreyBox {
         states: Rows<'py>,
     ) -> PyResult<f64> {
         let (samples, states) = (samples(py, &experiments)?, self.states_of(&states)?);
-        py.detach(|| Ok(Pieces::new(&samples)?.squares(&self.inner, &states)))
-            .map_err(|e| raise(py, e))
+        released(py, || {
+            Ok(Pieces::new(&samples)?.squares(&self.inner, &states))
+        })
     }
 
     /// Covariance of theta at the pieces' least squares, (p, p), and which parameters are determined, (p,).
@@ -420,8 +389,9 @@ impl GreyBox {
         states: Rows<'py>,
     ) -> PyResult<Estimate<'py>> {
         let (samples, states) = (samples(py, &experiments)?, self.states_of(&states)?);
-        let found = py.detach(|| Pieces::new(&samples)?.covariance(&self.inner, &states));
-        let (covariance, determined) = found.map_err(|e| raise(py, e))?;
+        let (covariance, determined) = released(py, || {
+            Pieces::new(&samples)?.covariance(&self.inner, &states)
+        })?;
         let columns = determined.len();
         Ok((
             array2(py, covariance, columns)?,
@@ -437,8 +407,9 @@ impl GreyBox {
         states: Rows<'py>,
     ) -> PyResult<f64> {
         let (samples, states) = (samples(py, &experiments)?, self.states_of(&states)?);
-        py.detach(|| Pieces::new(&samples)?.independent(&self.inner, &states))
-            .map_err(|e| raise(py, e))
+        released(py, || {
+            Pieces::new(&samples)?.independent(&self.inner, &states)
+        })
     }
 }
 
@@ -450,12 +421,11 @@ impl GreyBox {
 }
 
 /// A covariance, and which parameters are determined.
-type Estimate<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray1<bool>>);
+type Estimate<'py> = (Matrix<'py>, Bound<'py, PyArray1<bool>>);
 
 #[pyfunction]
 #[pyo3(signature = (experiments, *, width, delays, Ts, unit, k_q))]
-#[allow(non_snake_case)]
-fn greybox_regressed(
+pub fn greybox_regressed(
     py: Python<'_>,
     experiments: Experiments<'_>,
     width: f64,
@@ -472,6 +442,5 @@ fn greybox_regressed(
         unit,
         k_q,
     };
-    py.detach(|| greybox::regressed(&samples, &how))
-        .map_err(|e| raise(py, e))
+    released(py, || greybox::regressed(&samples, &how))
 }

@@ -1,10 +1,8 @@
 //! The device's guard, for machines without a device.
 
-use numpy::PyReadonlyArray1;
+use crate::seam::{Values, slice};
 use pyo3::prelude::*;
 use sewfast_control::link::{Limits, Trip, Watch};
-
-use crate::seam::slice;
 
 /// Watches the samples of one run.
 #[pyclass(module = "sewfast._core")]
@@ -39,7 +37,6 @@ impl Guard {
 impl Guard {
     #[new]
     #[pyo3(signature = (*, Ts, counts_per_rev, volt, speed, between=None))]
-    #[expect(non_snake_case, reason = "the field's name for the sample time")]
     fn new(
         Ts: f64,
         counts_per_rev: f64,
@@ -68,11 +65,7 @@ impl Guard {
         self.watch.take_on_time(counts, step).err().map(seen)
     }
 
-    fn watch(
-        &mut self,
-        u: PyReadonlyArray1<'_, f64>,
-        counts: PyReadonlyArray1<'_, f64>,
-    ) -> PyResult<Option<(usize, Seen)>> {
+    fn watch(&mut self, u: Values<'_>, counts: Values<'_>) -> PyResult<Option<(usize, Seen)>> {
         let (u, counts) = (slice(&u, "u")?, slice(&counts, "counts")?);
         for (k, (u, counts)) in u.iter().zip(counts).enumerate() {
             // a sample lost by the link
@@ -96,9 +89,4 @@ impl Guard {
     fn at_rest(&self) -> bool {
         self.watch.at_rest()
     }
-}
-
-/// Adds the guard to the module.
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<Guard>()
 }

@@ -6,24 +6,19 @@ use sewfast_core::{Error, Result};
 use sewfast_link::host_loop::{HostLoop, Locked, Outcome, Settings, Tick};
 use sewfast_link::{Channel, Client};
 
-use numpy::{PyArray1, PyReadonlyArray1};
+use numpy::PyArray1;
 
 use crate::control::Controller;
-use crate::seam::{array1, slice, watched};
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_function(wrap_pyfunction!(host_loop, module)?)
-}
+use crate::seam::{Values, array1, slice, watched};
 
 #[pyfunction]
 #[pyo3(signature = (port, controller, reference, *, tag, session, key, command, heartbeat, device_period, ratio, watchdog, batch,
     mask, channels, counts_per_unit, lock_memory=false, progress=None))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-fn host_loop<'py>(
+pub fn host_loop<'py>(
     py: Python<'py>,
     port: i32,
     controller: &Bound<'py, Controller>,
-    reference: PyReadonlyArray1<'py, f64>,
+    reference: Values<'py>,
     tag: u16,
     session: u32,
     key: u32,
@@ -95,11 +90,10 @@ fn run(_: i32, _: &mut HostLoop, _: &sewfast_core::Monitor) -> Result<()> {
 }
 
 fn record<'py>(py: Python<'py>, looped: &HostLoop) -> PyResult<Bound<'py, PyDict>> {
-    let record = PyDict::new(py);
-    record.set_item("outcome", outcome(py, looped.outcome())?)?;
-    record.set_item("ticks", ticks(py, &looped.ticks().run)?)?;
-    record.set_item("missed", looped.ticks().missed)?;
-    record.set_item("unsent", looped.ticks().unsent)?;
+    let record = dict! { py;
+        "outcome" => outcome(py, looped.outcome())?, "ticks" => ticks(py, &looped.ticks().run)?,
+        "missed" => looped.ticks().missed, "unsent" => looped.ticks().unsent,
+    };
     let (times, columns) = &looped.history().columns;
     record.set_item("times", PyArray1::from_slice(py, times))?;
     let columns = columns

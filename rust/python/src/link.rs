@@ -2,7 +2,8 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use numpy::{PyArray1, PyReadonlyArray1};
+use crate::seam::{Raised, Values, array1, raise, slice};
+use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyList};
 use sewfast_control::link::identity::VERSION;
@@ -12,18 +13,8 @@ use sewfast_link::bodies::{self, Description, Event, Greeting, Start, Status};
 use sewfast_link::client::{Client, Event as Heard};
 use sewfast_link::{Channel, Receiver, Upload};
 
-use crate::seam::{array1, raise, slice};
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<LinkClient>()?;
-    module.add_class::<LinkReceiver>()?;
-    module.add_class::<LinkUpload>()?;
-    module.add_class::<LinkBodies>()?;
-    module.add_function(wrap_pyfunction!(link_frame, module)?)
-}
-
 #[pyfunction]
-fn link_frame<'py>(
+pub fn link_frame<'py>(
     py: Python<'py>,
     kind: u8,
     tag: u16,
@@ -52,7 +43,7 @@ fn too_long(py: Python<'_>, received: &str) -> PyErr {
 
 /// The bodies of a host's frames, and of a device's replies; see docs/PROTOCOL.md.
 #[pyclass(frozen, module = "sewfast._core")]
-struct LinkBodies;
+pub struct LinkBodies;
 
 type Wire<'py> = PyResult<Bound<'py, PyBytes>>;
 
@@ -254,7 +245,7 @@ impl LinkBodies {
 
 /// Receives what a device sends; see docs/PROTOCOL.md.
 #[pyclass(frozen, module = "sewfast._core")]
-struct LinkReceiver {
+pub struct LinkReceiver {
     // a live view reads the counters on another thread than the one that feeds
     core: Mutex<Receiver>,
 }
@@ -315,7 +306,7 @@ fn expect(
     let channels: Result<Vec<Channel>> = channels.iter().map(described).collect();
     channels
         .and_then(|channels| receiver.expect(&channels, period_us))
-        .map_err(|e| raise(py, e))
+        .raised(py)
 }
 
 fn take<'py>(py: Python<'py>, receiver: &mut Receiver) -> PyResult<Columns<'py>> {
@@ -344,7 +335,7 @@ fn anomalies(receiver: &mut Receiver) -> Vec<Listed> {
 
 /// A session with a device; see docs/PROTOCOL.md.
 #[pyclass(frozen, module = "sewfast._core")]
-struct LinkClient {
+pub struct LinkClient {
     // a live view reads the counters on another thread than the one that uses the client
     core: Mutex<Client>,
 }
@@ -491,24 +482,20 @@ impl LinkClient {
 
 /// A run's values as the device stores them; see docs/PROTOCOL.md.
 #[pyclass(module = "sewfast._core")]
-struct LinkUpload {
+pub struct LinkUpload {
     core: Upload,
 }
 
 #[pymethods]
 impl LinkUpload {
     #[staticmethod]
-    fn commands(
-        values: PyReadonlyArray1<'_, f64>,
-        steps_per_unit: u32,
-        limit: f64,
-    ) -> PyResult<Self> {
+    fn commands(values: Values<'_>, steps_per_unit: u32, limit: f64) -> PyResult<Self> {
         let core = Upload::commands(slice(&values, "values")?, steps_per_unit, limit);
         Ok(Self { core })
     }
 
     #[staticmethod]
-    fn references(values: PyReadonlyArray1<'_, f64>, limit: f64) -> PyResult<Self> {
+    fn references(values: Values<'_>, limit: f64) -> PyResult<Self> {
         let core = Upload::references(slice(&values, "values")?, limit);
         Ok(Self { core })
     }

@@ -8,17 +8,7 @@ use sewfast_core::Result;
 use sewfast_core::loop_transfer::{self, Change, Changing, Loop, Path, Plant};
 
 use crate::control::controller::{Section, cascade};
-use crate::seam::{array1, raise, slice};
-
-type Values<'py> = PyReadonlyArray1<'py, f64>;
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<LoopPath>()?;
-    module.add_function(wrap_pyfunction!(sampled_fopdt, module)?)?;
-    module.add_function(wrap_pyfunction!(loop_response, module)?)?;
-    module.add_function(wrap_pyfunction!(margins, module)?)?;
-    module.add_function(wrap_pyfunction!(tolerance, module)?)
-}
+use crate::seam::{Raised, Values, Vector, array1, raise, released, slice};
 
 /// The part of a controller that is in the loop: its feedback path. Gains in standard form.
 #[pyclass(module = "sewfast._core", frozen)]
@@ -28,8 +18,6 @@ pub struct LoopPath(pub Path);
 impl LoopPath {
     #[new]
     #[pyo3(signature = (*, Kp, Ti, Td, N, Ts, filter_samples, filter_time, observer_time, encoder, slope=0.0, biquads=Vec::new()))]
-    #[expect(non_snake_case, reason = "the field's names")]
-    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
         py: Python<'_>,
         Kp: f64,
@@ -65,13 +53,12 @@ impl LoopPath {
 }
 
 /// Numerator and denominator of a plant in powers of z^-1, as NumPy has them.
-type Fraction<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>);
+type Fraction<'py> = (Vector<'py>, Vector<'py>);
 
 #[pyfunction]
 #[pyo3(signature = (K, T, L, *, Ts))]
-#[expect(non_snake_case, reason = "the field's names")]
-fn sampled_fopdt(py: Python<'_>, K: f64, T: f64, L: f64, Ts: f64) -> PyResult<Fraction<'_>> {
-    let plant = Plant::fopdt(K, T, L, Ts).map_err(|e| raise(py, e))?;
+pub fn sampled_fopdt(py: Python<'_>, K: f64, T: f64, L: f64, Ts: f64) -> PyResult<Fraction<'_>> {
+    let plant = Plant::fopdt(K, T, L, Ts).raised(py)?;
     Ok((
         array1(py, plant.num().to_vec()),
         array1(py, plant.den().to_vec()),
@@ -94,12 +81,11 @@ pub fn measured(
     let py = omega.py();
     let (omega, radius) = (slice(omega, "omega")?, slice(radius, "radius")?);
     let response = response.as_slice()?;
-    loop_transfer::Measured::new(omega, response, radius, *counted, ts).map_err(|e| raise(py, e))
+    loop_transfer::Measured::new(omega, response, radius, *counted, ts).raised(py)
 }
 
 #[pyfunction]
-#[pyo3(signature = (path, num, den, omega))]
-fn loop_response<'py>(
+pub fn loop_response<'py>(
     py: Python<'py>,
     path: &LoopPath,
     num: Values<'py>,
@@ -116,13 +102,12 @@ fn loop_response<'py>(
         let closed = Loop::new(&path.0, &plant)?;
         Ok(omega.iter().map(|&w| closed.response(w)).collect())
     };
-    let response = response().map_err(|e| raise(py, e))?;
+    let response = response().raised(py)?;
     Ok(PyArray1::from_vec(py, response))
 }
 
 #[pyfunction]
-#[pyo3(signature = (path, num, den))]
-fn margins<'py>(
+pub fn margins<'py>(
     py: Python<'py>,
     path: &LoopPath,
     num: Values<'py>,
@@ -130,13 +115,11 @@ fn margins<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let (num, den) = (slice(&num, "num")?, slice(&den, "den")?);
     // this takes half a millisecond: on a busy computer starting a thread takes longer
-    let found = py
-        .detach(|| {
-            let plant = Plant::new(num, den)?;
-            let closed = Loop::new(&path.0, &plant)?;
-            Ok(loop_transfer::margins(&closed))
-        })
-        .map_err(|e| raise(py, e))?;
+    let found = released(py, || {
+        let plant = Plant::new(num, den)?;
+        let closed = Loop::new(&path.0, &plant)?;
+        Ok(loop_transfer::margins(&closed))
+    })?;
     let dict = PyDict::new(py);
     dict.set_item("stable", found.stable)?;
     let numbers = [
@@ -164,16 +147,16 @@ fn margins<'py>(
 type Changed = (f64, f64, usize, f64);
 
 #[pyfunction]
-#[pyo3(signature = (path, num, den))]
-fn tolerance(
+pub fn tolerance(
     py: Python<'_>,
     path: &LoopPath,
     num: Values<'_>,
     den: Values<'_>,
 ) -> PyResult<(f64, Option<Changed>)> {
     let (num, den) = (slice(&num, "num")?, slice(&den, "den")?);
-    let found = py.detach(|| Ok(Changing::new(Plant::new(num, den)?).sensitivity(&path.0)));
-    let (robust, worst) = found.map_err(|e| raise(py, e))?;
+    let (robust, worst) = released(py, || {
+        Ok(Changing::new(Plant::new(num, den)?).sensitivity(&path.0))
+    })?;
     let changed = |(most, Change { gain, delay, pitch })| (most, gain, delay, pitch);
     Ok((robust, worst.map(changed)))
 }

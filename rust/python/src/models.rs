@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::PyClass;
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
@@ -12,7 +11,9 @@ use sewfast_core::guard::{Unsound, verdict};
 use sewfast_core::linearised::Linearised;
 use sewfast_core::{Error, Result, model, stacking};
 
-use crate::seam::{array1, array2, raise, rows, slice, watched};
+use crate::seam::{
+    Matrix, Raised, Rows, Values, Vector, array1, array2, raise, released, rows, slice, watched,
+};
 use linear::LinearModel;
 use neural::NeuralOE;
 use neural_ss::{Experiments, NeuralSS, recordings};
@@ -43,7 +44,7 @@ macro_rules! fit_methods {
             }
 
             #[getter]
-            fn trace<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+            fn trace<'py>(&self, py: Python<'py>) -> Vector<'py> {
                 array1(py, self.inner.trace.clone())
             }
 
@@ -67,7 +68,7 @@ macro_rules! started_fit_methods {
             }
 
             #[getter]
-            fn start_costs<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+            fn start_costs<'py>(&self, py: Python<'py>) -> Vector<'py> {
                 array1(py, self.inner.start_costs.clone())
             }
 
@@ -89,17 +90,6 @@ macro_rules! started_fit_methods {
 pub mod linear;
 pub mod neural;
 pub mod neural_ss;
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<Model>()?;
-    linear::register(module)?;
-    neural::register(module)?;
-    neural_ss::register(module)?;
-    module.add_function(wrap_pyfunction!(guard, module)?)?;
-    module.add_function(wrap_pyfunction!(convex_weights, module)?)?;
-    module.add_class::<EmbeddedModel>()?;
-    module.add_function(wrap_pyfunction!(tanh_quotients, module)?)
-}
 
 /// A model of any kind: the class below which each kind adds its parameters.
 #[pyclass(frozen, subclass, module = "sewfast._core")]
@@ -132,11 +122,11 @@ pub trait Kind: PyClass<BaseType = Model> + Sized {
 #[pymethods]
 impl Model {
     #[getter]
-    fn theta<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+    fn theta<'py>(&self, py: Python<'py>) -> Vector<'py> {
         array1(py, self.inner.theta())
     }
 
-    fn rest_state<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+    fn rest_state<'py>(&self, py: Python<'py>) -> Vector<'py> {
         array1(py, py.detach(|| self.inner.rest_state()))
     }
 
@@ -145,7 +135,7 @@ impl Model {
         py: Python<'py>,
         u: Rows<'py>,
         state: Values<'py>,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    ) -> PyResult<Vector<'py>> {
         let ((u, channels), state) = (rows(&u, "u")?, slice(&state, "state")?);
         let run = released(py, || self.inner.simulate(u, channels, state))?;
         Ok(array1(py, run))
@@ -158,7 +148,7 @@ impl Model {
         y: Values<'py>,
         state: Values<'py>,
         horizon: usize,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    ) -> PyResult<Vector<'py>> {
         let ((u, channels), y, state) = (rows(&u, "u")?, slice(&y, "y")?, slice(&state, "state")?);
         let run = released(py, || self.inner.predict(u, channels, y, state, horizon))?;
         Ok(array1(py, run))
@@ -169,7 +159,7 @@ impl Model {
         py: Python<'py>,
         u: Rows<'py>,
         y: Values<'py>,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    ) -> PyResult<Vector<'py>> {
         let ((u, channels), y) = (rows(&u, "u")?, slice(&y, "y")?);
         let state = released(py, || self.inner.estimate_state(u, channels, y))?;
         Ok(array1(py, state))
@@ -202,17 +192,12 @@ impl Model {
     #[pyo3(signature = (*, scaled=false))]
     fn embedded(&self, py: Python<'_>, scaled: bool) -> PyResult<EmbeddedModel> {
         let made = self.inner.embedded(scaled);
-        made.map(EmbeddedModel::of).map_err(|e| raise(py, e))
+        made.map(EmbeddedModel::of).raised(py)
     }
 }
 
 /// A, B, C, D.
-type Matrices<'py> = (
-    Bound<'py, PyArray2<f64>>,
-    Bound<'py, PyArray2<f64>>,
-    Bound<'py, PyArray2<f64>>,
-    Bound<'py, PyArray2<f64>>,
-);
+type Matrices<'py> = (Matrix<'py>, Matrix<'py>, Matrix<'py>, Matrix<'py>);
 
 fn matrices(py: Python<'_>, found: Result<Linearised>) -> PyResult<Matrices<'_>> {
     let Linearised {
@@ -222,7 +207,7 @@ fn matrices(py: Python<'_>, found: Result<Linearised>) -> PyResult<Matrices<'_>>
         d,
         states,
         inputs,
-    } = found.map_err(|e| raise(py, e))?;
+    } = found.raised(py)?;
     Ok((
         array2(py, a, states)?,
         array2(py, b, inputs)?,
@@ -231,20 +216,14 @@ fn matrices(py: Python<'_>, found: Result<Linearised>) -> PyResult<Matrices<'_>>
     ))
 }
 
-type RunAndJacobian<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
-pub type Rows<'py> = PyReadonlyArray2<'py, f64>;
-pub type Values<'py> = PyReadonlyArray1<'py, f64>;
-
-fn released<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send) -> PyResult<T> {
-    py.detach(work).map_err(|e| raise(py, e))
-}
+type RunAndJacobian<'py> = (Vector<'py>, Matrix<'py>);
 
 #[pyfunction]
-fn convex_weights<'py>(
+pub fn convex_weights<'py>(
     py: Python<'py>,
     residuals: Rows<'py>,
     weights: Values<'py>,
-) -> PyResult<Bound<'py, PyArray1<f64>>> {
+) -> PyResult<Vector<'py>> {
     let ((residuals, models), weights) =
         (rows(&residuals, "residuals")?, slice(&weights, "weights")?);
     let found = released(py, || stacking::convex_weights(residuals, models, weights))?;
@@ -253,7 +232,7 @@ fn convex_weights<'py>(
 
 #[pyfunction]
 #[pyo3(signature = (model, experiments, *, linear = Vec::new()))]
-fn guard(
+pub fn guard(
     py: Python<'_>,
     model: &Bound<'_, PyAny>,
     experiments: Experiments<'_>,
@@ -326,11 +305,10 @@ impl EmbeddedModel {
         let Some((u_mean, u_scale, y_mean, y_scale)) = &self.inner.scaling else {
             return Ok(None);
         };
-        let found = PyDict::new(py);
-        found.set_item("u_mean", array1(py, u_mean.clone()))?;
-        found.set_item("u_scale", array1(py, u_scale.clone()))?;
-        found.set_item("y_mean", array1(py, vec![*y_mean]))?;
-        found.set_item("y_scale", array1(py, vec![*y_scale]))?;
+        let found = dict! { py;
+            "u_mean" => array1(py, u_mean.clone()), "u_scale" => array1(py, u_scale.clone()),
+            "y_mean" => array1(py, vec![*y_mean]), "y_scale" => array1(py, vec![*y_scale]),
+        };
         Ok(Some(found))
     }
 
@@ -347,7 +325,7 @@ impl EmbeddedModel {
         state: Values<'py>,
         held: Values<'py>,
         precision: &str,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    ) -> PyResult<Vector<'py>> {
         let (u, state, held) = (
             rows(&u, "u")?.0,
             slice(&state, "state")?,
@@ -363,13 +341,13 @@ impl EmbeddedModel {
             }
         };
         let found = py.detach(|| run(self, u, state, held));
-        Ok(array1(py, found.map_err(|e| raise(py, e))?))
+        Ok(array1(py, found.raised(py)?))
     }
 }
 
 /// The coefficients of `tanh(x) = x P(x^2)/Q(x^2)`: numerator, denominator and end of each quotient.
 #[pyfunction]
-fn tanh_quotients(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
+pub fn tanh_quotients(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
     use sewfast_control::model::tanh::{FAR, NEAR, SINGLE};
     let found = PyDict::new(py);
     for (name, q) in [("near", NEAR), ("far", FAR)] {

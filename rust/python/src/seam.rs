@@ -13,6 +13,40 @@ use pyo3::types::{PyTuple, PyType};
 use sewfast_core::data::Samples;
 use sewfast_core::{Error, ErrorKind, Monitor, Record, Result};
 
+/// Values borrowed from Python, (N,).
+pub type Values<'py> = PyReadonlyArray1<'py, f64>;
+/// Values borrowed from Python, (N, n).
+pub type Rows<'py> = PyReadonlyArray2<'py, f64>;
+/// A new array, (N,).
+pub type Vector<'py> = Bound<'py, PyArray1<f64>>;
+/// A new array, (N, n).
+pub type Matrix<'py> = Bound<'py, PyArray2<f64>>;
+
+/// A dict from names and values.
+macro_rules! dict {
+    ($py:expr; $($name:literal => $value:expr),* $(,)?) => {{
+        let dict = pyo3::types::PyDict::new($py);
+        $(dict.set_item($name, $value)?;)*
+        dict
+    }};
+}
+
+/// A result whose error becomes an exception.
+pub trait Raised<T> {
+    fn raised(self, py: Python<'_>) -> PyResult<T>;
+}
+
+impl<T, E: Into<Error>> Raised<T> for std::result::Result<T, E> {
+    fn raised(self, py: Python<'_>) -> PyResult<T> {
+        self.map_err(|error| raise(py, error.into()))
+    }
+}
+
+/// Does `work` without the interpreter.
+pub fn released<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send) -> PyResult<T> {
+    py.detach(work).raised(py)
+}
+
 /// Turns a core error into the exception class of `sewfast.errors` for its kind.
 pub fn raise(py: Python<'_>, error: Error) -> PyErr {
     let class = match error.kind {
@@ -34,14 +68,14 @@ fn exception<'py>(py: Python<'py>, class: &str) -> PyResult<Bound<'py, PyType>> 
 }
 
 /// The values of a one-dimensional array, borrowed.
-pub fn slice<'a>(array: &'a PyReadonlyArray1<'_, f64>, name: &str) -> PyResult<&'a [f64]> {
+pub fn slice<'a>(array: &'a Values<'_>, name: &str) -> PyResult<&'a [f64]> {
     array
         .as_slice()
         .map_err(|_| not_contiguous(array.py(), name))
 }
 
 /// The values of a two-dimensional array row by row and its number of columns, borrowed.
-pub fn rows<'a>(array: &'a PyReadonlyArray2<'_, f64>, name: &str) -> PyResult<(&'a [f64], usize)> {
+pub fn rows<'a>(array: &'a Rows<'_>, name: &str) -> PyResult<(&'a [f64], usize)> {
     // `as_slice` of the array itself takes columns for rows where they are contiguous
     let view = array.as_array();
     let columns = view.ncols();
@@ -62,10 +96,10 @@ fn not_contiguous(py: Python<'_>, name: &str) -> PyErr {
 /// An experiment passed by Python, borrowed: `(u, y)`, or `(u, y, weights)` if its samples have weights.
 pub struct Experiment<'py, Y> {
     /// Inputs, time first.
-    pub u: PyReadonlyArray2<'py, f64>,
+    pub u: Rows<'py>,
     /// Outputs.
     pub y: Y,
-    weights: Option<PyReadonlyArray1<'py, f64>>,
+    weights: Option<Values<'py>>,
 }
 
 impl<'a, 'py, Y: FromPyObjectOwned<'py>> FromPyObject<'a, 'py> for Experiment<'py, Y> {
@@ -75,7 +109,7 @@ impl<'a, 'py, Y: FromPyObjectOwned<'py>> FromPyObject<'a, 'py> for Experiment<'p
         let is_weighted = values.cast::<PyTuple>().is_ok_and(|v| v.len() == 3);
         let (u, y, weights) = match is_weighted {
             true => values
-                .extract::<(_, _, PyReadonlyArray1<'py, f64>)>()
+                .extract::<(_, _, Values<'py>)>()
                 .map(|(u, y, w)| (u, y, Some(w)))?,
             false => values.extract().map(|(u, y)| (u, y, None))?,
         };
@@ -94,37 +128,33 @@ impl<Y> Experiment<'_, Y> {
 }
 
 /// A list of experiments of one output.
-pub type Experiments<'py> = Vec<Experiment<'py, PyReadonlyArray1<'py, f64>>>;
+pub type Experiments<'py> = Vec<Experiment<'py, Values<'py>>>;
 
 /// The experiments with their shapes checked but not their values.
 pub fn samples<'a>(py: Python<'_>, experiments: &'a Experiments<'_>) -> PyResult<Vec<Samples<'a>>> {
-    let samples = |experiment: &'a Experiment<'_, PyReadonlyArray1<'_, f64>>| {
+    let samples = |experiment: &'a Experiment<'_, Values<'_>>| {
         let ((u, channels), y) = (rows(&experiment.u, "u")?, slice(&experiment.y, "y")?);
         let weights = experiment.weights()?;
         let samples = Samples::new(u, channels, y);
         let weighted = samples.and_then(|s| weights.map_or(Ok(s), |w| s.with_weights(w)));
-        weighted.map_err(|e| raise(py, e))
+        weighted.raised(py)
     };
     experiments.iter().map(samples).collect()
 }
 
 /// The experiments as the core's records.
 pub fn records<'a>(py: Python<'_>, experiments: &'a Experiments<'_>) -> PyResult<Vec<Record<'a>>> {
-    let record = |samples: Samples<'a>| samples.record().map_err(|e| raise(py, e));
+    let record = |samples: Samples<'a>| samples.record().raised(py);
     samples(py, experiments)?.into_iter().map(record).collect()
 }
 
 /// A new one-dimensional array that owns `values`.
-pub fn array1(py: Python<'_>, values: Vec<f64>) -> Bound<'_, PyArray1<f64>> {
+pub fn array1(py: Python<'_>, values: Vec<f64>) -> Vector<'_> {
     PyArray1::from_vec(py, values)
 }
 
 /// A new two-dimensional array from `values` row by row.
-pub fn array2(
-    py: Python<'_>,
-    values: Vec<f64>,
-    columns: usize,
-) -> PyResult<Bound<'_, PyArray2<f64>>> {
+pub fn array2(py: Python<'_>, values: Vec<f64>, columns: usize) -> PyResult<Matrix<'_>> {
     use numpy::PyArrayMethods;
     let rows = values.len().checked_div(columns).unwrap_or(0);
     PyArray1::from_vec(py, values).reshape([rows, columns])
@@ -172,7 +202,7 @@ pub fn watched<T: Send>(
                 .ok()
                 .filter(|_| monitor.heard() || !is_ctrl_c(py, &interrupt))
                 .ok_or(interrupt),
-            None => result.map_err(|e| raise(py, e)),
+            None => result.raised(py),
         }
     })
 }
@@ -195,8 +225,7 @@ pub fn watched_over<T: Send>(
     if samples > BRIEF {
         return watched(py, None, work);
     }
-    py.detach(|| work(&Monitor::default()))
-        .map_err(|e| raise(py, e))
+    py.detach(|| work(&Monitor::default())).raised(py)
 }
 
 fn look(py: Python<'_>, progress: Option<&Bound<'_, PyAny>>, monitor: &Monitor) -> PyResult<()> {

@@ -3,21 +3,14 @@
 
 use std::sync::Mutex;
 
-use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use crate::seam::{Matrix, Raised, Rows, Values, array1, array2, is_ctrl_c, raise, rows, slice};
+use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_core::least_squares::{self, Residuals, Settings, Solution, Termination};
-use sewfast_core::search::nsga2::{self, Objectives, Values};
+use sewfast_core::search::nsga2::{self, Objectives};
 use sewfast_core::search::{Candidate, Judgement, Options, Problem, cma_es, genetic};
 use sewfast_core::{Error, Monitor};
-
-use crate::seam::{array1, array2, is_ctrl_c, raise, rows, slice};
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_function(wrap_pyfunction!(search_least, module)?)?;
-    module.add_function(wrap_pyfunction!(search_front, module)?)?;
-    module.add_function(wrap_pyfunction!(least_squares_fit, module)?)
-}
 
 /// A Python function over the unit box; an exception in it ends the search.
 struct Function {
@@ -93,7 +86,7 @@ impl Objectives for Function {
 
     fn memory(&self) {}
 
-    fn judge(&self, (): &mut (), points: &[Vec<f64>], monitor: &Monitor) -> Vec<Values> {
+    fn judge(&self, (): &mut (), points: &[Vec<f64>], monitor: &Monitor) -> Vec<nsga2::Values> {
         points
             .iter()
             .map(|point| self.values_of(point, monitor))
@@ -102,9 +95,9 @@ impl Objectives for Function {
 }
 
 impl Function {
-    fn values_of(&self, point: &[f64], monitor: &Monitor) -> Values {
+    fn values_of(&self, point: &[f64], monitor: &Monitor) -> nsga2::Values {
         let values = self.at(point, monitor, |value| value.extract::<Vec<f64>>());
-        Values {
+        nsga2::Values {
             violation: if values.is_some() { 0.0 } else { f64::INFINITY },
             objectives: values
                 .filter(|values| values.len() == self.objectives)
@@ -137,8 +130,7 @@ fn bounded(count: usize) -> sewfast_core::Result<()> {
 /// The least value of a function over the unit box.
 #[pyfunction]
 #[pyo3(signature = (function, dimensions, *, method, evaluations, seed, start=None, tolerance=1e-8))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-fn search_least<'py>(
+pub fn search_least<'py>(
     py: Python<'py>,
     function: Py<PyAny>,
     dimensions: usize,
@@ -155,7 +147,7 @@ fn search_least<'py>(
         raised: Mutex::new(None),
     };
     let inside = |s: &Vec<f64>| s.len() == dimensions && s.iter().all(|x| (0.0..=1.0).contains(x));
-    bounded(dimensions).map_err(|e| raise(py, e))?;
+    bounded(dimensions).raised(py)?;
     if dimensions == 0 || !start.as_ref().is_none_or(inside) {
         let message = format!(
             "expected {dimensions} coordinates, 1 or more, from 0 to 1 as a start, got {start:?}"
@@ -171,11 +163,11 @@ fn search_least<'py>(
             "expected method 'genetic' or 'cma-es', got '{method}'"
         ))),
     }
-    .map_err(|e| raise(py, e))?;
+    .raised(py)?;
     problem.checked()?;
-    let dict = PyDict::new(py);
-    dict.set_item("x", array1(py, found.point))?;
-    dict.set_item("value", found.judgement.cost)?;
+    let dict = dict! { py;
+        "x" => array1(py, found.point), "value" => found.judgement.cost,
+    };
     let trace = found.trace.iter().map(|j| j.cost).collect();
     dict.set_item("trace", array1(py, trace))?;
     Ok(dict)
@@ -184,7 +176,7 @@ fn search_least<'py>(
 /// A front of least values of a function over the unit box.
 #[pyfunction]
 #[pyo3(signature = (function, dimensions, objectives, *, size, evaluations, seed))]
-fn search_front<'py>(
+pub fn search_front<'py>(
     py: Python<'py>,
     function: Py<PyAny>,
     dimensions: usize,
@@ -199,12 +191,9 @@ fn search_front<'py>(
         objectives,
         raised: Mutex::new(None),
     };
-    bounded(dimensions)
-        .and(bounded(objectives))
-        .map_err(|e| raise(py, e))?;
+    bounded(dimensions).and(bounded(objectives)).raised(py)?;
     let options = options(evaluations, seed, 0.0);
-    let front = nsga2::search(&problem, &[], size, options, &Monitor::default())
-        .map_err(|e| raise(py, e))?;
+    let front = nsga2::search(&problem, &[], size, options, &Monitor::default()).raised(py)?;
     problem.checked()?;
     let dict = PyDict::new(py);
     let points: Vec<_> = front.members.iter().map(|m| m.point.clone()).collect();
@@ -217,8 +206,6 @@ fn search_front<'py>(
     dict.set_item("values", values)?;
     Ok(dict)
 }
-
-type Vector<'py> = PyReadonlyArray1<'py, f64>;
 
 /// Python functions as residuals. Every call gets its own arrays, so that a function may keep them.
 struct Functions<'a, 'py> {
@@ -241,7 +228,7 @@ impl<'py> Functions<'_, 'py> {
             return Ok(());
         }
         let values = self.fun.call1((PyArray1::from_slice(self.py, theta),))?;
-        let values: Vector<'py> = values.extract()?;
+        let values: Values<'py> = values.extract()?;
         r.copy_from_slice(slice(&values, "fun")?);
         Ok(())
     }
@@ -250,7 +237,7 @@ impl<'py> Functions<'_, 'py> {
         self.py.check_signals()?;
         let at = PyArray1::from_slice(self.py, theta);
         let values = self.jac.call1((at, PyArray1::from_slice(self.py, r)))?;
-        let values: PyReadonlyArray2<'py, f64> = values.extract()?;
+        let values: Rows<'py> = values.extract()?;
         j.copy_from_slice(rows(&values, "jac")?.0);
         Ok(())
     }
@@ -294,23 +281,22 @@ impl Residuals for Functions<'_, '_> {
 
 #[pyfunction]
 #[pyo3(signature = (fun, jac, x0, first, *, lower, upper, x_scale, ftol, xtol, gtol, max_nfev, precision))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-fn least_squares_fit<'py>(
+pub fn least_squares_fit<'py>(
     py: Python<'py>,
     fun: Bound<'py, PyAny>,
     jac: Bound<'py, PyAny>,
-    x0: Vector<'py>,
-    first: Vector<'py>,
-    lower: Option<Vector<'py>>,
-    upper: Option<Vector<'py>>,
-    x_scale: Option<Vector<'py>>,
+    x0: Values<'py>,
+    first: Values<'py>,
+    lower: Option<Values<'py>>,
+    upper: Option<Values<'py>>,
+    x_scale: Option<Values<'py>>,
     ftol: f64,
     xtol: f64,
     gtol: f64,
     max_nfev: usize,
     precision: f64,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let owned = |values: Option<Vector<'py>>, name| {
+    let owned = |values: Option<Values<'py>>, name| {
         values
             .map(|v| slice(&v, name).map(<[f64]>::to_vec))
             .transpose()
@@ -341,17 +327,16 @@ fn least_squares_fit<'py>(
     match functions.raised {
         // Exactly this class: Ctrl-C keeps the best point; every other exception goes to the caller.
         Some(error) if !is_ctrl_c(py, &error) => Err(error),
-        _ => story(py, solution.map_err(|e| raise(py, e))?),
+        _ => story(py, solution.raised(py)?),
     }
 }
 
 fn story(py: Python<'_>, solution: Solution) -> PyResult<Bound<'_, PyDict>> {
     let n = solution.theta.len();
-    let story = PyDict::new(py);
-    story.set_item("x", array1(py, solution.theta))?;
-    story.set_item("cost", solution.cost)?;
-    story.set_item("fun", array1(py, solution.residual))?;
-    let jacobian: Bound<'_, PyArray2<f64>> = array2(py, solution.jacobian, n)?;
+    let story = dict! { py;
+        "x" => array1(py, solution.theta), "cost" => solution.cost, "fun" => array1(py, solution.residual),
+    };
+    let jacobian: Matrix<'_> = array2(py, solution.jacobian, n)?;
     story.set_item("jac", jacobian)?;
     story.set_item("success", solution.termination.is_converged())?;
     story.set_item("status", status(solution.termination))?;

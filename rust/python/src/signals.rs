@@ -1,88 +1,57 @@
 //! Bindings of the core's signals, and of its methods from counts to speed.
 
-use numpy::{PyArray1, PyReadonlyArray1};
+use crate::seam::{Raised, Values, Vector, array1, released, slice};
 use pyo3::prelude::*;
 use sewfast_core::signals::{self, Chirp, Jumps, Limits, Multisine, RandomSteps, Sweep, Trapezoid};
 use sewfast_core::speed::{self, Kalman, Scale};
 use sewfast_core::{Error, Result};
 
-use crate::seam::{array1, raise, slice};
+type Signal<'py> = PyResult<Vector<'py>>;
 
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_function(wrap_pyfunction!(step, module)?)?;
-    module.add_function(wrap_pyfunction!(staircase, module)?)?;
-    module.add_function(wrap_pyfunction!(trapezoid, module)?)?;
-    module.add_function(wrap_pyfunction!(chirp, module)?)?;
-    module.add_function(wrap_pyfunction!(random_steps, module)?)?;
-    module.add_function(wrap_pyfunction!(prbs, module)?)?;
-    module.add_function(wrap_pyfunction!(multisine, module)?)?;
-    module.add_function(wrap_pyfunction!(jumps, module)?)?;
-    module.add_function(wrap_pyfunction!(limit, module)?)?;
-    module.add_function(wrap_pyfunction!(crest_factor, module)?)?;
-    module.add_function(wrap_pyfunction!(speed_difference, module)?)?;
-    module.add_function(wrap_pyfunction!(speed_savgol, module)?)?;
-    module.add_function(wrap_pyfunction!(speed_kalman, module)?)?;
-    module.add_function(wrap_pyfunction!(unwrap_counts, module)?)
-}
-
-type Signal<'py> = PyResult<Bound<'py, PyArray1<f64>>>;
-
-fn released(py: Python<'_>, work: impl FnOnce() -> Result<Vec<f64>> + Send) -> Signal<'_> {
-    let values = py.detach(work).map_err(|e| raise(py, e))?;
+fn made(py: Python<'_>, work: impl FnOnce() -> Result<Vec<f64>> + Send) -> Signal<'_> {
+    let values = released(py, work)?;
     Ok(array1(py, values))
 }
 
 #[pyfunction]
 #[pyo3(signature = (*, duration, Ts, at, low, high))]
-#[allow(non_snake_case)]
-fn step(py: Python<'_>, duration: f64, Ts: f64, at: f64, low: f64, high: f64) -> Signal<'_> {
-    released(py, || signals::step(duration, Ts, at, low, high))
+pub fn step(py: Python<'_>, duration: f64, Ts: f64, at: f64, low: f64, high: f64) -> Signal<'_> {
+    made(py, || signals::step(duration, Ts, at, low, high))
 }
 
 #[pyfunction]
 #[pyo3(signature = (*, Ts, levels, hold))]
-#[allow(non_snake_case)]
-fn staircase<'py>(
-    py: Python<'py>,
-    Ts: f64,
-    levels: PyReadonlyArray1<'py, f64>,
-    hold: f64,
-) -> Signal<'py> {
+pub fn staircase<'py>(py: Python<'py>, Ts: f64, levels: Values<'py>, hold: f64) -> Signal<'py> {
     let levels = slice(&levels, "levels")?;
-    released(py, || signals::staircase(Ts, levels, hold))
+    made(py, || signals::staircase(Ts, levels, hold))
 }
 
-#[pyfunction]
-#[pyo3(signature = (*, duration, Ts, start, rise, hold, fall, low, high))]
-#[allow(non_snake_case, clippy::too_many_arguments)]
-fn trapezoid(
-    py: Python<'_>,
-    duration: f64,
-    Ts: f64,
-    start: f64,
-    rise: f64,
-    hold: f64,
-    fall: f64,
-    low: f64,
-    high: f64,
-) -> Signal<'_> {
-    let shape = Trapezoid {
-        duration,
-        start,
-        rise,
-        hold,
-        fall,
-        low,
-        high,
+/// A signal with the fields of a settings struct as keywords, and its arguments of `generate`.
+macro_rules! signal {
+    ($name:ident, $of:ident { $($field:ident: $kind:ty),* }, $($given:ident: $type:ty),*) => {
+        #[pyfunction]
+        #[pyo3(signature = (*, $($given),*, $($field),*))]
+        pub fn $name(py: Python<'_>, $($given: $type,)* $($field: $kind),*) -> Signal<'_> {
+            made(py, || $of { $($field),* }.generate($($given),*))
+        }
     };
-    released(py, || shape.generate(Ts))
 }
+
+signal!(trapezoid, Trapezoid {
+    duration: f64, start: f64, rise: f64, hold: f64, fall: f64, low: f64, high: f64
+}, Ts: f64);
+signal!(multisine, Multisine {
+    duration: f64, f_low: f64, f_high: f64, amplitude: f64, offset: f64
+}, Ts: f64, seed: u64);
+signal!(jumps, Jumps {
+    duration: f64, speed_low: f64, speed_high: f64, change_min: f64, level_min: f64, level_max: f64,
+    hold_min: f64, hold_max: f64, ramp: f64, gain: f64, acceleration: f64
+}, Ts: f64, seed: u64);
 
 #[pyfunction]
 #[pyo3(signature = (*, duration, Ts, f_start, f_end, amplitude_start, amplitude_end, offset_start, offset_end,
     sweep = "linear", phase = -std::f64::consts::FRAC_PI_2))]
-#[allow(non_snake_case, clippy::too_many_arguments)]
-fn chirp<'py>(
+pub fn chirp<'py>(
     py: Python<'py>,
     duration: f64,
     Ts: f64,
@@ -103,10 +72,10 @@ fn chirp<'py>(
         amplitude_end,
         offset_start,
         offset_end,
-        sweep: sweep_named(sweep).map_err(|e| raise(py, e))?,
+        sweep: sweep_named(sweep).raised(py)?,
         phase,
     };
-    released(py, || chirp.generate(Ts))
+    made(py, || chirp.generate(Ts))
 }
 
 fn sweep_named(name: &str) -> Result<Sweep> {
@@ -121,8 +90,7 @@ fn sweep_named(name: &str) -> Result<Sweep> {
 
 #[pyfunction]
 #[pyo3(signature = (*, duration, Ts, low, high, hold_min, hold_max, smoothing, seed, start = None))]
-#[allow(non_snake_case, clippy::too_many_arguments)]
-fn random_steps(
+pub fn random_steps(
     py: Python<'_>,
     duration: f64,
     Ts: f64,
@@ -143,13 +111,12 @@ fn random_steps(
         smoothing,
         start,
     };
-    released(py, || steps.generate(Ts, seed))
+    made(py, || steps.generate(Ts, seed))
 }
 
 #[pyfunction]
 #[pyo3(signature = (*, duration, Ts, low, high, hold, seed))]
-#[allow(non_snake_case)]
-fn prbs(
+pub fn prbs(
     py: Python<'_>,
     duration: f64,
     Ts: f64,
@@ -158,74 +125,14 @@ fn prbs(
     hold: f64,
     seed: u64,
 ) -> Signal<'_> {
-    released(py, || signals::prbs(duration, Ts, low, high, hold, seed))
-}
-
-#[pyfunction]
-#[pyo3(signature = (*, duration, Ts, f_low, f_high, amplitude, offset, seed))]
-#[allow(non_snake_case, clippy::too_many_arguments)]
-fn multisine(
-    py: Python<'_>,
-    duration: f64,
-    Ts: f64,
-    f_low: f64,
-    f_high: f64,
-    amplitude: f64,
-    offset: f64,
-    seed: u64,
-) -> Signal<'_> {
-    let multisine = Multisine {
-        duration,
-        f_low,
-        f_high,
-        amplitude,
-        offset,
-    };
-    released(py, || multisine.generate(Ts, seed))
-}
-
-#[pyfunction]
-#[pyo3(signature = (*, duration, Ts, speed_low, speed_high, change_min, level_min, level_max, hold_min, hold_max,
-    ramp, gain, acceleration, seed))]
-#[allow(non_snake_case, clippy::too_many_arguments)]
-fn jumps(
-    py: Python<'_>,
-    duration: f64,
-    Ts: f64,
-    speed_low: f64,
-    speed_high: f64,
-    change_min: f64,
-    level_min: f64,
-    level_max: f64,
-    hold_min: f64,
-    hold_max: f64,
-    ramp: f64,
-    gain: f64,
-    acceleration: f64,
-    seed: u64,
-) -> Signal<'_> {
-    let jumps = Jumps {
-        duration,
-        speed_low,
-        speed_high,
-        change_min,
-        level_min,
-        level_max,
-        hold_min,
-        hold_max,
-        ramp,
-        gain,
-        acceleration,
-    };
-    released(py, || jumps.generate(Ts, seed))
+    made(py, || signals::prbs(duration, Ts, low, high, hold, seed))
 }
 
 #[pyfunction]
 #[pyo3(signature = (signal, *, Ts, low, high, rate, slew))]
-#[allow(non_snake_case)]
-fn limit<'py>(
+pub fn limit<'py>(
     py: Python<'py>,
-    signal: PyReadonlyArray1<'py, f64>,
+    signal: Values<'py>,
     Ts: f64,
     low: f64,
     high: f64,
@@ -239,32 +146,29 @@ fn limit<'py>(
         slew,
     };
     let signal = slice(&signal, "signal")?;
-    released(py, || limits.apply(signal, Ts))
+    made(py, || limits.apply(signal, Ts))
 }
 
 #[pyfunction]
-fn crest_factor(py: Python<'_>, signal: PyReadonlyArray1<'_, f64>) -> PyResult<f64> {
-    signals::crest_factor(slice(&signal, "signal")?).map_err(|e| raise(py, e))
+pub fn crest_factor(py: Python<'_>, signal: Values<'_>) -> PyResult<f64> {
+    signals::crest_factor(slice(&signal, "signal")?).raised(py)
 }
-
-type Counts<'py> = PyReadonlyArray1<'py, f64>;
 
 fn of_counts<'py>(
     py: Python<'py>,
-    counts: &Counts<'py>,
+    counts: &Values<'py>,
     work: impl FnOnce(&[f64]) -> Result<Vec<f64>> + Send,
 ) -> Signal<'py> {
     let counts = slice(counts, "counts")?;
-    let values = py.detach(|| work(counts)).map_err(|e| raise(py, e))?;
+    let values = released(py, || work(counts))?;
     Ok(array1(py, values))
 }
 
 #[pyfunction]
 #[pyo3(signature = (counts, *, Ts, counts_per_unit))]
-#[allow(non_snake_case)]
-fn speed_difference<'py>(
+pub fn speed_difference<'py>(
     py: Python<'py>,
-    counts: Counts<'py>,
+    counts: Values<'py>,
     Ts: f64,
     counts_per_unit: f64,
 ) -> Signal<'py> {
@@ -275,10 +179,9 @@ fn speed_difference<'py>(
 
 #[pyfunction]
 #[pyo3(signature = (counts, *, Ts, counts_per_unit, window, order))]
-#[allow(non_snake_case)]
-fn speed_savgol<'py>(
+pub fn speed_savgol<'py>(
     py: Python<'py>,
-    counts: Counts<'py>,
+    counts: Values<'py>,
     Ts: f64,
     counts_per_unit: f64,
     window: usize,
@@ -292,10 +195,9 @@ fn speed_savgol<'py>(
 #[pyfunction]
 #[pyo3(signature = (counts, *, Ts, counts_per_unit, process_noise = None, ripple_orders = Vec::new(),
     counts_per_rev = 1.0))]
-#[allow(non_snake_case)]
-fn speed_kalman<'py>(
+pub fn speed_kalman<'py>(
     py: Python<'py>,
-    counts: Counts<'py>,
+    counts: Values<'py>,
     Ts: f64,
     counts_per_unit: f64,
     process_noise: Option<f64>,
@@ -314,6 +216,6 @@ fn speed_kalman<'py>(
 
 #[pyfunction]
 #[pyo3(signature = (counts, *, bits))]
-fn unwrap_counts<'py>(py: Python<'py>, counts: Counts<'py>, bits: u32) -> Signal<'py> {
+pub fn unwrap_counts<'py>(py: Python<'py>, counts: Values<'py>, bits: u32) -> Signal<'py> {
     of_counts(py, &counts, |counts| speed::unwrap(counts, bits))
 }

@@ -150,11 +150,8 @@ fn several_members_share_a_table_that_is_best_for_their_mean() {
     let of_both = |table: &[f64]| -> f64 {
         let each = [&slow, &fast].map(|model| {
             let member = member(model, &controller);
-            squares(
-                &Ran::new(&member, Knots::new(r.len(), 0), table)
-                    .unwrap()
-                    .error(&r),
-            )
+            let ran = Ran::new(&member, Knots::new(r.len(), 0), table).unwrap();
+            rmse(&r, &ran.y).powi(2)
         });
         each.iter().sum()
     };
@@ -189,7 +186,7 @@ fn learned(models: &[Member<'_>], machine: &Member<'_>, r: &[f64], preview: usiz
         let played = added(&table, &learner.signal(&c).unwrap());
         let ran = Ran::new(machine, learner.knots, &played).unwrap();
         let error = ran.error(r);
-        errors.push(rms(&error));
+        errors.push(rmse(r, &ran.y));
         c = learner.next(&c, &error, 1.0).unwrap().0;
     }
     errors

@@ -20,8 +20,10 @@ const REACH: f64 = 1.05;
 const CHEAP: f64 = 0.25;
 /// Added to the diagonal of the normal equations, relative to its mean.
 const RIDGE: f64 = 1e-8;
-/// Doublings until the pull to the centre is strong enough, and halvings to find the strength needed.
-const PULLS: (usize, usize) = (200, 40);
+/// Doublings until the pull to the centre is strong enough.
+const DOUBLINGS: usize = 200;
+/// Halvings to find the strength needed.
+const HALVINGS: usize = 40;
 
 /// Coefficients of a quadratic function.
 fn coefficients(dimensions: usize) -> usize {
@@ -197,22 +199,9 @@ impl Model {
             let step = self.boxed(&self.cost.plus(weight, excess), radius)?;
             (excess.at(&step) <= 0.0).then_some(step)
         };
-        let (mut low, mut high) = (0.0, self.cost.slope.norm() / excess.slope.norm());
-        let doubled = (0..PULLS.1).find_map(|_| {
-            high *= 2.0;
-            within(high)
-        });
-        let Some(mut best) = doubled else {
-            return self.boxed(excess, radius).map(|step| self.place(&step));
-        };
-        for _ in 0..PULLS.1 {
-            let middle = 0.5 * (low + high);
-            match within(middle) {
-                Some(step) => (best, high) = (step, middle),
-                None => low = middle,
-            }
-        }
-        Some(self.place(&best))
+        let start = self.cost.slope.norm() / excess.slope.norm();
+        let found = weakest(start, HALVINGS, within).or_else(|| self.boxed(excess, radius))?;
+        Some(self.place(&found))
     }
 
     fn place(&self, step: &DVector<f64>) -> DVector<f64> {
@@ -248,21 +237,10 @@ impl Model {
         if let Some(step) = inside(0.0) {
             return Some(step);
         }
-        let (mut low, mut high) = (0.0, of.curvature.norm() / self.metric.norm());
-        let doubled = (0..PULLS.0).find_map(|_| {
-            high *= 2.0;
-            inside(high)
-        });
+        let start = of.curvature.norm() / self.metric.norm();
+        let strongest = start * 2.0_f64.powi(DOUBLINGS as i32);
         // Coordinates fixed at the edge may already lie beyond the radius.
-        let mut best = doubled.or_else(|| self.pulled(of, fixed, high))?;
-        for _ in 0..PULLS.1 {
-            let middle = 0.5 * (low + high);
-            match inside(middle) {
-                Some(step) => (best, high) = (step, middle),
-                None => low = middle,
-            }
-        }
-        Some(best)
+        weakest(start, DOUBLINGS, inside).or_else(|| self.pulled(of, fixed, strongest))
     }
 
     /// Solves `(H + pull M) d = -g` for the free coordinates; `None` if that is no minimum.
@@ -278,6 +256,24 @@ impl Model {
         }
         step.iter().all(|x| x.is_finite()).then_some(step)
     }
+}
+
+/// The result of the least strength that has one, by doubling from `start` and then halving; `None` after so many doublings
+/// without a result.
+fn weakest<T>(start: f64, doublings: usize, of: impl Fn(f64) -> Option<T>) -> Option<T> {
+    let (mut low, mut high) = (0.0, start);
+    let mut best = (0..doublings).find_map(|_| {
+        high *= 2.0;
+        of(high)
+    })?;
+    for _ in 0..HALVINGS {
+        let middle = 0.5 * (low + high);
+        match of(middle) {
+            Some(found) => (best, high) = (found, middle),
+            None => low = middle,
+        }
+    }
+    Some(best)
 }
 
 /// Coefficients of `1, z, z_i z_j` fitted to values less `base`, and the standard deviation of the residuals; near points, and those with

@@ -1,6 +1,6 @@
 //! Bindings of the controller, one sample at a time, in double precision and in the single precision of most microcontrollers.
 
-use numpy::{PyReadonlyArray1, PyReadonlyArray2};
+use crate::seam::{Raised, Rows, Values, raise, slice};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::{
@@ -9,17 +9,6 @@ use sewfast_control::{
 };
 use sewfast_core::inverse::{self, Local};
 use sewfast_core::{Error, Result as CoreResult};
-
-use crate::seam::{raise, slice};
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<Controller>()?;
-    module.add_class::<SingleController>()?;
-    module.add_class::<StateFeedback>()?;
-    module.add_class::<SingleStateFeedback>()?;
-    module.add_function(wrap_pyfunction!(biquad, module)?)?;
-    module.add_function(wrap_pyfunction!(inverse_taps, module)?)
-}
 
 /// The controller's arithmetic (paper Fig. 16). Gains in standard form.
 #[pyclass(module = "sewfast._core")]
@@ -64,7 +53,6 @@ pub fn cascade(sections: &[Section]) -> Result<Cascade<f64>, Refused> {
 /// The coefficients of a biquad of `kind` with its numbers, at sample time `Ts` \[s\].
 #[pyfunction]
 #[pyo3(signature = (kind, numbers, *, Ts))]
-#[expect(non_snake_case, reason = "the field's names")]
 pub fn biquad(py: Python<'_>, kind: &str, numbers: Vec<f64>, Ts: f64) -> PyResult<Section> {
     let made = match (kind, &numbers[..]) {
         ("notch", &[frequency, depth, width]) => Biquad::notch(frequency, depth, width, Ts),
@@ -96,19 +84,12 @@ fn feedforward(given: &Option<Ahead>) -> Result<Feedforward<f64>, Refused> {
 }
 
 /// A, B, C, D of one input, its delay [samples], and the slope of the levels.
-type Point1<'py> = (
-    PyReadonlyArray2<'py, f64>,
-    PyReadonlyArray1<'py, f64>,
-    PyReadonlyArray1<'py, f64>,
-    f64,
-    usize,
-    f64,
-);
+type Point1<'py> = (Rows<'py>, Values<'py>, Values<'py>, f64, usize, f64);
 
 /// The taps of a feedforward on plants linearised about levels, for each pair of preview and smoothing.
 #[pyfunction]
 #[pyo3(signature = (points, choices, *, count))]
-fn inverse_taps(
+pub fn inverse_taps(
     py: Python<'_>,
     points: Vec<Point1<'_>>,
     choices: Vec<(usize, f64)>,
@@ -129,7 +110,7 @@ fn inverse_taps(
     let each = choices.iter();
     each.map(|&(preview, smoothing)| inverse::taps(&plants, preview, count, smoothing))
         .collect::<CoreResult<_>>()
-        .map_err(|e| raise(py, e))
+        .raised(py)
 }
 
 fn schedule(rows: &[Given]) -> Result<Schedule<f64>, Refused> {
@@ -214,12 +195,12 @@ macro_rules! controller_methods {
                     Err(_) => *self.core.design(),
                 };
                 let done = self.core.set_design(design);
-                done.map_err(|refused| raise(py, Error::from(refused)))
+                done.raised(py)
             }
 
             fn set_manual(&mut self, py: Python<'_>, u: $float) -> PyResult<()> {
                 let done = self.core.set_manual(u);
-                done.map_err(|refused| raise(py, Error::from(refused)))
+                done.raised(py)
             }
 
             fn set_automatic(&mut self) {
@@ -296,8 +277,6 @@ macro_rules! controller_methods {
 controller_methods!(Controller, f64 {
     #[new]
     #[pyo3(signature = (*, Kp, Ti, Td, alpha, beta, N, Tt, u_min, u_max, slew, Ts, filter_samples, filter_time, observer_time=0.0, r_rate=f64::INFINITY, schedule=Vec::new(), biquads=Vec::new(), feedforward=None))]
-    #[expect(non_snake_case, reason = "the field's names")]
-    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
         py: Python<'_>,
         Kp: f64,
@@ -347,14 +326,14 @@ controller_methods!(Controller, f64 {
                 feedforward: self::feedforward(&feedforward)?,
             })
         });
-        let core = made.map_err(|refused| raise(py, Error::from(refused)))?;
+        let core = made.raised(py)?;
         Ok(Self { core })
     }
 
     /// The same settings in single precision.
     fn single(&self, py: Python<'_>) -> PyResult<SingleController> {
         let made = single(self.core.design()).and_then(Core::new);
-        let core = made.map_err(|refused| raise(py, Error::from(refused)))?;
+        let core = made.raised(py)?;
         Ok(SingleController { core })
     }
 });
@@ -418,8 +397,6 @@ macro_rules! state_feedback_methods {
 state_feedback_methods!(StateFeedback, f64 {
     #[new]
     #[pyo3(signature = (*, num, den, rho, integral, noise, weight, lead, r_rate, u_min, u_max, slew, Ts))]
-    #[expect(non_snake_case, reason = "the field's names")]
-    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
         py: Python<'_>,
         num: [f64; STATES],
@@ -459,14 +436,14 @@ state_feedback_methods!(StateFeedback, f64 {
             weights,
         };
         let made = lqg(plant, weights).and_then(States::new);
-        let core = made.map_err(|refused| raise(py, Error::from(refused)))?;
+        let core = made.raised(py)?;
         Ok(Self { core })
     }
 
     /// The same gains in single precision.
     fn single(&self, py: Python<'_>) -> PyResult<SingleStateFeedback> {
         let made = States::new(self.core.design().single());
-        let core = made.map_err(|refused| raise(py, Error::from(refused)))?;
+        let core = made.raised(py)?;
         Ok(SingleStateFeedback { core })
     }
 

@@ -9,18 +9,8 @@ use sewfast_core::profile::Reach;
 use sewfast_core::{Error, Result};
 
 use super::controller::AnyGiven;
-use super::{AnyPlant, Model, Values};
-use crate::seam::{array1, raise, slice, watched};
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<MoveLearner>()?;
-    module.add_function(wrap_pyfunction!(plan_move, module)?)?;
-    module.add_function(wrap_pyfunction!(reach, module)?)?;
-    module.add_function(wrap_pyfunction!(constant_reach, module)?)?;
-    module.add_function(wrap_pyfunction!(profile, module)?)
-}
-
-type Samples<'py> = Bound<'py, numpy::PyArray1<f64>>;
+use super::{AnyPlant, Model};
+use crate::seam::{Raised, Values, Vector, array1, released, slice, watched};
 
 fn models(plants: &[Bound<'_, PyAny>]) -> PyResult<Vec<Model>> {
     plants.iter().map(Model::of).collect()
@@ -55,7 +45,7 @@ fn preview(design: &AnyDesign<f64>) -> usize {
 /// The table of a move for a controller on these plants.
 #[pyfunction]
 #[pyo3(signature = (plants, controller, reference, *, counted, threads, progress=None))]
-fn plan_move<'py>(
+pub fn plan_move<'py>(
     py: Python<'py>,
     plants: Vec<Bound<'py, PyAny>>,
     controller: AnyGiven<'py>,
@@ -70,19 +60,15 @@ fn plan_move<'py>(
         let members = members(&models, &design, counted, &[(1.0, 0)])?;
         moves::plan(&members, reference, preview(&design), threads, monitor)
     })?;
-    let dict = PyDict::new(py);
-    dict.set_item("setpoint", array1(py, found.setpoint))?;
-    dict.set_item("y", array1(py, found.y))?;
-    dict.set_item("u", array1(py, found.u))?;
-    dict.set_item("errors", found.errors)?;
-    dict.set_item("limited", found.limited)?;
-    dict.set_item("interrupted", found.interrupted)?;
-    Ok(dict)
+    Ok(dict! { py;
+        "setpoint" => array1(py, found.setpoint), "y" => array1(py, found.y), "u" => array1(py, found.u),
+        "errors" => found.errors, "limited" => found.limited, "interrupted" => found.interrupted,
+    })
 }
 
 /// Improves the table of a move from the errors of its repetitions.
 #[pyclass(module = "sewfast._core")]
-struct MoveLearner {
+pub struct MoveLearner {
     core: moves::Learner,
 }
 
@@ -90,7 +76,6 @@ struct MoveLearner {
 impl MoveLearner {
     #[new]
     #[pyo3(signature = (plants, controller, reference, table, *, variations, counted, threads, progress=None))]
-    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
         py: Python<'_>,
         plants: Vec<Bound<'_, PyAny>>,
@@ -127,9 +112,9 @@ impl MoveLearner {
         self.core.contraction
     }
 
-    fn signal<'py>(&self, py: Python<'py>, correction: Values<'py>) -> PyResult<Samples<'py>> {
+    fn signal<'py>(&self, py: Python<'py>, correction: Values<'py>) -> PyResult<Vector<'py>> {
         let found = self.core.signal(slice(&correction, "correction")?);
-        Ok(array1(py, found.map_err(|e| raise(py, e))?))
+        Ok(array1(py, found.raised(py)?))
     }
 
     /// The next correction, and the error that is left by it.
@@ -139,10 +124,9 @@ impl MoveLearner {
         correction: Values<'py>,
         error: Values<'py>,
         gain: f64,
-    ) -> PyResult<(Samples<'py>, Samples<'py>)> {
+    ) -> PyResult<(Vector<'py>, Vector<'py>)> {
         let (correction, error) = (slice(&correction, "correction")?, slice(&error, "error")?);
-        let found = py.detach(|| self.core.next(correction, error, gain));
-        let (next, left) = found.map_err(|e| raise(py, e))?;
+        let (next, left) = released(py, || self.core.next(correction, error, gain))?;
         Ok((array1(py, next), array1(py, left)))
     }
 }
@@ -159,8 +143,7 @@ fn told(of: Reach) -> Reached {
 /// What all of these plants can do by a share of their rates.
 #[pyfunction]
 #[pyo3(signature = (plants, *, Ts, u, levels, share))]
-#[expect(non_snake_case, reason = "the field's name for the sample time")]
-fn reach(
+pub fn reach(
     py: Python<'_>,
     plants: Vec<Bound<'_, PyAny>>,
     Ts: f64,
@@ -182,17 +165,21 @@ fn reach(
 /// The same bounds at every level.
 #[pyfunction]
 #[pyo3(signature = (*, low, high, rate, jerk))]
-fn constant_reach(py: Python<'_>, low: f64, high: f64, rate: f64, jerk: f64) -> PyResult<Reached> {
+pub fn constant_reach(
+    py: Python<'_>,
+    low: f64,
+    high: f64,
+    rate: f64,
+    jerk: f64,
+) -> PyResult<Reached> {
     let made = Reach::constant(low, high, rate, jerk);
-    made.map(told).map_err(|e| raise(py, e))
+    made.map(told).raised(py)
 }
 
 /// A reference within a reach and further bounds of levels, rate and jerk, and whether levels, rate and jerk were at their bounds.
 #[pyfunction]
 #[pyo3(signature = (reference, reach, *, Ts, low, high, rate, jerk))]
-#[expect(non_snake_case, reason = "the field's name for the sample time")]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-fn profile<'py>(
+pub fn profile<'py>(
     py: Python<'py>,
     reference: Values<'py>,
     reach: Reached,
@@ -201,7 +188,7 @@ fn profile<'py>(
     high: f64,
     rate: f64,
     jerk: f64,
-) -> PyResult<(Samples<'py>, [bool; 3])> {
+) -> PyResult<(Vector<'py>, [bool; 3])> {
     let reference = slice(&reference, "reference")?;
     let (least, most, levels, up, down, own) = reach;
     let found = watched(py, None, |_| {

@@ -11,23 +11,14 @@ use sewfast_core::tune::{self as tuning, Method, Objective, Tuned, Variable, ter
 use sewfast_core::{Error, Result};
 
 use super::controller::AnyGiven;
-use super::{Values, named};
-use crate::seam::{array1, raise, slice, watched};
+use super::named;
+use crate::seam::{Raised, Values, array1, slice, watched};
 use task::{Asked, Given};
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_function(wrap_pyfunction!(cost_terms, module)?)?;
-    module.add_function(wrap_pyfunction!(tuning_costs, module)?)?;
-    module.add_function(wrap_pyfunction!(tuning_loads, module)?)?;
-    module.add_function(wrap_pyfunction!(pareto, module)?)?;
-    module.add_function(wrap_pyfunction!(tune, module)?)
-}
 
 /// What a run was like, term by term.
 #[pyfunction]
 #[pyo3(signature = (reference, u, y, *, u_min, u_max, Ts))]
-#[expect(non_snake_case, reason = "the field's name for the sample time")]
-fn cost_terms<'py>(
+pub fn cost_terms<'py>(
     py: Python<'py>,
     reference: Values<'py>,
     u: Values<'py>,
@@ -42,7 +33,7 @@ fn cost_terms<'py>(
         y: slice(&y, "y")?.to_vec(),
         ..Run::default()
     };
-    let terms = terms(reference, &run, (u_min, u_max), Ts).map_err(|e| raise(py, e))?;
+    let terms = terms(reference, &run, (u_min, u_max), Ts).raised(py)?;
     named(
         py,
         [
@@ -80,7 +71,7 @@ fn options(evaluations: usize, seed: u64, threads: usize) -> Options {
 /// The best controller, and how the search found it.
 #[pyfunction]
 #[pyo3(signature = (task, *, method, evaluations, seed, threads, progress=None))]
-fn tune<'py>(
+pub fn tune<'py>(
     py: Python<'py>,
     task: Asked<'py>,
     method: &str,
@@ -90,7 +81,7 @@ fn tune<'py>(
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let given = Given::new(py, &task)?;
-    let method = self::method(method).map_err(|e| raise(py, e))?;
+    let method = self::method(method).raised(py)?;
     let options = options(evaluations, seed, threads);
     let tuned = watched(py, progress, |monitor| {
         given.with(monitor, |task| tuning::tune(task, method, options, monitor))
@@ -130,7 +121,7 @@ fn values(variables: &[Variable], design: &AnyDesign<f64>) -> Vec<f64> {
 /// What controllers cost, and by how much they violate the constraints.
 #[pyfunction]
 #[pyo3(signature = (task, controllers, *, threads, progress=None))]
-fn tuning_costs<'py>(
+pub fn tuning_costs<'py>(
     py: Python<'py>,
     task: Asked<'py>,
     controllers: Vec<AnyGiven<'py>>,
@@ -157,7 +148,7 @@ fn designs(controllers: &[AnyGiven<'_>]) -> Vec<AnyDesign<f64>> {
 
 /// Recovery [ms] and rms deviation [y] of each plant in each variation under the load steps, the worst of these.
 #[pyfunction]
-fn tuning_loads<'py>(py: Python<'py>, task: Asked<'py>) -> PyResult<Vec<(f64, f64)>> {
+pub fn tuning_loads<'py>(py: Python<'py>, task: Asked<'py>) -> PyResult<Vec<(f64, f64)>> {
     let given = Given::new(py, &task)?;
     let did = watched(py, None, |monitor| {
         given.with(monitor, |task| tuning::loaded(task, &task.start, monitor))
@@ -168,8 +159,7 @@ fn tuning_loads<'py>(py: Python<'py>, task: Asked<'py>) -> PyResult<Vec<(f64, f6
 /// Controllers of which none is better than another in everything.
 #[pyfunction]
 #[pyo3(signature = (task, *, others, objectives, size, evaluations, seed, threads, progress=None))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-fn pareto<'py>(
+pub fn pareto<'py>(
     py: Python<'py>,
     task: Asked<'py>,
     others: Vec<AnyGiven<'py>>,
@@ -185,7 +175,7 @@ fn pareto<'py>(
         .iter()
         .map(|name| Objective::named(name))
         .collect::<Result<_>>()
-        .map_err(|e| raise(py, e))?;
+        .raised(py)?;
     let mut starts = vec![given.start];
     starts.extend(designs(&others));
     let options = options(evaluations, seed, threads);

@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_core::hammerstein::{self, Knots};
@@ -10,20 +9,11 @@ use sewfast_core::lagged::{Lagged, Lags};
 use sewfast_core::output_error::Fit;
 use sewfast_core::{Error, arx, innovations, iv, linear, oe};
 
-use super::{Kind, Model, Rows, Values};
-use crate::seam::{Experiments, array1, array2, raise, records, rows, samples, slice, watched};
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<LinearModel>()?;
-    module.add_class::<LinearFit>()?;
-    module.add_function(wrap_pyfunction!(fit_arx, module)?)?;
-    module.add_function(wrap_pyfunction!(fit_iv, module)?)?;
-    module.add_function(wrap_pyfunction!(fit_innovations, module)?)?;
-    module.add_function(wrap_pyfunction!(fit_oe, module)?)?;
-    module.add_class::<HammersteinWiener>()?;
-    module.add_class::<HammersteinWienerFit>()?;
-    module.add_function(wrap_pyfunction!(fit_hammerstein_wiener, module)?)
-}
+use super::{Kind, Model};
+use crate::seam::{
+    Experiments, Matrix, Raised, Rows, Values, Vector, array1, array2, raise, records, released,
+    rows, samples, slice, watched,
+};
 
 /// A linear difference equation with offset.
 #[pyclass(frozen, extends = Model, module = "sewfast._core")]
@@ -54,16 +44,16 @@ impl LinearModel {
         let (b, _) = rows(&b, "b")?;
         linear::LinearModel::new(slice(&a, "a")?.to_vec(), b.to_vec(), channels, nk, offset)
             .map(Self::wrapped)
-            .map_err(|e| raise(py, e))
+            .raised(py)
     }
 
     #[getter]
-    fn a<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+    fn a<'py>(&self, py: Python<'py>) -> Vector<'py> {
         array1(py, self.inner.a().to_vec())
     }
 
     #[getter]
-    fn b<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    fn b<'py>(&self, py: Python<'py>) -> PyResult<Matrix<'py>> {
         array2(py, self.inner.b().to_vec(), self.inner.lags().nb)
     }
 
@@ -87,7 +77,7 @@ impl LinearModel {
         self.inner.is_stable()
     }
 
-    fn poles<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    fn poles<'py>(&self, py: Python<'py>) -> PyResult<Matrix<'py>> {
         let pairs = self
             .inner
             .poles()
@@ -97,7 +87,7 @@ impl LinearModel {
         array2(py, pairs, 2)
     }
 
-    fn dc_gain<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+    fn dc_gain<'py>(&self, py: Python<'py>) -> Vector<'py> {
         array1(py, self.inner.dc_gain())
     }
 }
@@ -115,26 +105,26 @@ fit_methods!(LinearFit {
     }
 
     #[getter]
-    fn initial_states<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    fn initial_states<'py>(&self, py: Python<'py>) -> PyResult<Matrix<'py>> {
         let states = self.inner.initial_states.concat();
         array2(py, states, self.inner.model.lags().na)
     }
 
     #[getter]
-    fn covariance<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    fn covariance<'py>(&self, py: Python<'py>) -> PyResult<Matrix<'py>> {
         let rows = self.inner.covariance.clone();
         array2(py, rows, self.inner.model.parameters())
     }
 
     #[getter]
-    fn standard_errors<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+    fn standard_errors<'py>(&self, py: Python<'py>) -> Vector<'py> {
         array1(py, self.inner.standard_errors())
     }
 });
 
 #[pyfunction]
 #[pyo3(signature = (experiments, *, na, nb, nk, offset))]
-fn fit_arx(
+pub fn fit_arx(
     py: Python<'_>,
     experiments: Experiments<'_>,
     na: usize,
@@ -143,7 +133,7 @@ fn fit_arx(
     offset: bool,
 ) -> PyResult<Py<LinearModel>> {
     let samples = samples(py, &experiments)?;
-    let inner = super::released(py, || arx::fit_samples(&samples, na, nb, nk, offset))?;
+    let inner = released(py, || arx::fit_samples(&samples, na, nb, nk, offset))?;
     LinearModel::object(py, inner)
 }
 
@@ -151,8 +141,7 @@ fn fit_arx(
 #[pyo3(signature = (
     experiments, *, na, nb, nk, offset = true, max_iterations = 100, initial = None, progress = None
 ))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-fn fit_oe(
+pub fn fit_oe(
     py: Python<'_>,
     experiments: Experiments<'_>,
     na: usize,
@@ -185,8 +174,7 @@ fn fit_oe(
 
 #[pyfunction]
 #[pyo3(signature = (experiments, *, na, nb, nk, offset = true, max_iterations = 50, progress = None))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-fn fit_iv(
+pub fn fit_iv(
     py: Python<'_>,
     experiments: Experiments<'_>,
     na: usize,
@@ -205,7 +193,7 @@ fn fit_iv(
 
 #[pyfunction]
 #[pyo3(signature = (experiments, *, nk = None, max_iterations = 60, progress = None))]
-fn fit_innovations(
+pub fn fit_innovations(
     py: Python<'_>,
     experiments: Experiments<'_>,
     nk: Option<usize>,
@@ -237,7 +225,6 @@ impl Kind for HammersteinWiener {
 impl HammersteinWiener {
     #[new]
     #[pyo3(signature = (*, na, nb, nk, input_low, input_high, input_pieces, x_low, x_high, output_pieces, theta))]
-    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
         py: Python<'_>,
         na: usize,
@@ -270,7 +257,7 @@ impl HammersteinWiener {
         Lags::new(na, nb, nk, low.len().max(high.len()))
             .and_then(|lags| hammerstein::HammersteinWiener::new(lags, &inputs, output, theta))
             .map(Self::wrapped)
-            .map_err(|e| raise(py, e))
+            .raised(py)
     }
 
     #[getter]
@@ -281,17 +268,11 @@ impl HammersteinWiener {
             self.inner.output_knots(),
         );
         let ends = |of: fn(&Knots) -> f64| array1(py, inputs.iter().map(of).collect());
-        let settings = PyDict::new(py);
-        settings.set_item("na", lags.na)?;
-        settings.set_item("nb", lags.nb)?;
-        settings.set_item("nk", lags.nk)?;
-        settings.set_item("input_low", ends(|k| k.low))?;
-        settings.set_item("input_high", ends(|k| k.high))?;
-        settings.set_item("input_pieces", inputs[0].pieces)?;
-        settings.set_item("x_low", output.low)?;
-        settings.set_item("x_high", output.high)?;
-        settings.set_item("output_pieces", output.pieces)?;
-        Ok(settings)
+        Ok(dict! { py;
+            "na" => lags.na, "nb" => lags.nb, "nk" => lags.nk, "input_low" => ends(|k| k.low),
+            "input_high" => ends(|k| k.high), "input_pieces" => inputs[0].pieces, "x_low" => output.low,
+            "x_high" => output.high, "output_pieces" => output.pieces,
+        })
     }
 
     fn input_curve<'py>(
@@ -299,15 +280,11 @@ impl HammersteinWiener {
         py: Python<'py>,
         input: usize,
         u: Values<'py>,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    ) -> PyResult<Vector<'py>> {
         Ok(array1(py, self.inner.input_curve(input, slice(&u, "u")?)))
     }
 
-    fn output_curve<'py>(
-        &self,
-        py: Python<'py>,
-        x: Values<'py>,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    fn output_curve<'py>(&self, py: Python<'py>, x: Values<'py>) -> PyResult<Vector<'py>> {
         Ok(array1(py, self.inner.output_curve(slice(&x, "x")?)))
     }
 }
@@ -325,7 +302,7 @@ fit_methods!(HammersteinWienerFit {
     }
 
     #[getter]
-    fn initial_states<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    fn initial_states<'py>(&self, py: Python<'py>) -> PyResult<Matrix<'py>> {
         let states = self.inner.initial_states.concat();
         array2(py, states, self.inner.model.lags().na)
     }
@@ -335,8 +312,7 @@ fit_methods!(HammersteinWienerFit {
 #[pyo3(signature = (
     experiments, *, na, nb, nk, input_pieces, output_pieces, max_iterations = 100, progress = None
 ))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-fn fit_hammerstein_wiener(
+pub fn fit_hammerstein_wiener(
     py: Python<'_>,
     experiments: Experiments<'_>,
     na: usize,

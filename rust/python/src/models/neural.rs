@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_core::lagged::{Lagged, Lags};
@@ -10,14 +9,11 @@ use sewfast_core::neural::{self, InitialState, Scaling, Settings, Shape};
 use sewfast_core::{Error, Result};
 
 use super::linear::LinearModel;
-use super::{Kind, Model, Rows, Values};
-use crate::seam::{Experiments, array1, array2, raise, records, rows, slice, watched};
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<NeuralOE>()?;
-    module.add_class::<NeuralFit>()?;
-    module.add_function(wrap_pyfunction!(fit_neural_oe, module)?)
-}
+use super::{Kind, Model};
+use crate::seam::{
+    Experiments, Matrix, Raised, Rows, Values, Vector, array1, array2, raise, records, rows, slice,
+    watched,
+};
 
 /// Network output-error model.
 #[pyclass(frozen, extends = Model, module = "sewfast._core")]
@@ -38,7 +34,6 @@ impl Kind for NeuralOE {
 impl NeuralOE {
     #[new]
     #[pyo3(signature = (*, na, nb, nk, n_inputs, hidden, bypass, theta, u_mean, u_scale, y_mean, y_scale, output_low, output_high))]
-    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
         py: Python<'_>,
         na: usize,
@@ -70,27 +65,20 @@ impl NeuralOE {
             .and_then(|lags| Shape::new(lags, hidden, bypass))
             .and_then(|shape| neural::NeuralOE::new(shape, theta, scaling, limits))
             .map(Self::wrapped)
-            .map_err(|e| raise(py, e))
+            .raised(py)
     }
 
     #[getter]
     fn settings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let (shape, scaling) = (self.inner.shape(), self.inner.scaling());
         let limit = |value: f64| value.is_finite().then_some(value);
-        let settings = PyDict::new(py);
-        settings.set_item("na", shape.lags.na)?;
-        settings.set_item("nb", shape.lags.nb)?;
-        settings.set_item("nk", shape.lags.nk)?;
-        settings.set_item("n_inputs", shape.lags.channels)?;
-        settings.set_item("hidden", shape.hidden)?;
-        settings.set_item("bypass", shape.bypass)?;
-        settings.set_item("u_mean", array1(py, scaling.u_mean.clone()))?;
-        settings.set_item("u_scale", array1(py, scaling.u_scale.clone()))?;
-        settings.set_item("y_mean", scaling.y_mean)?;
-        settings.set_item("y_scale", scaling.y_scale)?;
-        settings.set_item("output_low", limit(self.inner.limits().0))?;
-        settings.set_item("output_high", limit(self.inner.limits().1))?;
-        Ok(settings)
+        Ok(dict! { py;
+            "na" => shape.lags.na, "nb" => shape.lags.nb, "nk" => shape.lags.nk,
+            "n_inputs" => shape.lags.channels, "hidden" => shape.hidden, "bypass" => shape.bypass,
+            "u_mean" => array1(py, scaling.u_mean.clone()), "u_scale" => array1(py, scaling.u_scale.clone()),
+            "y_mean" => scaling.y_mean, "y_scale" => scaling.y_scale,
+            "output_low" => limit(self.inner.limits().0), "output_high" => limit(self.inner.limits().1),
+        })
     }
 
     #[getter]
@@ -123,7 +111,7 @@ started_fit_methods!(NeuralFit {
     }
 
     #[getter]
-    fn initial_states<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    fn initial_states<'py>(&self, py: Python<'py>) -> PyResult<Matrix<'py>> {
         let states = self.inner.initial_states.concat();
         array2(py, states, self.inner.model.lags().na)
     }
@@ -135,8 +123,7 @@ started_fit_methods!(NeuralFit {
     initial_state, weight_decay, max_iterations, starts, seed, threads, initial_theta = None,
     progress = None
 ))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-fn fit_neural_oe(
+pub fn fit_neural_oe(
     py: Python<'_>,
     experiments: Experiments<'_>,
     validation: Experiments<'_>,
@@ -177,7 +164,7 @@ fn fit_neural_oe(
         linear: linear.map(|l| l.inner.as_ref().clone()),
         scaling,
         saturate,
-        initial_state: parsed(initial_state).map_err(|e| raise(py, e))?,
+        initial_state: parsed(initial_state).raised(py)?,
         weight_decay,
         max_iterations,
         starts,

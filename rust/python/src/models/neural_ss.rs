@@ -11,14 +11,10 @@ use sewfast_core::neural_ss::{
 use sewfast_core::{Error, Result};
 
 use super::linear::LinearModel;
-use super::{Kind, Model, Rows, Values};
-use crate::seam::{Experiment, array1, array2, raise, rows, slice, watched};
-
-pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<NeuralSS>()?;
-    module.add_class::<NeuralSSFit>()?;
-    module.add_function(wrap_pyfunction!(fit_neural_ss, module)?)
-}
+use super::{Kind, Model};
+use crate::seam::{
+    Experiment, Raised, Rows, Values, Vector, array1, array2, raise, released, rows, slice, watched,
+};
 
 /// Outputs: one per sample, or rows of several.
 pub(super) type Outputs<'py> = PyReadonlyArrayDyn<'py, f64>;
@@ -48,7 +44,6 @@ impl NeuralSS {
         *, nx, nk, n_inputs, n_outputs, hidden, integrator, output, output_parameters, theta, u_mean, u_scale, y_mean,
         y_scale, state_mean, state_covariance, residual_variance, process_noise
     ))]
-    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
         py: Python<'_>,
         nx: usize,
@@ -93,7 +88,7 @@ impl NeuralSS {
         OutputFunction::new(output, slice(&output_parameters, "output_parameters")?)
             .and_then(|output| neural_ss::NeuralSS::new(shape, output, theta, scaling, statistics))
             .map(Self::wrapped)
-            .map_err(|e| raise(py, e))
+            .raised(py)
     }
 
     #[getter]
@@ -110,20 +105,14 @@ impl NeuralSS {
     fn settings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let (shape, scaling) = (self.inner.shape(), self.inner.scaling());
         let (output, statistics) = (self.inner.output(), self.inner.statistics());
-        let settings = PyDict::new(py);
-        settings.set_item("nx", shape.nx)?;
-        settings.set_item("nk", shape.nk)?;
-        settings.set_item("n_inputs", shape.inputs)?;
-        settings.set_item("n_outputs", shape.outputs)?;
-        settings.set_item("hidden", shape.hidden)?;
-        settings.set_item("integrator", shape.integrator)?;
-        settings.set_item("output", output.name())?;
-        settings.set_item("output_parameters", array1(py, output.parameters()))?;
-        settings.set_item("u_mean", array1(py, scaling.u_mean.clone()))?;
-        settings.set_item("u_scale", array1(py, scaling.u_scale.clone()))?;
-        settings.set_item("y_mean", array1(py, scaling.y_mean.clone()))?;
-        settings.set_item("y_scale", array1(py, scaling.y_scale.clone()))?;
-        settings.set_item("state_mean", array1(py, statistics.state_mean.clone()))?;
+        let settings = dict! { py;
+            "nx" => shape.nx, "nk" => shape.nk, "n_inputs" => shape.inputs, "n_outputs" => shape.outputs,
+            "hidden" => shape.hidden, "integrator" => shape.integrator, "output" => output.name(),
+            "output_parameters" => array1(py, output.parameters()),
+            "u_mean" => array1(py, scaling.u_mean.clone()), "u_scale" => array1(py, scaling.u_scale.clone()),
+            "y_mean" => array1(py, scaling.y_mean.clone()), "y_scale" => array1(py, scaling.y_scale.clone()),
+            "state_mean" => array1(py, statistics.state_mean.clone()),
+        };
         let covariance = array2(py, statistics.state_covariance.clone(), shape.nx)?;
         settings.set_item("state_covariance", covariance)?;
         let variance = array1(py, statistics.residual_variance.clone());
@@ -134,12 +123,12 @@ impl NeuralSS {
 
     fn slowed(&self, py: Python<'_>, factor: f64) -> PyResult<Py<Self>> {
         let slowed = self.inner.slowed(factor);
-        Self::object(py, slowed.map_err(|e| raise(py, e))?)
+        Self::object(py, slowed.raised(py)?)
     }
 
     fn grown(&self, py: Python<'_>, nx: usize, hidden: usize, seed: u64) -> PyResult<Py<Self>> {
         let grown = self.inner.grown(nx, hidden, seed);
-        Self::object(py, grown.map_err(|e| raise(py, e))?)
+        Self::object(py, grown.raised(py)?)
     }
 
     fn simulate<'py>(
@@ -149,7 +138,7 @@ impl NeuralSS {
         state: Values<'py>,
     ) -> PyResult<Array<'py>> {
         let ((u, channels), state) = (rows(&u, "u")?, slice(&state, "state")?);
-        let run = super::released(py, || self.inner.simulate(u, channels, state))?;
+        let run = released(py, || self.inner.simulate(u, channels, state))?;
         self.outputs(py, run)
     }
 
@@ -160,7 +149,7 @@ impl NeuralSS {
         state: Values<'py>,
     ) -> PyResult<Array<'py>> {
         let ((u, channels), state) = (rows(&u, "u")?, slice(&state, "state")?);
-        let states = super::released(py, || self.inner.states(u, channels, state))?;
+        let states = released(py, || self.inner.states(u, channels, state))?;
         shaped(py, states, &[self.inner.shape().nx])
     }
 
@@ -174,7 +163,7 @@ impl NeuralSS {
     ) -> PyResult<Array<'py>> {
         let ((u, channels), state) = (rows(&u, "u")?, slice(&state, "state")?);
         let (y, _) = outputs(py, &y)?;
-        let run = super::released(py, || self.inner.predict(u, channels, y, state, horizon))?;
+        let run = released(py, || self.inner.predict(u, channels, y, state, horizon))?;
         self.outputs(py, run)
     }
 
@@ -183,9 +172,9 @@ impl NeuralSS {
         py: Python<'py>,
         u: Rows<'py>,
         y: Outputs<'py>,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    ) -> PyResult<Vector<'py>> {
         let ((u, channels), (y, _)) = (rows(&u, "u")?, outputs(py, &y)?);
-        let state = super::released(py, || self.inner.estimate_initial_state(u, channels, y))?;
+        let state = released(py, || self.inner.estimate_initial_state(u, channels, y))?;
         Ok(array1(py, state))
     }
 
@@ -196,7 +185,7 @@ impl NeuralSS {
         state: Values<'py>,
     ) -> PyResult<(Array<'py>, Array<'py>)> {
         let ((u, channels), state) = (rows(&u, "u")?, slice(&state, "state")?);
-        let (run, jacobian) = super::released(py, || self.inner.jacobian(u, channels, state))?;
+        let (run, jacobian) = released(py, || self.inner.jacobian(u, channels, state))?;
         let shape = self.inner.shape();
         let columns = shape.parameters() + shape.nx;
         let jacobian = match shape.outputs {
@@ -257,7 +246,7 @@ pub(super) fn recordings<'a>(
         let ((y, count), weights) = (outputs(py, &experiment.y)?, experiment.weights()?);
         let recording = Recording::new(u, inputs, y, count);
         let weighted = recording.and_then(|r| weights.map_or(Ok(r), |w| r.with_weights(w)));
-        weighted.map_err(|e| raise(py, e))
+        weighted.raised(py)
     };
     experiments.iter().map(recording).collect()
 }
@@ -304,8 +293,7 @@ started_fit_methods!(NeuralSSFit {
     experiments, validation, *, nx, nk, hidden, linear, output, output_parameters, integrator, weight_decay,
     hidden_scale, max_iterations, starts, first_start, seed, threads, initial = None, guard = true, progress = None
 ))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-fn fit_neural_ss(
+pub fn fit_neural_ss(
     py: Python<'_>,
     experiments: Experiments<'_>,
     validation: Experiments<'_>,
@@ -336,7 +324,7 @@ fn fit_neural_ss(
         hidden,
         linear: linear.map(|l| l.inner.as_ref().clone()),
         initial: initial.iter().map(|m| m.inner.as_ref().clone()).collect(),
-        output: output.map_err(|e| raise(py, e))?,
+        output: output.raised(py)?,
         integrator,
         weight_decay,
         hidden_scale,

@@ -12,9 +12,9 @@ use sewfast_core::tune::{
 use sewfast_core::{Error, Monitor, Result, loop_transfer as linear};
 
 use super::super::controller::AnyGiven;
-use super::super::{AnyPlant, Model, Values};
+use super::super::{AnyPlant, Model};
 use crate::loop_transfer::{Lines, measured};
-use crate::seam::{raise, slice};
+use crate::seam::{Raised, Values, slice};
 
 /// A variable by its name, with its bounds unless they are the usual ones.
 type Wanted = (String, Option<(f64, f64)>);
@@ -145,7 +145,7 @@ type Fraction<'py> = (Values<'py>, Values<'py>);
 fn loops(given: &[Fraction<'_>]) -> PyResult<Vec<linear::Changing>> {
     let plant = |(num, den): &Fraction<'_>| {
         let (num, den) = (slice(num, "num")?, slice(den, "den")?);
-        let plant = linear::Plant::new(num, den).map_err(|e| raise(given[0].0.py(), e))?;
+        let plant = linear::Plant::new(num, den).raised(given[0].0.py())?;
         Ok(linear::Changing::new(plant))
     };
     given.iter().map(plant).collect()
@@ -153,7 +153,6 @@ fn loops(given: &[Fraction<'_>]) -> PyResult<Vec<linear::Changing>> {
 
 impl Given {
     pub fn new(py: Python<'_>, asked: &Asked<'_>) -> PyResult<Self> {
-        let refused = |e| raise(py, e);
         let start = asked.start.design();
         let owned = |name: &'static str, signals: &[Values<'_>]| -> PyResult<Vec<Vec<f64>>> {
             let samples = |s: &Values<'_>| slice(s, name).map(<[f64]>::to_vec);
@@ -177,9 +176,9 @@ impl Given {
             variations: asked.variations.clone(),
             counts_per_unit: asked.counts_per_unit,
             start,
-            variables: variables(&asked.variables, &start).map_err(refused)?,
-            cost: cost(&asked.cost).map_err(refused)?,
-            aggregate: aggregate(&asked.aggregate).map_err(refused)?,
+            variables: variables(&asked.variables, &start).raised(py)?,
+            cost: cost(&asked.cost).raised(py)?,
+            aggregate: aggregate(&asked.aggregate).raised(py)?,
             ms: limits.ms,
             overshoot: limits.overshoot,
             u: limits.u,
