@@ -1008,20 +1008,6 @@ def effort(u: _F, *, u_min: float, u_max: float) -> dict[str, float]:
 def step_metrics(y: _F, reference: _F, *, Ts: float, smoothing: float) -> dict[str, float]:
     """rise_time_ms, reference_rise_time_ms, overshoot_percent of a response to a step or trapezoid."""
 
-# --- search.rs --------------------------------------------------------------------------------------------
-
-def search_least(
-    function: Callable[[_F], float], dimensions: int, *, method: str, evaluations: int, seed: int,
-    start: Sequence[float] | None = None, tolerance: float = 1e-8,
-) -> dict[str, Any]:
-    """x, value, trace of the least value of a function over the unit box; an exception of it ends the search."""
-
-def search_front(
-    function: Callable[[_F], Sequence[float]], dimensions: int, objectives: int, *, size: int, evaluations: int,
-    seed: int,
-) -> dict[str, Any]:
-    """points and values of a Pareto front of least values over the unit box (NSGA-II)."""
-
 # --- link.rs: see docs/PROTOCOL.md ------------------------------------------------------------------------
 
 def link_frame(kind: int, tag: int, sequence: int, time: int, body: bytes) -> bytes:
