@@ -49,6 +49,16 @@ def milliseconds(value: float | None) -> str:
     return NONE if value is None else f"{value:.0f}{_SPACE}ms"
 
 
+class Shown:
+    """A result that a notebook shows as the table of its text; `repr` is the first line of that."""
+
+    def _repr_html_(self) -> str:
+        return html_of(str(self))
+
+    def __repr__(self) -> str:
+        return f"<{str(self).splitlines()[0]}>"
+
+
 def html_of(text: str) -> str:
     """Lines of text, `name: value` or `name   value`, as a table; the first line is its caption."""
     caption, *lines = text.splitlines()

@@ -9,8 +9,8 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
-from .control.controller import SampledController
 from .arrays import bridged
+from .control.controller import SampledController
 from .control.defaults import default_references
 from .control.loop import (
     ClosedLoopRun,

@@ -59,22 +59,22 @@ def add(commands: Commands) -> None:
 
 def deploy_command(args: argparse.Namespace) -> None:
     from sewfast import storage
-    from sewfast.control.controller import FORMAT as CONTROLLER
+    from sewfast.control.controller import Controller
     from sewfast.control.files import load_pid
-    from sewfast.dynamic_model import FORMAT as MODEL
+    from sewfast.dynamic_model import DynamicModel
     from sewfast.errors import ModelFileError
     from sewfast.models import load_model
 
     from .code import deploy
 
     found = storage.format_of(args.file)
-    if found not in ("", CONTROLLER, MODEL):
+    if found not in ("", Controller.FORMAT, DynamicModel.FORMAT):
         raise ModelFileError(
             name=args.file, expected="a model or a controller",
             received=f"a file of format {found!r}",
             remedy="`sewfast identify` and `sewfast tune` write those",
         )  # fmt: skip
-    what = load_pid(args.file) if found == CONTROLLER else load_model(args.file)
+    what = load_pid(args.file) if found == Controller.FORMAT else load_model(args.file)
     done = deploy(
         what, args.folder, to=args.to, precision=args.precision, name=args.prefix,
         changeable=args.changeable,
