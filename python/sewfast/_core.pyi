@@ -261,7 +261,7 @@ class NeuralOE(Model):
 class NeuralSS(Model):
     """Neural state-space model (docs/CONVENTIONS.md); theta = [A, B, E, Wx, Wu, bh, C, D, c, G], row by row.
 
-    States are in scaled units. With one output, runs are (N,) and rows (N, n); with ny outputs (N, ny) and (N, ny, n).
+    States are in scaled units. Of outputs there is one: ``n_outputs`` is 1, and its mean, scale and variance are (1,).
     """
 
     def __new__(
@@ -288,12 +288,6 @@ class NeuralSS(Model):
         """
     def states(self, u: _F, state: _F) -> _F:
         """States of the free run, (N, nx)."""
-    def simulate(self, u: _F, state: _F) -> _F: ...
-    def predict(self, u: _F, y: _F, state: _F, horizon: int) -> _F:
-        """Extended Kalman filter up to sample k - horizon, then free run; NaN in y is not used."""
-    def estimate_initial_state(self, u: _F, y: _F) -> _F:
-        """Maximum a posteriori, (nx,); NaN in y does not count."""
-    def jacobian(self, u: _F, state: _F) -> tuple[_F, _F]: ...
 
 GREYBOX_UNITS: int
 
@@ -540,7 +534,7 @@ def fit_neural_ss(
 ) -> NeuralSSFit:
     """Train in free run; each start is stopped and judged on ``validation``, without it on the training data.
 
-    y is (N,) or (N, ny); NaN in it has no weight. Scaled units are means and standard deviations of the training data;
+    NaN in y has no weight. Scaled units are means and standard deviations of the training data;
     with output 'abs' y_mean is 0 and y_scale the root mean square. ``linear`` has na = nx, nb <= nx + 1 and the same nk;
     without it a start begins with random states. Start i of the seed is ``first_start + i`` here: starts spread over
     several calls, or over threads (0 uses all), have the same bits. With ``initial`` nothing is drawn: start i trains
@@ -1010,20 +1004,6 @@ def effort(u: _F, *, u_min: float, u_max: float) -> dict[str, float]:
 
 def step_metrics(y: _F, reference: _F, *, Ts: float, smoothing: float) -> dict[str, float]:
     """rise_time_ms, reference_rise_time_ms, overshoot_percent of a response to a step or trapezoid."""
-
-# --- search.rs --------------------------------------------------------------------------------------------
-
-def search_least(
-    function: Callable[[_F], float], dimensions: int, *, method: str, evaluations: int, seed: int,
-    start: Sequence[float] | None = None, tolerance: float = 1e-8,
-) -> dict[str, Any]:
-    """x, value, trace of the least value of a function over the unit box; an exception of it ends the search."""
-
-def search_front(
-    function: Callable[[_F], Sequence[float]], dimensions: int, objectives: int, *, size: int, evaluations: int,
-    seed: int,
-) -> dict[str, Any]:
-    """points and values of a Pareto front of least values over the unit box (NSGA-II)."""
 
 # --- link.rs: see docs/PROTOCOL.md ------------------------------------------------------------------------
 

@@ -28,8 +28,6 @@ from .equilibrium import linearise
 from .errors import DataError, SettingError, SewfastError
 from .tables import html_of
 
-FORMAT = "sewfast.model"
-VERSION = 1
 INIT = 20
 """Default number of samples that determine the initial state."""
 
@@ -83,12 +81,15 @@ class Core(Protocol):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DynamicModel(ABC):
+class DynamicModel(ABC, storage.Stored):
     """A model of one plant that can run, in the units of the data it was identified from.
 
     The interface for validation and evidence; users have a `sewfast.Model`, which builds on them
     and documents the parameters.
     """
+
+    FORMAT: ClassVar[str] = "sewfast.model"
+    VERSION: ClassVar[int] = 1
 
     core: Any
     Ts: float
@@ -415,16 +416,6 @@ class DynamicModel(ABC):
             "parameters": self.parameters(),
             "training": dict(self.training),
         }
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the model as versioned JSON for `load_model`; the file is complete or absent.
-
-        Raises
-        ------
-        ModelFileError
-            If the file cannot be written.
-        """
-        storage.write(path, FORMAT, VERSION, self.to_dict())
 
     def __eq__(self, other: object) -> bool:
         """Whether both have the same kind, numbers, names, units and provenance, as in a file."""

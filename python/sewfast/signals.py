@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,99 +73,32 @@ class Signal:
         )
 
 
-def _excitation(
-    name: str, duration: float, description: str, shape: Callable[[int], FloatArray]
+def _named_signal(
+    unit: str,
+    name: str,
+    description: str,
+    make: Callable[..., FloatArray],
+    *,
+    is_random: bool = False,
+    **settings: Any,
 ) -> Signal:
-    return Signal(name, "V", duration, description, -20.0, 20.0, math.inf, shape)
+    """An excitation or a reference within its limits: `make` with the settings and, if it is
+    random, the seed.
+    """
+
+    def shape(seed: int) -> FloatArray:
+        return make(Ts=TS, **settings, **({"seed": seed} if is_random else {}))
+
+    limits = {"V": (-20.0, 20.0, math.inf), "RPM": (0.0, 3500.0, 20_000.0)}[unit]
+    return Signal(name, unit, settings["duration"], description, *limits, shape)
 
 
-def _reference(
-    name: str, duration: float, description: str, shape: Callable[[int], FloatArray]
-) -> Signal:
-    return Signal(name, "RPM", duration, description, 0.0, 3500.0, 20_000.0, shape)
+_excitation, _reference = partial(_named_signal, "V"), partial(_named_signal, "RPM")
 
 
-def _chirp(amplitude: tuple[float, float], offset: tuple[float, float]) -> FloatArray:
-    return _core.chirp(
-        duration=20.0,
-        Ts=TS,
-        f_start=0.1,
-        f_end=3.0,
-        amplitude_start=amplitude[0],
-        amplitude_end=amplitude[1],
-        offset_start=offset[0],
-        offset_end=offset[1],
-    )
-
-
-def _random_voltage(seed: int) -> FloatArray:
-    return _core.random_steps(
-        duration=20.0,
-        Ts=TS,
-        low=0.3,
-        high=6.0,
-        hold_min=0.1,
-        hold_max=0.8,
-        smoothing=0.04,
-        seed=seed,
-    )
-
-
-def _random_speed(seed: int) -> FloatArray:
-    return _core.random_steps(
-        duration=10.0,
-        Ts=TS,
-        low=200.0,
-        high=2000.0,
-        hold_min=0.25,
-        hold_max=0.9,
-        smoothing=0.2,
-        seed=seed,
-        start=0.0,
-    )
-
-
-def _multisine(seed: int) -> FloatArray:
-    return _core.multisine(
-        duration=20.0, Ts=TS, f_low=0.1, f_high=5.0, amplitude=2.7, offset=3.2, seed=seed
-    )
-
-
-def _saturating(seed: int) -> FloatArray:
-    return _core.jumps(
-        duration=20.0,
-        Ts=TS,
-        speed_low=200.0,
-        speed_high=4300.0,
-        change_min=700.0,
-        level_min=16.0,
-        level_max=20.0,
-        hold_min=0.08,
-        hold_max=0.5,
-        ramp=0.0,
-        gain=GAIN,
-        acceleration=ACCELERATION,
-        seed=seed,
-    )
-
-
-def _saturating_2(seed: int) -> FloatArray:
-    # A stream other than that of `saturating` for the same seed.
-    return _core.jumps(
-        duration=15.0,
-        Ts=TS,
-        speed_low=500.0,
-        speed_high=4000.0,
-        change_min=1200.0,
-        level_min=18.0,
-        level_max=20.0,
-        hold_min=0.2,
-        hold_max=0.9,
-        ramp=0.02,
-        gain=GAIN,
-        acceleration=ACCELERATION,
-        seed=seed ^ 0x5EED_2,
-    )
+def _other_jumps(*, seed: int, **settings: Any) -> FloatArray:
+    # a stream other than that of `saturating` for the same seed
+    return _core.jumps(seed=seed ^ 0x5EED_2, **settings)
 
 
 #: Height [RPM], rise, hold, fall and pause after it [s] of the reference `trapezoids`.
@@ -178,125 +113,108 @@ TRAPEZOIDS = (
 )
 
 
-def _trapezoid(
-    height: float, rise: float, hold: float, fall: float, after: float, low: float = 0.0
-) -> FloatArray:
-    start = 0.1
-    return _core.trapezoid(
-        duration=start + rise + hold + fall + after,
-        Ts=TS,
-        start=start,
-        rise=rise,
-        hold=hold,
-        fall=fall,
-        low=low,
-        high=height,
-    )
+START = 0.1
+"""Time before a trapezoid [s]."""
 
 
-def _trapezoids(seed: int) -> FloatArray:
-    # speed between the trapezoids of the training reference
-    slow_rpm = 400.0
+def _trapezoids(*, duration: float, Ts: float) -> FloatArray:
     # Down to a low speed, not to rest: a crank held by friction shows nothing about the drive.
-    rise = np.linspace(0.0, slow_rpm, round(0.1 / TS))
-    return np.concatenate([rise, *(_trapezoid(*shape, low=slow_rpm) for shape in TRAPEZOIDS)])
+    slow_rpm = 400.0
+    parts = [np.linspace(0.0, slow_rpm, round(START / Ts))]
+    for height, rise, hold, fall, after in TRAPEZOIDS:
+        parts.append(
+            _core.trapezoid(
+                duration=START + rise + hold + fall + after, Ts=Ts, start=START, rise=rise,
+                hold=hold, fall=fall, low=slow_rpm, high=height,
+            )
+        )  # fmt: skip
+    return np.concatenate(parts)
 
 
 def _table(*signals: Signal) -> Mapping[str, Signal]:
     return MappingProxyType({signal.name: signal for signal in signals})
 
 
+_CHIRP: dict[str, Any] = {"duration": 20.0, "f_start": 0.1, "f_end": 3.0}
+_LEVELS = np.array([0.0, 0.5, 1, 2, 3, 4, 6, 5, 3.5, 2.5, 1.5, 0])
+
 EXCITATIONS = _table(
     _excitation(
-        "step",
-        3.0,
-        "0 to 5 V at 0.5 s; for the first-order fit",
-        lambda seed: _core.step(duration=3.0, Ts=TS, at=0.5, low=0.0, high=5.0),
+        "step", "0 to 5 V at 0.5 s; for the first-order fit", _core.step,
+        duration=3.0, at=0.5, low=0.0, high=5.0,
     ),
     _excitation(
-        "staircase",
-        12.0,
-        "0 to 6 V and back in steps of 1 to 2 V, 1 s each; for the steady gain",
-        lambda seed: _core.staircase(
-            Ts=TS, levels=np.array([0.0, 0.5, 1, 2, 3, 4, 6, 5, 3.5, 2.5, 1.5, 0]), hold=1.0
-        ),
+        "staircase", "0 to 6 V and back in steps of 1 to 2 V, 1 s each; for the steady gain",
+        lambda *, duration, Ts, hold: _core.staircase(Ts=Ts, levels=_LEVELS, hold=hold),
+        duration=12.0, hold=1.0,
     ),
     _excitation(
         "chirp_lo_hi",
-        20.0,
         "0.1 to 3 Hz, amplitude 0.5 growing to 4.6 V; the training record of the paper",
-        lambda seed: _chirp((0.5, 4.6), (1.0, 5.2)),
+        _core.chirp, **_CHIRP,
+        amplitude_start=0.5, amplitude_end=4.6, offset_start=1.0, offset_end=5.2,
     ),
     _excitation(
-        "chirp_hi_lo",
-        20.0,
-        "0.1 to 3 Hz, amplitude 3.4 shrinking to 0.5 V; for validation",
-        lambda seed: _chirp((3.4, 0.5), (3.65, 1.5)),
+        "chirp_hi_lo", "0.1 to 3 Hz, amplitude 3.4 shrinking to 0.5 V; for validation",
+        _core.chirp, **_CHIRP,
+        amplitude_start=3.4, amplitude_end=0.5, offset_start=3.65, offset_end=1.5,
     ),
     _excitation(
-        "random",
-        20.0,
-        "random levels 0.3 to 6 V, held 0.1 to 0.8 s, changes of 40 ms; for validation",
-        _random_voltage,
+        "random", "random levels 0.3 to 6 V, held 0.1 to 0.8 s, changes of 40 ms; for validation",
+        _core.random_steps, is_random=True,
+        duration=20.0, low=0.3, high=6.0, hold_min=0.1, hold_max=0.8, smoothing=0.04,
     ),
     _excitation(
-        "prbs",
-        20.0,
-        "maximum length sequence between 1 and 5 V, 50 ms a bit",
-        lambda seed: _core.prbs(duration=20.0, Ts=TS, low=1.0, high=5.0, hold=0.05, seed=seed),
+        "prbs", "maximum length sequence between 1 and 5 V, 50 ms a bit", _core.prbs,
+        is_random=True, duration=20.0, low=1.0, high=5.0, hold=0.05,
     ),
     _excitation(
         "multisine",
-        20.0,
         "random phases, every 0.05 Hz from 0.1 to 5 Hz, 0.5 to 5.9 V, crest factor 3 to 4",
-        _multisine,
+        _core.multisine, is_random=True,
+        duration=20.0, f_low=0.1, f_high=5.0, amplitude=2.7, offset=3.2,
     ),
     _excitation(
         "saturating",
-        20.0,
         "pulses of 16 to 20 V between speeds of 200 to 4,300 RPM; drives the current limit",
-        _saturating,
+        _core.jumps, is_random=True,
+        duration=20.0, speed_low=200.0, speed_high=4300.0, change_min=700.0, level_min=16.0,
+        level_max=20.0, hold_min=0.08, hold_max=0.5, ramp=0.0, gain=GAIN, acceleration=ACCELERATION,
     ),
     _excitation(
         "saturating_2",
-        15.0,
         "slanted pulses of 18 to 20 V, larger changes, longer holds; for tests, never trained on",
-        _saturating_2,
+        _other_jumps, is_random=True,
+        duration=15.0, speed_low=500.0, speed_high=4000.0, change_min=1200.0, level_min=18.0,
+        level_max=20.0, hold_min=0.2, hold_max=0.9, ramp=0.02, gain=GAIN, acceleration=ACCELERATION,
     ),
-)
+)  # fmt: skip
 
 REFERENCES = _table(
     _reference(
-        "trapezoid",
-        1.5,
-        "0 to 3,000 RPM in 150 ms, held 0.6 s, down in 150 ms",
-        lambda seed: _trapezoid(3000.0, 0.15, 0.6, 0.15, 0.5),
+        "trapezoid", "0 to 3,000 RPM in 150 ms, held 0.6 s, down in 150 ms", _core.trapezoid,
+        duration=1.5, start=START, rise=0.15, hold=0.6, fall=0.15, low=0.0, high=3000.0,
     ),
     _reference(
-        "chirp_hi_lo",
-        20.0,
-        "0.1 to 3 Hz, to 2,000 RPM, amplitude shrinking",
-        lambda seed: _chirp((1080.0, 150.0), (1080.0, 400.0)),
+        "chirp_hi_lo", "0.1 to 3 Hz, to 2,000 RPM, amplitude shrinking", _core.chirp, **_CHIRP,
+        amplitude_start=1080.0, amplitude_end=150.0, offset_start=1080.0, offset_end=400.0,
     ),
     _reference(
-        "chirp_lo_hi",
-        20.0,
-        "0.1 to 3 Hz, to 600 RPM, amplitude growing",
-        lambda seed: _chirp((50.0, 250.0), (50.0, 350.0)),
+        "chirp_lo_hi", "0.1 to 3 Hz, to 600 RPM, amplitude growing", _core.chirp, **_CHIRP,
+        amplitude_start=50.0, amplitude_end=250.0, offset_start=50.0, offset_end=350.0,
     ),
     _reference(
-        "random",
-        10.0,
-        "from rest, random levels 200 to 2,000 RPM, changes of 200 ms",
-        _random_speed,
+        "random", "from rest, random levels 200 to 2,000 RPM, changes of 200 ms",
+        _core.random_steps, is_random=True,
+        duration=10.0, low=200.0, high=2000.0, hold_min=0.25, hold_max=0.9, smoothing=0.2,
+        start=0.0,
     ),
     _reference(
         "trapezoids",
-        0.1 + sum(0.1 + sum(shape[1:]) for shape in TRAPEZOIDS),
         "seven trapezoids from 400 to 700-3,500 RPM, rises of 150 to 400 ms; to train on",
-        _trapezoids,
+        _trapezoids, duration=START + sum(START + sum(shape[1:]) for shape in TRAPEZOIDS),
     ),
-)
+)  # fmt: skip
 
 
 def excitation(name: str, seed: int = 0) -> FloatArray:

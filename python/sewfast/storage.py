@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -180,6 +180,27 @@ def write(
     replace(path, text)
 
 
+class Stored:
+    """A value with a file: its `to_dict` under a format and a version."""
+
+    FORMAT: ClassVar[str]
+    VERSION: ClassVar[int]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as JSON values."""
+        raise NotImplementedError
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it as JSON (docs/CONVENTIONS.md, Files); the file is either complete or absent.
+
+        Raises
+        ------
+        ModelFileError
+            If the file cannot be written.
+        """
+        write(path, self.FORMAT, self.VERSION, self.to_dict())
+
+
 def replace(path: str | os.PathLike[str], content: str | bytes) -> None:
     """As :func:`replace_file`, with an error that has a remedy: `ModelFileError`."""
     try:
@@ -324,6 +345,13 @@ class Fields:
                 raise self.refuse(name, f"one of {', '.join(known)}", self.values[name])
         for name in known:
             self.any(name)
+
+    def take(self, **names: str) -> dict[str, Any]:
+        """Fields by name, read by the method that each group is named after: `number="rmse Ts"`."""
+        return {
+            name: getattr(self, kind)(name) for kind, group in names.items()
+            for name in group.split()
+        }  # fmt: skip
 
     def any(self, name: str) -> Any:
         if name not in self.values:

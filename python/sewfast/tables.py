@@ -56,6 +56,16 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["  ".join(row).rstrip() for row in cells]
 
 
+class Shown:
+    """A result that a notebook shows as the table of its text; `repr` is the first line of that."""
+
+    def _repr_html_(self) -> str:
+        return html_of(str(self))
+
+    def __repr__(self) -> str:
+        return f"<{str(self).splitlines()[0]}>"
+
+
 def html_of(text: str) -> str:
     """Lines of text, `name: value` or `name   value`, as a table; the first line is its caption."""
     caption, *lines = text.splitlines()

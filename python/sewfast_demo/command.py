@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from sewfast.cli.arguments import Commands, add_command, add_overwrite
@@ -20,18 +19,17 @@ controller are written as well, ready for the other commands.
 """
 
 
+OPTIONS = """\
+--out DIR  path=demo  folder to fill (demo)
+--seed N  int=0  seed of the random signals and of every search (0)
+"""
+
+
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "demo", command,
-        summary="the whole experiment, with a report", text=TEXT,
+        summary="the whole experiment, with a report", text=TEXT, options=OPTIONS,
         examples="examples:\n  sewfast demo\n  sewfast demo --out second --seed 1",
-    )  # fmt: skip
-    parser.add_argument(
-        "--out", type=Path, default=Path("demo"), metavar="DIR", help="folder to fill (demo)"
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, metavar="N",
-        help="seed of the random signals and of every search (0)",
     )  # fmt: skip
     add_overwrite(parser)
 

@@ -36,53 +36,45 @@ try it:  cc -std=c99 firmware/controller.c firmware/controller_test.c && ./a.out
 """
 
 
+OPTIONS = """\
+file FILE.json  text  model or controller
+folder DIR  path  folder for the code
+--to  {c99,st,fmi,onnx}=c99  C99, structured text, FMU or ONNX (c99)
+--precision  {f32,f64}  precision of the arithmetic (f32; f64 for fmi, onnx)
+--changeable  flag  gains and limits of the controller can be changed while it runs (C99 only)
+"""
+
+
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "deploy", deploy_command,
         summary="a model or controller as C99, PLC code, FMU or ONNX",
-        text=DEPLOY, examples=EXAMPLES,
+        text=DEPLOY, options=OPTIONS, examples=EXAMPLES,
     )  # fmt: skip
-    parser.add_argument("file", metavar="FILE.json", help="model or controller")
-    parser.add_argument("folder", metavar="DIR", type=Path, help="folder for the code")
-    parser.add_argument(
-        "--to",
-        choices=("c99", "st", "fmi", "onnx"),
-        default="c99",
-        help="C99, structured text, FMU or ONNX (c99)",
-    )
-    parser.add_argument(
-        "--precision",
-        choices=("f32", "f64"),
-        help="precision of the arithmetic (f32; f64 for fmi, onnx)",
-    )
     parser.add_argument(
         "--name", dest="prefix", metavar="NAME",
         help="prefix of all names in the code; default: controller or model",
-    )  # fmt: skip
-    parser.add_argument(
-        "--changeable", action="store_true",
-        help="gains and limits of the controller can be changed while it runs (C99 only)",
     )  # fmt: skip
 
 
 def deploy_command(args: argparse.Namespace) -> None:
     from sewfast import storage
-    from sewfast.control.controller import FORMAT as CONTROLLER
+    from sewfast.control.controller import Controller
     from sewfast.control.files import load_pid
-    from sewfast.dynamic_model import FORMAT as MODEL
+    from sewfast.dynamic_model import DynamicModel
     from sewfast.errors import ModelFileError
     from sewfast.models import load_model
 
     from .code import deploy
 
     found = storage.format_of(args.file)
-    if found not in ("", CONTROLLER, MODEL):
+    if found not in ("", Controller.FORMAT, DynamicModel.FORMAT):
         raise ModelFileError(
             name=args.file, expected="a model or a controller",
             received=f"a file of format {found!r}",
             remedy="`sewfast identify` and `sewfast tune` write those",
         )  # fmt: skip
-    what = load_pid(args.file) if found == CONTROLLER else load_model(args.file)
+    what = load_pid(args.file) if found == Controller.FORMAT else load_model(args.file)
     done = deploy(
         what, args.folder, to=args.to, precision=args.precision, name=args.prefix,
         changeable=args.changeable,
@@ -123,10 +115,21 @@ LIMITS = "volt=10,speed=8000,acceleration=90000,current=inf"
 """Limits of the computed motor."""
 
 
+PIL_OPTIONS = """\
+--board  {mps2-an386,mps2-an500}  board to build for: a Cortex-M4 or a Cortex-M7 (mps2-an386)
+--out DIR  path=pil  folder for the results (pil)
+--clock  {credit,real}=credit  the board's time: granted by the host, or the computer's (credit)
+--watchdog MS  float  the board stops without a frame from this computer for this time (as for
+    `record`)
+--seed N  int=0  seed of the commissioning (0)
+"""
+
+
 def add_pil(commands: Commands) -> None:
     parser = add_command(
         commands, "pil", pil_command,
-        summary="the firmware on an emulated processor", text=PIL, examples=PIL_EXAMPLES,
+        summary="the firmware on an emulated processor",
+        text=PIL, options=PIL_OPTIONS, examples=PIL_EXAMPLES,
     )  # fmt: skip
     place = parser.add_mutually_exclusive_group()
     place.add_argument(
@@ -137,24 +140,6 @@ def add_pil(commands: Commands) -> None:
         "--firmware", type=Path, metavar="FILE.elf",
         help="a built firmware for either board",
     )  # fmt: skip
-    parser.add_argument(
-        "--board", choices=("mps2-an386", "mps2-an500"),
-        help="board to build for: a Cortex-M4 or a Cortex-M7 (mps2-an386)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--out", type=Path, default=Path("pil"), metavar="DIR", help="folder for the results (pil)"
-    )
-    parser.add_argument(
-        "--clock", choices=("credit", "real"), default="credit",
-        help="the board's time: granted by the host, or the computer's (credit)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--watchdog", type=float, metavar="MS",
-        help="the board stops without a frame from this computer for this time (as for `record`)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="seed of the commissioning (0)"
-    )
     parser.add_argument(
         "--no-commission", dest="commission", action="store_false", help="leave commissioning out"
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
-from pathlib import Path
 
 from sewfast.cli.arguments import Commands, add_command, add_plot, require_plot
 from sewfast.cli.output import DONE, INTERRUPTED, print_json
@@ -30,42 +29,32 @@ examples:
 """
 
 
+OPTIONS = """\
+recordings FOLDER|MANIFEST  text  recordings, or their list
+-o,--out OUT  path!  .csv, .json or .parquet
+--input COL  text...  column of the input; repeat it for several
+--output COL  text  column of the output; default: both by their names and units
+--ts,--Ts S  float  sample time [s]; default: the time column's
+--controller FILE.json  text  tune this controller for every model
+--before FILE  text  an earlier table, to find drift
+--scheduler ADDRESS  text  scheduler of a Dask cluster
+--workers N  int  processes on this computer (its cores); 0: in this process, without Dask
+--memory SIZE  text=500MB  of each worker (500MB)
+--seed N  int=0  seed of searches (0)
+"""
+
+
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "fleet", command,
-        summary="many recordings, one row each", text=TEXT, examples=EXAMPLES,
-    )  # fmt: skip
-    parser.add_argument("recordings", metavar="FOLDER|MANIFEST", help="recordings, or their list")
-    parser.add_argument(
-        "-o", "--out", required=True, type=Path, metavar="OUT", help=".csv, .json or .parquet"
-    )
-    parser.add_argument(
-        "--input", action="append", metavar="COL", help="column of the input; repeat it for several"
-    )
-    parser.add_argument(
-        "--output", metavar="COL",
-        help="column of the output; default: both by their names and units",
+        summary="many recordings, one row each", text=TEXT, options=OPTIONS, examples=EXAMPLES,
     )  # fmt: skip
     parser.set_defaults(columns_of="file", counts=None)
-    parser.add_argument(
-        "--ts", "--Ts", type=float, metavar="S", help="sample time [s]; default: the time column's"
-    )
     parser.add_argument(
         "--model", default="oe", choices=KINDS,
         help="kind of model (oe)",
     )  # fmt: skip
-    parser.add_argument(
-        "--controller", metavar="FILE.json", help="tune this controller for every model"
-    )
-    parser.add_argument("--before", metavar="FILE", help="an earlier table, to find drift")
     add_plot(parser, "draw gain, residence time and noise of every machine")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="scheduler of a Dask cluster")
-    parser.add_argument(
-        "--workers", type=int, metavar="N",
-        help="processes on this computer (its cores); 0: in this process, without Dask",
-    )  # fmt: skip
-    parser.add_argument("--memory", default="500MB", metavar="SIZE", help="of each worker (500MB)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of searches (0)")
 
 
 def command(args: argparse.Namespace) -> int:

@@ -30,20 +30,20 @@ examples:
 """
 
 
+OPTIONS = """\
+place FOLDER|FILE|PORT  text?  project folder (this one), a recording or model in it, or the port of
+    a drive
+--demo  flag  records and a model of the virtual machine
+--port N  int=0  default: a free one
+"""
+
+
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "studio", command,
         summary="look, identify, validate, tune on a local page",
-        text=TEXT, examples=EXAMPLES,
+        text=TEXT, options=OPTIONS, examples=EXAMPLES,
     )  # fmt: skip
-    parser.add_argument(
-        "place", nargs="?", metavar="FOLDER|FILE|PORT",
-        help="project folder (this one), a recording or model in it, or the port of a drive",
-    )  # fmt: skip
-    parser.add_argument(
-        "--demo", action="store_true", help="records and a model of the virtual machine"
-    )
-    parser.add_argument("--port", type=int, default=0, metavar="N", help="default: a free one")
     parser.add_argument(
         "--no-browser", dest="browser", action="store_false", help="only print the address"
     )

@@ -470,9 +470,8 @@ def _number(value: Any) -> str:
 
 def _document(controller: Controller) -> str:
     """The text of its file."""
-    from sewfast.control.controller import FORMAT, VERSION
-
-    return json.dumps({"format": FORMAT, "version": VERSION, **controller.to_dict()}, indent=1)
+    head = {"format": controller.FORMAT, "version": controller.VERSION}
+    return json.dumps({**head, **controller.to_dict()}, indent=1)
 
 
 def _word(text: str) -> str:

@@ -13,7 +13,7 @@ from plants import bent_data, linear_data
 from sewfast import _core
 from sewfast.control.loop import run
 from sewfast.dataset import Dataset
-from sewfast.dynamic_model import FORMAT, VERSION
+from sewfast.dynamic_model import DynamicModel
 from sewfast.errors import FitError, ModelFileError, SettingError
 from sewfast.models import Ensemble, LinearOE, Model, load_model, model_schema
 from sewfast.tuning import tune
@@ -166,7 +166,8 @@ def test_kept_files_follow_the_published_schema(path: Path) -> None:
 
 
 def edited(change: Any) -> dict[str, Any]:
-    values = copy.deepcopy({"format": FORMAT, "version": VERSION, **three().to_dict()})
+    head = {"format": DynamicModel.FORMAT, "version": DynamicModel.VERSION}
+    values = copy.deepcopy({**head, **three().to_dict()})
     change(values["parameters"])
     return values
 

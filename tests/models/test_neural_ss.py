@@ -94,29 +94,25 @@ def test_run_and_derivatives_agree_with_complex_steps() -> None:
     assert worst <= 1e-10
 
 
-def test_shapes_are_those_of_the_number_of_outputs() -> None:
-    rng = np.random.default_rng(1)
-    for outputs, columns in ((1, ()), (2, (2,))):
-        case = next(
-            c
-            for c in iter(lambda: neural_ss_equations.random_case(rng), None)
-            if c["settings"]["n_outputs"] == outputs
-        )
-        core, u, state = made(case), case["u"], case["state"]
-        run, rows = core.jacobian(u, state)
-        assert run.shape == (30, *columns)
-        assert rows.shape == (30, *columns, len(case["theta"]) + core.nx)
-        assert core.predict(u, run, state, 2).shape == run.shape
-        assert core.states(u, state).shape == (30, core.nx)
-        np.testing.assert_array_equal(core.states(u, state)[0], state)
+def test_runs_rows_and_states_have_their_shapes() -> None:
+    case = neural_ss_equations.random_case(np.random.default_rng(1))
+    core, u, state = made(case), case["u"], case["state"]
+    run, rows = core.jacobian(u, state)
+    assert run.shape == (30,)
+    assert rows.shape == (30, len(case["theta"]) + core.nx)
+    assert core.predict(u, run, state, 2).shape == run.shape
+    assert core.states(u, state).shape == (30, core.nx)
+    np.testing.assert_array_equal(core.states(u, state)[0], state)
+    with pytest.raises(SettingError, match="one output"):
+        made({**case, "settings": case["settings"] | {"n_outputs": 2}})
 
 
 def test_a_clean_record_gives_its_state_back() -> None:
     rng = np.random.default_rng(2)
-    for _ in range(30):
+    for _ in range(60):
         case = neural_ss_equations.random_case(rng, samples=60)
-        if case["settings"]["output"] == "abs":
-            continue  # which sign it was cannot always be told
+        if case["settings"]["output"] != "linear":
+            continue  # a sign that is lost, or a limit, can hide the state
         case["settings"]["residual_variance"][:] = 1e-12
         core = made(case)
         y = core.simulate(case["u"], case["state"])
@@ -189,7 +185,7 @@ def test_the_guard_says_in_words_what_is_wrong_with_a_model() -> None:
         TypeError, match="expected a LinearModel, a NeuralOE or a NeuralSS, got int"
     ):
         _core.guard(3, [(u, y)])  # type: ignore[arg-type]
-    with pytest.raises(DataError, match="1 inputs and 1 outputs"):
+    with pytest.raises(DataError, match="1 inputs in every experiment"):
         _core.guard(good, [(np.hstack([u, u]), y)])
 
 
@@ -245,21 +241,15 @@ def test_a_linear_model_with_offset_and_direct_input_is_realised(delay: int) -> 
     assert found.trace[0] < 1e-3
 
 
-def test_gaps_have_no_weight_and_outputs_may_be_several() -> None:
+def test_gaps_have_no_weight() -> None:
     u, y = bent(1500, 3)
-    both = np.column_stack([y, np.roll(y, 1) ** 2 / 300])
-    hidden = both.copy()
-    hidden[100:200, 0] = np.nan
-    hidden[300:500] = np.nan
-    one = fit([(u[:500], hidden[:500]), (u[500:], hidden[500:])], hidden=6, nx=3)
-    assert one.initial_states.shape == (2, 3)
-    spoilt = np.where(np.isnan(hidden), 1e9, hidden)
-    spoilt[np.isnan(hidden)] = np.nan
-    two = fit([(u[:500], spoilt[:500]), (u[500:], spoilt[500:])], hidden=6, nx=3)
-    np.testing.assert_array_equal(one.model.theta, two.model.theta)
-    run = one.model.simulate(u[:500], one.initial_states[0])
-    assert percent(both[:500, 0], run[:, 0]) > 97
-    assert percent(both[:500, 1], run[:, 1]) > 97
+    hidden = y.copy()
+    hidden[100:200] = np.nan
+    hidden[800:900] = np.nan
+    found = fit([(u[:500], hidden[:500]), (u[500:], hidden[500:])], hidden=6, nx=3)
+    assert found.initial_states.shape == (2, 3)
+    run = found.model.simulate(u[:500], found.initial_states[0])
+    assert percent(y[:500], run) > 97
 
 
 def test_validation_data_stop_and_rank_the_starts() -> None:
@@ -391,7 +381,7 @@ def test_unusable_records_are_refused() -> None:
         fit([])
     with pytest.raises(DataError, match="to change"):
         fit([(np.ones_like(u), y)])
-    with pytest.raises(DataError, match="some of them known"):
+    with pytest.raises(DataError, match="a measured output"):
         fit([(u, np.full(300, np.nan))])
     with pytest.raises(DataError, match="more than"):
         fit([(u[:20], y[:20])])
@@ -471,7 +461,7 @@ def test_a_twin_has_every_bit() -> None:
 
 def test_a_loop_is_closed_around_it() -> None:
     case = neural_ss_equations.random_case(np.random.default_rng(16))
-    while case["settings"]["n_inputs"] != 1 or case["settings"]["n_outputs"] != 1:
+    while case["settings"]["n_inputs"] != 1:
         case = neural_ss_equations.random_case(
             np.random.default_rng(int(1e6 * case["theta"][0] ** 2))
         )

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import subprocess
-import sys
 import time
 import tracemalloc
 import zipfile
@@ -31,39 +29,6 @@ from sewfast.recordfile.format import (
     RECORD,
     ZSTD,
 )
-
-
-def limited(code: str) -> subprocess.CompletedProcess[str]:
-    """A process that may take 4 GB: where it wants more it would be aborted."""
-    prelude = "import resource; resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))\n"
-    return subprocess.run(
-        [sys.executable, "-c", prelude + code], capture_output=True, text=True, timeout=120
-    )
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="the limit of the address space is Linux's")
-def test_no_argument_aborts_the_process() -> None:
-    done = limited("""
-from sewfast import _core
-from sewfast.errors import SettingError
-
-def refused(call):
-    try:
-        call()
-    except SettingError as e:
-        print(e)
-
-for size in (2001, 2**31 - 1, 10**10, 2**63):
-    refused(lambda: _core.search_front(min, 2, 2, size=size, evaluations=8, seed=0))
-refused(lambda: _core.search_front(lambda x: [0.0], 10**12, 1, size=8, evaluations=8, seed=0))
-for method in ("genetic", "cma-es"):
-    refused(lambda: _core.search_least(lambda x: 0.0, 10**12, method=method, evaluations=8, seed=0))
-print("alive")
-""")
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("expected a population of 4 to 2000") == 4
-    assert done.stdout.count("expected at most 1000 coordinates") == 3
-    assert done.stdout.endswith("alive\n")
 
 
 def test_a_horizon_beyond_the_record_is_the_free_run() -> None:

@@ -136,8 +136,8 @@ def _settle_plant(args: argparse.Namespace) -> None:
     a slip must not move a motor.
     """
     from .. import storage
-    from ..control.controller import FORMAT
-    from ..dynamic_model import FORMAT as MODEL
+    from ..control.controller import Controller
+    from ..dynamic_model import DynamicModel
 
     if (args.on is None) == (args.plant is None):
         received = "neither" if args.on is None else "both"
@@ -146,7 +146,7 @@ def _settle_plant(args: argparse.Namespace) -> None:
         )
     if args.plant is not None:
         formats = tuple(storage.format_of(path) for path in (args.controller, args.plant))
-        if formats == (MODEL, FORMAT):
+        if formats == (DynamicModel.FORMAT, Controller.FORMAT):
             args.controller, args.plant = args.plant, args.controller
         if is_port(args.plant):
             raise SettingError(
@@ -192,13 +192,13 @@ def _show_run(
 def plant_of(text: str) -> Plant:
     """The plant named by a text: `virtual[:SEED][?NAME=VALUE]`, a motor's file, or a model's."""
     from .. import storage
-    from ..greybox.motor import FORMAT, load_motor
+    from ..greybox.motor import Motor, load_motor
     from ..machine import VirtualMachine
     from ..models import load_model
 
     if re.match(r"virtual(?![\w.])", text) and not Path(text).exists():
         return VirtualMachine.from_name(text)
-    if storage.format_of(text) == FORMAT:
+    if storage.format_of(text) == Motor.FORMAT:
         return load_motor(text).machine()
     return load_model(text)
 

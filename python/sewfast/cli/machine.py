@@ -277,7 +277,7 @@ def _of_machine(
 def _of_record(args: argparse.Namespace) -> FrequencyResponse | ResponsesOverSpeed:
     from .. import storage
     from ..commissioning import bode, unsmoothed
-    from ..frequency import load_response, load_responses, response, speeds
+    from ..frequency import FrequencyResponse, ResponsesOverSpeed, load_response, load_responses
     from .data import read_training
 
     require_no_drive_options(args)
@@ -289,9 +289,9 @@ def _of_record(args: argparse.Namespace) -> FrequencyResponse | ResponsesOverSpe
             )  # fmt: skip
     if args.data.endswith(".json"):
         format = storage.format_of(args.data)
-        if format == speeds.FORMAT:
+        if format == ResponsesOverSpeed.FORMAT:
             return load_responses(args.data)
-        if format != response.FORMAT:
+        if format != FrequencyResponse.FORMAT:
             raise SettingError(
                 f"{args.data}: expected a recording or a response that `sewfast bode -o` wrote"
             )

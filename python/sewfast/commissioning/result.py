@@ -28,7 +28,7 @@ from ..recording import Recording
 from ..report.commissioned import FORMAT, NUMBERS, RESPONSE, VERSION, run_file
 from ..rules import Fopdt
 from ..storage import write_table
-from ..tables import html_of
+from ..tables import Shown
 from ..trust import Judgement
 from ..tuning.objective import Cost
 from ..tuning.search import TuningResult
@@ -44,7 +44,7 @@ UNREACHED = "predicted, target not reached"
 
 
 @dataclass(frozen=True, eq=False)
-class Commissioning:
+class Commissioning(Shown):
     """A controller with the evidence for it.
 
     Attributes
@@ -237,9 +237,6 @@ class Commissioning:
         ]
         units = shown.predicted.units
         return loop_drawing(traces, units["y"], units["u"]).plot(ax, file)
-
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
 
     def __str__(self) -> str:
         lines = [f"commissioning of {self.machine}: {self.verdict}"]

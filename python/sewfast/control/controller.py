@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -15,7 +14,7 @@ from ..arrays import FloatArray
 from ..errors import SettingError
 from ..gains import Gains, real, vector, whole
 from ..storage import Fields
-from ..tables import html_of
+from ..tables import Shown
 from ..units import counts_per_unit
 from .biquad import MOST, NUMBERS, Biquad
 from .feedforward import Feedforward
@@ -30,8 +29,6 @@ SETTINGS = (
 )  # fmt: skip
 """Variables of a search besides the gains, those of a schedule's points and the notches."""
 
-FORMAT = "sewfast.controller"
-VERSION = 5
 """Version of the files; version 1 had no observer, ramp or schedule, version 2 no biquads, and
 version 3 no feedforward. Version 4 is that of other kinds."""
 
@@ -52,13 +49,14 @@ _OTHERS = ("version", "gains", "u_unit", "y_unit", "filter_samples", "counts_per
 _Kind = TypeVar("_Kind", bound="SampledController")
 
 
-class SampledController:
+class SampledController(storage.Stored, Shown):
     """Base class of all kinds of controllers, for `run`, `tune` and drives. A kind has its settings
     as fields, and implements the members that raise NotImplementedError here.
     """
 
     KIND: ClassVar[str]
     """Its name in files."""
+    FORMAT: ClassVar[str] = "sewfast.controller"
     VERSION: ClassVar[int] = 4
     """Version of its files."""
 
@@ -165,19 +163,6 @@ class SampledController:
         """Everything as JSON values."""
         raise NotImplementedError
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write it as JSON (docs/CONVENTIONS.md, Files); the file is either complete or absent.
-
-        Raises
-        ------
-        ModelFileError
-            If the file cannot be written.
-        """
-        storage.write(path, FORMAT, self.VERSION, self.to_dict())
-
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
-
 
 @dataclass(frozen=True)
 class Controller(SampledController):
@@ -229,7 +214,7 @@ class Controller(SampledController):
     """
 
     KIND: ClassVar[str] = "pid"
-    VERSION: ClassVar[int] = VERSION
+    VERSION: ClassVar[int] = 5
 
     gains: Gains
     Ts: float = 0.001

@@ -7,10 +7,8 @@ import os
 from .. import storage
 from ..errors import ModelFileError, SewfastError, located
 from ..storage import Fields
-from .controller import FORMAT, Controller, SampledController
+from .controller import Controller, SampledController
 from .move import COLUMNS, MoveTable, Repetition
-from .move import FORMAT as TABLE
-from .move import VERSION as TABLE_VERSION
 from .state_feedback import StateFeedback
 
 KINDS: dict[str, type[SampledController]] = {
@@ -28,7 +26,7 @@ def load_controller(path: str | os.PathLike[str]) -> SampledController:
         If the file is missing, damaged, of another format or of an unknown version, or holds a
         setting outside its range; the message names the file and the field.
     """
-    fields = Fields(os.fspath(path), storage.read(path, FORMAT, (1, 2, 3, 4, 5)))
+    fields = Fields(os.fspath(path), storage.read(path, Controller.FORMAT, (1, 2, 3, 4, 5)))
     try:
         return read_controller(fields)
     except ModelFileError:
@@ -65,7 +63,7 @@ def load_table(path: str | os.PathLike[str]) -> MoveTable:
         If the file is missing, damaged, of another format or of an unknown version, or holds a
         setting outside its range; the message names the file and the field.
     """
-    fields = Fields(os.fspath(path), storage.read(path, TABLE, (TABLE_VERSION,)))
+    fields = Fields(os.fspath(path), storage.read(path, MoveTable.FORMAT, (MoveTable.VERSION,)))
     fields.require_only(
         ("version", "name", "controller", "errors", "limited", *COLUMNS, "correction",
          "repetitions")

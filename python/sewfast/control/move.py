@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,10 +17,9 @@ from .. import storage
 from ..arrays import FloatArray
 from ..errors import DataError, SettingError
 from ..storage import Fields
-from ..tables import html_of
+from ..tables import Shown
 from .controller import SampledController
 
-FORMAT, VERSION = "sewfast.table", 1
 COLUMNS = ("reference", "planned", "setpoint", "u", "y")
 _NUMBERS = ("number", "error", "largest", "predicted")
 
@@ -63,7 +62,7 @@ class Repetition:
 
 
 @dataclass(frozen=True, eq=False)
-class MoveTable:
+class MoveTable(storage.Stored, Shown):
     """The table of a known move; entry k belongs to the time k Ts.
 
     Attributes
@@ -89,6 +88,9 @@ class MoveTable:
     repetitions : sequence of Repetition
         What was done on the machine, in order.
     """
+
+    FORMAT: ClassVar[str] = "sewfast.table"
+    VERSION: ClassVar[int] = 1
 
     reference: FloatArray
     setpoint: FloatArray
@@ -156,16 +158,6 @@ class MoveTable:
             "repetitions": [one.to_dict() for one in self.repetitions],
         }
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write it as JSON (docs/CONVENTIONS.md, Files); the file is either complete or absent.
-
-        Raises
-        ------
-        ModelFileError
-            If the file cannot be written.
-        """
-        storage.write(path, FORMAT, VERSION, self.to_dict())
-
     def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
         """Draw the reference with the expected output, the error and the command in three panels.
 
@@ -179,9 +171,6 @@ class MoveTable:
         trace = Trace.of(self.columns(), "model", "expected")
         limits = (self.controller.u_min, self.controller.u_max)
         return loop_drawing([trace], self.units["y"], self.units["u"], limits).plot(ax, file)
-
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
 
     def __str__(self) -> str:
         unit = self.units["y"] or "y"

@@ -22,12 +22,12 @@ from ..control.controller import Controller
 from ..control.margins import Margins, loop_path, margins, sampled
 from ..errors import FitError, SettingError
 from ..gains import Gains, real
-from ..tables import html_of
+from ..tables import Shown
 from .shaft import ShaftFit
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Proposal:
+class Proposal(Shown):
     """A controller from a frequency response, and its margins on the fitted machine.
     The loop weakens disturbances by 3 dB or more up to `bandwidth_hertz` [Hz]; `without` is the
     best proposal without filters, if this one has any.
@@ -37,12 +37,6 @@ class Proposal:
     bandwidth_hertz: float
     margins: Margins
     without: Proposal | None = None
-
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
-
-    def __repr__(self) -> str:
-        return f"<{str(self).splitlines()[0]}>"
 
     def __str__(self) -> str:
         first = f"disturbances weakened up to {self.bandwidth_hertz:.3g} Hz"

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from ..control.controller import Controller
 from ..control.margins import loop_path
 from ..errors import DataError, SettingError
 from ..plotting import LOOKS, Drawing, stacked
-from ..tables import html_of
+from ..tables import Shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 Complex = NDArray[np.complex128]
 
-FORMAT = "sewfast-frequency-response"
-VERSION, VERSIONS = 2, (1, 2)
 """Before version 2, `blocks` was always one number."""
 
 PROVENANCE = {"properties": {"cautions": {"type": "array", "items": {"type": "string"}}}}
@@ -38,7 +36,7 @@ LEAST_LINES = 3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FrequencyResponse:
+class FrequencyResponse(storage.Stored, Shown):
     """Frequency response of a sampled system, as measured.
 
     Attributes
@@ -64,6 +62,9 @@ class FrequencyResponse:
     provenance : mapping
         Machine, speed, method; `cautions` on a record, `incomplete` if the run broke off.
     """
+
+    FORMAT: ClassVar[str] = "sewfast-frequency-response"
+    VERSION: ClassVar[int] = 2
 
     hertz: FloatArray
     value: Complex
@@ -205,10 +206,6 @@ class FrequencyResponse:
 
     # --- Files, other tools, pictures -------------------------------------------------------------
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the response as JSON; `load_response` reads it."""
-        storage.write(path, FORMAT, VERSION, self.to_dict())
-
     def to_dict(self) -> dict[str, Any]:
         """Everything by name, as JSON values."""
         return {
@@ -293,12 +290,6 @@ class FrequencyResponse:
 
         return stacked((gain_panel, phase_panel, coherence_panel), (2.4, 2.0, 1.2))
 
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
-
-    def __repr__(self) -> str:
-        return f"<{str(self).splitlines()[0]}>"
-
     def __str__(self) -> str:
         known = self.coherence > 0.95
         best = self.hertz[known]
@@ -337,7 +328,8 @@ def load_response(path: str | os.PathLike[str]) -> FrequencyResponse:
     ModelFileError
         For any other file.
     """
-    return response_of(storage.Fields(str(path), storage.read(path, FORMAT, VERSIONS)))
+    stored = storage.read(path, FrequencyResponse.FORMAT, (1, 2))
+    return response_of(storage.Fields(str(path), stored))
 
 
 def response_of(fields: storage.Fields) -> FrequencyResponse:

@@ -26,7 +26,7 @@ from ..arrays import FloatArray
 from ..control.biquad import Biquad
 from ..errors import DataError, FitError
 from ..models import LinearOE
-from ..tables import html_of
+from ..tables import Shown
 from .response import Complex, FrequencyResponse
 
 RIGID, SHAFT = 4, 4
@@ -48,7 +48,7 @@ class Parameter:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ShaftFit:
+class ShaftFit(Shown):
     """A rigid machine, two masses or three, with intervals.
 
     Attributes
@@ -136,12 +136,6 @@ class ShaftFit:
             "resonance": self.has_resonance, "misfit": self.misfit, "parameters": rows,
             "beyond_hertz": self.beyond_hertz,
         }  # fmt: skip
-
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
-
-    def __repr__(self) -> str:
-        return f"<{str(self).splitlines()[0]}>"
 
     def __str__(self) -> str:
         kind = ("rigid", "two masses and a shaft", "three masses and two shafts")[self.resonances]

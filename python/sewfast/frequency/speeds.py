@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -15,19 +15,16 @@ from ..arrays import FloatArray
 from ..control.controller import Controller
 from ..errors import DataError, FitError, SettingError
 from ..plotting import Drawing, stacked
-from ..tables import html_of
+from ..tables import Shown
 from .response import FrequencyResponse, LoopMargins, response_of
 from .shaft import ShaftFit, fit_shaft
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FORMAT = "sewfast-frequency-responses"
-VERSION = 1
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ResponsesOverSpeed:
+class ResponsesOverSpeed(storage.Stored, Shown):
     """Frequency responses at several working speeds; iterating gives the responses.
 
     Attributes
@@ -37,6 +34,9 @@ class ResponsesOverSpeed:
     refused : mapping from float to str
         Speeds without a response, and why.
     """
+
+    FORMAT: ClassVar[str] = "sewfast-frequency-responses"
+    VERSION: ClassVar[int] = 1
 
     responses: Mapping[float, FrequencyResponse]
     refused: Mapping[float, str] = field(default_factory=dict)
@@ -78,10 +78,6 @@ class ResponsesOverSpeed:
         return {s: r.margins(controller, speed=s) for s, r in self.responses.items()}
 
     # --- Files, pictures --------------------------------------------------------------------------
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the responses as JSON; `load_responses` reads them."""
-        storage.write(path, FORMAT, VERSION, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
         """Everything by name, as JSON values."""
@@ -132,12 +128,6 @@ class ResponsesOverSpeed:
         )
         return stacked(panels, (2.4, 2.0, 1.2), legend=min(len(self), 6))
 
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
-
-    def __repr__(self) -> str:
-        return f"<{str(self).splitlines()[0]}>"
-
     def __str__(self) -> str:
         lines = [
             f"frequency responses at {len(self)} speeds",
@@ -167,7 +157,8 @@ def load_responses(path: str | os.PathLike[str]) -> ResponsesOverSpeed:
     ModelFileError
         For any other file.
     """
-    fields = storage.Fields(str(path), storage.read(path, FORMAT, (VERSION,)))
+    of = ResponsesOverSpeed
+    fields = storage.Fields(str(path), storage.read(path, of.FORMAT, (of.VERSION,)))
     speeds, inner = fields.vector("speeds"), fields.objects("responses")
     if not inner or np.any(np.diff(speeds) <= 0.0):
         raise fields.refuse("speeds", "rising speeds", speeds)
@@ -180,4 +171,4 @@ def load_responses(path: str | os.PathLike[str]) -> ResponsesOverSpeed:
     ):  # fmt: skip
         raise fields.refuse("refused", "pairs of a speed and a reason", refused)
     found = {float(speed): response_of(part) for speed, part in zip(speeds, inner, strict=True)}
-    return ResponsesOverSpeed(found, {float(s): why for s, why in refused})
+    return of(found, {float(s): why for s, why in refused})

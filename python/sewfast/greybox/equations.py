@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,19 +23,17 @@ from ..frequency.shaft import Parameter
 from ..identification.least_squares import least_squares
 from ..motorfit.estimation import CONFIDENCE, covariance_of, filtered, whitener
 from ..motorfit.records import Piece, Records, rad_per_second
-from ..tables import html_of
-from .motor import findings
+from .motor import Findings, findings
 
 Equations: TypeAlias = Callable[[Any, Any, Mapping[str, Any]], Any]
 """`f(x, u, p)`: derivatives of the state (n,), under a command, with parameters by name."""
 
-FORMAT, VERSION = "sewfast-equations", 1
 MOST = 1000
 """Most states, and most substeps of a sample."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class EquationFit:
+class EquationFit(Findings):
     """Parameters of equations that you gave, identified from a record.
 
     Attributes
@@ -56,6 +54,9 @@ class EquationFit:
         Whether the least-squares minimum was confirmed.
     """
 
+    FORMAT: ClassVar[str] = "sewfast-equations"
+    VERSION: ClassVar[int] = 1
+
     parameters: Mapping[str, Parameter]
     undetermined: Mapping[str, str]
     values: Mapping[str, float]
@@ -71,23 +72,6 @@ class EquationFit:
     speed_unit: str
     equations: Equations | None = field(default=None)
     """The function; None in a fit read from a file, which holds no code."""
-
-    def value(self, name: str) -> float:
-        """A parameter's value.
-
-        Raises
-        ------
-        DataError
-            If the record does not determine it; the message gives the reason.
-        """
-        if name in self.parameters:
-            return self.parameters[name].value
-        if name in self.undetermined:
-            raise DataError(f"{name}: {self.undetermined[name]}")
-        raise DataError(
-            name=name, expected=f"a parameter of {', '.join(self.parameters)}",
-            received=repr(name),
-        )  # fmt: skip
 
     def with_equations(self, equations: Equations) -> EquationFit:
         """The same fit with its function, which a file does not hold."""
@@ -123,16 +107,6 @@ class EquationFit:
             )  # fmt: skip
         return found
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write parameters and the function's name as JSON, whole or not at all; no code.
-
-        Raises
-        ------
-        ModelFileError
-            If the file cannot be written.
-        """
-        storage.write(path, FORMAT, VERSION, self.to_dict())
-
     def to_dict(self) -> dict[str, Any]:
         """Everything except the function, as JSON values."""
         return {
@@ -141,12 +115,6 @@ class EquationFit:
             "values": dict(self.values),
             **{n: getattr(self, n) for n in _KEPT},
         }
-
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
-
-    def __repr__(self) -> str:
-        return f"<{str(self).splitlines()[0]}>"
 
     def __str__(self) -> str:
         width = max(map(len, self.values), default=0)
@@ -173,7 +141,8 @@ def load_equations(path: str | os.PathLike[str]) -> EquationFit:
     ModelFileError
         For any other file.
     """
-    fields = storage.Fields(str(path), storage.read(path, FORMAT, (VERSION,)))
+    stored = storage.read(path, EquationFit.FORMAT, (EquationFit.VERSION,))
+    fields = storage.Fields(str(path), stored)
     fields.require_only(["version", "parameters", "undetermined", "values", *_KEPT])
     parameters, undetermined, unit = findings(fields)
     values = fields.object("values")
@@ -181,20 +150,12 @@ def load_equations(path: str | os.PathLike[str]) -> EquationFit:
         if not 1 <= fields.integer(name) <= MOST:
             raise fields.refuse(name, f"a whole number from 1 to {MOST}", fields.integer(name))
     return EquationFit(
-        parameters,
-        undetermined,
-        {n: values.number(n) for n in values.values},
-        fields.text("equations_name"),
-        fields.integer("states"),
-        fields.integer("substeps"),
-        fields.number("fit_percent"),
-        fields.number("rmse"),
-        fields.flag("converged"),
-        fields.integer("samples"),
-        fields.positive("Ts"),
-        fields.text("u_unit"),
-        unit,
-    )
+        parameters, undetermined, {n: values.number(n) for n in values.values}, speed_unit=unit,
+        **fields.take(
+            text="equations_name u_unit", integer="states substeps samples",
+            number="fit_percent rmse", flag="converged", positive="Ts",
+        ),
+    )  # fmt: skip
 
 
 # --- Calls of the function ------------------------------------------------------------------------

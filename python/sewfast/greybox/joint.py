@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -20,12 +20,10 @@ from ..models.grey_box import NAMES as MOTOR_NAMES
 from ..models.grey_box import GreyBox
 from ..motorfit.estimation import CONFIDENCE
 from ..motorfit.joint import fitted, is_commanded
-from ..tables import html_of
 from .inner_gains import InnerGains, inner_gains
 from .joint_exports import JointTarget, Replay, checked, export
 from .motor import APART, VAGUE, Findings, stored_parameters
 
-FORMAT, VERSION = "sewfast-joint", 1
 Values: TypeAlias = Mapping[str, float]
 _INSIDE = {
     "k_p": "encoder and command show the controller's gain only relative to the inertia; it takes "
@@ -67,6 +65,9 @@ class Joint(Findings):
     model : GreyBox
         The joint as a model: `simulate`, `sewfast.run`, `sewfast.tune`.
     """
+
+    FORMAT: ClassVar[str] = "sewfast-joint"
+    VERSION: ClassVar[int] = 1
 
     parameters: Mapping[str, Parameter]
     undetermined: Mapping[str, str]
@@ -158,22 +159,6 @@ class Joint(Findings):
             "samples": self.samples,
             "model": self.model.to_dict(),
         }
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the joint as JSON; the file is complete or absent.
-
-        Raises
-        ------
-        ModelFileError
-            If the file cannot be written.
-        """
-        storage.write(path, FORMAT, VERSION, self.to_dict())
-
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
-
-    def __repr__(self) -> str:
-        return f"<{str(self).splitlines()[0]}>"
 
     def __str__(self) -> str:
         terms = ", ".join(self.terms) or "no further terms"
@@ -297,7 +282,7 @@ def load_joint(path: str | os.PathLike[str]) -> Joint:
     """
     from ..models.files import restored
 
-    document = storage.read(path, FORMAT, (VERSION,))
+    document = storage.read(path, Joint.FORMAT, (Joint.VERSION,))
     fields = storage.Fields(str(path), document)
     parameters, undetermined = stored_parameters(fields)
     model = restored(dict(fields.object("model").values), ())

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,14 +22,12 @@ from ..motorfit.estimation import CONFIDENCE
 from ..motorfit.problem import State
 from ..motorfit.terms import Values, profiled, slope_of, values_of
 from ..plotting import LOOKS, Drawing
-from ..tables import html_of
+from ..tables import Shown
 from .exports import Target, Winding, export
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FORMAT = "sewfast-motor"
-VERSION = 3
 """Version 1 has `untold` for `undetermined`, version 2 no `orders`; both are read."""
 NAMES = tuple(_core.GREYBOX_PARAMETERS)
 VAGUE = 1.0
@@ -47,7 +45,7 @@ _NO_VOLTS = (
 )
 
 
-class Findings:
+class Findings(storage.Stored, Shown):
     """Parameters with their intervals, and the reasons why the record does not determine others."""
 
     parameters: Mapping[str, Parameter]
@@ -63,11 +61,12 @@ class Findings:
         """
         if name in self.parameters:
             return self.parameters[name].value
+        if name in self.undetermined:
+            raise DataError(f"{name}: {self.undetermined[name]}")
         raise DataError(
-            f"{name}: {self.undetermined[name]}"
-            if name in self.undetermined
-            else f"expected a parameter of {', '.join(self.parameters)}, received {name!r}"
-        )
+            name=name, expected=f"a parameter of {', '.join(self.parameters)}",
+            received=repr(name),
+        )  # fmt: skip
 
     def _lines(self) -> list[str]:
         """A line for each parameter, and for each reason the names of those that it concerns."""
@@ -102,6 +101,9 @@ class Motor(Findings):
     converged : bool
         Whether the least-squares minimum was confirmed, or any further gain is within the noise.
     """
+
+    FORMAT: ClassVar[str] = "sewfast-motor"
+    VERSION: ClassVar[int] = 3
 
     parameters: Mapping[str, Parameter]
     undetermined: Mapping[str, str]
@@ -283,16 +285,6 @@ class Motor(Findings):
         """Fitted values by their names in the equations; 0 for a term that is not shown."""
         return dict(zip(NAMES, self.theta.tolist(), strict=True))
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the motor as JSON; the file is complete or absent.
-
-        Raises
-        ------
-        ModelFileError
-            If the file cannot be written.
-        """
-        storage.write(path, FORMAT, VERSION, self.to_dict())
-
     def to_dict(self) -> dict[str, Any]:
         """Everything except the plotted runs, as JSON values."""
         limit = NAMES.index("limit")
@@ -363,12 +355,6 @@ class Motor(Findings):
         heights = (2.4,) * len(panels)
         return Drawing(tuple((p,) for p in panels), heights, share_x=False)
 
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
-
-    def __repr__(self) -> str:
-        return f"<{str(self).splitlines()[0]}>"
-
     def __str__(self) -> str:
         terms = ", ".join(self.terms) or "no further terms"
         lines = [
@@ -384,17 +370,9 @@ class Motor(Findings):
 
 
 _NUMBERS = (
-    "fit_percent",
-    "rmse",
-    "converged",
-    "samples",
-    "spikes",
-    "Ts",
-    "u_limit",
-    "counts_per_rev",
-    "volts",
-    "resistance",
-)
+    "fit_percent", "rmse", "converged", "samples", "spikes", "Ts", "u_limit", "counts_per_rev",
+    "volts", "resistance",
+)  # fmt: skip
 
 
 def stored_parameters(fields: storage.Fields) -> tuple[dict[str, Parameter], dict[str, str]]:
@@ -428,10 +406,10 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
     ModelFileError
         For any other file.
     """
-    document = storage.read(path, FORMAT, (1, 2, VERSION))
+    document = storage.read(path, Motor.FORMAT, (1, 2, Motor.VERSION))
     if document["version"] == 1 and "untold" in document:
         document["undetermined"] = document.pop("untold")
-    if document["version"] < VERSION:  # terms added later
+    if document["version"] < Motor.VERSION:  # terms added later
         document.setdefault("orders", [0] * len(WAVES))
         if isinstance(document.get("theta"), dict):
             # first of the parameters that files before version 3 lack
@@ -439,19 +417,8 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
                 dict.fromkeys(NAMES[NAMES.index("limit") + 1 :], 0.0) | document["theta"]
             )
     fields = storage.Fields(str(path), document)
-    fields.require_only(
-        [
-            "version",
-            "parameters",
-            "undetermined",
-            "terms",
-            *_NUMBERS,
-            "u_unit",
-            "speed_unit",
-            "theta",
-            "orders",
-        ]
-    )
+    names = ("version", "parameters", "undetermined", "terms", *_NUMBERS)
+    fields.require_only([*names, "u_unit", "speed_unit", "theta", "orders"])
     parameters, undetermined, unit = findings(fields)
     theta = fields.object("theta")
     theta.require_only(NAMES)
@@ -469,24 +436,12 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
     if not all(isinstance(t, str) for t in terms):
         raise fields.refuse("terms", "names", terms)
     return Motor(
-        parameters,
-        undetermined,
-        tuple(terms),
-        fields.number("fit_percent"),
-        fields.number("rmse"),
-        fields.flag("converged"),
-        fields.integer("samples"),
-        fields.integer("spikes"),
-        fields.positive("Ts"),
-        fields.text("u_unit"),
-        unit,
-        fields.positive("u_limit"),
-        fields.optional_number("counts_per_rev"),
-        fields.optional_number("volts"),
-        fields.optional_number("resistance"),
-        np.array(values),
-        tuple(orders),
-    )
+        parameters, undetermined, tuple(terms), speed_unit=unit, theta=np.array(values),
+        orders=tuple(orders), **fields.take(
+            number="fit_percent rmse", flag="converged", integer="samples spikes",
+            positive="Ts u_limit", text="u_unit", optional_number="counts_per_rev volts resistance",
+        ),
+    )  # fmt: skip
 
 
 # --- From the estimate to a motor -----------------------------------------------------------------

@@ -17,7 +17,7 @@ from ..dataset.experiment import in_effect
 from ..dataset.pieces import require_fittable
 from ..errors import SettingError
 from ..plotting import SHADE, lettered, stacked
-from ..tables import html_of
+from ..tables import Shown
 from ..units import duration
 
 LONGEST = 30
@@ -62,7 +62,7 @@ class InputDelay:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DelayEstimate:
+class DelayEstimate(Shown):
     """Delays of all inputs; prints itself.
 
     Attributes
@@ -97,9 +97,6 @@ class DelayEstimate:
         for found in self.inputs:
             panels += [partial(_draw_costs, found=found), partial(_draw_correlation, found=found)]
         return stacked(panels, (2.0, 1.8) * len(self.inputs)).plot(ax, file)
-
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
 
     def __str__(self) -> str:
         head = f"delay: {self.nk} sample(s), {duration(self.nk * self.Ts, 6)}"

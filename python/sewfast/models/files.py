@@ -12,7 +12,7 @@ from importlib.resources import files
 from typing import Any
 
 from .. import storage
-from ..dynamic_model import FORMAT, VERSION
+from ..dynamic_model import DynamicModel
 from ..errors import ModelFileError, SettingError, SewfastError, located
 from ..storage import Fields
 from .base import COMBINATIONS, MOST_MEMBERS, Ensemble, Model, SingleModel, StructuredModel
@@ -21,7 +21,7 @@ from .hammerstein import HammersteinWiener
 from .linear import ARX, IV, LinearOE
 from .neural import NeuralOE, NeuralSS
 
-SCHEMA = f"model-{VERSION}.json"
+SCHEMA = f"model-{DynamicModel.VERSION}.json"
 SINGLE: tuple[type[SingleModel], ...] = (
     ARX, IV, LinearOE, HammersteinWiener, GreyBox, NeuralOE, NeuralSS,
 )  # fmt: skip
@@ -50,7 +50,8 @@ def load_model(path: str | os.PathLike[str]) -> Model:
         If the file is missing, damaged, of another format, or of an unknown version or kind;
         the message names the file and the field.
     """
-    model = _read(Fields(os.fspath(path), storage.read(path, FORMAT, (VERSION,))))
+    stored = storage.read(path, DynamicModel.FORMAT, (DynamicModel.VERSION,))
+    model = _read(Fields(os.fspath(path), stored))
     try:
         _ = model.about_rest
     except SettingError as e:
@@ -60,7 +61,7 @@ def load_model(path: str | os.PathLike[str]) -> Model:
 
 def from_dict(values: dict[str, Any]) -> Model:
     """The model of these values, the inverse of `Model.to_dict`."""
-    return _read(Fields("model", {"version": VERSION} | values))
+    return _read(Fields("model", {"version": DynamicModel.VERSION} | values))
 
 
 def restored(values: dict[str, Any], alternatives: tuple[Model, ...]) -> Model:

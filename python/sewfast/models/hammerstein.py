@@ -101,16 +101,11 @@ class HammersteinWiener(StructuredModel):
         if not len(low) == len(high) == fields.integer("n_inputs"):
             raise fields.refuse("n_inputs", "the length of input_low and input_high", len(low))
         return _core.HammersteinWiener(
-            na=fields.integer("na"),
-            nb=fields.integer("nb"),
-            nk=fields.integer("nk"),
             input_low=low,
             input_high=high,
-            input_pieces=fields.integer("input_pieces"),
-            x_low=fields.number("x_low"),
-            x_high=fields.number("x_high"),
-            output_pieces=fields.integer("output_pieces"),
-            theta=fields.vector("theta"),
+            **fields.take(
+                integer="na nb nk input_pieces output_pieces", number="x_low x_high", vector="theta"
+            ),
         )
 
     @staticmethod

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -72,20 +72,11 @@ class NeuralOE(_Network):
     def core_from(fields: Fields) -> _core.NeuralOE:
         """The compiled model from the parameters of a file."""
         return _core.NeuralOE(
-            na=fields.integer("na"),
-            nb=fields.integer("nb"),
-            nk=fields.integer("nk"),
-            n_inputs=fields.integer("n_inputs"),
-            hidden=fields.integer("hidden"),
-            bypass=fields.flag("bypass"),
-            theta=fields.vector("theta"),
-            u_mean=fields.vector("u_mean"),
-            u_scale=fields.vector("u_scale"),
-            y_mean=fields.number("y_mean"),
-            y_scale=fields.number("y_scale"),
-            output_low=fields.optional_number("output_low"),
-            output_high=fields.optional_number("output_high"),
-        )
+            **fields.take(
+                integer="na nb nk n_inputs hidden", flag="bypass", vector="theta u_mean u_scale",
+                number="y_mean y_scale", optional_number="output_low output_high",
+            )
+        )  # fmt: skip
 
     def describe(self) -> list[str]:
         s = self.settings
@@ -175,24 +166,12 @@ class NeuralSS(_Network):
         if fields.integer("n_outputs") != 1:
             raise fields.refuse("n_outputs", "1, as a data set has", fields.any("n_outputs"))
         return _core.NeuralSS(
-            nx=fields.integer("nx"),
-            nk=fields.integer("nk"),
-            n_inputs=fields.integer("n_inputs"),
-            n_outputs=fields.integer("n_outputs"),
-            hidden=fields.integer("hidden"),
-            integrator=fields.flag("integrator"),
-            output=cast(Literal["linear", "saturation", "abs"], output),
-            output_parameters=fields.vector("output_parameters"),
-            theta=fields.vector("theta"),
-            u_mean=fields.vector("u_mean"),
-            u_scale=fields.vector("u_scale"),
-            y_mean=fields.vector("y_mean"),
-            y_scale=fields.vector("y_scale"),
-            state_mean=fields.vector("state_mean"),
-            state_covariance=fields.matrix("state_covariance"),
-            residual_variance=fields.vector("residual_variance"),
-            process_noise=fields.number("process_noise"),
-        )
+            **fields.take(
+                integer="nx nk n_inputs n_outputs hidden", flag="integrator", text="output",
+                vector="output_parameters theta u_mean u_scale y_mean y_scale state_mean "
+                "residual_variance", matrix="state_covariance", number="process_noise",
+            )
+        )  # fmt: skip
 
     def describe(self) -> list[str]:
         s = self.settings

@@ -21,7 +21,7 @@ from ..gains import whole
 from ..machine import VirtualMachine
 from ..recording import Recording
 from ..speed import speed_from_counts
-from ..tables import html_of
+from ..tables import Shown
 from ..threads import available
 from .planning import plants_of
 
@@ -30,7 +30,7 @@ VARIATIONS = ((1.0, 0), (0.8, 0), (1.25, 0), (1.0, 1))
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
+class Learned(Shown):
     """What repetitions on a machine have brought.
 
     Attributes
@@ -76,9 +76,6 @@ class Learned:
                 remedy="repeat the move first",
             )  # fmt: skip
         return self.best.plot(ax, others=[self.first], file=file)
-
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
 
     def __str__(self) -> str:
         unit = self.table.units["y"] or "y"

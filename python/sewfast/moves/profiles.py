@@ -16,7 +16,7 @@ from ..control.loop import Plants, common_rest, cores_about, each_plant
 from ..errors import DataError, FitError, SettingError
 from ..gains import real, vector
 from ..models import Model
-from ..tables import html_of
+from ..tables import Shown
 from ..units import duration
 
 SHARE = 0.9
@@ -122,7 +122,7 @@ class Reach:
 
 
 @dataclass(frozen=True, eq=False)
-class Profile:
+class Profile(Shown):
     """A reference that a drive can follow.
 
     Attributes
@@ -155,9 +155,6 @@ class Profile:
         t = np.arange(len(self.r)) * self.Ts
         last = np.full(len(self.r) - len(self.asked), self.asked[-1])
         return {"t": t, "r": self.r, "asked": np.append(self.asked, last)}
-
-    def _repr_html_(self) -> str:
-        return html_of(str(self))
 
     def __str__(self) -> str:
         lines = [f"reference of {len(self.r) * self.Ts:g} s within reach: {self.reach}"]

@@ -198,21 +198,12 @@ impl NeuralOE {
 
 impl NeuralSS {
     /// The microcontroller's form.
-    ///
-    /// # Errors
-    /// `ErrorKind::Setting` for several outputs.
-    pub fn embedded(&self) -> Result<Embedded> {
+    pub fn embedded(&self) -> Embedded {
         let (shape, theta, p) = (self.shape(), self.theta(), self.shape().parts());
-        if shape.outputs != 1 {
-            return Err(Error::setting(format!(
-                "expected a model of one output, got {}; identify one model an output",
-                shape.outputs
-            )));
-        }
         let scaling = self.scaling();
         let names = ["a", "b", "e", "wx", "wu", "bh", "c", "d", "constant", "g"];
         let ranges = [p.a, p.b, p.e, p.wx, p.wu, p.bh, p.c, p.d, p.constant, p.g];
-        Ok(Embedded {
+        Embedded {
             kind: "states",
             orders: Orders {
                 na: shape.nx,
@@ -227,10 +218,10 @@ impl NeuralSS {
             scaling: Some((
                 scaling.u_mean.clone(),
                 scaling.u_scale.clone(),
-                scaling.y_mean[0],
-                scaling.y_scale[0],
+                scaling.y_mean,
+                scaling.y_scale,
             )),
             output: self.output(),
-        })
+        }
     }
 }

@@ -6,10 +6,10 @@
 //! Results are measured in widths of the output's range, so one set of bounds serves every drive. If the drive itself
 //! is slow, so are its linear models, and the bounds are relaxed to what these do in the same runs.
 
+use crate::data::window;
 use crate::lagged::{Lagged, STATE_SAMPLES};
 use crate::linear::LinearModel;
-use crate::neural_ss::Recording;
-use crate::{Error, ErrorKind, Monitor, Result};
+use crate::{Error, ErrorKind, Monitor, Record, Result};
 
 /// Most samples of an experiment that are used, from its beginning.
 const LONGEST: usize = 20_000;
@@ -70,9 +70,6 @@ pub trait Guarded {
     /// Number of inputs.
     fn inputs(&self) -> usize;
 
-    /// Number of outputs.
-    fn outputs(&self) -> usize;
-
     /// The state before these first samples.
     ///
     /// # Errors
@@ -104,10 +101,6 @@ impl<M: Lagged> Guarded for M {
         self.lags().channels
     }
 
-    fn outputs(&self) -> usize {
-        1
-    }
-
     fn first_state(&self, u: &[f64], y: &[f64]) -> Result<Vec<f64>> {
         self.estimate_initial_state(u, self.lags().channels, y)
     }
@@ -131,10 +124,6 @@ struct Yardstick<'a> {
 impl Guarded for Yardstick<'_> {
     fn inputs(&self) -> usize {
         self.model.inputs()
-    }
-
-    fn outputs(&self) -> usize {
-        1
     }
 
     fn first_state(&self, u: &[f64], y: &[f64]) -> Result<Vec<f64>> {
@@ -165,17 +154,14 @@ impl Guarded for Yardstick<'_> {
 /// `ErrorKind::Fit` if a stop was requested.
 pub fn verdict<M: Guarded>(
     model: &M,
-    recordings: &[Recording],
+    records: &[Record],
     linear: &[LinearModel],
     monitor: &Monitor,
 ) -> Result<Option<Unsound>> {
-    check(model, recordings, linear)?;
-    let ranges = (0..model.outputs())
-        .map(|p| Range::of(recordings, p))
-        .collect::<Result<Vec<_>>>()?;
+    check(model, records, linear)?;
     let task = Task {
-        recordings,
-        ranges,
+        records,
+        range: Range::of(records)?,
         by_level: !linear.is_empty(),
         monitor,
     };
@@ -203,49 +189,41 @@ pub fn verdict<M: Guarded>(
     Ok(found.verdict(Some(&known), integrates))
 }
 
-fn check<M: Guarded>(model: &M, recordings: &[Recording], linear: &[LinearModel]) -> Result<()> {
-    let (inputs, outputs) = (model.inputs(), model.outputs());
-    if recordings.is_empty() {
+fn check<M: Guarded>(model: &M, records: &[Record], linear: &[LinearModel]) -> Result<()> {
+    let inputs = model.inputs();
+    if records.is_empty() {
         return Err(Error::data("expected one experiment or more, got none"));
     }
-    for r in recordings {
-        if (r.inputs, r.outputs) != (inputs, outputs) || r.y.iter().all(|y| y.is_nan()) {
-            return Err(Error::data(format!(
-                "expected {inputs} inputs and {outputs} outputs, some of them known, in every experiment, got {} and {}; give the records that the model was trained on",
-                r.inputs, r.outputs
-            )));
-        }
+    if let Some(record) = records.iter().find(|r| r.channels != inputs) {
+        return Err(Error::data(format!(
+            "expected {inputs} inputs in every experiment, got {}; give the records that the model was trained on",
+            record.channels
+        )));
     }
-    if linear
-        .iter()
-        .any(|l| outputs != 1 || l.lags().channels != inputs)
-    {
+    if linear.iter().any(|l| l.lags().channels != inputs) {
         return Err(Error::setting(format!(
-            "expected linear models of {inputs} inputs and of one output, as the model has, got others; leave them out"
+            "expected linear models of {inputs} inputs, as the model has, got others; leave them out"
         )));
     }
     Ok(())
 }
 
-/// The range of one output.
+/// The range of the output.
 struct Range {
     low: f64,
     high: f64,
 }
 
 impl Range {
-    /// The range of output `p`; unknown outputs do not count.
-    fn of(recordings: &[Recording], p: usize) -> Result<Self> {
-        let measured = recordings
-            .iter()
-            .flat_map(|r| r.y.iter().skip(p).step_by(r.outputs));
-        let (low, high) = extremes(measured);
+    /// Unknown outputs do not count.
+    fn of(records: &[Record]) -> Result<Self> {
+        let (low, high) = extremes(records.iter().flat_map(|r| r.y));
         if low < high {
             return Ok(Self { low, high });
         }
-        Err(Error::data(format!(
-            "expected output {p} (0-based) to change, got a constant or no known value; leave it out or excite the drive"
-        )))
+        Err(Error::data(
+            "expected an output that changes, got a constant or no known value; excite the drive",
+        ))
     }
 
     fn width(&self) -> f64 {
@@ -265,7 +243,7 @@ fn extremes<'a>(values: impl Iterator<Item = &'a f64>) -> (f64, f64) {
     values.fold((f64::INFINITY, f64::NEG_INFINITY), wider)
 }
 
-/// Results of a model's runs in widths of the output's range; each is the largest over outputs and experiments.
+/// Results of a model's runs in widths of the output's range; each is the largest over experiments.
 #[derive(Clone, Copy, Debug, Default)]
 struct Distances {
     /// Beyond the range, on the record itself.
@@ -331,8 +309,8 @@ impl Distances {
 
 /// The records, with all that is common to every model.
 struct Task<'a> {
-    recordings: &'a [Recording<'a>],
-    ranges: Vec<Range>,
+    records: &'a [Record<'a>],
+    range: Range,
     /// Whether blocks are also sorted by their level, which leads a slow drive far away.
     by_level: bool,
     monitor: &'a Monitor,
@@ -342,8 +320,8 @@ impl Task<'_> {
     /// Over all experiments; `None` if a free run over one of them is not finite.
     fn distances<M: Guarded>(&self, model: &M) -> Result<Option<Distances>> {
         let mut all = Distances::default();
-        for recording in self.recordings {
-            let Some(its) = self.distances_in(model, recording)? else {
+        for record in self.records {
+            let Some(its) = self.distances_in(model, record)? else {
                 return Ok(None);
             };
             all = all.or_larger(&its);
@@ -351,11 +329,12 @@ impl Task<'_> {
         Ok(Some(all))
     }
 
-    fn distances_in<M: Guarded>(&self, model: &M, r: &Recording) -> Result<Option<Distances>> {
-        let samples = r.samples().min(LONGEST);
-        let (u, first) = (&r.u[..samples * r.inputs], r.first_samples(STATE_SAMPLES));
-        let (u_first, y_first) = (&r.u[..first * r.inputs], &r.y[..first * r.outputs]);
-        let Some(state) = self.found(model.first_state(u_first, y_first))? else {
+    fn distances_in<M: Guarded>(&self, model: &M, r: &Record) -> Result<Option<Distances>> {
+        let inputs = r.channels;
+        let u = &r.u[..r.len().min(LONGEST) * inputs];
+        let first = window(r.y, STATE_SAMPLES).unwrap_or(r.len());
+        let Some(state) = self.found(model.first_state(&r.u[..first * inputs], &r.y[..first]))?
+        else {
             return Ok(None);
         };
         let run = |u: &[f64], state: &[f64]| self.found(model.free_run(u, state, self.monitor));
@@ -363,20 +342,21 @@ impl Task<'_> {
             return Ok(None);
         };
         let mut its = Distances {
-            record: self.beyond(&usual),
+            record: self.range.beyond(usual.iter()),
             ..Distances::default()
         };
         let outside = f64::INFINITY;
-        let larger = run(&enlarged(u, r.inputs), &state)?;
-        its.larger = larger.as_ref().map_or(outside, |run| self.beyond(run));
-        its.faster = larger.map_or(outside, |run| self.faster(&run, &usual, r.y));
-        for state in model.states_beside(self.ranges[0].low, self.ranges[0].high) {
+        let larger = run(&enlarged(u, inputs), &state)?;
+        let beyond = |run: &Vec<f64>| self.range.beyond(run.iter());
+        its.larger = larger.as_ref().map_or(outside, beyond);
+        its.faster = larger.map_or(outside, |run| faster(&run, &usual, r.y));
+        for state in model.states_beside(self.range.low, self.range.high) {
             let left = run(u, &state)?.map_or(outside, |other| self.left(&other, &usual));
             its.state = its.state.max(left);
         }
-        for order in orders(u, r.inputs, self.by_level) {
-            let other = run(&rearranged(u, r.inputs, &order.blocks), &state)?;
-            let away = other.as_ref().map_or(outside, |run| self.beyond(run));
+        for order in orders(u, inputs, self.by_level) {
+            let other = run(&rearranged(u, inputs, &order.blocks), &state)?;
+            let away = other.as_ref().map_or(outside, beyond);
             its.away = its.away.max(away);
             if order.by_step {
                 let apart = |run: Vec<f64>| self.apart(&run, &usual, &order.blocks);
@@ -400,80 +380,49 @@ impl Task<'_> {
         }
     }
 
-    /// The largest value over the outputs.
-    fn largest(&self, of: impl Fn(usize, &Range) -> f64) -> f64 {
-        let each = self
-            .ranges
-            .iter()
-            .enumerate()
-            .map(|(p, range)| of(p, range));
-        each.fold(0.0, f64::max)
-    }
-
-    /// The values of output `p`.
-    fn output<'r>(&self, run: &'r [f64], p: usize) -> impl Iterator<Item = &'r f64> + use<'r> {
-        run.iter().skip(p).step_by(self.ranges.len())
-    }
-
-    fn beyond(&self, run: &[f64]) -> f64 {
-        self.largest(|p, range| range.beyond(self.output(run, p)))
-    }
-
-    /// How far a run's changes from sample to sample exceed those of the record, in widths of their range.
-    ///
-    /// Noise makes the measured changes larger than the true ones, and a model that moves too fast makes its own too
-    /// large: the narrower range counts.
-    fn faster(&self, run: &[f64], usual: &[f64], measured: &[f64]) -> f64 {
-        let changes = |run: &[f64], p: usize| -> Vec<f64> {
-            let (now, next) = (self.output(run, p), self.output(run, p).skip(1));
-            let changes = now.zip(next).map(|(now, next)| next - now);
-            changes.filter(|change| !change.is_nan()).collect()
-        };
-        let range = |run: &[f64], p: usize| {
-            let (low, high) = extremes(changes(run, p).iter());
-            Range { low, high }
-        };
-        self.largest(|p, _| {
-            let (own, known) = (range(usual, p), range(measured, p));
-            let is_narrower = known.width() > 0.0 && known.width() < own.width();
-            let usual = if is_narrower { known } else { own };
-            usual.beyond(changes(run, p).iter())
-        })
-    }
-
     /// Mean distance of two runs over their last tenth.
     fn left(&self, run: &[f64], usual: &[f64]) -> f64 {
-        let last = (usual.len() / self.ranges.len()).div_ceil(10);
-        let from = usual.len() - last * self.ranges.len();
-        self.largest(|p, range| {
-            let pairs = self
-                .output(&run[from..], p)
-                .zip(self.output(&usual[from..], p));
-            pairs.map(|(a, b)| (a - b).abs()).sum::<f64>() / (last as f64 * range.width())
-        })
+        let from = usual.len() - usual.len().div_ceil(10);
+        self.mean_distance(run[from..].iter().zip(&usual[from..]))
     }
 
     /// Mean distance in the second halves of the blocks of a run over rearranged inputs.
     fn apart(&self, run: &[f64], usual: &[f64], blocks: &[usize]) -> f64 {
-        let outputs = self.ranges.len();
         let length = run.len() / BLOCKS;
-        let half = length / outputs / 2 * outputs;
-        let second = |run: &[f64], block: usize, p: usize| -> Vec<f64> {
-            let half = &run[block * length + half..(block + 1) * length];
-            self.output(half, p).copied().collect()
-        };
-        self.largest(|p, range| {
-            let (mut sum, mut count) = (0.0, 0.0);
-            for (place, &block) in blocks.iter().enumerate() {
-                let pairs = second(run, place, p)
-                    .into_iter()
-                    .zip(second(usual, block, p));
-                sum += pairs.map(|(a, b)| (a - b).abs()).sum::<f64>();
-                count += (length - half) as f64 / outputs as f64;
-            }
-            sum / (count * range.width())
-        })
+        let second = |block: usize| block * length + length / 2..(block + 1) * length;
+        let pairs = blocks.iter().enumerate().flat_map(|(place, &block)| {
+            let (own, other) = (&run[second(place)], &usual[second(block)]);
+            own.iter().zip(other)
+        });
+        self.mean_distance(pairs)
     }
+
+    /// In widths of the range.
+    fn mean_distance<'a>(&self, pairs: impl Iterator<Item = (&'a f64, &'a f64)>) -> f64 {
+        let (sum, count) = pairs.fold((0.0, 0.0), |(sum, n), (a, b)| {
+            (sum + (a - b).abs(), n + 1.0)
+        });
+        sum / (count * self.range.width())
+    }
+}
+
+/// How far a run's changes from sample to sample exceed those of the record, in widths of their range.
+///
+/// Noise makes the measured changes larger than the true ones, and a model that moves too fast makes its own too
+/// large: the narrower range counts.
+fn faster(run: &[f64], usual: &[f64], measured: &[f64]) -> f64 {
+    let changes = |run: &[f64]| -> Vec<f64> {
+        let changes = run.iter().zip(&run[1..]).map(|(now, next)| next - now);
+        changes.filter(|change| !change.is_nan()).collect()
+    };
+    let range = |run: &[f64]| {
+        let (low, high) = extremes(changes(run).iter());
+        Range { low, high }
+    };
+    let (own, known) = (range(usual), range(measured));
+    let is_narrower = known.width() > 0.0 && known.width() < own.width();
+    let usual = if is_narrower { known } else { own };
+    usual.beyond(changes(run).iter()).max(0.0)
 }
 
 /// The inputs, a quarter larger around their means.
@@ -552,10 +501,6 @@ mod tests {
             1
         }
 
-        fn outputs(&self) -> usize {
-            1
-        }
-
         fn first_state(&self, _: &[f64], y: &[f64]) -> Result<Vec<f64>> {
             Ok(vec![y[0]])
         }
@@ -596,8 +541,8 @@ mod tests {
         y: &[f64],
         linear: &[LinearModel],
     ) -> Option<Unsound> {
-        let recording = Recording::new(u, 1, y, 1).unwrap();
-        verdict(model, &[recording], linear, &Monitor::default()).unwrap()
+        let record = Record::with_gaps(u, 1, y).unwrap();
+        verdict(model, &[record], linear, &Monitor::default()).unwrap()
     }
 
     #[test]
@@ -741,9 +686,9 @@ mod tests {
     #[test]
     fn hears_a_stop_and_refuses_what_does_not_fit() {
         let u = levels(1_000, 5);
-        let recording = Recording::new(&u, 1, &u, 1).unwrap();
+        let record = Record::new(&u, 1, &u).unwrap();
         let ask = |linear: &[LinearModel], monitor: &Monitor| {
-            verdict(&lag(0.5), &[recording], linear, monitor)
+            verdict(&lag(0.5), &[record], linear, monitor)
                 .unwrap_err()
                 .kind
         };
@@ -752,8 +697,8 @@ mod tests {
         assert_eq!(ask(&[], &stopped), ErrorKind::Fit);
         let two = LinearModel::new(vec![0.0], vec![1.0, 1.0], 2, 0, 0.0).unwrap();
         assert_eq!(ask(&[two], &Monitor::default()), ErrorKind::Setting);
-        let still = Recording::new(&u, 1, &[1.0; 1_000], 1).unwrap();
-        let pairs = Recording::new(&u, 2, &u[..500], 1).unwrap();
+        let still = Record::new(&u, 1, &[1.0; 1_000]).unwrap();
+        let pairs = Record::new(&u, 2, &u[..500]).unwrap();
         for bad in [&[still][..], &[pairs], &[]] {
             let found = verdict(&lag(0.5), bad, &[], &Monitor::default());
             assert_eq!(found.unwrap_err().kind, ErrorKind::Data);

@@ -176,12 +176,7 @@ pub trait Lagged {
     ) -> Result<Vec<f64>> {
         let lags = self.lags();
         let samples = lags.check(u, channels, y_past)?;
-        check_measured(y, samples)?;
-        if horizon == 0 {
-            return Err(Error::setting(
-                "expected a horizon of 1 step or more, got 0; 1 is one-step prediction",
-            ));
-        }
+        check_predicted(y, samples, horizon)?;
         let filled = self.filled(u, y, y_past);
         let y = filled.as_deref().unwrap_or(y);
         let mut phi = vec![0.0; lags.regressors()];
@@ -308,7 +303,8 @@ fn best_of(found: impl Iterator<Item = (f64, Vec<f64>)>) -> Result<(f64, Vec<f64
     })
 }
 
-fn check_measured(y: &[f64], samples: usize) -> Result<()> {
+/// Refuses outputs that are not one per input sample, finite or NaN.
+pub(crate) fn check_measured(y: &[f64], samples: usize) -> Result<()> {
     if y.len() != samples {
         return Err(Error::data(format!(
             "expected {samples} measured outputs, one per input sample, got {}; give u and y the same number of samples",
@@ -318,6 +314,17 @@ fn check_measured(y: &[f64], samples: usize) -> Result<()> {
     if y.iter().any(|v| v.is_infinite()) {
         return Err(Error::data(
             "expected finite outputs, or NaN where none was measured, got infinity; set it to NaN",
+        ));
+    }
+    Ok(())
+}
+
+/// As [`check_measured`]; also refuses a horizon of 0.
+pub(crate) fn check_predicted(y: &[f64], samples: usize, horizon: usize) -> Result<()> {
+    check_measured(y, samples)?;
+    if horizon == 0 {
+        return Err(Error::setting(
+            "expected a horizon of 1 step or more, got 0; 1 is one-step prediction",
         ));
     }
     Ok(())

@@ -117,7 +117,7 @@ impl NeuralSS {
         let part = |part: std::ops::Range<usize>, rows: usize| {
             DMatrix::from_row_slice(rows, part.len() / rows, &self.theta()[part])
         };
-        let (nx, outputs, hidden) = (shape.nx, shape.outputs, shape.hidden);
+        let (nx, hidden) = (shape.nx, shape.hidden);
         let scaled = u.iter().enumerate().map(|(j, u)| scaling.input(j, *u));
         let (x, v) = (
             DVector::from_column_slice(state),
@@ -126,15 +126,9 @@ impl NeuralSS {
         let (wx, wu) = (part(parts.wx, hidden), part(parts.wu, hidden));
         let z = &wx * &x + &wu * &v + part(parts.bh, hidden);
         let rises = DMatrix::from_diagonal(&z.map(|z| z.cosh().powi(-2)));
-        let (c, d, g) = (
-            part(parts.c, outputs),
-            part(parts.d, outputs),
-            part(parts.g, outputs),
-        );
-        let sums = &c * &x + &d * &v + part(parts.constant, outputs) + &g * z.map(f64::tanh);
-        let slope = |s: f64| self.output().value_and_slope(s).1;
-        let steepness = DVector::from_fn(outputs, |p, _| slope(sums[p]) * scaling.y_scale[p]);
-        let steepness = DMatrix::from_diagonal(&steepness);
+        let (c, d, g) = (part(parts.c, 1), part(parts.d, 1), part(parts.g, 1));
+        let sum = &c * &x + &d * &v + part(parts.constant, 1) + &g * z.map(f64::tanh);
+        let steepness = self.output().value_and_slope(sum[0]).1 * scaling.y_scale;
         let per_input = DVector::from_fn(shape.inputs, |j, _| scaling.u_scale[j].recip());
         let per_input = DMatrix::from_diagonal(&per_input);
         let bent = part(parts.e, nx) * &rises;
@@ -143,7 +137,7 @@ impl NeuralSS {
         Ok(Linearised {
             a: rows(part(parts.a, nx) + &bent * &wx),
             b: rows((part(parts.b, nx) + bent * &wu) * &per_input),
-            c: rows(&steepness * (c + &bent_output * wx)),
+            c: rows(steepness * (c + &bent_output * wx)),
             d: rows(steepness * (d + bent_output * wu) * per_input),
             states: nx,
             inputs: shape.inputs,
@@ -274,7 +268,6 @@ mod tests {
                 nx: 1 + i,
                 nk: i,
                 inputs: 1 + i % 2,
-                outputs: 1 + i / 2,
                 hidden: 3 + 4 * i,
                 integrator: false,
             };
@@ -284,15 +277,15 @@ mod tests {
             let scaling = Scaling {
                 u_mean: draw(shape.inputs),
                 u_scale: vec![1.5; shape.inputs],
-                y_mean: draw(shape.outputs),
-                y_scale: vec![2.5; shape.outputs],
+                y_mean: draw(1)[0],
+                y_scale: 2.5,
             };
             let unit =
                 (0..shape.nx * shape.nx).map(|i| f64::from(u8::from(i % (shape.nx + 1) == 0)));
             let statistics = Statistics {
                 state_mean: vec![0.0; shape.nx],
                 state_covariance: unit.collect(),
-                residual_variance: vec![1.0; shape.outputs],
+                residual_variance: 1.0,
                 process_noise: 0.0,
             };
             let theta = draw(shape.parameters());

@@ -2,15 +2,14 @@
 //!
 //! In reading order: [`Model`] is what Python, the closed loop and the deployment use. A lagged model has its step,
 //! from which [`Lagged`] makes free run, prediction and state; it adds [`Differentiable`], and the rest of [`Model`]
-//! follows. [`NeuralSS`] has its own states and implements [`Model`] itself.
+//! follows. [`NeuralSS`](crate::neural_ss::NeuralSS) has its own states and implements [`Model`] itself.
 
-use crate::closed_loop::{LaggedPlant, Plant, StatePlant};
+use crate::closed_loop::{LaggedPlant, Plant};
 use crate::embedded::Embedded;
 use crate::lagged::Lagged;
 use crate::linear::LinearModel;
 use crate::linearised::{self, Linearised};
 use crate::neural::NeuralOE;
-use crate::neural_ss::NeuralSS;
 use crate::{Error, Result};
 
 /// A free run and its derivatives, row by row: with respect to the parameters, then to the initial state.
@@ -196,50 +195,5 @@ impl Differentiable for NeuralOE {
 
     fn embedded(&self, scaled: bool) -> Result<Embedded> {
         Ok(NeuralOE::embedded(self, scaled))
-    }
-}
-
-impl Model for NeuralSS {
-    fn theta(&self) -> Vec<f64> {
-        NeuralSS::theta(self).to_vec()
-    }
-
-    fn rest_state(&self) -> Vec<f64> {
-        NeuralSS::rest_state(self)
-    }
-
-    fn simulate(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<Vec<f64>> {
-        NeuralSS::simulate(self, u, channels, state)
-    }
-
-    fn predict(
-        &self,
-        u: &[f64],
-        channels: usize,
-        y: &[f64],
-        state: &[f64],
-        horizon: usize,
-    ) -> Result<Vec<f64>> {
-        NeuralSS::predict(self, u, channels, y, state, horizon)
-    }
-
-    fn estimate_state(&self, u: &[f64], channels: usize, y: &[f64]) -> Result<Vec<f64>> {
-        self.estimate_initial_state(u, channels, y)
-    }
-
-    fn jacobian(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<RunAndRows> {
-        NeuralSS::jacobian(self, u, channels, state)
-    }
-
-    fn linearise(&self, u: &[f64], state: &[f64]) -> Result<Linearised> {
-        NeuralSS::linearise(self, u, state)
-    }
-
-    fn plant(&self, ts: f64) -> Result<Box<dyn ClonePlant + '_>> {
-        Ok(Box::new(StatePlant::new(self, ts)?))
-    }
-
-    fn embedded(&self, _scaled: bool) -> Result<Embedded> {
-        NeuralSS::embedded(self)
     }
 }

@@ -8,7 +8,7 @@ mod kalman;
 mod network;
 mod output;
 mod problem;
-mod recording;
+mod records;
 mod referee;
 mod sensitivities;
 mod shape;
@@ -18,7 +18,6 @@ mod train;
 
 pub use free_run::Stepper;
 pub use output::OutputFunction;
-pub use recording::Recording;
 pub use shape::{Scaling, Shape};
 pub use state::Statistics;
 pub use train::{NeuralSSFit, Settings, fit};
@@ -28,8 +27,12 @@ use kalman::Filter;
 use network::{Network, Scratch};
 use sensitivities::{Columns, Recursion, Rows, Sensitivities};
 
+use crate::closed_loop::StatePlant;
+use crate::embedded::Embedded;
 use crate::guard::Guarded;
-use crate::lagged::finite;
+use crate::lagged::{check_measured, check_predicted, finite};
+use crate::linearised::Linearised;
+use crate::model::{ClonePlant, Model, RunAndRows};
 use crate::{Error, Monitor, Result, simd};
 
 /// `x+ = A x + B v + E h`, `y = f(C x + D v + c + G h)` with `h = tanh(Wx x + Wu v + bh)`, in scaled units
@@ -78,7 +81,7 @@ impl NeuralSS {
                 theta[i]
             )));
         }
-        scaling.check(shape.inputs, shape.outputs)?;
+        scaling.check(shape.inputs)?;
         statistics.check(shape)?;
         let network = Network::new(shape, output, &theta);
         Ok(Self {
@@ -138,148 +141,13 @@ impl NeuralSS {
         Self::new(self.shape(), self.output(), theta, scaling, statistics)
     }
 
-    /// The state at which the model rests at input zero, in scaled units: least `|x+ - x|^2 + |y|^2`.
-    pub fn rest_state(&self) -> Vec<f64> {
-        let Shape {
-            inputs, outputs, ..
-        } = self.shape();
-        let v: Vec<f64> = (0..inputs).map(|j| self.scaling.input(j, 0.0)).collect();
-        let zero: Vec<f64> = (0..outputs).map(|p| self.scaling.output(p, 0.0)).collect();
-        state::rest(&self.network, &self.statistics, &v, &zero)
-    }
-
-    /// Free run in the data's units, time first.
-    ///
-    /// # Errors
-    /// `ErrorKind::Data` for wrong shapes or values, `ErrorKind::Fit` for a run that leaves the finite numbers.
-    pub fn simulate(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<Vec<f64>> {
-        let run = self.run(u, channels, state, &Monitor::default())?;
-        finite(self.restored(&run.sums))
-    }
-
     /// The states of the free run, time first, in scaled units.
     ///
     /// # Errors
-    /// As [`NeuralSS::simulate`].
+    /// As [`Model::simulate`].
     pub fn states(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<Vec<f64>> {
         let run = self.run(u, channels, state, &Monitor::default())?;
         finite(run.states)
-    }
-
-    /// Free run in the data's units, and its derivatives row by row, output by output: with respect to theta, then to the state.
-    ///
-    /// # Errors
-    /// As [`NeuralSS::simulate`].
-    pub fn jacobian(
-        &self,
-        u: &[f64],
-        channels: usize,
-        state: &[f64],
-    ) -> Result<(Vec<f64>, Vec<f64>)> {
-        let shape = self.shape();
-        let monitor = Monitor::default();
-        let trajectory = self.run(u, channels, state, &monitor)?;
-        let run = finite(self.restored(&trajectory.sums))?;
-        let columns = Columns::new(shape);
-        let states = (0..shape.nx).map(|j| columns.state + j);
-        let mut dense = Dense {
-            columns: columns.of_theta().into_iter().chain(states).collect(),
-            block: vec![0.0; columns.room * shape.outputs.max(single::BLOCK)],
-            room: columns.room,
-            rows: Vec::with_capacity(run.len() * (self.theta.len() + shape.nx)),
-            scales: &self.scaling.y_scale,
-        };
-        let known = vec![0.0; run.len()];
-        simd::run(Recursion {
-            network: &self.network,
-            run: &trajectory,
-            v: &self.scaling.delayed_inputs(u, shape.nk),
-            y: &known,
-            weights: &[],
-            buffers: &mut Sensitivities::new(shape),
-            rows: &mut dense,
-            exact: true,
-            monitor: &monitor,
-        });
-        Ok((run, dense.rows))
-    }
-
-    /// The output `horizon` steps ahead: an extended Kalman filter follows the measured outputs up to sample
-    /// `k - horizon`, then the model runs free. Outputs that are NaN are not used.
-    ///
-    /// # Errors
-    /// `ErrorKind::Data` for wrong shapes, `ErrorKind::Setting` for a horizon of 0, `ErrorKind::Fit` as in free run.
-    pub fn predict(
-        &self,
-        u: &[f64],
-        channels: usize,
-        y: &[f64],
-        state: &[f64],
-        horizon: usize,
-    ) -> Result<Vec<f64>> {
-        let shape = self.shape();
-        let samples = self.check(u, channels, state)?;
-        self.check_measured(y, samples)?;
-        if horizon == 0 {
-            return Err(Error::setting(
-                "expected a horizon of 1 step or more, got 0; 1 is one-step prediction",
-            ));
-        }
-        // the first samples have too few known outputs before them and run free from the state
-        let first = horizon.min(samples);
-        let mut run = self.simulate(&u[..first * channels], channels, state)?;
-        let v = self.scaling.delayed_inputs(u, shape.nk);
-        let mut filtered = Vec::with_capacity(samples * shape.nx);
-        simd::run(Filter {
-            network: &self.network,
-            prior: &self.statistics,
-            process: self.statistics.process_noise,
-            state,
-            v: &v,
-            y: &self.scaling.outputs(y),
-            each: |_: usize, _: &[f64], x: &[f64]| filtered.extend_from_slice(x),
-        });
-        // no longer than the record, even for a longer horizon
-        let mut trajectory = Trajectory::new(&self.network, first + 1);
-        let mut scratch = Scratch::new(shape);
-        for k in first..samples {
-            let state = &filtered[(k - horizon) * shape.nx..][..shape.nx];
-            self.free(
-                &v[(k - horizon) * channels..(k + 1) * channels],
-                state,
-                &mut trajectory,
-                &mut scratch,
-                &Monitor::default(),
-            )?;
-            run.extend(self.restored(&trajectory.sums[horizon * shape.outputs..]));
-        }
-        finite(run)
-    }
-
-    /// The most likely state at the first sample, given these samples (docs/CONVENTIONS.md), in scaled units. Outputs
-    /// that are NaN do not count.
-    ///
-    /// # Errors
-    /// `ErrorKind::Data` for wrong shapes or no samples, `ErrorKind::Fit` if every start leaves the finite numbers.
-    pub fn estimate_initial_state(
-        &self,
-        u: &[f64],
-        channels: usize,
-        y: &[f64],
-    ) -> Result<Vec<f64>> {
-        let samples = self.check(u, channels, &vec![0.0; self.shape().nx])?;
-        self.check_measured(y, samples)?;
-        if samples == 0 {
-            return Err(Error::data(
-                "expected samples to estimate the initial state from, got none; give 20 or so",
-            ));
-        }
-        let v = self.scaling.delayed_inputs(u, self.shape().nk);
-        let y = self.scaling.outputs(y);
-        let rest = [self.rest_state()];
-        state::estimate(&self.network, &self.statistics, &v, &y, &rest).ok_or_else(|| {
-            Error::fit("expected an initial state with a finite free run, found none; the model is unstable on this record")
-        })
     }
 
     fn run(
@@ -312,9 +180,8 @@ impl NeuralSS {
     }
 
     fn restored(&self, sums: &[f64]) -> Vec<f64> {
-        let (count, output) = (self.shape().outputs, self.network.output);
-        let restored = |(i, s): (usize, &f64)| self.scaling.restored(i % count, output.value(*s));
-        sums.iter().enumerate().map(restored).collect()
+        let restored = |s: &f64| self.scaling.restored(self.network.output.value(*s));
+        sums.iter().map(restored).collect()
     }
 
     /// Number of samples in `u`, after all shapes have been checked.
@@ -340,21 +207,133 @@ impl NeuralSS {
         }
         Ok(u.len() / channels)
     }
+}
 
-    fn check_measured(&self, y: &[f64], samples: usize) -> Result<()> {
-        let outputs = self.shape().outputs;
-        if y.len() != samples * outputs {
-            return Err(Error::data(format!(
-                "expected {samples} x {outputs} measured outputs, one row per input sample, got {} values; give u and y the same number of samples",
-                y.len()
-            )));
+impl Model for NeuralSS {
+    fn theta(&self) -> Vec<f64> {
+        self.theta.clone()
+    }
+
+    /// The state at which the model rests at input zero, in scaled units: least `|x+ - x|^2 + |y|^2`.
+    fn rest_state(&self) -> Vec<f64> {
+        let inputs = 0..self.shape().inputs;
+        let v: Vec<f64> = inputs.map(|j| self.scaling.input(j, 0.0)).collect();
+        state::rest(
+            &self.network,
+            &self.statistics,
+            &v,
+            self.scaling.output(0.0),
+        )
+    }
+
+    /// Free run in the data's units, time first.
+    fn simulate(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<Vec<f64>> {
+        let run = self.run(u, channels, state, &Monitor::default())?;
+        finite(self.restored(&run.sums))
+    }
+
+    /// The output `horizon` steps ahead: an extended Kalman filter follows the measured outputs up to sample
+    /// `k - horizon`, then the model runs free. Outputs that are NaN are not used.
+    fn predict(
+        &self,
+        u: &[f64],
+        channels: usize,
+        y: &[f64],
+        state: &[f64],
+        horizon: usize,
+    ) -> Result<Vec<f64>> {
+        let shape = self.shape();
+        let samples = self.check(u, channels, state)?;
+        check_predicted(y, samples, horizon)?;
+        // the first samples have too few known outputs before them and run free from the state
+        let first = horizon.min(samples);
+        let mut run = self.simulate(&u[..first * channels], channels, state)?;
+        let v = self.scaling.delayed_inputs(u, shape.nk);
+        let mut filtered = Vec::with_capacity(samples * shape.nx);
+        simd::run(Filter {
+            network: &self.network,
+            prior: &self.statistics,
+            process: self.statistics.process_noise,
+            state,
+            v: &v,
+            y: &self.scaling.outputs(y),
+            each: |_: usize, _: f64, x: &[f64]| filtered.extend_from_slice(x),
+        });
+        // no longer than the record, even for a longer horizon
+        let mut trajectory = Trajectory::new(&self.network, first + 1);
+        let mut scratch = Scratch::new(shape);
+        for k in first..samples {
+            let state = &filtered[(k - horizon) * shape.nx..][..shape.nx];
+            self.free(
+                &v[(k - horizon) * channels..(k + 1) * channels],
+                state,
+                &mut trajectory,
+                &mut scratch,
+                &Monitor::default(),
+            )?;
+            run.extend(self.restored(&trajectory.sums[horizon..]));
         }
-        if y.iter().any(|v| v.is_infinite()) {
+        finite(run)
+    }
+
+    /// The most likely state at the first sample, given these samples (docs/CONVENTIONS.md), in scaled units. Outputs
+    /// that are NaN do not count.
+    fn estimate_state(&self, u: &[f64], channels: usize, y: &[f64]) -> Result<Vec<f64>> {
+        let samples = self.check(u, channels, &vec![0.0; self.shape().nx])?;
+        check_measured(y, samples)?;
+        if samples == 0 {
             return Err(Error::data(
-                "expected measured outputs that are finite, or NaN where not known, got infinity; cut or repair that part",
+                "expected samples to estimate the initial state from, got none; give 20 or so",
             ));
         }
-        Ok(())
+        let v = self.scaling.delayed_inputs(u, self.shape().nk);
+        let y = self.scaling.outputs(y);
+        let rest = [self.rest_state()];
+        state::estimate(&self.network, &self.statistics, &v, &y, &rest).ok_or_else(|| {
+            Error::fit("expected an initial state with a finite free run, found none; the model is unstable on this record")
+        })
+    }
+
+    /// Free run in the data's units, and its derivatives row by row: with respect to theta, then to the state.
+    fn jacobian(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<RunAndRows> {
+        let shape = self.shape();
+        let monitor = Monitor::default();
+        let trajectory = self.run(u, channels, state, &monitor)?;
+        let run = finite(self.restored(&trajectory.sums))?;
+        let columns = Columns::new(shape);
+        let states = (0..shape.nx).map(|j| columns.state + j);
+        let mut dense = Dense {
+            columns: columns.of_theta().into_iter().chain(states).collect(),
+            block: vec![0.0; columns.room * single::BLOCK],
+            room: columns.room,
+            rows: Vec::with_capacity(run.len() * (self.theta.len() + shape.nx)),
+            scale: self.scaling.y_scale,
+        };
+        let known = vec![0.0; run.len()];
+        simd::run(Recursion {
+            network: &self.network,
+            run: &trajectory,
+            v: &self.scaling.delayed_inputs(u, shape.nk),
+            y: &known,
+            weights: &[],
+            buffers: &mut Sensitivities::new(shape),
+            rows: &mut dense,
+            exact: true,
+            monitor: &monitor,
+        });
+        Ok((run, dense.rows))
+    }
+
+    fn linearise(&self, u: &[f64], state: &[f64]) -> Result<Linearised> {
+        NeuralSS::linearise(self, u, state)
+    }
+
+    fn plant(&self, ts: f64) -> Result<Box<dyn ClonePlant + '_>> {
+        Ok(Box::new(StatePlant::new(self, ts)?))
+    }
+
+    fn embedded(&self, _scaled: bool) -> Result<Embedded> {
+        Ok(NeuralSS::embedded(self))
     }
 }
 
@@ -366,12 +345,8 @@ impl Guarded for NeuralSS {
         self.shape().inputs
     }
 
-    fn outputs(&self) -> usize {
-        self.shape().outputs
-    }
-
     fn first_state(&self, u: &[f64], y: &[f64]) -> Result<Vec<f64>> {
-        self.estimate_initial_state(u, self.shape().inputs, y)
+        self.estimate_state(u, self.shape().inputs, y)
     }
 
     fn free_run(&self, u: &[f64], state: &[f64], monitor: &Monitor) -> Result<Vec<f64>> {
@@ -402,16 +377,16 @@ impl Guarded for NeuralSS {
 }
 
 /// Rows in the data's units, in the order of theta.
-struct Dense<'a> {
+struct Dense {
     columns: Vec<usize>,
     /// Rows that have not been kept yet.
     block: Vec<f64>,
     room: usize,
     rows: Vec<f64>,
-    scales: &'a [f64],
+    scale: f64,
 }
 
-impl Rows for Dense<'_> {
+impl Rows for Dense {
     fn width(&self) -> usize {
         self.room
     }
@@ -422,9 +397,9 @@ impl Rows for Dense<'_> {
 
     fn keep(&mut self, count: usize) {
         let rows = self.block.chunks_exact(self.room).take(count);
-        for (row, scale) in rows.zip(self.scales.iter().cycle()) {
-            self.rows
-                .extend(self.columns.iter().map(|&c| row[c] * scale));
+        for row in rows {
+            let scaled = self.columns.iter().map(|&c| row[c] * self.scale);
+            self.rows.extend(scaled);
         }
     }
 }

@@ -15,10 +15,10 @@ mod frequency;
 mod greybox;
 mod guard;
 mod host_loop;
+mod least_squares;
 mod link;
 mod loop_transfer;
 mod models;
-mod search;
 mod signals;
 
 use pyo3::prelude::*;
@@ -66,6 +66,8 @@ mod _core {
     #[pymodule_export]
     use crate::host_loop::host_loop;
     #[pymodule_export]
+    use crate::least_squares::least_squares_fit;
+    #[pymodule_export]
     use crate::link::{LinkBodies, LinkClient, LinkReceiver, LinkUpload, link_frame};
     #[pymodule_export]
     use crate::loop_transfer::{LoopPath, loop_response, margins, sampled_fopdt, tolerance};
@@ -80,8 +82,6 @@ mod _core {
     use crate::models::neural_ss::{NeuralSS, NeuralSSFit, fit_neural_ss};
     #[pymodule_export]
     use crate::models::{EmbeddedModel, Model, convex_weights, guard, tanh_quotients};
-    #[pymodule_export]
-    use crate::search::{least_squares_fit, search_front, search_least};
     #[pymodule_export]
     use crate::signals::{
         chirp, crest_factor, jumps, limit, multisine, prbs, random_steps, speed_difference,

@@ -12,11 +12,12 @@ use sewfast_core::linearised::Linearised;
 use sewfast_core::{Error, Result, model, stacking};
 
 use crate::seam::{
-    Matrix, Raised, Rows, Values, Vector, array1, array2, raise, released, rows, slice, watched,
+    Experiments, Matrix, Raised, Rows, Values, Vector, array1, array2, raise, records, released,
+    rows, slice, watched,
 };
 use linear::LinearModel;
 use neural::NeuralOE;
-use neural_ss::{Experiments, NeuralSS, recordings};
+use neural_ss::NeuralSS;
 
 /// The methods of a fit: common ones, and its own. PyO3 allows one block of methods per class.
 macro_rules! fit_methods {
@@ -238,7 +239,7 @@ pub fn guard(
     experiments: Experiments<'_>,
     linear: Vec<PyRef<'_, LinearModel>>,
 ) -> PyResult<&'static str> {
-    let experiments = recordings(py, &experiments)?;
+    let experiments = records(py, &experiments)?;
     let linear: Vec<_> = linear.iter().map(|m| m.inner.as_ref().clone()).collect();
     let found = if let Ok(model) = model.cast::<LinearModel>() {
         let model = model.get().inner.as_ref();

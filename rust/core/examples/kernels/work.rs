@@ -182,17 +182,17 @@ fn state_space_training(max_iterations: usize) -> Call {
         state_space_settings(max_iterations, third_order()),
     );
     Box::new(move || {
-        let records = [neural_ss::Recording::new(&u, 1, &y, 1).expect("a recording")];
+        let records = [Record::new(&u, 1, &y).expect("a record")];
         black_box(neural_ss::fit(&records, &[], &settings, &Monitor::default()).expect("a fit"));
     })
 }
 
 fn state_space_run() -> Call {
     let ((u, y), settings) = (sensed(), state_space_settings(1, third_order()));
-    let records = [neural_ss::Recording::new(&u, 1, &y, 1).expect("a recording")];
+    let records = [Record::new(&u, 1, &y).expect("a record")];
     let fit = neural_ss::fit(&records, &[], &settings, &Monitor::default()).expect("a fit");
     Box::new(move || {
-        let run = fit.model.simulate(&u, 1, &[0.0; 3]);
+        let run = sewfast_core::model::Model::simulate(&fit.model, &u, 1, &[0.0; 3]);
         black_box(run.expect("a stable run"));
     })
 }

@@ -2,7 +2,7 @@
 
 use super::{KernelPlant, Known, Plant};
 use crate::lagged::{Form, Lagged, Lags};
-use crate::neural_ss::{NeuralSS, Shape, Stepper};
+use crate::neural_ss::{NeuralSS, Stepper};
 use crate::speed::Encoder;
 use crate::{Error, Result};
 
@@ -111,14 +111,12 @@ impl StatePlant {
     /// `model` at rest, after inputs of zero. `ts` \[s\] is the sample time it was identified at.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for a model with several inputs or outputs or without delay, or an unusable sample time.
+    /// `ErrorKind::Setting` for a model with several inputs or without delay, or an unusable sample time.
     pub fn new(model: &NeuralSS, ts: f64) -> Result<Self> {
-        let Shape {
-            inputs, outputs, ..
-        } = model.shape();
-        if inputs != 1 || outputs != 1 {
+        let inputs = model.shape().inputs;
+        if inputs != 1 {
             return Err(Error::setting(format!(
-                "expected a model with one input and one output to close a loop around, got {inputs} and {outputs}; identify it from the command alone"
+                "expected a model with one input to close a loop around, got {inputs}; identify it from the command alone"
             )));
         }
         if !(ts > 0.0 && ts.is_finite()) {
@@ -142,7 +140,7 @@ impl Plant for StatePlant {
     }
 
     fn output(&self) -> f64 {
-        self.stepper.output(0)
+        self.stepper.output()
     }
 
     fn position(&self) -> f64 {

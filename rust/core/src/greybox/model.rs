@@ -19,7 +19,7 @@ use super::{
 };
 use crate::closed_loop::{KernelPlant, Known, Plant};
 use crate::embedded::Embedded;
-use crate::lagged::finite;
+use crate::lagged::{check_predicted, finite};
 use crate::linearised::Linearised;
 use crate::model::{ClonePlant, Model, RunAndRows};
 use crate::neural::Nothing;
@@ -609,19 +609,7 @@ impl Model for GreyBox {
         horizon: usize,
     ) -> Result<Vec<f64>> {
         self.check(u, channels, state)?;
-        if y.len() != u.len() || y.iter().any(|v| v.is_infinite()) {
-            return Err(Error::data(format!(
-                "expected {} measured outputs, finite or NaN where none was measured, got {}; give u and y the same number \
-                 of samples",
-                u.len(),
-                y.len()
-            )));
-        }
-        if horizon == 0 {
-            return Err(Error::setting(
-                "expected a horizon of 1 step or more, got 0; 1 is one-step prediction",
-            ));
-        }
+        check_predicted(y, u.len(), horizon)?;
         let v = self.acting(u);
         let noise = self.frame.process_noise;
         let mut filter = Filter {

@@ -9,7 +9,6 @@ use crate::guard;
 use crate::lagged::{Lagged, STATE_SAMPLES};
 use crate::linear::LinearModel;
 use crate::lm::{self, Damping, Outcome, Termination};
-use crate::neural_ss::Recording;
 use crate::random::Random;
 use crate::{Error, Monitor, Record, Result, arx, starts};
 
@@ -122,7 +121,7 @@ pub fn fit(
 pub(super) struct Training<'a> {
     pub settings: &'a Settings,
     monitor: &'a Monitor,
-    recordings: Vec<Recording<'a>>,
+    records: Vec<Record<'a>>,
     pub shape: Shape,
     scaling: Scaling,
     pub limits: (f64, f64),
@@ -181,7 +180,7 @@ impl<'a> Training<'a> {
         Ok(Self {
             settings,
             monitor,
-            recordings: records.iter().map(Recording::from).collect(),
+            records: records.to_vec(),
             shape,
             limits: limits(&experiments, settings.saturate),
             constant_cost: constant_cost(&experiments),
@@ -287,9 +286,8 @@ impl<'a> Training<'a> {
     fn passes(&self, theta: &[f64]) -> bool {
         let linear = self.settings.linear.as_slice();
         let monitor = Monitor::default();
-        self.model(theta).is_ok_and(|model| {
-            guard::verdict(&model, &self.recordings, linear, &monitor) == Ok(None)
-        })
+        self.model(theta)
+            .is_ok_and(|model| guard::verdict(&model, &self.records, linear, &monitor) == Ok(None))
     }
 
     fn chosen(&self, results: Vec<Option<Trained>>) -> Result<NeuralFit> {

@@ -22,7 +22,7 @@ const FLOOR: f64 = 1e-13;
 const REACH: f64 = 1e-3;
 /// Poles of a start without a linear model: fast and slow ones.
 pub(super) const POLES: (f64, f64) = (0.5, 0.99);
-/// Added to the normal equations of the outputs, relative to their mean.
+/// Added to the normal equations of the output, relative to their mean.
 const RIDGE: f64 = 1e-9;
 
 /// Share of an integrator's starts that have a unit which switches with the sign of the speed.
@@ -39,7 +39,7 @@ pub(super) struct Realisation {
     pub b: DMatrix<f64>,
     pub c: DMatrix<f64>,
     pub d: DMatrix<f64>,
-    pub constant: DVector<f64>,
+    pub constant: f64,
 }
 
 impl Realisation {
@@ -74,15 +74,15 @@ impl Realisation {
                 shape.nk
             )));
         };
-        if lags.channels != shape.inputs || shape.outputs != 1 {
+        if lags.channels != shape.inputs {
             return Err(Error::setting(format!(
-                "expected a linear model with {} inputs for one output, got {} inputs for {} outputs; with several outputs leave the linear model out",
-                shape.inputs, lags.channels, shape.outputs
+                "expected a linear model with {} inputs, got one with {}; fit it to the same record",
+                shape.inputs, lags.channels
             )));
         }
         let mut a = vec![0.0; nx + 1];
         a[1..=lags.na].copy_from_slice(linear.a());
-        let scale = |j: usize| scaling.u_scale[j] / scaling.y_scale[0];
+        let scale = |j: usize| scaling.u_scale[j] / scaling.y_scale;
         let b = |i: usize, j: usize| match i.checked_sub(shift) {
             Some(i) if i < lags.nb => linear.b()[j * lags.nb + i] * scale(j),
             _ => 0.0,
@@ -93,7 +93,7 @@ impl Realisation {
         let level = (linear.offset() + moved) / held;
         // An integrator has no level of its own: its state holds it.
         let constant = if held.abs() > 1e-9 {
-            scaling.output(0, level)
+            scaling.output(level)
         } else {
             0.0
         };
@@ -102,7 +102,7 @@ impl Realisation {
             b: DMatrix::from_fn(nx, shape.inputs, |i, j| b(i + 1, j) - a[i + 1] * b(0, j)),
             c: DMatrix::from_fn(1, nx, |_, j| f64::from(u8::from(j == 0))),
             d: DMatrix::from_fn(1, shape.inputs, |_, j| b(0, j)),
-            constant: DVector::from_element(1, constant),
+            constant,
         })
     }
 
@@ -209,7 +209,7 @@ impl Realisation {
         put(parts.b, &self.b);
         put(parts.c, &self.c);
         put(parts.d, &self.d);
-        theta[parts.constant].copy_from_slice(self.constant.as_slice());
+        theta[parts.constant.start] = self.constant;
         theta
     }
 }
@@ -271,7 +271,7 @@ fn switch(theta: &mut [f64], linear: &Realisation, shape: Shape, random: &mut Ra
     }
 }
 
-/// Random states that decay at different rates, with output equations fitted to the data; `None` if these are not
+/// Random states that decay at different rates, with an output equation fitted to the data; `None` if these are not
 /// finite.
 pub(super) fn small(
     shape: Shape,
@@ -283,9 +283,9 @@ pub(super) fn small(
     let mut states = Realisation {
         a: DMatrix::zeros(nx, nx),
         b: DMatrix::from_fn(nx, shape.inputs, |_, _| random.normal()),
-        c: DMatrix::zeros(shape.outputs, nx),
-        d: DMatrix::zeros(shape.outputs, shape.inputs),
-        constant: DVector::zeros(shape.outputs),
+        c: DMatrix::zeros(1, nx),
+        d: DMatrix::zeros(1, shape.inputs),
+        constant: 0.0,
     };
     (0..free).for_each(|i| states.a[(i, i)] = random.between(POLES.0, POLES.1));
     if shape.integrator {
@@ -294,41 +294,38 @@ pub(super) fn small(
     }
     states
         .normalised(shape, experiments)?
-        .with_outputs(shape, experiments)
+        .with_output(shape, experiments)
 }
 
 impl Realisation {
-    /// The states' part in the change of the first output from one sample to the next.
+    /// The states' part in the change of the output from one sample to the next.
     fn speed(&self) -> RowDVector<f64> {
         self.c.row(0) * &self.a - self.c.row(0)
     }
 
-    /// With `C`, `D` and `c` fitted to the outputs by least squares.
-    fn with_outputs(mut self, shape: Shape, experiments: &[Experiment]) -> Option<Self> {
+    /// With `C`, `D` and `c` fitted to the output by least squares.
+    fn with_output(mut self, shape: Shape, experiments: &[Experiment]) -> Option<Self> {
         let (nx, width) = (shape.nx, shape.arguments() + 1);
-        for p in 0..shape.outputs {
-            let (mut left, mut right) = (DMatrix::zeros(width, width), DVector::zeros(width));
-            for experiment in experiments {
-                let mut x = DVector::zeros(nx);
-                let outputs = experiment.y.chunks_exact(shape.outputs);
-                for (v, y) in experiment.v.chunks_exact(shape.inputs).zip(outputs) {
-                    let row = x.iter().chain(v).copied().chain([1.0]);
-                    let row = DVector::from_iterator(width, row);
-                    if !y[p].is_nan() {
-                        left.ger(1.0, &row, &row, 1.0);
-                        right.axpy(y[p], &row, 1.0);
-                    }
-                    x = &self.a * &x + &self.b * DVector::from_column_slice(v);
+        let (mut left, mut right) = (DMatrix::zeros(width, width), DVector::zeros(width));
+        for experiment in experiments {
+            let mut x = DVector::zeros(nx);
+            for (v, y) in experiment.v.chunks_exact(shape.inputs).zip(&experiment.y) {
+                let row = x.iter().chain(v).copied().chain([1.0]);
+                let row = DVector::from_iterator(width, row);
+                if !y.is_nan() {
+                    left.ger(1.0, &row, &row, 1.0);
+                    right.axpy(*y, &row, 1.0);
                 }
+                x = &self.a * &x + &self.b * DVector::from_column_slice(v);
             }
-            let ridge = RIDGE * left.trace() / width as f64;
-            let found = (left + DMatrix::identity(width, width) * ridge)
-                .cholesky()?
-                .solve(&right);
-            (0..nx).for_each(|j| self.c[(p, j)] = found[j]);
-            (0..shape.inputs).for_each(|j| self.d[(p, j)] = found[nx + j]);
-            self.constant[p] = found[width - 1];
         }
+        let ridge = RIDGE * left.trace() / width as f64;
+        let found = (left + DMatrix::identity(width, width) * ridge)
+            .cholesky()?
+            .solve(&right);
+        (0..nx).for_each(|j| self.c[j] = found[j]);
+        (0..shape.inputs).for_each(|j| self.d[j] = found[nx + j]);
+        self.constant = found[width - 1];
         Some(self)
     }
 }
@@ -426,9 +423,7 @@ impl NeuralSS {
             statistics.state_mean[state] = mean / (1.0 - pole);
             // a slow input brings the state to this size, at which it should move the output no further than at size 1
             let size = (of_states + of_inputs).sqrt() / (1.0 - pole);
-            for p in 0..new.outputs {
-                theta[to.c.start + p * nx + state] = NEW_REACH * random.normal() / size.max(1.0);
-            }
+            theta[to.c.start + state] = NEW_REACH * random.normal() / size.max(1.0);
         }
         new.hold(&mut theta);
         Self::new(new, self.output(), theta, self.scaling.clone(), statistics)

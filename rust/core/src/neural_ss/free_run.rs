@@ -1,12 +1,13 @@
 //! Free runs in scaled units, one or two side by side; and the model stepped sample by sample for a closed loop.
 //!
-//! A run waits for its own last state: a tanh and two sums. A second run fits into the waiting times. Models of one
-//! output, up to four states and up to 16 hidden units step entirely in registers: at 2.5 GHz with AVX-512 one run
+//! A run waits for its own last state: a tanh and two sums. A second run fits into the waiting times. Models of
+//! up to four states and up to 16 hidden units step entirely in registers: at 2.5 GHz with AVX-512 one run
 //! takes 47 ns a sample, the general step 50, and two side by side 63 (docs/PERFORMANCE.md).
 
 use super::network::{Network, Scratch, copy, unrolled};
-use super::shape::{Scaling, Shape};
+use super::shape::Scaling;
 use super::{NeuralSS, state};
+use crate::model::Model;
 use crate::monitor::Limit;
 use crate::simd::{self, F64x8, Kernel, Lanes};
 use crate::{Error, Monitor, Result};
@@ -29,11 +30,11 @@ pub(super) struct Trajectory {
 
 impl Trajectory {
     pub fn new(network: &Network, samples: usize) -> Self {
-        let Shape { nx, outputs, .. } = network.shape;
+        let nx = network.shape.nx;
         Self {
             states: vec![0.0; samples * nx],
             hidden: vec![Lanes::ZERO; samples * network.groups()],
-            sums: vec![0.0; samples * outputs],
+            sums: vec![0.0; samples],
         }
     }
 }
@@ -156,9 +157,9 @@ fn advance<V: F64x8, const NX: usize, const RUNS: usize>(
     let network = runs[0].network;
     // More groups fill the waiting times themselves, and their hidden outputs do not fit into registers beside the
     // loads of the weights.
-    match (NX, network.shape.outputs, network.groups()) {
-        (1.., 1, 1) => together::<V, NX, 1, RUNS>(runs, start, v, inputs),
-        (1.., 1, 2) => together::<V, NX, 2, RUNS>(runs, start, v, inputs),
+    match (NX, network.groups()) {
+        (1.., 1) => together::<V, NX, 1, RUNS>(runs, start, v, inputs),
+        (1.., 2) => together::<V, NX, 2, RUNS>(runs, start, v, inputs),
         _ => {
             for (k, v) in v.chunks_exact(inputs).enumerate() {
                 // In turn, sample by sample, so that two runs overlap here, too.
@@ -170,7 +171,7 @@ fn advance<V: F64x8, const NX: usize, const RUNS: usize>(
     }
 }
 
-/// A block of models of one output, `NX` states and `GROUPS` groups of hidden units, side by side.
+/// A block of models of `NX` states and `GROUPS` groups of hidden units, side by side.
 #[inline(always)]
 fn together<V: F64x8, const NX: usize, const GROUPS: usize, const RUNS: usize>(
     runs: &mut [Run; RUNS],
@@ -203,17 +204,15 @@ impl Run<'_> {
     /// Sample `k`.
     #[inline(always)]
     fn step<V: F64x8, const NX: usize>(&mut self, k: usize, v: &[f64]) {
-        let Shape { nx, outputs, .. } = self.network.shape;
-        let nx = if NX == 0 { nx } else { NX };
+        let nx = if NX == 0 { self.network.shape.nx } else { NX };
         let (groups, scratch) = (self.network.groups(), &mut *self.scratch);
         let x = &mut self.run.states[k * nx..][..nx];
         let h = &mut self.run.hidden[k * groups..][..groups];
-        let s = &mut self.run.sums[k * outputs..][..outputs];
         // Stored before the step: the trajectory has the state to which a sample's output belongs.
         copy(x, &scratch.next[..nx]);
         scratch.set(x, v);
-        self.network
-            .step::<V, NX>(&scratch.arguments, h, &mut scratch.next, s);
+        let (arguments, next) = (&scratch.arguments, &mut scratch.next);
+        self.run.sums[k] = self.network.step::<V, NX>(arguments, h, next);
     }
 
     /// Measures a block: adds its squared errors, and ends the run if it cannot win any more.
@@ -226,13 +225,11 @@ impl Run<'_> {
         bound: f64,
     ) {
         let Some(limit) = self.limit else { return };
-        let Shape { nx, outputs, .. } = self.network.shape;
-        let output = self.network.output;
-        let (first, behind) = (start * outputs, end * outputs);
-        if let Some(y) = y.get(first..behind) {
+        let (nx, output) = (self.network.shape.nx, self.network.output);
+        if let Some(y) = y.get(start..end) {
             // One sum in the order of the samples: after the run, off its chain, over numbers in the cache.
-            let pairs = self.run.sums[first..behind].iter().zip(y);
-            match weights.get(first..behind) {
+            let pairs = self.run.sums[start..end].iter().zip(y);
+            match weights.get(start..end) {
                 None => {
                     for (s, y) in pairs.filter(|(_, y)| !y.is_nan()) {
                         *sum += (y - output.value(*s)).powi(2);
@@ -305,14 +302,14 @@ impl Stepper {
         }
         self.oldest = 0;
         self.scratch.next.copy_from_slice(&self.rest);
-        // One step ahead: the sums of sample 0 are needed before its input is known.
+        // One step ahead: the sum of sample 0 is needed before its input is known.
         self.advance_state();
     }
 
-    /// Output `p` at this sample, in the data's unit.
-    pub fn output(&self, p: usize) -> f64 {
-        let scaled = self.network.output.value(self.scratch.sums[p]);
-        self.scaling.restored(p, scaled)
+    /// The output at this sample, in the data's unit.
+    pub fn output(&self) -> f64 {
+        let scaled = self.network.output.value(self.scratch.sum);
+        self.scaling.restored(scaled)
     }
 
     /// Holds the inputs for one sample time and advances to the next sample.

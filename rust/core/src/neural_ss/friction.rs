@@ -195,7 +195,6 @@ mod tests {
             nx,
             nk: 1,
             inputs: 1,
-            outputs: 1,
             hidden: 2,
             integrator: true,
         }

@@ -219,7 +219,6 @@ mod tests {
             nx,
             nk: 1,
             inputs: 2,
-            outputs: 1,
             hidden,
             integrator: true,
         }
@@ -302,7 +301,6 @@ mod tests {
             nx: 3,
             nk: 1,
             inputs: 2,
-            outputs: 1,
             hidden: 2,
             integrator: true,
         };

@@ -14,8 +14,8 @@ const FIRST_EXPONENT: i32 = -3;
 /// Most samples used by it: more do not change a power of ten.
 const MOST_SAMPLES: usize = 20_000;
 
-/// A filter over one record, as a kernel. `each(k, s, x)` receives the sums predicted for sample `k`, before its
-/// outputs count, and the state corrected by them.
+/// A filter over one record, as a kernel. `each(k, s, x)` receives the sum predicted for sample `k`, before its
+/// output counts, and the state corrected by it.
 pub(super) struct Filter<'a, F> {
     pub network: &'a Network,
     pub prior: &'a Statistics,
@@ -29,7 +29,7 @@ pub(super) struct Filter<'a, F> {
     pub each: F,
 }
 
-impl<F: FnMut(usize, &[f64], &[f64])> Kernel for Filter<'_, F> {
+impl<F: FnMut(usize, f64, &[f64])> Kernel for Filter<'_, F> {
     type Output = ();
 
     #[inline(always)]
@@ -43,12 +43,7 @@ impl<F: FnMut(usize, &[f64], &[f64])> Kernel for Filter<'_, F> {
             y,
             mut each,
         } = self;
-        let Shape {
-            nx,
-            inputs,
-            outputs,
-            ..
-        } = network.shape;
+        let Shape { nx, inputs, .. } = network.shape;
         // Q = process P0, with P0 the covariance of the states in training: only one number to choose, with the states'
         // scales right.
         let noise: Vec<f64> = prior.state_covariance.iter().map(|c| process * c).collect();
@@ -60,40 +55,22 @@ impl<F: FnMut(usize, &[f64], &[f64])> Kernel for Filter<'_, F> {
             row: vec![0.0; nx],
             gain: vec![0.0; nx],
         };
-        let (mut scratch, mut predicted) = (Scratch::new(network.shape), vec![0.0; outputs]);
-        for (k, (v, y)) in v
-            .chunks_exact(inputs)
-            .zip(y.chunks_exact(outputs))
-            .enumerate()
-        {
+        let mut scratch = Scratch::new(network.shape);
+        for (k, (v, y)) in v.chunks_exact(inputs).zip(y).enumerate() {
             scratch.next.copy_from_slice(&memory.x);
             // s and ds/dx at the predicted state.
             step_with_slopes::<V>(network, &mut scratch, v);
-            predicted.copy_from_slice(&scratch.sums);
-            // The slopes stay those of the prediction while the outputs are used one by one; `moved` in `measure`
-            // accounts for the earlier corrections to first order.
-            for (p, y) in y.iter().enumerate().filter(|(_, y)| !y.is_nan()) {
-                memory.measure(
-                    network,
-                    &scratch,
-                    p,
-                    *y,
-                    prior.residual_variance[p],
-                    state_before(&scratch, nx),
-                );
+            let predicted = scratch.sum;
+            if !y.is_nan() {
+                memory.measure(network, &scratch, *y, prior.residual_variance);
             }
-            each(k, &predicted, &memory.x);
+            each(k, predicted, &memory.x);
             // A second step, from the corrected state: gives f and F there.
             scratch.next.copy_from_slice(&memory.x);
             step_with_slopes::<V>(network, &mut scratch, v);
             memory.advance(&scratch, &noise);
         }
     }
-}
-
-/// The state from which the last step started.
-fn state_before(scratch: &Scratch, nx: usize) -> &[f64] {
-    &scratch.arguments[..nx]
 }
 
 struct Memory {
@@ -106,21 +83,13 @@ struct Memory {
 }
 
 impl Memory {
-    /// Uses one output: the outputs' noises are independent, so outputs can be used one after the other.
-    fn measure(
-        &mut self,
-        network: &Network,
-        scratch: &Scratch,
-        p: usize,
-        y: f64,
-        noise: f64,
-        before: &[f64],
-    ) {
+    /// Uses an output.
+    fn measure(&mut self, network: &Network, scratch: &Scratch, y: f64, noise: f64) {
         let nx = self.x.len();
-        let (value, steepness) = network.output.value_and_slope(scratch.sums[p]);
-        //   H = f' ds/dx,  K = P H'/S,  S = H P H' + R,  e = y - yhat - H (x - x before)
+        let (value, steepness) = network.output.value_and_slope(scratch.sum);
+        //   H = f' ds/dx,  K = P H'/S,  S = H P H' + R,  e = y - yhat
         for (j, row) in self.row.iter_mut().enumerate() {
-            *row = steepness * scratch.slope((nx + p) * nx + j);
+            *row = steepness * scratch.slope(nx * nx + j);
         }
         // P H', needed for both the gain and the new covariance.
         for (i, gain) in self.gain.iter_mut().enumerate() {
@@ -136,9 +105,7 @@ impl Memory {
                 .zip(&self.gain)
                 .map(|(r, g)| r * g)
                 .sum::<f64>();
-        // yhat belongs to the prediction; the corrections by earlier outputs have moved it by H (x - x before).
-        let moved: f64 = (0..nx).map(|j| self.row[j] * (self.x[j] - before[j])).sum();
-        let innovation = (y - value - moved) / spread;
+        let innovation = (y - value) / spread;
         // x + K e and P - K S K' = P - (P H')(P H')'/S, symmetric by construction: entries (i, j) and (j, i) are the
         // same product. R > 0 keeps S above 0.
         for i in 0..nx {
@@ -200,7 +167,7 @@ pub(super) fn process_noise(
     10f64.powi(at)
 }
 
-/// Sum of squared one-step errors, each relative to its output's residual variance.
+/// Sum of squared one-step errors, relative to the residual variance.
 fn one_step_error(
     network: &Network,
     prior: &Statistics,
@@ -208,15 +175,13 @@ fn one_step_error(
     states: &[Vec<f64>],
     process: f64,
 ) -> f64 {
-    let Shape {
-        inputs, outputs, ..
-    } = network.shape;
+    let inputs = network.shape.inputs;
     let (mut left, mut sum) = (MOST_SAMPLES, 0.0);
     for (experiment, state) in experiments.iter().zip(states) {
         // The first 20,000 samples over all experiments.
-        let samples = left.min(experiment.y.len() / outputs);
+        let samples = left.min(experiment.y.len());
         left -= samples;
-        let y = &experiment.y[..samples * outputs];
+        let y = &experiment.y[..samples];
         simd::run(Filter {
             network,
             prior,
@@ -224,13 +189,10 @@ fn one_step_error(
             state,
             v: &experiment.v[..samples * inputs],
             y,
-            each: |k: usize, s: &[f64], _: &[f64]| {
-                for (p, s) in s.iter().enumerate() {
-                    let error = y[k * outputs + p] - network.output.value(*s);
-                    if !y[k * outputs + p].is_nan() {
-                        // Outputs of different units count alike: each relative to the variance of its residuals.
-                        sum += error * error / prior.residual_variance[p];
-                    }
+            each: |k: usize, s: f64, _: &[f64]| {
+                let error = y[k] - network.output.value(s);
+                if !y[k].is_nan() {
+                    sum += error * error / prior.residual_variance;
                 }
             },
         });

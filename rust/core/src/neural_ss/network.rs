@@ -6,7 +6,7 @@
 //!   s  = C x + D v + c + G h
 //! ```
 //!
-//! [`Network::step`] takes any sizes. [`Network::step_small`] takes one output and sizes known at compile time: without it a run takes 10
+//! [`Network::step`] takes any sizes. [`Network::step_small`] takes sizes known at compile time: without it a run takes 10
 //! % longer (`state_space_run` of the kernels' example, Zen 4, least and median of 200), a training the same time.
 
 use super::output::OutputFunction;
@@ -22,15 +22,15 @@ pub(super) struct Network {
     //   group 0: | x_1 | .. | x_nx | v_1 | .. | v_nu | 1 |   group 1: ..        eight units each
     // The bias is the weight of an argument that is 1.
     first: Vec<Lanes>,
-    /// For each state and each output its weights for the groups: `[E; G]`.
+    /// For each state and the output its weights for the groups: `[E; G]`.
     pub second: Vec<Lanes>,
     /// `[A B; C D]` row by row.
     linear: Vec<f64>,
     /// `c`.
-    constant: Vec<f64>,
+    constant: f64,
     /// For each group of slopes, the weight products that multiply each hidden unit's `1 - h^2`.
     // (dx+/dx)_qj = A_qj + sum over units of E_qi (1 - h_i^2) Wx_ij. With E_qi Wx_ij formed once per theta, a lane is
-    // an entry (q, j) and a unit's 1 - h^2 is broadcast: no sum over lanes is left. This takes nx (nx + ny) numbers a
+    // an entry (q, j) and a unit's 1 - h^2 is broadcast: no sum over lanes is left. This takes nx (nx + 1) numbers a
     // unit.
     products: Vec<Lanes>,
     /// The linear part of the slopes: `[A; C]` in the order of `products`.
@@ -50,8 +50,8 @@ pub(super) struct Scratch {
     pub hidden: Vec<Lanes>,
     /// The next state.
     pub next: Vec<f64>,
-    /// The sums `s`, before the output function.
-    pub sums: Vec<f64>,
+    /// The sum `s`, before the output function.
+    pub sum: f64,
     /// `1 - h^2`.
     pub rises: Vec<Lanes>,
     /// `dx+/dx`, then `ds/dx`, row by row.
@@ -61,14 +61,14 @@ pub(super) struct Scratch {
 impl Scratch {
     pub fn new(shape: Shape) -> Self {
         let groups = shape.hidden.div_ceil(LANES);
-        let slopes = ((shape.nx + shape.outputs) * shape.nx).div_ceil(LANES);
+        let slopes = ((shape.nx + 1) * shape.nx).div_ceil(LANES);
         let mut arguments = vec![0.0; shape.arguments() + 1];
         arguments[shape.arguments()] = 1.0;
         Self {
             arguments,
             hidden: vec![Lanes::ZERO; groups],
             next: vec![0.0; shape.nx],
-            sums: vec![0.0; shape.outputs],
+            sum: 0.0,
             rises: vec![Lanes::ZERO; groups],
             slopes: vec![Lanes::ZERO; slopes],
         }
@@ -138,7 +138,7 @@ impl Network {
     /// A network with the weights `theta`, which has `shape.parameters()` values.
     pub fn new(shape: Shape, output: OutputFunction, theta: &[f64]) -> Self {
         let groups = shape.hidden.div_ceil(LANES);
-        let (rows, width) = (shape.nx + shape.outputs, shape.arguments());
+        let (rows, width) = (shape.nx + 1, shape.arguments());
         let slopes = (rows * shape.nx).div_ceil(LANES);
         let mut network = Self {
             shape,
@@ -146,7 +146,7 @@ impl Network {
             first: vec![Lanes::ZERO; groups * (width + 1)],
             second: vec![Lanes::ZERO; rows * groups],
             linear: vec![0.0; rows * width],
-            constant: vec![0.0; shape.outputs],
+            constant: 0.0,
             products: vec![Lanes::ZERO; slopes * groups * LANES],
             base: vec![Lanes::ZERO; slopes],
             columns: vec![Lanes::ZERO; width + 1],
@@ -166,7 +166,6 @@ impl Network {
         let Shape {
             nx,
             inputs: nu,
-            outputs: ny,
             hidden,
             ..
         } = self.shape;
@@ -191,33 +190,32 @@ impl Network {
         let (left, right) = (&theta[parts.a], &theta[parts.b]);
         let (lower_left, lower_right) = (&theta[parts.c], &theta[parts.d]);
         // [A B] and [C D] row by row, with states and inputs side by side as in `arguments`.
-        for q in 0..nx + ny {
-            let row = &mut self.linear[q * width..][..width];
-            let (states, inputs) = match q.checked_sub(nx) {
-                None => (&left[q * nx..][..nx], &right[q * nu..][..nu]),
-                Some(p) => (&lower_left[p * nx..][..nx], &lower_right[p * nu..][..nu]),
+        for (q, row) in self.linear.chunks_exact_mut(width).enumerate() {
+            let (states, inputs) = match q < nx {
+                true => (&left[q * nx..][..nx], &right[q * nu..][..nu]),
+                false => (lower_left, lower_right),
             };
             row[..nx].copy_from_slice(states);
             row[nx..].copy_from_slice(inputs);
         }
-        self.constant.copy_from_slice(&theta[parts.constant]);
+        self.constant = theta[parts.constant.start];
         // After E, G and [A B; C D], from which the products are made.
         self.multiply(wx);
         // A lane per row; only `step_small` reads these.
-        if nx + ny <= LANES {
+        if nx < LANES {
             for (q, row) in self.linear.chunks_exact(width).enumerate() {
                 for (column, weight) in self.columns.iter_mut().zip(row) {
                     column.0[q] = *weight;
                 }
             }
-            self.columns[width].0[nx..nx + ny].copy_from_slice(&self.constant);
+            self.columns[width].0[nx] = self.constant;
         }
     }
 
     /// Computes the weights that only the slopes need.
     fn multiply(&mut self, wx: &[f64]) {
         let (nx, width, groups) = (self.shape.nx, self.shape.arguments(), self.groups());
-        for q in 0..nx + self.shape.outputs {
+        for q in 0..=nx {
             for j in 0..nx {
                 // Entry (q, j) of [dx+/dx; ds/dx] row by row, eight to a group; `products` has a group of entries for
                 // each unit.
@@ -259,15 +257,15 @@ impl Network {
         }
     }
 
-    /// `h = tanh(Wx x + Wu v + bh)`, `x+ = A x + B v + E h`, `s = C x + D v + c + G h` for `[x, v, 1]`.
+    /// `h = tanh(Wx x + Wu v + bh)`, `x+ = A x + B v + E h`, and returns
+    /// `s = C x + D v + c + G h`, for `[x, v, 1]`.
     #[inline(always)]
     pub fn step<V: F64x8, const NX: usize>(
         &self,
         arguments: &[f64],
         hidden: &mut [Lanes],
         next: &mut [f64],
-        sums: &mut [f64],
-    ) {
+    ) -> f64 {
         let nx = if NX == 0 { self.shape.nx } else { NX };
         let (states, inputs) = arguments.split_at(nx);
         for (g, hidden) in hidden.iter_mut().enumerate() {
@@ -279,12 +277,10 @@ impl Network {
             // `next` is not `states`: all rows use the same x.
             *next = self.row::<V>(q, states, inputs, hidden);
         }
-        for (p, (sum, constant)) in sums.iter_mut().zip(&self.constant).enumerate() {
-            *sum = constant + self.row::<V>(nx + p, states, inputs, hidden);
-        }
+        self.constant + self.row::<V>(nx, states, inputs, hidden)
     }
 
-    /// [`Network::step`] for one output and constant numbers of states and groups: advances `x` by one step, with
+    /// [`Network::step`] for constant numbers of states and groups: advances `x` by one step, with
     /// everything in registers. Returns the sum `s`.
     #[inline(always)]
     pub fn step_small<V: F64x8, const NX: usize, const GROUPS: usize>(

@@ -22,7 +22,7 @@ const DIVERGED: f64 = 1e3;
 #[derive(Clone, Debug)]
 pub(super) struct Experiment {
     /// Inputs, delayed by nk.
-    // Sample by sample, inputs side by side; y and its weights likewise, so an index is an output of a sample.
+    // Sample by sample, inputs side by side; y and its weights likewise, so an index is a sample.
     pub v: Vec<f64>,
     /// Outputs, NaN if unknown.
     pub y: Vec<f64>,
@@ -55,8 +55,7 @@ pub(super) struct Attempts(RefCell<Vec<Attempt>>);
 
 impl Attempts {
     pub fn new(network: &Network, experiments: &[Experiment]) -> Self {
-        let outputs = network.shape.outputs;
-        let runs = |e: &Experiment| Trajectory::new(network, e.y.len() / outputs);
+        let runs = |e: &Experiment| Trajectory::new(network, e.y.len());
         let attempt = || Attempt {
             theta: Vec::new(),
             network: network.clone(),
@@ -89,11 +88,11 @@ const MOST_GROUPS: usize = 2;
 /// Whether a second run beside the first takes hardly any extra time. That needs the widest registers; with narrower
 /// ones it is no faster than one run after the other.
 fn pays(network: &Network, experiments: &[Experiment]) -> bool {
-    let Shape { nx, outputs, .. } = network.shape;
+    let nx = network.shape.nx;
     let samples: usize = experiments.iter().map(|e| e.y.len()).sum();
     let bytes = size_of::<f64>() * (nx + 1) + size_of::<Lanes>() * network.groups();
     // The shapes of `free_run::together`, whose registers let two runs overlap.
-    let small = outputs == 1 && nx <= MOST_STATES && network.groups() <= MOST_GROUPS;
+    let small = nx <= MOST_STATES && network.groups() <= MOST_GROUPS;
     // With AVX2 two runs together take as long as one after the other: 16 registers hold only one of them.
     small && samples * bytes <= MOST_TOGETHER && simd::level() == Ok(simd::Level::Avx512)
 }
@@ -330,32 +329,29 @@ mod tests {
 
     #[test]
     fn puts_weights_on_cost_and_normal_equations_alike() {
-        // with one output and up to four states rows are written block by block
-        for (nx, outputs, hidden) in [(2, 1, 3), (4, 1, 15), (5, 1, 8), (2, 2, 8)] {
+        // with up to four states rows are written block by block
+        for (nx, hidden) in [(2, 3), (4, 15), (5, 8)] {
             let shape = Shape {
                 nx,
                 nk: 1,
                 inputs: 2,
-                outputs,
                 hidden,
                 integrator: false,
             };
             let output = OutputFunction::Abs { width: 0.3 };
             let samples = 150;
-            let (v, mut y) = (noise(2 * samples, 1), noise(outputs * samples, 2));
+            let (v, mut y) = (noise(2 * samples, 1), noise(samples, 2));
             y[..4].fill(f64::NAN);
             y[90..111].fill(f64::NAN);
             let parameters = shape.parameters() + 2 * nx;
             let theta: Vec<f64> = noise(parameters, 3).iter().map(|t| 0.15 * t).collect();
             let experiments = |weights: &[f64]| {
-                let repeated = |w: &f64| std::iter::repeat_n(*w, outputs);
                 let experiment = |weights: Vec<f64>| Experiment {
                     v: v.clone(),
                     y: y.clone(),
                     weights,
                 };
-                let weighted = weights.iter().flat_map(repeated).collect();
-                [experiment(weighted), experiment(Vec::new())]
+                [experiment(weights.to_vec()), experiment(Vec::new())]
             };
             let network = Network::new(shape, output, &theta[..shape.parameters()]);
             let monitor = Monitor::default();
@@ -369,7 +365,7 @@ mod tests {
                 experiments(&(0..samples).map(weight).collect::<Vec<f64>>())
             };
             let (tripled, plain, mut only) = (of(3.0, 1.0), of(1.0, 1.0), of(1.0, 0.0));
-            only[1].weights = vec![0.0; outputs * samples];
+            only[1].weights = vec![0.0; samples];
             let attempts = [&tripled, &plain, &only].map(|e| Attempts::new(&network, e));
             let problem =
                 |e, i: usize| Training::new(e, network.clone(), 0.0, &attempts[i], &monitor);

@@ -3,7 +3,6 @@
 use super::free_run::{self, Trajectory};
 use super::network::{Network, Scratch};
 use super::problem::{Attempts, Experiment};
-use super::shape::Shape;
 use super::state::{self, Statistics};
 use crate::Monitor;
 use crate::lagged::STATE_SAMPLES;
@@ -41,10 +40,9 @@ impl<'a> Referee<'a> {
         validation: &'a [Experiment],
         monitor: &'a Monitor,
     ) -> Self {
-        let outputs = network.shape.outputs;
         let own = validation
             .iter()
-            .map(|e| Trajectory::new(&network, e.y.len() / outputs));
+            .map(|e| Trajectory::new(&network, e.y.len()));
         Self {
             own: own.collect(),
             scratch: Scratch::new(network.shape),
@@ -90,12 +88,10 @@ impl<'a> Referee<'a> {
 
     /// Sum of squared errors, and of the weights of the outputs in it.
     fn score(&mut self, i: usize, statistics: &Statistics) -> Option<(f64, f64)> {
-        let Shape {
-            inputs, outputs, ..
-        } = self.network.shape;
         let Experiment { v, y, .. } = &self.validation[i];
-        let skipped = STATE_SAMPLES.min(y.len() / outputs / 2);
-        let (first_v, first_y) = (&v[..skipped * inputs], &y[..skipped * outputs]);
+        let skipped = STATE_SAMPLES.min(y.len() / 2);
+        let first_v = &v[..skipped * self.network.shape.inputs];
+        let first_y = &y[..skipped];
         let state = match self.states[i].take() {
             Some(last) => {
                 let starts = [last, statistics.state_mean.clone()];
@@ -118,7 +114,7 @@ impl<'a> Referee<'a> {
             return None;
         }
         let (sums, output) = (&run.sums, self.network.output);
-        let known = (skipped * outputs..y.len()).filter(|&k| !y[k].is_nan());
+        let known = (skipped..y.len()).filter(|&k| !y[k].is_nan());
         let errors = known.map(|k| (y[k] - output.value(sums[k]), self.validation[i].weight(k)));
         Some(errors.fold((0.0, 0.0), |(sum, known), (e, w)| {
             (sum + w * (e * e), known + w)
@@ -132,7 +128,7 @@ pub(super) fn statistics(
     experiments: &[Experiment],
     runs: &[Trajectory],
 ) -> Statistics {
-    let Shape { nx, outputs, .. } = network.shape;
+    let nx = network.shape.nx;
     let states = || runs.iter().flat_map(|run| run.states.chunks_exact(nx));
     let count = states().count() as f64;
     let mut mean = vec![0.0; nx];
@@ -150,24 +146,18 @@ pub(super) fn statistics(
         }
     }
     (0..nx).for_each(|i| (0..i).for_each(|j| covariance[j * nx + i] = covariance[i * nx + j]));
-    let variance = |p: usize| {
-        let pairs = runs.iter().zip(experiments).flat_map(|(run, e)| {
-            let known = (p..e.y.len())
-                .step_by(outputs)
-                .filter(|&i| !e.y[i].is_nan());
-            known.map(|i| (e.y[i] - network.output.value(run.sums[i]), e.weight(i)))
-        });
-        let (sum, known) = pairs.fold((0.0, 0.0), |(sum, n), (e, w)| (sum + w * (e * e), n + w));
-        let variance: f64 = if known > 0.0 { sum / known } else { 0.0 };
-        if variance.is_finite() {
-            variance.max(LEAST_VARIANCE)
-        } else {
-            1.0
-        }
-    };
+    let errors = runs.iter().zip(experiments).flat_map(|(run, e)| {
+        let known = (0..e.y.len()).filter(|&i| !e.y[i].is_nan());
+        known.map(|i| (e.y[i] - network.output.value(run.sums[i]), e.weight(i)))
+    });
+    let (sum, known) = errors.fold((0.0, 0.0), |(sum, n), (e, w)| (sum + w * (e * e), n + w));
+    let variance: f64 = if known > 0.0 { sum / known } else { 0.0 };
     Statistics {
         state_mean: mean,
-        residual_variance: (0..outputs).map(variance).collect(),
+        residual_variance: match variance.is_finite() {
+            true => variance.max(LEAST_VARIANCE),
+            false => 1.0,
+        },
         state_covariance: covariance,
         process_noise: 0.0,
     }

@@ -17,11 +17,11 @@
 //!
 //! In a row they are sorted by kind, with the hidden units side by side (`Columns`), so eight columns share every
 //! scalar factor. Adjacent parts may overlap when written: a group with missing last units writes zeros over the next
-//! group's first columns, which come later. Models of one output and up to four states process a block of samples at a
+//! group's first columns, which come later. Models of up to four states process a block of samples at a
 //! time (`super::single`); all others go sample by sample here.
 
 use super::free_run::Trajectory;
-use super::network::{Network, Scratch, rises_of, unrolled};
+use super::network::{Network, Scratch, rises_of};
 use super::shape::Shape;
 use super::single::Block;
 use crate::Monitor;
@@ -32,7 +32,7 @@ use crate::simd::{F64x8, Kernel, LANES, Lanes};
 const LOOK: usize = 64;
 
 /// Order of the parameters' columns in a row: all hidden units for each state, for each input and for the bias, then for each row of E,
-/// then for each row of G; then `[A B]` row by row, the initial state, `[C D c]` row by row, the error.
+/// then for G; then `[A B]` row by row, the initial state, `[C D c]`, the error.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Columns {
     pub(super) shape: Shape,
@@ -52,13 +52,13 @@ pub(super) struct Columns {
 
 impl Columns {
     pub fn new(shape: Shape) -> Self {
-        let (nx, ny, width) = (shape.nx, shape.outputs, shape.arguments());
-        //   | Wx Wu bh: width + 1 kinds | E: nx kinds | G: ny kinds | [A B] | x0 | [C D c] | error |      a kind is all hidden units
+        let (nx, width) = (shape.nx, shape.arguments());
+        //   | Wx Wu bh: width + 1 kinds | E: nx kinds | G | [A B] | x0 | [C D c] | error |      a kind is all hidden units
         let direct = (width + 1 + nx) * shape.hidden;
-        let linear = direct + ny * shape.hidden;
+        let linear = direct + shape.hidden;
         let state = linear + nx * width;
         let sums = state + nx;
-        let error = sums + ny * (width + 1);
+        let error = sums + width + 1;
         // The last group of [A B x0] is written whole and may end beyond the error.
         let room = (error + 1).max(linear + (nx * width + nx).next_multiple_of(LANES));
         Self {
@@ -77,7 +77,6 @@ impl Columns {
         let Shape {
             nx,
             inputs: nu,
-            outputs: ny,
             hidden,
             ..
         } = self.shape;
@@ -93,12 +92,8 @@ impl Columns {
         columns.extend((0..hidden).flat_map(|i| (0..nx).map(move |j| j * hidden + i)));
         columns.extend((0..hidden).flat_map(|i| (0..nu).map(move |j| (nx + j) * hidden + i)));
         columns.extend((0..hidden).map(|i| width * hidden + i));
-        columns.extend((0..ny).flat_map(|p| (0..nx).map(move |j| self.sums + p * (width + 1) + j)));
-        columns.extend(
-            (0..ny).flat_map(|p| (0..nu).map(move |j| self.sums + p * (width + 1) + nx + j)),
-        );
-        columns.extend((0..ny).map(|p| self.sums + p * (width + 1) + width));
-        columns.extend((0..ny * hidden).map(|i| self.direct + i));
+        columns.extend(self.sums..self.error);
+        columns.extend(self.direct..self.linear);
         columns
     }
 }
@@ -141,14 +136,14 @@ pub(super) struct Sensitivities {
     pub(super) linear: Vec<Lanes>,
     /// `[E; f' G] diag(1 - h^2)`.
     pub(super) weighted: Vec<Lanes>,
-    /// `f' ds/dx` of the outputs that are known.
+    /// `f' ds/dx`.
     pub(super) outward: Vec<f64>,
     /// Buffer for one group of columns of the states.
     moved: Vec<Lanes>,
     pub(super) scratch: Scratch,
     pub(super) block: Block,
-    /// The known outputs of a sample: index, slope of the output function, error.
-    known: Vec<(usize, f64, f64)>,
+    /// Slope of the output function and error of a sample whose output is known.
+    known: Option<(f64, f64)>,
 }
 
 impl Sensitivities {
@@ -160,12 +155,12 @@ impl Sensitivities {
             columns: Columns::new(shape),
             states: vec![Lanes::ZERO; (hidden + small) * nx],
             linear: vec![Lanes::ZERO; small * nx],
-            weighted: vec![Lanes::ZERO; (nx + shape.outputs) * groups],
-            outward: vec![0.0; nx * shape.outputs],
+            weighted: vec![Lanes::ZERO; (nx + 1) * groups],
+            outward: vec![0.0; nx],
             moved: vec![Lanes::ZERO; nx],
             scratch: Scratch::new(shape),
             block: Block::new(shape),
-            known: Vec::with_capacity(shape.outputs),
+            known: None,
         }
     }
 
@@ -204,22 +199,20 @@ impl Kernel for Recursion<'_> {
     #[inline(always)]
     fn run<V: F64x8>(self) {
         self.buffers.reset();
-        let Shape { nx, outputs, .. } = self.network.shape;
         // The sizes that are trained most use the block pass; `super::single` states its gain.
-        match (outputs, nx) {
-            (1, 1) => self.blocks::<V, 1>(),
-            (1, 2) => self.blocks::<V, 2>(),
-            (1, 3) => self.blocks::<V, 3>(),
-            (1, 4) => self.blocks::<V, 4>(),
-            _ => unrolled!(nx, self.samples::<V>),
+        match self.network.shape.nx {
+            1 => self.blocks::<V, 1>(),
+            2 => self.blocks::<V, 2>(),
+            3 => self.blocks::<V, 3>(),
+            4 => self.blocks::<V, 4>(),
+            _ => self.samples::<V>(),
         }
     }
 }
 
 impl Recursion<'_> {
-    /// `NX` states; 0 for any number.
     #[inline(always)]
-    fn samples<V: F64x8, const NX: usize>(self) {
+    fn samples<V: F64x8>(self) {
         let Self {
             network,
             run,
@@ -231,34 +224,27 @@ impl Recursion<'_> {
             exact,
             monitor,
         } = self;
-        let Shape {
-            inputs, outputs, ..
-        } = network.shape;
-        let nx = if NX == 0 { network.shape.nx } else { NX };
+        let Shape { nx, inputs, .. } = network.shape;
         let hidden = run.hidden.chunks_exact(network.groups());
         let samples = run
             .states
             .chunks_exact(nx)
             .zip(v.chunks_exact(inputs))
             .zip(hidden);
-        let sums = run.sums.chunks_exact(outputs).zip(y.chunks_exact(outputs));
-        for (k, (((x, v), h), (s, y))) in samples.zip(sums).enumerate() {
+        for (k, (((x, v), h), (s, y))) in samples.zip(run.sums.iter().zip(y)).enumerate() {
             if !buffers.look(k, monitor) {
                 return;
             }
             buffers.scratch.set(x, v);
-            // First everything that the columns share, then the columns: with 155 parameters X is 18 groups of three
-            // registers, which here pass through memory at every sample. `super::single` keeps them in registers.
-            buffers.prepare::<V>(network, h, (s, y), exact);
-            let count = buffers.known.len();
+            // First everything that the columns share, then the columns: X passes through memory at every sample, while
+            // `super::single` keeps it in registers.
+            buffers.prepare::<V>(network, h, (*s, *y), exact);
+            // An unknown output takes part in the recursion but has no row.
+            let count = usize::from(buffers.known.is_some());
             let width = rows.width();
-            // A row for each known output: an unknown output takes part in the recursion but has no row.
             let room = rows.room(count);
-            buffers.advance::<V, NX>(network, h, room, width);
-            if let Some(weights) = weights.get(k * outputs..(k + 1) * outputs) {
-                let known = buffers.known.iter().map(|&(p, ..)| weights[p]);
-                weigh(known, room, width);
-            }
+            buffers.advance::<V>(network, h, room);
+            weigh(weights.get(k).copied().into_iter(), room, width);
             rows.keep(count);
         }
     }
@@ -296,7 +282,7 @@ impl Sensitivities {
         &mut self,
         network: &Network,
         h: &[Lanes],
-        (s, y): (&[f64], &[f64]),
+        (s, y): (f64, f64),
         exact: bool,
     ) {
         let Scratch {
@@ -306,14 +292,9 @@ impl Sensitivities {
             ..
         } = &mut self.scratch;
         let (nx, width) = (network.shape.nx, network.shape.arguments());
-        self.known.clear();
-        for (p, (s, y)) in s.iter().zip(y).enumerate() {
-            let (value, slope) = network.output.value_and_slope(*s);
-            // f' and the error of each known output; s and f' are those of the free run.
-            if !y.is_nan() {
-                self.known.push((p, slope, y - value));
-            }
-        }
+        // f' and the error of a known output; s and f' are those of the free run.
+        let (value, steepness) = network.output.value_and_slope(s);
+        self.known = (!y.is_nan()).then_some((steepness, y - value));
         // 1 - h^2 loses its digits if h is near 1. In training that is far below the resolution of the sum of squares;
         // in a Jacobian that leaves the core it would be wrong.
         if exact {
@@ -322,21 +303,16 @@ impl Sensitivities {
             rises_of::<V>(h, rises);
         }
         network.slopes::<V>(rises, slopes);
-        for (row, outward) in self.known.iter().zip(self.outward.chunks_exact_mut(nx)) {
-            for (j, outward) in outward.iter_mut().enumerate() {
-                let at = (nx + row.0) * nx + j;
-                // Row nx + p of the slopes is ds_p/dx.
-                *outward = row.1 * slopes[at / LANES].0[at % LANES];
-            }
+        for (j, outward) in self.outward.iter_mut().enumerate() {
+            // The last row of the slopes is ds/dx.
+            let at = nx * nx + j;
+            *outward = steepness * slopes[at / LANES].0[at % LANES];
         }
         // E diag(1 - h^2) and f' G diag(1 - h^2): common to all weights of a hidden unit, so computed once a sample,
         // not once a column.
-        let groups = rises.len();
-        let of_outputs = self
-            .known
-            .iter()
-            .map(|&(p, steepness, _)| (nx + p, steepness));
-        for (row, steepness) in (0..nx).map(|q| (q, 1.0)).chain(of_outputs) {
+        let groups = network.groups();
+        let of_output = (nx, steepness);
+        for (row, steepness) in (0..nx).map(|q| (q, 1.0)).chain([of_output]) {
             let weights = &network.second[row * groups..][..groups];
             let weighted = &mut self.weighted[row * groups..][..groups];
             for ((weighted, weight), rise) in weighted.iter_mut().zip(weights).zip(&*rises) {
@@ -353,181 +329,100 @@ impl Sensitivities {
         }
     }
 
-    /// Writes the sample's rows and takes `X` to the next sample.
+    /// Writes the sample's row, if its output is known, and takes `X` to the next sample.
     #[inline(always)]
-    fn advance<V: F64x8, const NX: usize>(
-        &mut self,
-        network: &Network,
-        h: &[Lanes],
-        rows: &mut [f64],
-        stride: usize,
-    ) {
-        let nx = if NX == 0 { network.shape.nx } else { NX };
-        let (groups, hidden) = (h.len(), network.shape.hidden);
+    fn advance<V: F64x8>(&mut self, network: &Network, h: &[Lanes], row: &mut [f64]) {
+        let (nx, groups, hidden) = (network.shape.nx, h.len(), network.shape.hidden);
         let width = network.shape.arguments();
-        // [E; f' G] diag(1 - h^2): rows of the states, then of those outputs that are known in this sample.
-        let (of_states, of_outputs) = self.weighted.split_at(nx * groups);
-        // F broadcast once for all columns: NX^2 registers, at most 16 of 32.
-        let mut onward = [[V::splat(0.0); NX]; NX];
-        for (i, slope) in onward.as_flattened_mut().iter_mut().enumerate() {
-            *slope = V::splat(self.scratch.slope(i));
-        }
-        let slopes = Slopes::<V, NX> {
-            onward,
+        // [E; f' G] diag(1 - h^2): rows of the states, then of the output.
+        let (of_states, of_output) = self.weighted.split_at(nx * groups);
+        let mut step = Step {
             scratch: &self.scratch,
             outward: &self.outward,
-            known: &self.known,
+            moved: &mut self.moved,
+            row,
         };
-        let moved = &mut self.moved;
+        let zero = V::splat(0.0);
         let mut states = self.states.chunks_exact_mut(nx);
         // Wx, Wu, bh: the weighted rows of all units times each argument c, the last of which is 1.
         for (c, argument) in self.scratch.arguments.iter().enumerate() {
             let argument = V::splat(*argument);
             for g in 0..groups {
                 let Some(x) = states.next() else { return };
-                let place = (c * hidden + g * LANES, stride);
-                slopes.advance(
-                    x,
-                    moved,
-                    rows,
-                    place,
-                    |p| argument.mul(V::load(&of_outputs[p * groups + g].0)),
-                    |q| argument.mul(V::load(&of_states[q * groups + g].0)),
-                );
+                let direct = argument.mul(V::load(&of_output[g].0));
+                let next = |q: usize| argument.mul(V::load(&of_states[q * groups + g].0));
+                step.advance(x, c * hidden + g * LANES, direct, next);
             }
         }
         // E: h_i moves only state q for unit i of row q.
         for row in 0..nx {
             for (g, h) in h.iter().enumerate() {
                 let Some(x) = states.next() else { return };
-                let start = (width + 1 + row) * hidden + g * LANES;
-                let place = (start, stride);
-                let own = |q: usize| {
-                    if q == row {
-                        V::load(&h.0)
-                    } else {
-                        V::splat(0.0)
-                    }
-                };
-                slopes.advance(x, moved, rows, place, |_| V::splat(0.0), own);
+                let own = |q: usize| if q == row { V::load(&h.0) } else { zero };
+                step.advance(x, (width + 1 + row) * hidden + g * LANES, zero, own);
             }
         }
         // G comes between E and [A B] in a row, and its groups write beyond their end as the others do: this order must
         // be kept.
-        slopes.write_direct(h, rows, stride, self.columns.direct, hidden);
+        if let Some((steepness, _)) = self.known {
+            for (g, h) in h.iter().enumerate() {
+                let place = &mut step.row[self.columns.direct + g * LANES..];
+                V::load(&h.0).mul(V::splat(steepness)).write(place);
+            }
+        }
         // [A B x0]: `linear` has the argument in the row of the column's own state.
         for (i, linear) in self.linear.chunks_exact(nx).enumerate() {
             let Some(x) = states.next() else { return };
-            let start = self.columns.linear + i * LANES;
-            let place = (start, stride);
-            slopes.advance(
-                x,
-                moved,
-                rows,
-                place,
-                |_| V::splat(0.0),
-                |q| V::load(&linear[q].0),
-            );
+            let own = |q: usize| V::load(&linear[q].0);
+            step.advance(x, self.columns.linear + i * LANES, zero, own);
         }
-        slopes.write_sums(rows, stride, &self.columns);
+        if let Some((steepness, error)) = self.known {
+            let sums = &mut step.row[self.columns.sums..];
+            for (sum, argument) in sums.iter_mut().zip(&self.scratch.arguments) {
+                *sum = steepness * argument;
+            }
+            step.row[self.columns.error] = error;
+        }
     }
 }
 
-/// The slopes of one sample.
-struct Slopes<'a, V, const NX: usize> {
-    /// `dx+/dx` in registers, if the number of states is a constant.
-    // Empty if NX is 0: the general step then reads `scratch`.
-    onward: [[V; NX]; NX],
+/// The step of one sample.
+struct Step<'a> {
     scratch: &'a Scratch,
     outward: &'a [f64],
-    known: &'a [(usize, f64, f64)],
+    moved: &'a mut [Lanes],
+    /// Empty if the output is unknown.
+    row: &'a mut [f64],
 }
 
-impl<V: F64x8, const NX: usize> Slopes<'_, V, NX> {
-    /// Writes one group of columns into the rows, from `start` on, and advances its `X` by one step. `direct(p)` and
+impl Step<'_> {
+    /// Writes one group of columns into the row, from `start` on, and advances its `X` by one step. `direct` and
     /// `next(q)` are `f' ds/dtheta` and `dx+/dtheta`.
     #[inline(always)]
-    fn advance(
-        &self,
+    fn advance<V: F64x8>(
+        &mut self,
         x: &mut [Lanes],
-        moved: &mut [Lanes],
-        rows: &mut [f64],
-        (start, stride): (usize, usize),
-        direct: impl Fn(usize) -> V,
+        start: usize,
+        direct: V,
         next: impl Fn(usize) -> V,
     ) {
         let nx = x.len();
         // dy = f' (ds/dx X + ds/dtheta), with X before the step.
-        let outward = self.outward.chunks_exact(nx);
-        // Each known output has its own row, `stride` numbers apart.
-        for (row, ((p, ..), outward)) in self.known.iter().zip(outward).enumerate() {
-            let sum = outward.iter().zip(&*x).fold(direct(*p), |sum, (slope, x)| {
+        if !self.row.is_empty() {
+            let pairs = self.outward.iter().zip(&*x);
+            let sum = pairs.fold(direct, |sum, (slope, x)| {
                 sum.add_product(V::splat(*slope), V::load(&x.0))
             });
-            sum.write(&mut rows[start + row * stride..]);
+            sum.write(&mut self.row[start..]);
         }
         // All states are read before one is written: the new ones go to a buffer first.
-        if NX == 0 {
-            for (q, moved) in moved.iter_mut().enumerate() {
-                let sum = x.iter().enumerate().fold(next(q), |sum, (j, x)| {
-                    let slope = V::splat(self.scratch.slope(q * nx + j));
-                    sum.add_product(slope, V::load(&x.0))
-                });
-                sum.store(&mut moved.0);
-            }
-            x.copy_from_slice(moved);
-            return;
+        for (q, moved) in self.moved.iter_mut().enumerate() {
+            let sum = x.iter().enumerate().fold(next(q), |sum, (j, x)| {
+                let slope = V::splat(self.scratch.slope(q * nx + j));
+                sum.add_product(slope, V::load(&x.0))
+            });
+            sum.store(&mut moved.0);
         }
-        let mut old = [V::splat(0.0); NX];
-        for (old, x) in old.iter_mut().zip(&*x) {
-            *old = V::load(&x.0);
-        }
-        for (q, (x, slopes)) in x.iter_mut().zip(&self.onward).enumerate() {
-            let sum = slopes
-                .iter()
-                .zip(&old)
-                .fold(next(q), |sum, (slope, old)| sum.add_product(*slope, *old));
-            sum.store(&mut x.0);
-        }
-    }
-
-    /// The columns of G.
-    #[inline(always)]
-    fn write_direct(
-        &self,
-        h: &[Lanes],
-        rows: &mut [f64],
-        stride: usize,
-        first: usize,
-        hidden: usize,
-    ) {
-        let outputs = self.scratch.sums.len();
-        for (row, &(own, steepness, _)) in rows.chunks_exact_mut(stride).zip(self.known) {
-            for p in 0..outputs {
-                for (g, h) in h.iter().enumerate() {
-                    // ds_p/dG_q = h if p = q, else 0.
-                    let factor = if p == own { steepness } else { 0.0 };
-                    let place = &mut row[first + p * hidden + g * LANES..];
-                    V::load(&h.0).mul(V::splat(factor)).write(place);
-                }
-            }
-        }
-    }
-
-    /// The columns of `[C D c]` and the error.
-    #[inline(always)]
-    fn write_sums(&self, rows: &mut [f64], stride: usize, columns: &Columns) {
-        let arguments = &self.scratch.arguments;
-        for (row, &(own, steepness, error)) in rows.chunks_exact_mut(stride).zip(self.known) {
-            // [C D c] row by row, each as wide as the arguments including their 1.
-            let sums = row[columns.sums..columns.error].chunks_exact_mut(arguments.len());
-            for (p, sums) in sums.enumerate() {
-                let factor = if p == own { steepness } else { 0.0 };
-                for (sum, argument) in sums.iter_mut().zip(arguments) {
-                    *sum = factor * argument;
-                }
-            }
-            row[columns.error] = error;
-        }
+        x.copy_from_slice(self.moved);
     }
 }

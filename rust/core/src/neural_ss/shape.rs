@@ -13,8 +13,6 @@ pub struct Shape {
     pub nk: usize,
     /// Number of inputs.
     pub inputs: usize,
-    /// Number of outputs.
-    pub outputs: usize,
     /// Hidden units.
     pub hidden: usize,
     /// Whether the last state is the sum of a function of the others.
@@ -22,11 +20,10 @@ pub struct Shape {
 }
 
 /// Larger sizes are typing errors.
-const MOST: [(&str, usize, usize); 5] = [
+const MOST: [(&str, usize, usize); 4] = [
     ("nx", 1, 50),
     ("nk", 0, 1_000),
     ("inputs", 1, 100),
-    ("outputs", 1, 50),
     ("hidden", 1, 1_000),
 ];
 
@@ -51,7 +48,7 @@ impl Shape {
     /// # Errors
     /// `ErrorKind::Setting` for sizes out of range.
     pub fn checked(self) -> Result<Self> {
-        let sizes = [self.nx, self.nk, self.inputs, self.outputs, self.hidden];
+        let sizes = [self.nx, self.nk, self.inputs, self.hidden];
         for ((name, least, most), value) in MOST.into_iter().zip(sizes) {
             if value < least || value > most {
                 return Err(Error::setting(format!(
@@ -74,7 +71,7 @@ impl Shape {
 
     /// The range of each part.
     pub(crate) fn parts(&self) -> Parts {
-        let (nx, nu, ny, hidden) = (self.nx, self.inputs, self.outputs, self.hidden);
+        let (nx, nu, hidden) = (self.nx, self.inputs, self.hidden);
         let mut next = 0;
         let mut part = |size: usize| {
             next += size;
@@ -87,10 +84,10 @@ impl Shape {
             wx: part(hidden * nx),
             wu: part(hidden * nu),
             bh: part(hidden),
-            c: part(ny * nx),
-            d: part(ny * nu),
-            constant: part(ny),
-            g: part(ny * hidden),
+            c: part(nx),
+            d: part(nu),
+            constant: part(1),
+            g: part(hidden),
         }
     }
 
@@ -130,30 +127,30 @@ impl Shape {
     }
 }
 
-/// `(u - u_mean)/u_scale` and `(y - y_mean)/y_scale`, input by input and output by output.
+/// `(u - u_mean)/u_scale`, input by input, and `(y - y_mean)/y_scale`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scaling {
     /// Subtracted from each input.
     pub u_mean: Vec<f64>,
     /// Each input is then divided by it.
     pub u_scale: Vec<f64>,
-    /// Subtracted from each output.
-    pub y_mean: Vec<f64>,
-    /// Each output is then divided by it.
-    pub y_scale: Vec<f64>,
+    /// Subtracted from the output.
+    pub y_mean: f64,
+    /// The output is then divided by it.
+    pub y_scale: f64,
 }
 
 impl Scaling {
-    /// Refuses a scaling that does not fit the numbers of inputs and outputs.
+    /// Refuses a scaling that does not fit the number of inputs.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for wrong lengths, scales that are not positive, values that are not finite.
-    pub fn check(&self, inputs: usize, outputs: usize) -> Result<()> {
+    pub fn check(&self, inputs: usize) -> Result<()> {
         let parts = [
             ("u_mean", &self.u_mean, inputs),
             ("u_scale", &self.u_scale, inputs),
-            ("y_mean", &self.y_mean, outputs),
-            ("y_scale", &self.y_scale, outputs),
+            ("y_mean", &vec![self.y_mean], 1),
+            ("y_scale", &vec![self.y_scale], 1),
         ];
         for (name, values, count) in parts {
             let is_scale = name.ends_with("scale");
@@ -187,21 +184,17 @@ impl Scaling {
 
     /// All outputs, scaled.
     pub(super) fn outputs(&self, y: &[f64]) -> Vec<f64> {
-        let count = self.y_mean.len();
-        y.iter()
-            .enumerate()
-            .map(|(i, y)| self.output(i % count, *y))
-            .collect()
+        y.iter().map(|y| self.output(*y)).collect()
     }
 
-    /// Output `p`, scaled.
-    pub(super) fn output(&self, p: usize, y: f64) -> f64 {
-        (y - self.y_mean[p]) / self.y_scale[p]
+    /// An output, scaled.
+    pub(super) fn output(&self, y: f64) -> f64 {
+        (y - self.y_mean) / self.y_scale
     }
 
-    /// Output `p` in the data's unit.
-    pub(super) fn restored(&self, p: usize, scaled: f64) -> f64 {
-        scaled * self.y_scale[p] + self.y_mean[p]
+    /// An output in the data's unit.
+    pub(super) fn restored(&self, scaled: f64) -> f64 {
+        scaled * self.y_scale + self.y_mean
     }
 }
 

@@ -1,4 +1,4 @@
-//! The sensitivity recursion for one output and up to four states, a block of samples at a time. Everything that the
+//! The sensitivity recursion for up to four states, a block of samples at a time. Everything that the
 //! columns share is prepared for all samples of the block; then each group of columns passes over them with its states
 //! in registers.
 //!

@@ -14,15 +14,15 @@ const RIDGE: f64 = 1e-8;
 const MOST_RIDGES: usize = 10;
 
 /// Training results of a model beside its parameters, in scaled units: the prior of a state before any output is
-/// measured, and the variances of outputs and equations.
+/// measured, and the variances of output and equations.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Statistics {
     /// Mean of the training states.
     pub state_mean: Vec<f64>,
     /// Their covariance, row by row.
     pub state_covariance: Vec<f64>,
-    /// Variance of each output's residual in free run.
-    pub residual_variance: Vec<f64>,
+    /// Variance of the output's residual in free run.
+    pub residual_variance: f64,
     /// Process noise of the Kalman filter, relative to the states' covariance.
     pub process_noise: f64,
 }
@@ -38,20 +38,18 @@ impl Statistics {
         let finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
         let sound = self.state_mean.len() == nx
             && self.state_covariance.len() == nx * nx
-            && self.residual_variance.len() == shape.outputs
             && finite(&self.state_mean)
             && finite(&self.state_covariance)
-            && finite(&self.residual_variance)
             && (0..nx).all(|i| self.state_covariance[i * nx + i] >= 0.0)
-            && self.residual_variance.iter().all(|v| *v > 0.0)
+            && self.residual_variance > 0.0
+            && self.residual_variance.is_finite()
             && self.process_noise >= 0.0
             && self.process_noise.is_finite();
         if sound {
             return Ok(());
         }
         Err(Error::setting(format!(
-            "expected state_mean ({nx},), state_covariance ({nx}, {nx}), residual_variance ({},) above 0 and process_noise of 0 or more, all finite, got {self:?}; identify the model again",
-            shape.outputs
+            "expected state_mean ({nx},), state_covariance ({nx}, {nx}), residual_variance above 0 and process_noise of 0 or more, all finite, got {self:?}; identify the model again"
         )))
     }
 
@@ -182,7 +180,7 @@ pub(super) fn update(
 
 /// The state at which the model rests: least `|x+ - x|^2 + |y|^2` at input zero, where `y` is the output in scaled
 /// units above `zero`.
-pub(super) fn rest(network: &Network, prior: &Statistics, v: &[f64], zero: &[f64]) -> Vec<f64> {
+pub(super) fn rest(network: &Network, prior: &Statistics, v: &[f64], zero: f64) -> Vec<f64> {
     let factor = prior.factor();
     let mut starts = prior.starts(&factor);
     starts.push(vec![0.0; prior.state_mean.len()]);
@@ -280,12 +278,7 @@ impl Kernel for Evaluation<'_, '_> {
             sensitivity,
             moved,
         } = posterior;
-        let Shape {
-            nx,
-            inputs,
-            outputs,
-            ..
-        } = network.shape;
+        let Shape { nx, inputs, .. } = network.shape;
         let mut sum = 0.0;
         normal.copy_from_slice(inverse);
         for (i, gradient) in gradient.iter_mut().enumerate() {
@@ -296,15 +289,15 @@ impl Kernel for Evaluation<'_, '_> {
         sensitivity.fill(0.0);
         (0..nx).for_each(|i| sensitivity[i * nx + i] = 1.0);
         scratch.next.copy_from_slice(x);
-        for (v, y) in v.chunks_exact(inputs).zip(y.chunks_exact(outputs)) {
+        let weight = 1.0 / prior.residual_variance;
+        for (v, y) in v.chunks_exact(inputs).zip(*y) {
             step_with_slopes::<V>(network, scratch, v);
-            for (p, y) in y.iter().enumerate().filter(|(_, y)| !y.is_nan()) {
-                let (value, steepness) = network.output.value_and_slope(scratch.sums[p]);
-                let weight = 1.0 / prior.residual_variance[p];
+            if !y.is_nan() {
+                let (value, steepness) = network.output.value_and_slope(scratch.sum);
                 sum += weight * (y - value) * (y - value);
                 let row = &mut moved[..nx];
                 for (i, row) in row.iter_mut().enumerate() {
-                    let slope = |j: usize| scratch.slope((nx + p) * nx + j);
+                    let slope = |j: usize| scratch.slope(nx * nx + j);
                     *row = steepness
                         * (0..nx)
                             .map(|j| slope(j) * sensitivity[j * nx + i])
@@ -336,11 +329,11 @@ pub(super) fn step_with_slopes<V: F64x8>(network: &Network, scratch: &mut Scratc
         arguments,
         hidden,
         next,
-        sums,
+        sum,
         rises,
         slopes,
     } = scratch;
-    network.step::<V, 0>(arguments, hidden, next, sums);
+    *sum = network.step::<V, 0>(arguments, hidden, next);
     rises_of::<V>(hidden, rises);
     network.slopes::<V>(rises, slopes);
 }
@@ -349,7 +342,7 @@ pub(super) fn step_with_slopes<V: F64x8>(network: &Network, scratch: &mut Scratc
 struct Still<'a> {
     network: &'a Network,
     v: &'a [f64],
-    zero: &'a [f64],
+    zero: f64,
     scratch: Scratch,
 }
 
@@ -365,15 +358,13 @@ impl Squares for Still<'_> {
         normal.fill(0.0);
         gradient.fill(0.0);
         let mut sum = 0.0;
-        for (row, at) in x.iter().chain(self.zero).enumerate() {
+        for (row, at) in x.iter().chain([&self.zero]).enumerate() {
             // residuals x - x+ and -y, and the derivatives of their negatives
-            let (residual, steepness) = match row.checked_sub(nx) {
-                None => (at - scratch.next[row], 1.0),
-                Some(p) => {
-                    let (value, steepness) = self.network.output.value_and_slope(scratch.sums[p]);
-                    (at - value, steepness)
-                }
+            let (value, steepness) = match scratch.next.get(row) {
+                Some(next) => (*next, 1.0),
+                None => self.network.output.value_and_slope(scratch.sum),
             };
+            let residual = at - value;
             let slope =
                 |j: usize| steepness * scratch.slope(row * nx + j) - f64::from(u8::from(row == j));
             sum += residual * residual;
@@ -419,9 +410,9 @@ impl Kernel for Next<'_> {
             arguments,
             hidden,
             next,
-            sums,
+            sum,
             ..
         } = self.scratch;
-        self.network.step::<V, 0>(arguments, hidden, next, sums);
+        *sum = self.network.step::<V, 0>(arguments, hidden, next);
     }
 }

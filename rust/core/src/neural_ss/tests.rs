@@ -19,14 +19,14 @@ fn random_model(seed: u64, shape: Shape, output: OutputFunction) -> NeuralSS {
     let scaling = Scaling {
         u_mean: ramp(shape.inputs, 0.1),
         u_scale: ramp(shape.inputs, 2.0),
-        y_mean: ramp(shape.outputs, 3.0),
-        y_scale: ramp(shape.outputs, 20.0),
+        y_mean: 3.0,
+        y_scale: 20.0,
     };
     let unit = (0..shape.nx * shape.nx).map(|i| f64::from(u8::from(i % (shape.nx + 1) == 0)));
     let statistics = Statistics {
         state_mean: vec![0.0; shape.nx],
         state_covariance: unit.collect(),
-        residual_variance: vec![1e-6; shape.outputs],
+        residual_variance: 1e-6,
         process_noise: 1e-3,
     };
     NeuralSS::new(shape, output, theta, scaling, statistics).unwrap()
@@ -46,22 +46,15 @@ pub(super) fn noise(count: usize, seed: u64) -> Vec<f64> {
 
 fn shapes() -> impl Strategy<Value = Shape> {
     let integrator = any::<bool>();
-    (
-        1usize..7,
-        0usize..3,
-        1usize..4,
-        1usize..3,
-        1usize..19,
-        integrator,
-    )
-        .prop_map(|(nx, nk, inputs, outputs, hidden, integrator)| Shape {
+    (1usize..7, 0usize..3, 1usize..4, 1usize..19, integrator).prop_map(
+        |(nx, nk, inputs, hidden, integrator)| Shape {
             nx,
             nk,
             inputs,
-            outputs,
             hidden,
             integrator,
-        })
+        },
+    )
 }
 
 fn functions() -> impl Strategy<Value = OutputFunction> {
@@ -109,14 +102,14 @@ proptest! {
 
     #[test]
     fn a_clean_record_gives_its_state_back(seed in any::<u64>(), hidden in 1usize..10) {
-        let shape = Shape { nx: 2, nk: 1, inputs: 1, outputs: 1, hidden, integrator: false };
+        let shape = Shape { nx: 2, nk: 1, inputs: 1, hidden, integrator: false };
         let model = random_model(seed, shape, OutputFunction::Linear);
         let u = noise(30, seed ^ 1);
         let y = model.simulate(&u, 1, &[0.5, -0.8]).unwrap();
-        let state = model.estimate_initial_state(&u, 1, &y).unwrap();
+        let state = model.estimate_state(&u, 1, &y).unwrap();
         let again = model.simulate(&u, 1, &state).unwrap();
         let worst = y.iter().zip(&again).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-        prop_assert!(worst < 1e-2 * model.scaling().y_scale[0], "{worst}");
+        prop_assert!(worst < 1e-2 * model.scaling().y_scale, "{worst}");
     }
 }
 
@@ -124,7 +117,6 @@ const SMALL: Shape = Shape {
     nx: 2,
     nk: 1,
     inputs: 1,
-    outputs: 1,
     hidden: 3,
     integrator: false,
 };
@@ -150,7 +142,7 @@ fn rests_where_nothing_moves() {
     let shape = Shape { inputs: 2, ..SMALL };
     let mut model = random_model(6, shape, OutputFunction::Linear);
     model.scaling.u_mean = vec![0.0; 2];
-    model.scaling.y_mean = vec![0.0];
+    model.scaling.y_mean = 0.0;
     for range in [shape.parts().bh, shape.parts().constant] {
         model.theta[range].fill(0.0);
     }
@@ -171,7 +163,7 @@ fn steps_as_it_simulates() {
         u.extend(noise(50, 8));
         let run = model.simulate(&u, 1, &model.rest_state()).unwrap();
         for (u, y) in u.iter().zip(&run) {
-            assert!((stepper.output(0) - y).abs() < 1e-12);
+            assert!((stepper.output() - y).abs() < 1e-12);
             stepper.advance(&[*u]);
         }
     }
@@ -207,12 +199,12 @@ fn refuses_what_is_no_model() {
         .is_err()
     );
     let mut statistics = good().1;
-    statistics.residual_variance[0] = 0.0;
+    statistics.residual_variance = 0.0;
     assert!(with(good().0, statistics, SMALL).is_err());
     assert!(model.simulate(&[0.0; 4], 2, &[0.0; 2]).is_err());
     assert!(model.simulate(&[0.0; 4], 1, &[0.0; 3]).is_err());
     assert!(model.simulate(&[f64::NAN; 4], 1, &[0.0; 2]).is_err());
-    assert!(model.estimate_initial_state(&[], 1, &[]).is_err());
+    assert!(model.estimate_state(&[], 1, &[]).is_err());
 }
 
 fn settings(shape: Shape) -> Settings {
@@ -241,12 +233,12 @@ fn recovers_a_model_of_its_own_class_and_gaps_do_not_matter() {
     let (u, other) = (noise(1200, 12), noise(400, 13));
     let mut y = truth.simulate(&u, 1, &[0.2, 0.1]).unwrap();
     y[100..140].fill(f64::NAN);
-    let recording = Recording::new(&u, 1, &y, 1).unwrap();
+    let recording = crate::Record::with_gaps(&u, 1, &y).unwrap();
     let fit = fit(&[recording], &[], &settings(SMALL), &Monitor::default()).unwrap();
     let expected = truth.simulate(&other, 1, &[0.0, 0.0]).unwrap();
     let state = fit
         .model
-        .estimate_initial_state(&other[..50], 1, &expected[..50])
+        .estimate_state(&other[..50], 1, &expected[..50])
         .unwrap();
     let found = fit.model.simulate(&other, 1, &state).unwrap();
     let error: f64 = found
@@ -266,7 +258,7 @@ fn the_threads_and_the_split_of_the_starts_do_not_matter() {
     let truth = random_model(21, SMALL, OutputFunction::Linear);
     let u = noise(300, 22);
     let y = truth.simulate(&u, 1, &[0.2, 0.1]).unwrap();
-    let recording = [Recording::new(&u, 1, &y, 1).unwrap()];
+    let recording = [crate::Record::with_gaps(&u, 1, &y).unwrap()];
     let fit =
         |settings: &Settings| super::fit(&recording, &[], settings, &Monitor::default()).unwrap();
     let base = Settings {
@@ -295,7 +287,7 @@ fn a_model_is_trained_further_where_it_was_left() {
     let truth = random_model(31, SMALL, OutputFunction::Linear);
     let u = noise(300, 32);
     let y = truth.simulate(&u, 1, &[0.2, 0.1]).unwrap();
-    let recording = [Recording::new(&u, 1, &y, 1).unwrap()];
+    let recording = [crate::Record::with_gaps(&u, 1, &y).unwrap()];
     let fit = |settings: &Settings| super::fit(&recording, &[], settings, &Monitor::default());
     let first = fit(&Settings {
         max_iterations: 5,
@@ -411,13 +403,11 @@ pub(super) fn network_of(seed: u64, shape: Shape) -> Network {
 }
 
 fn kinds() -> impl Iterator<Item = Shape> {
-    let kinds = [(1, 1), (2, 1), (3, 1), (4, 1), (5, 1), (3, 2)];
-    kinds.into_iter().flat_map(|(nx, outputs)| {
+    (1..6).flat_map(|nx| {
         [3, 8, 15, 20].map(|hidden| Shape {
             nx,
             nk: 1,
             inputs: 2,
-            outputs,
             hidden,
             integrator: false,
         })
@@ -431,7 +421,7 @@ fn every_processor_runs_and_differentiates_alike() {
     for shape in kinds() {
         let network = network_of(3, shape);
         let (v, state) = (noise(75 * shape.inputs, 4), noise(shape.nx, 5));
-        let y = noise(75 * shape.outputs, 6);
+        let y = noise(75, 6);
         let all = simd::run_everywhere(|| Whole {
             network: &network,
             v: &v,
@@ -456,7 +446,7 @@ fn outputs_that_are_not_known_have_no_row_and_change_no_other() {
     for shape in kinds() {
         let network = network_of(7, shape);
         let (v, state) = (noise(75 * shape.inputs, 8), noise(shape.nx, 9));
-        let all = noise(75 * shape.outputs, 10);
+        let all = noise(75, 10);
         let is_known = |i: &usize| i % 5 != 1 && !(30..36).contains(i) && i + 1 != all.len();
         let some: Vec<f64> = (0..all.len())
             .map(|i| if is_known(&i) { all[i] } else { f64::NAN })
@@ -504,7 +494,6 @@ fn a_grown_model_runs_almost_as_before() {
             nx: 1 + seed as usize % 5,
             nk: 1,
             inputs: 1 + seed as usize % 2,
-            outputs: 1 + seed as usize % 3 / 2,
             hidden: 1 + seed as usize % 17,
             integrator: seed % 4 == 3,
         };
@@ -527,22 +516,16 @@ fn a_grown_model_runs_almost_as_before() {
             assert_eq!(grown.shape().nx, shape.nx + nx);
             let state = grown_state(&model, &grown, &state);
             let run = grown.simulate(&u, shape.inputs, &state).unwrap();
-            for p in 0..shape.outputs {
-                let of = |run: &[f64]| -> Vec<f64> {
-                    run.iter().skip(p).step_by(shape.outputs).copied().collect()
-                };
-                let (y, run) = (of(&y), of(&run));
-                let mean = y.iter().sum::<f64>() / y.len() as f64;
-                let rms = |squares: f64| (squares / y.len() as f64).sqrt();
-                let spread = rms(y.iter().map(|y| (y - mean).powi(2)).sum());
-                let moved = rms(y.iter().zip(&run).map(|(y, run)| (y - run).powi(2)).sum());
-                // an output that hardly moves is measured by its scale in training
-                let moved = moved / spread.max(model.scaling().y_scale[p]);
-                assert!(
-                    moved < 1e-2 && moved > 0.0,
-                    "{seed} {shape:?} {nx} {hidden}: {moved}"
-                );
-            }
+            let mean = y.iter().sum::<f64>() / y.len() as f64;
+            let rms = |squares: f64| (squares / y.len() as f64).sqrt();
+            let spread = rms(y.iter().map(|y| (y - mean).powi(2)).sum());
+            let moved = rms(y.iter().zip(&run).map(|(y, run)| (y - run).powi(2)).sum());
+            // an output that hardly moves is measured by its scale in training
+            let moved = moved / spread.max(model.scaling().y_scale);
+            assert!(
+                moved < 1e-2 && moved > 0.0,
+                "{seed} {shape:?} {nx} {hidden}: {moved}"
+            );
         }
     }
 }

@@ -7,7 +7,7 @@ use super::integrated::{Leak, Speed};
 use super::network::Network;
 use super::output::OutputFunction;
 use super::problem::{self, Attempts, Experiment};
-use super::recording::{Recording, check_recordings, constant_cost, scaling};
+use super::records::{check_records, constant_cost, scaling};
 use super::referee::{Referee, statistics};
 use super::shape::{Scaling, Shape};
 use super::state::{self, Statistics};
@@ -16,7 +16,7 @@ use crate::guard;
 use crate::linear::LinearModel;
 use crate::lm::{self, Damping, Outcome, Problem, Termination};
 use crate::random::Random;
-use crate::{Error, Monitor, Result, starts};
+use crate::{Error, Monitor, Record, Result, starts};
 
 /// What to train, and how.
 #[derive(Clone, Debug)]
@@ -115,12 +115,12 @@ const LINEAR_RESIDUAL: f64 = 0.1;
 /// # Errors
 /// `ErrorKind::Data` and `ErrorKind::Setting` for data or settings that cannot be trained; `ErrorKind::Fit` if every start failed.
 pub fn fit(
-    recordings: &[Recording],
-    validation: &[Recording],
+    records: &[Record],
+    validation: &[Record],
     settings: &Settings,
     monitor: &Monitor,
 ) -> Result<NeuralSSFit> {
-    let task = Task::new(recordings, validation, settings, monitor)?;
+    let task = Task::new(records, validation, settings, monitor)?;
     monitor.set_total((settings.starts * settings.max_iterations) as u64);
     let results = starts::run_all(settings.starts, settings.threads, monitor, |start| {
         task.run(settings.first_start + start)
@@ -132,7 +132,7 @@ pub fn fit(
 struct Task<'a> {
     settings: &'a Settings,
     monitor: &'a Monitor,
-    recordings: &'a [Recording<'a>],
+    records: &'a [Record<'a>],
     shape: Shape,
     scaling: Scaling,
     experiments: Vec<Experiment>,
@@ -155,43 +155,42 @@ struct Trained {
 
 impl<'a> Task<'a> {
     fn new(
-        recordings: &'a [Recording<'a>],
-        validation: &[Recording],
+        records: &'a [Record<'a>],
+        validation: &[Record],
         settings: &'a Settings,
         monitor: &'a Monitor,
     ) -> Result<Self> {
-        let first = recordings
+        let first = records
             .first()
             .ok_or_else(|| Error::data("expected one experiment or more, got none"))?;
         let shape = Shape {
             nx: settings.nx,
             nk: settings.nk,
-            inputs: first.inputs,
-            outputs: first.outputs,
+            inputs: first.channels,
             hidden: settings.hidden,
             integrator: settings.integrator,
         }
         .checked()?;
         check(settings)?;
-        check_recordings(recordings, validation, shape)?;
+        check_records(records, validation, shape)?;
         let scaling = match settings.initial.first() {
             Some(model) => model.scaling().clone(),
-            None => scaling(recordings, settings.output)?,
+            None => scaling(records, settings.output)?,
         };
         check_initial(settings, shape, &scaling)?;
-        let scaled = |r: &Recording| Experiment {
+        let scaled = |r: &Record| Experiment {
             v: scaling.delayed_inputs(r.u, shape.nk),
             y: scaling.outputs(r.y),
-            weights: r.output_weights(),
+            weights: r.weights.unwrap_or_default().to_vec(),
         };
-        let experiments: Vec<Experiment> = recordings.iter().map(scaled).collect();
+        let experiments: Vec<Experiment> = records.iter().map(scaled).collect();
         let linear = settings.linear.as_ref();
         Ok(Self {
             settings,
             monitor,
-            recordings,
+            records,
             shape,
-            constant_cost: constant_cost(&experiments, shape),
+            constant_cost: constant_cost(&experiments),
             validation: validation.iter().map(scaled).collect(),
             linear: linear
                 .map(|l| Realisation::of(l, shape, &scaling, &experiments))
@@ -263,8 +262,7 @@ impl<'a> Task<'a> {
 
     /// A position's start from an estimate of its dry friction; `None` if the draw is against it, or if no friction shows.
     fn with_friction(&self, random: &mut Random) -> Option<Vec<f64>> {
-        let Shape { nx, outputs, .. } = self.shape;
-        let is_position = self.shape.integrator && nx > 1 && outputs == 1;
+        let is_position = self.shape.integrator && self.shape.nx > 1;
         if !is_position || random.between(0.0, 1.0) >= WITH_FRICTION {
             return None;
         }
@@ -287,9 +285,8 @@ impl<'a> Task<'a> {
         random: &mut Random,
         attempts: &Attempts,
     ) -> Option<(Vec<f64>, usize)> {
-        let is_position = self.shape.integrator && self.shape.outputs == 1;
         let is_linear = self.settings.output == OutputFunction::Linear;
-        if !is_position || !is_linear || !self.settings.initial.is_empty() {
+        if !self.shape.integrator || !is_linear || !self.settings.initial.is_empty() {
             return None;
         }
         let speed = Speed::new(&self.experiments, self.shape)?;
@@ -314,8 +311,7 @@ impl<'a> Task<'a> {
         theta: Vec<f64>,
         attempts: &Attempts,
     ) -> (Vec<f64>, usize) {
-        let is_position = self.shape.integrator && self.shape.outputs == 1;
-        if !is_position || !self.settings.initial.is_empty() {
+        if !self.shape.integrator || !self.settings.initial.is_empty() {
             return (theta, 0);
         }
         let iterations = self.settings.max_iterations / FIRST_PART;
@@ -488,12 +484,8 @@ impl<'a> Task<'a> {
 
     /// The guard's verdict, independent of the monitor: a trained model is judged even after a stop request.
     fn passes(&self, model: &NeuralSS) -> bool {
-        let linear = match self.shape.outputs {
-            1 => self.settings.linear.as_slice(),
-            _ => &[],
-        };
-        let monitor = Monitor::default();
-        guard::verdict(model, self.recordings, linear, &monitor) == Ok(None)
+        let (linear, monitor) = (self.settings.linear.as_slice(), Monitor::default());
+        guard::verdict(model, self.records, linear, &monitor) == Ok(None)
     }
 
     fn chosen(&self, mut results: Vec<Option<Trained>>) -> Result<NeuralSSFit> {
@@ -541,12 +533,12 @@ impl<'a> Task<'a> {
 
 /// Statistics before there is a run: states are scaled to unit variance.
 fn unit_prior(shape: Shape) -> Statistics {
-    let Shape { nx, outputs, .. } = shape;
+    let nx = shape.nx;
     let unit = (0..nx * nx).map(|i| f64::from(u8::from(i % (nx + 1) == 0)));
     Statistics {
         state_mean: vec![0.0; nx],
         state_covariance: unit.collect(),
-        residual_variance: vec![LINEAR_RESIDUAL; outputs],
+        residual_variance: LINEAR_RESIDUAL,
         process_noise: 0.0,
     }
 }
@@ -558,12 +550,9 @@ fn with_states(
     prior: &Statistics,
     experiments: &[Experiment],
 ) -> Vec<f64> {
-    let Shape {
-        inputs, outputs, ..
-    } = network.shape;
     for Experiment { v, y, .. } in experiments {
-        let samples = STATE_SAMPLES.min(y.len() / outputs);
-        let (v, y) = (&v[..samples * inputs], &y[..samples * outputs]);
+        let samples = STATE_SAMPLES.min(y.len());
+        let (v, y) = (&v[..samples * network.shape.inputs], &y[..samples]);
         let mean = std::slice::from_ref(&prior.state_mean);
         let state = state::update(network, prior, v, y, mean);
         theta.extend(state.unwrap_or_else(|| prior.state_mean.clone()));

@@ -29,6 +29,36 @@ pub(super) fn half<K: Kernel>(kernel: K) -> K::Output {
     kernel.run::<Halves>()
 }
 
+/// A method that is one instruction, in one register or in both halves.
+macro_rules! lanes {
+    (wide one $name:ident $of:ident) => {
+        lanes!($name(self) { $of(self.0) });
+    };
+    (halves one $name:ident $of:ident) => {
+        lanes!($name(self) { $of(self.0), $of(self.1) });
+    };
+    (wide two $name:ident $of:ident) => {
+        lanes!($name(self, other) { $of(self.0, other.0) });
+    };
+    (halves two $name:ident $of:ident) => {
+        lanes!($name(self, other) { $of(self.0, other.0), $of(self.1, other.1) });
+    };
+    // If one is NaN the instruction returns its second operand, so `self` is the second.
+    (wide limit $name:ident $of:ident) => {
+        lanes!($name(self, limits) { $of(limits.0, self.0) });
+    };
+    (halves limit $name:ident $of:ident) => {
+        lanes!($name(self, limits) { $of(limits.0, self.0), $of(limits.1, self.1) });
+    };
+    ($name:ident($this:ident $(, $other:ident)?) { $($half:expr),* }) => {
+        #[inline(always)]
+        fn $name($this $(, $other: Self)?) -> Self {
+            // SAFETY: as `splat`.
+            unsafe { Self($($half),*) }
+        }
+    };
+}
+
 #[derive(Clone, Copy)]
 pub(super) struct Wide(__m512d);
 
@@ -94,35 +124,11 @@ impl Arithmetic for Wide {
         unsafe { Self(_mm512_set1_pd(value)) }
     }
 
-    #[inline(always)]
-    fn add(self, other: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm512_add_pd(self.0, other.0)) }
-    }
-
-    #[inline(always)]
-    fn sub(self, other: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm512_sub_pd(self.0, other.0)) }
-    }
-
-    #[inline(always)]
-    fn mul(self, other: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm512_mul_pd(self.0, other.0)) }
-    }
-
-    #[inline(always)]
-    fn div(self, other: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm512_div_pd(self.0, other.0)) }
-    }
-
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm512_sqrt_pd(self.0)) }
-    }
+    lanes!(wide two add _mm512_add_pd);
+    lanes!(wide two sub _mm512_sub_pd);
+    lanes!(wide two mul _mm512_mul_pd);
+    lanes!(wide two div _mm512_div_pd);
+    lanes!(wide one sqrt _mm512_sqrt_pd);
 
     #[inline(always)]
     fn load(values: &[f64; LANES]) -> Self {
@@ -131,23 +137,9 @@ impl Arithmetic for Wide {
         unsafe { Self(_mm512_loadu_pd(values.as_ptr())) }
     }
 
-    #[inline(always)]
-    fn at_most_each(self, limits: Self) -> Self {
-        // SAFETY: as `splat`. If one is NaN the instruction returns its second operand, so `self` is the second.
-        unsafe { Self(_mm512_min_pd(limits.0, self.0)) }
-    }
-
-    #[inline(always)]
-    fn at_least_each(self, limits: Self) -> Self {
-        // SAFETY: as `splat`. If one is NaN the instruction returns its second operand, so `self` is the second.
-        unsafe { Self(_mm512_max_pd(limits.0, self.0)) }
-    }
-
-    #[inline(always)]
-    fn abs(self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm512_abs_pd(self.0)) }
-    }
+    lanes!(wide limit at_most_each _mm512_min_pd);
+    lanes!(wide limit at_least_each _mm512_max_pd);
+    lanes!(wide one abs _mm512_abs_pd);
 
     #[inline(always)]
     fn if_less(self, other: Self, yes: Self, no: Self) -> Self {
@@ -281,55 +273,11 @@ impl Arithmetic for Halves {
         Self(all, all)
     }
 
-    #[inline(always)]
-    fn add(self, other: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe {
-            Self(
-                _mm256_add_pd(self.0, other.0),
-                _mm256_add_pd(self.1, other.1),
-            )
-        }
-    }
-
-    #[inline(always)]
-    fn sub(self, other: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe {
-            Self(
-                _mm256_sub_pd(self.0, other.0),
-                _mm256_sub_pd(self.1, other.1),
-            )
-        }
-    }
-
-    #[inline(always)]
-    fn mul(self, other: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe {
-            Self(
-                _mm256_mul_pd(self.0, other.0),
-                _mm256_mul_pd(self.1, other.1),
-            )
-        }
-    }
-
-    #[inline(always)]
-    fn div(self, other: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe {
-            Self(
-                _mm256_div_pd(self.0, other.0),
-                _mm256_div_pd(self.1, other.1),
-            )
-        }
-    }
-
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm256_sqrt_pd(self.0), _mm256_sqrt_pd(self.1)) }
-    }
+    lanes!(halves two add _mm256_add_pd);
+    lanes!(halves two sub _mm256_sub_pd);
+    lanes!(halves two mul _mm256_mul_pd);
+    lanes!(halves two div _mm256_div_pd);
+    lanes!(halves one sqrt _mm256_sqrt_pd);
 
     #[inline(always)]
     fn load(values: &[f64; LANES]) -> Self {
@@ -338,27 +286,8 @@ impl Arithmetic for Halves {
         unsafe { Self(_mm256_loadu_pd(start), _mm256_loadu_pd(start.add(4))) }
     }
 
-    #[inline(always)]
-    fn at_most_each(self, limits: Self) -> Self {
-        // SAFETY: as `splat`. If one is NaN the instruction returns its second operand, so `self` is the second.
-        unsafe {
-            Self(
-                _mm256_min_pd(limits.0, self.0),
-                _mm256_min_pd(limits.1, self.1),
-            )
-        }
-    }
-
-    #[inline(always)]
-    fn at_least_each(self, limits: Self) -> Self {
-        // SAFETY: as `splat`. If one is NaN the instruction returns its second operand, so `self` is the second.
-        unsafe {
-            Self(
-                _mm256_max_pd(limits.0, self.0),
-                _mm256_max_pd(limits.1, self.1),
-            )
-        }
-    }
+    lanes!(halves limit at_most_each _mm256_min_pd);
+    lanes!(halves limit at_least_each _mm256_max_pd);
 
     #[inline(always)]
     fn abs(self) -> Self {
@@ -422,11 +351,7 @@ impl F64x8 for Halves {
         }
     }
 
-    #[inline(always)]
-    fn floor(self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm256_floor_pd(self.0), _mm256_floor_pd(self.1)) }
-    }
+    lanes!(halves one floor _mm256_floor_pd);
 
     #[inline(always)]
     fn store(self, values: &mut [f64; LANES]) {

@@ -1,3 +1,4 @@
+use super::super::shape::Shape;
 use super::*;
 use crate::neural_ss::tests::{network_of, noise};
 
@@ -7,7 +8,7 @@ const SAMPLES: usize = 150;
 fn runs(shape: Shape, limits: [f64; 2], together: bool) -> ([Option<f64>; 2], [Trajectory; 2]) {
     let networks = [1, 2].map(|seed| network_of(seed, shape));
     let v = noise(SAMPLES * shape.inputs, 3);
-    let mut y = noise(SAMPLES * shape.outputs, 4);
+    let mut y = noise(SAMPLES, 4);
     y[5] = f64::NAN;
     let state = noise(shape.nx, 5);
     let mut left = networks
@@ -56,19 +57,11 @@ fn runs(shape: Shape, limits: [f64; 2], together: bool) -> ([Option<f64>; 2], [T
 }
 
 fn shapes() -> impl Iterator<Item = Shape> {
-    let sizes = [
-        (1, 3, 1),
-        (2, 8, 1),
-        (3, 15, 1),
-        (4, 20, 1),
-        (5, 8, 1),
-        (3, 15, 2),
-    ];
-    sizes.into_iter().map(|(nx, hidden, outputs)| Shape {
+    let sizes = [(1, 3), (2, 8), (3, 15), (4, 20), (5, 8)];
+    sizes.into_iter().map(|(nx, hidden)| Shape {
         nx,
         nk: 1,
         inputs: 2,
-        outputs,
         hidden,
         integrator: false,
     })
