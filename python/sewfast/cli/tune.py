@@ -79,6 +79,7 @@ examples:
   sewfast tune one.json two.json --aggregate worst --variables Kp,Ti,alpha -o controller.json
   sewfast tune drive.json -o controller.json --plot tuned.png
   sewfast tune drive.json --controller state-feedback -o states.json
+  sewfast tune drive.json --loop position -o position.json
   sewfast tune network.json --rival linear.json -o controller.json
   sewfast tune shaft.json --notch 75 --constraint Ms=1.7 --response response.json -o controller.json
   sewfast tune drive.json --pareto tracking,chatter --front front.png -o controller.json
@@ -132,6 +133,11 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--no-feedforward", dest="feedforward", action="store_const", const="none",
         help="the PID alone",
+    )  # fmt: skip
+    parser.add_argument(
+        "--loop", choices=("speed", "position"), default="speed",
+        help="with a position loop over that of the speed, for run --stop-at and --positions "
+        "(speed)",
     )  # fmt: skip
     parser.add_argument(
         "--notch", action="append", metavar="HZ[:DEPTH[:WIDTH]]",
@@ -214,6 +220,11 @@ def tune_command(args: argparse.Namespace) -> int | None:
     if args.pareto is not None and args.method != "genetic":
         raise SettingError(
             name="--method", expected="no --pareto, as a front is searched by NSGA-II",
+            received="both", remedy="leave one of them out",
+        )  # fmt: skip
+    if args.pareto is not None and args.loop != "speed":
+        raise SettingError(
+            name="--loop", expected="no --pareto, as a front has speed loops only",
             received="both", remedy="leave one of them out",
         )  # fmt: skip
     if args.pareto is not None and args.rival is not None:
@@ -384,8 +395,8 @@ def _tuned(
     with Progress("tune", quiet=args.quiet) as progress:
         return tune(
             models, references, **_started(args, models), **settings, rival=rival,
-            feedforward=args.feedforward, method=args.method, time_budget=args.time_budget,
-            progress=progress,
+            feedforward=args.feedforward, loop=args.loop, method=args.method,
+            time_budget=args.time_budget, progress=progress,
         )  # fmt: skip
 
 
@@ -416,6 +427,7 @@ def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
                 "termination": found.termination,
                 "method": found.method,
                 "lost": list(found.lost),
+                "position": None if found.position is None else found.position.to_json(),
                 "grade": found.grade,
                 "verdict": found.verdict.to_json(),
                 "warning": found.warning,

@@ -61,6 +61,8 @@ class SampledController:
     """Its name in files."""
     VERSION: ClassVar[int] = 4
     """Version of its files."""
+    LOOP: ClassVar[str] = "speed"
+    """What its references are: of the output, or ``position``, its integral."""
 
     if TYPE_CHECKING:
         # declared as properties, as the fields of a frozen dataclass are read-only

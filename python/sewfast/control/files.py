@@ -11,10 +11,11 @@ from .controller import FORMAT, Controller, SampledController
 from .move import COLUMNS, MoveTable, Repetition
 from .move import FORMAT as TABLE
 from .move import VERSION as TABLE_VERSION
+from .position import PositionController
 from .state_feedback import StateFeedback
 
 KINDS: dict[str, type[SampledController]] = {
-    kind.KIND: kind for kind in (Controller, StateFeedback)
+    kind.KIND: kind for kind in (Controller, StateFeedback, PositionController)
 }
 """The kinds by name. A file of versions 1 to 3 has no kind and is a PID."""
 

@@ -217,7 +217,11 @@ fn rms(x: &[f64]) -> f64 {
 }
 
 /// Applies `work` to all, over threads, in order.
-fn each<T: Sync, R: Send>(all: &[T], threads: usize, work: impl Fn(&T) -> R + Sync) -> Vec<R> {
+pub(crate) fn each<T: Sync, R: Send>(
+    all: &[T],
+    threads: usize,
+    work: impl Fn(&T) -> R + Sync,
+) -> Vec<R> {
     let part = all
         .len()
         .div_ceil(threads.clamp(1, all.len().max(1)))

@@ -3,6 +3,7 @@
 
 pub mod controller;
 mod moves;
+mod position;
 mod tuning;
 
 use std::sync::Arc;
@@ -37,6 +38,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(effort, module)?)?;
     tuning::register(module)?;
     moves::register(module)?;
+    position::register(module)?;
     module.add_function(wrap_pyfunction!(fit_fopdt, module)?)?;
     module.add_function(wrap_pyfunction!(table_1, module)?)?;
     module.add_function(wrap_pyfunction!(eq_12, module)?)?;
