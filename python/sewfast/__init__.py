@@ -21,6 +21,12 @@ if TYPE_CHECKING:
     from .control.loop import ClosedLoopRun, run
     from .control.machine import Machine, record
     from .control.margins import Margins, margins, operating_point
+    from .control.position import (
+        PositionController,
+        PositionRun,
+        follow_positions,
+        stop_at,
+    )
     from .control.state_feedback import StateFeedback
     from .dataset import Dataset, Diagnosis, Experiment, diagnose
     from .errors import (
@@ -108,6 +114,8 @@ __all__ = [
     "NeuralSS",
     "OrderTable",
     "ParetoFront",
+    "PositionController",
+    "PositionRun",
     "Profile",
     "Reach",
     "Recording",
@@ -132,6 +140,7 @@ __all__ = [
     "diagnose",
     "fit_fopdt",
     "fit_shaft",
+    "follow_positions",
     "identify",
     "learn",
     "least_squares",
@@ -157,6 +166,7 @@ __all__ = [
     "run",
     "signals",
     "speed_from_counts",
+    "stop_at",
     "table_1",
     "trust",
     "tune",
@@ -193,6 +203,7 @@ _HOMES = {
     "recording": "Recording",
     "moves": "Learned MoveTable Profile Reach Repetition learn load_table plan profile",
     "control.margins": "Margins margins operating_point",
+    "control.position": "PositionController PositionRun follow_positions stop_at",
     "speed": "speed_from_counts",
     "validation": "Validation validate",
     "storage": "write_table",

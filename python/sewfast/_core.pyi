@@ -806,6 +806,57 @@ def profile(
 ) -> tuple[_F, list[bool]]:
     """The reference within a reach; whether levels, rate and jerk were at their bounds."""
 
+# --- control/position.rs ----------------------------------------------------------------------------------
+
+_Rates: TypeAlias = Sequence[tuple[float, float, float]]
+
+@final
+class PositionController:
+    """A position loop over a PID with what it is to do, at rest; see ``sewfast_control::position``.
+
+    ``rates``: speed, largest rates away from rest and towards it; ``stop``: samples before it, angle and turn
+    [counts], whether it goes onward.
+    """
+
+    def __new__(
+        cls, speed: Any, *, gain: float, counts_per_unit: float, fastest: float, rates: _Rates,
+        smoothing: int, landing: float, creep: float, releases: bool,
+        stop: tuple[int, float, float, bool] | None = None,
+    ) -> PositionController: ...
+    def step(self, r: float, y: float) -> float:
+        """The command, from a goal [counts] or, before a stop, a speed, both early, and the counted speed."""
+    def reset(self) -> None: ...
+    @property
+    def filtered(self) -> float: ...
+    @property
+    def place(self) -> float:
+        """Where the profile is at this sample [counts]."""
+    @property
+    def goal(self) -> float: ...
+    def early(self, reference: _F) -> _F:
+        """References as the steps take them; the last value stays."""
+
+def position_run(
+    plant: Any, controller: PositionController, reference: _F, *, counts_per_unit: float,
+    encoder_phase: float = 0.5, disturbance: _F | None = None,
+) -> dict[str, _F]:
+    """u, y, feedback, counts, position, place, goal of a run from rest on a model or a virtual machine."""
+
+def position_rates(reach: _Reach) -> tuple[list[tuple[float, float, float]], float]:
+    """Rows of rates from rest on that a reach has in either direction, and the largest speed that it knows."""
+
+def approach(rates: _Rates, speed: float, *, hold: int, Ts: float) -> _F:
+    """A reference that comes up to a speed at the rates and holds it for so many samples."""
+
+def judge_stops(
+    plants: Sequence[Any], speed: Any, designs: Sequence[tuple[float, _Rates, int, float, float]], *,
+    counts_per_unit: float, fastest: float, turn: float, speeds: Sequence[float], before: int,
+    after: int, load: float, variations: Sequence[tuple[float, int]], encoder_phase: float = 0.5,
+    progress: _Progress = None,
+) -> list[list[float]]:
+    """Of each design (gain, rates, smoothing, landing, creep) the worst of all plants: rms error, how far a stop
+    passes its angle, how far from it the shaft rests, its swing there, and how far it yields to a load [counts]."""
+
 # --- rules.rs ---------------------------------------------------------------------------------------------
 
 def fit_fopdt(u: _F, y: _F, *, Ts: float) -> dict[str, Any]:
@@ -841,13 +892,14 @@ class LoopPath:
     """The parts of a controller within the loop: gains in standard form, derivative filter, feedback filters.
 
     ``encoder``: the output is measured as a mean over the previous sample. ``slope`` [u/y] is added to the
-    proportional gain: the effect of a gain schedule on ``-Kp alpha r``.
+    proportional gain: the effect of a gain schedule on ``-Kp alpha r``. ``position`` is the gain of a position
+    loop around it [1/s].
     """
 
     def __new__(
         cls, *, Kp: float, Ti: float, Td: float, N: float, Ts: float, filter_samples: int,
         filter_time: float, observer_time: float, encoder: bool, slope: float = 0.0,
-        biquads: Sequence[tuple[float, float, float, float]] = ...,
+        biquads: Sequence[tuple[float, float, float, float]] = ..., position: float = 0.0,
     ) -> LoopPath: ...
 
 def sampled_fopdt(K: float, T: float, L: float, *, Ts: float) -> tuple[_F, _F]:
@@ -863,6 +915,9 @@ def margins(path: LoopPath, num: _F, den: _F) -> dict[str, Any]:
 
     An unstable loop has infinite peaks and noise gain, its other margins are NaN.
     """
+
+def position_sensitivity(path: LoopPath, num: _F, den: _F) -> float:
+    """Largest sensitivity of the position loop of a path, broken at its error; inf for an unstable loop."""
 
 def tolerance(
     path: LoopPath, num: _F, den: _F

@@ -32,6 +32,7 @@ _WRITTEN = {
     "deg": "° degree degrees",
     "rad": "radian radians",
     "°c": "degc celsius",
+    "counts": "count",
 }
 """Other spellings of a unit, in lower case; `u` is German for turns, `tr` French."""
 _SPELLINGS = {other: unit for unit, others in _WRITTEN.items() for other in others.split()}
@@ -68,6 +69,28 @@ def radians(unit: str) -> float | None:
 def is_position(unit: str) -> bool:
     """Whether it is a unit of an angle or a length, or counts of an encoder."""
     return radians(unit) is not None or spelled(unit) in LENGTHS or spelled(unit) == "counts"
+
+
+def position_unit(text: str) -> str:
+    """The unit of a position on a shaft in the package's spelling.
+
+    Raises
+    ------
+    SettingError
+        For a unit that is no angle and not counts.
+    """
+    unit = spelled(text)
+    if unit == "counts" or unit in ANGLES:
+        return unit
+    raise SettingError(
+        name="unit", expected="deg, rad, turns or counts", received=repr(text),
+        remedy="a shaft has no lengths: convert them by its lead or radius",
+    )  # fmt: skip
+
+
+def counts_of(value: float, unit: str, counts_per_rev: float) -> float:
+    """A position on a shaft in counts, from a unit of `position_unit`."""
+    return value if unit == "counts" else value * ANGLES[unit] / math.tau * counts_per_rev
 
 
 def counts_per_unit(counts_per_rev: float, unit: str = "rpm") -> float:

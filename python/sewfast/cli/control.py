@@ -44,6 +44,10 @@ Close the loop around a model, a virtual machine or a drive, with the same contr
 Columns: t [s], r, u, y (the plant's true output; of a real drive the speed estimated from its
 counts), feedback (y after encoder and filter).
 
+With a controller of positions (sewfast tune --loop position), --stop-at brings a running drive to
+an angle, and --positions goes from goal to goal; there are further columns counts, position, place
+(of the profile) and goal. Angles count from where the run begins. No device has positions yet.
+
 On a drive the controller runs on the device; the run is written as MCAP while it runs, and
 a file with another ending is made from it afterwards. Ctrl-C stops the motor and keeps the file.
 """
@@ -55,6 +59,8 @@ examples:
   sewfast run controller.json --on virtual --reference trapezoid -o measured.csv
   sewfast run controller.json --on virtual:7 --reference cycle.csv --json
   sewfast run controller.json --on virtual --table seam.json -o measured.csv
+  sewfast run position.json --on virtual --stop-at 90deg --speed 2000 -o stop.csv
+  sewfast run position.json --on virtual --positions moves.csv -o measured.csv
   sewfast run controller.json --on /dev/ttyUSB0 --reference trapezoid -o measured.mcap \\
       --limits volt=10,speed=3500,acceleration=30000,current=15
   sewfast run controller.json --on /dev/ttyUSB0 --reference cycle.csv -o measured.csv \\
@@ -79,6 +85,7 @@ def add(commands: Commands) -> None:
         summary="a closed loop on a model, a machine or a drive",
         text=RUN, options=OPTIONS, examples=RUN_EXAMPLES,
     )  # fmt: skip
+    _add_positions(parser)
     add_output(
         parser, "OUT",
         "CSV, .npz, .mat or Parquet, for a drive also .mcap; default: CSV to standard output",
@@ -101,6 +108,9 @@ def run_command(args: argparse.Namespace) -> int | None:
         return run_host_loop(args, pid, _wanted(args, pid))
     require_place(args.out, RECORDINGS if is_port(args.on) else TABLES)
     controller = load_controller(args.controller)
+    if args.stop_at is not None or args.positions is not None:
+        _run_positions(args, controller)
+        return None
     name = None if args.reference is None else Path(args.reference).stem
     table = None if args.table is None else load_table(args.table)
     if not is_port(args.on):
@@ -128,6 +138,94 @@ def run_command(args: argparse.Namespace) -> int | None:
         )  # fmt: skip
     _show_run(args, found, place)
     return None
+
+
+def _add_positions(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group(
+        "positions", "With a controller of positions, on a model, a virtual machine or an FMU."
+    )
+    group.add_argument(
+        "--stop-at", metavar="ANGLE",
+        help="run at a speed, then stop at this angle of the turn: 90deg, 1.57rad, .25turns, "
+        "393counts; the loop then holds it",
+    )  # fmt: skip
+    group.add_argument(
+        "--positions", metavar="FILE",
+        help="goals to go to, a CSV with columns t [s], r [deg, rad, turns or counts]",
+    )  # fmt: skip
+    group.add_argument(
+        "--speed", type=float, metavar="Y",
+        help="speed from which it stops (half of the largest known one); or give --reference",
+    )  # fmt: skip
+    group.add_argument(
+        "--way", choices=("onward", "shortest"), default="onward",
+        help="to the angle that is reached first without turning back, or the shorter way (onward)",
+    )  # fmt: skip
+    group.add_argument(
+        "--zero", type=float, default=0.0, metavar="COUNTS",
+        help="the encoder's count at the angle 0, from where the run begins (0)",
+    )  # fmt: skip
+    group.add_argument(
+        "--after", type=float, default=1.0, metavar="S", help="time from the stop on (1 s)"
+    )
+    group.add_argument(
+        "--release", action="store_true",
+        help="take the command away once the shaft has come to rest, in place of holding it",
+    )  # fmt: skip
+
+
+def _run_positions(args: argparse.Namespace, controller: SampledController) -> None:
+    from ..commissioning.fmu import is_fmu
+    from ..control.position import follow_positions, require_position, stop_at
+
+    position = require_position(controller, "run --stop-at")
+    if is_port(args.on):
+        position.sent()
+    require_no_drive_options(args)
+    on: Any = machine_of(args.on) if is_fmu(args.on) else plant_of(args.on)
+    if args.stop_at is not None:
+        reference = _wanted(args, position.speed)
+        if isinstance(reference, str):
+            raise SettingError(
+                name="--reference", expected="a file of speeds before the stop",
+                received=reference, remedy="or give --speed",
+            )  # fmt: skip
+        found = stop_at(
+            position, on, args.stop_at, speed=args.speed, reference=reference, way=args.way,
+            zero=args.zero, after=args.after, release=args.release,
+        )  # fmt: skip
+    else:
+        goals, unit = _goals(args.positions, position.Ts)
+        name = Path(args.positions).stem
+        found = follow_positions(position, on, goals, unit=unit, release=args.release, name=name)
+    summary: dict[str, Any] = {"plant": found.plant, "asked": found.name, "unit": found.unit}
+    summary |= {"n": len(found.t), "Ts": found.Ts, **found.metrics()}
+    lines = str(found).splitlines()
+    if args.plot is not None:
+        found.plot(file=args.plot)
+        summary["plot"] = str(args.plot)
+        lines.append(f"written to {args.plot}")
+    write_columns(args.out, found.columns(), found.units, summary, lines, as_json=args.json)
+
+
+def _goals(path: str, Ts: float) -> tuple[FloatArray, str]:
+    """Goals of a file with columns t, r, and their unit."""
+    from ..readers import read_columns
+
+    data = read_columns(path, inputs="r")
+    data.require_inputs()
+    if abs(data.Ts - Ts) > 0.01 * Ts:
+        raise DataError(
+            name=path, expected=f"the loop's sample time of {Ts:g} s", received=f"{data.Ts:g} s",
+            remedy="resample the goals",
+        )  # fmt: skip
+    unit = data.input_units[0]
+    if not unit:
+        raise DataError(
+            name=path, expected="a unit of r: deg, rad, turns or counts", received="none",
+            remedy="name the column 'r [deg]'",
+        )  # fmt: skip
+    return data.experiments[0].u[:, 0].copy(), unit
 
 
 def _settle_plant(args: argparse.Namespace) -> None:
@@ -160,7 +258,15 @@ def _settle_plant(args: argparse.Namespace) -> None:
             received="one of them",
             remedy="leave it out; a loop on this computer has no table, run it on the device",
         )  # fmt: skip
-    needed = is_port(args.on) or args.host_loop is not None
+    moves = [name for name in ("stop_at", "positions") if getattr(args, name) is not None]
+    beside = (args.table, args.host_loop, args.reference if "positions" in moves else None)
+    if len(moves) > 1 or (moves and any(x is not None for x in beside)):
+        raise SettingError(
+            name="--" + moves[0].replace("_", "-"),
+            expected="one of --stop-at, --positions, --table, --reference, --host-loop",
+            received="two", remedy="leave one of them out",
+        )  # fmt: skip
+    needed = (is_port(args.on) and not moves) or args.host_loop is not None
     if args.reference is None and args.table is None and needed:
         raise SettingError("--reference: expected a reference to track, received nothing")
 

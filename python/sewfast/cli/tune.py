@@ -80,6 +80,7 @@ examples:
   sewfast tune one.json two.json --aggregate worst --variables Kp,Ti,alpha -o controller.json
   sewfast tune drive.json -o controller.json --plot tuned.png
   sewfast tune drive.json --controller state-feedback -o states.json
+  sewfast tune drive.json --loop position -o position.json
   sewfast tune network.json --rival linear.json -o controller.json
   sewfast tune shaft.json --notch 75 --constraint Ms=1.7 --response response.json -o controller.json
   sewfast tune drive.json --pareto tracking,chatter --front front.png -o controller.json
@@ -103,6 +104,8 @@ model MODEL.json  text...  model file that identify wrote
     Table 1 on the first model's step response
 --feedforward  {preview,causal}=preview  add the command that the models need for the reference,
     known ahead (preview) or only in time (causal), if following it then costs less
+--loop  {speed,position}=speed  with a position loop over that of the speed, for run --stop-at and
+    --positions (speed)
 --notch HZ[:DEPTH[:WIDTH]]  text...  a notch to start with, tuned together with the gains; may
     repeat (depth .1, width .5; sewfast bode suggests one)
 --response RESPONSE.json  text  a response measured by sewfast bode, for whose bands Ms must hold as
@@ -161,6 +164,11 @@ def tune_command(args: argparse.Namespace) -> int | None:
     if args.pareto is not None and args.method != "genetic":
         raise SettingError(
             name="--method", expected="no --pareto, as a front is searched by NSGA-II",
+            received="both", remedy="leave one of them out",
+        )  # fmt: skip
+    if args.pareto is not None and args.loop != "speed":
+        raise SettingError(
+            name="--loop", expected="no --pareto, as a front has speed loops only",
             received="both", remedy="leave one of them out",
         )  # fmt: skip
     if args.pareto is not None and args.rival is not None:
@@ -331,8 +339,8 @@ def _tuned(
     with Progress("tune", quiet=args.quiet) as progress:
         return tune(
             models, references, **_started(args, models), **settings, rival=rival,
-            feedforward=args.feedforward, method=args.method, time_budget=args.time_budget,
-            progress=progress,
+            feedforward=args.feedforward, loop=args.loop, method=args.method,
+            time_budget=args.time_budget, progress=progress,
         )  # fmt: skip
 
 
@@ -363,6 +371,7 @@ def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
                 "termination": found.termination,
                 "method": found.method,
                 "lost": list(found.lost),
+                "position": None if found.position is None else found.position.to_json(),
                 "grade": found.grade,
                 "verdict": found.verdict.to_json(),
                 "warning": found.warning,

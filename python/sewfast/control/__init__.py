@@ -3,7 +3,8 @@
 Read in this order: `biquad` (notches and other filters), `feedforward` (the command that a model
 needs), `controller` (the base class of all kinds;
 the PID), `state_feedback` (the second kind), `files` (`load_controller`), `loop` (`run`: on a model
-or a machine), `machine` (`Machine`, the protocol of machines; `record`), `defaults` (limits, filter
+or a machine), `machine` (`Machine`, the protocol of machines; `record`), `position` (a position
+loop over a PID; `stop_at`), `defaults` (limits, filter
 and references of a drive by default), `margins` (of the linear loop), `systems` (the linear loop as
 state space), `forms` (a PID as MATLAB's and python-control's).
 """

@@ -59,6 +59,8 @@ class SampledController(storage.Stored, Shown):
     FORMAT: ClassVar[str] = "sewfast.controller"
     VERSION: ClassVar[int] = 4
     """Version of its files."""
+    LOOP: ClassVar[str] = "speed"
+    """What its references are: of the output, or ``position``, its integral."""
 
     if TYPE_CHECKING:
         # declared as properties, as the fields of a frozen dataclass are read-only

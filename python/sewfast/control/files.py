@@ -9,10 +9,11 @@ from ..errors import ModelFileError, SewfastError, located
 from ..storage import Fields
 from .controller import Controller, SampledController
 from .move import COLUMNS, MoveTable, Repetition
+from .position import PositionController
 from .state_feedback import StateFeedback
 
 KINDS: dict[str, type[SampledController]] = {
-    kind.KIND: kind for kind in (Controller, StateFeedback)
+    kind.KIND: kind for kind in (Controller, StateFeedback, PositionController)
 }
 """The kinds by name. A file of versions 1 to 3 has no kind and is a PID."""
 

@@ -300,6 +300,11 @@ def run(
         On Ctrl-C or `cancel` with a drive; the motor is stopped, `best` is the run so far.
     """
     require_controller(controller, on, "run(controller, plant, reference)", SampledController)
+    if controller.LOOP != "speed":
+        raise SettingError(
+            name="controller", expected="a controller of the output", received="one of positions",
+            remedy="stop_at and follow_positions run it, or run its speed loop (controller.speed)",
+        )  # fmt: skip
     if table is not None:
         played = _setpoint(table, controller, reference)
         found = run(

@@ -431,8 +431,12 @@ def _require_units(gains: Gains, plant: Any) -> None:
         require_units(gains, plant_units(plant))
 
 
-def loop_path(controller: Controller, *, speed: float | None = None) -> _core.LoopPath:
-    """The part of the controller in the feedback path, with a schedule's gains at `speed`."""
+def loop_path(
+    controller: Controller, *, speed: float | None = None, position: float = 0.0
+) -> _core.LoopPath:
+    """The part of the controller in the feedback path, with a schedule's gains at `speed`, and the
+    gain of a `position` loop around it [1/s].
+    """
     gains, slope = scheduled_gains(controller, speed)
     return _core.LoopPath(
         Kp=gains.Kp,
@@ -446,6 +450,7 @@ def loop_path(controller: Controller, *, speed: float | None = None) -> _core.Lo
         observer_time=controller.observer_time,
         biquads=controller.sections(),
         encoder=controller.counts_per_rev is not None,
+        position=position,
     )
 
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from .. import _core
 from ..control.controller import Controller, SampledController, pid_of
 from ..control.loop import Plant, Plants, References, check_fits, each_plant, run
+from ..control.position import PositionController
 from ..errors import FitError, Interrupted, SettingError
 from ..gains import whole
 from ..progress import TimeUp, shown_in_notebooks
@@ -22,6 +23,7 @@ from ..tables import Table, significant
 from .lead import LEADING, LEADS, PART, WEIGHTS, Effort, Lead, Led, with_lead
 from .objective import Constraints, Cost, LoadStep
 from .opinion import SHARE, SecondOpinion, second_opinion
+from .position import PositionTuning, with_position
 from .robustness import HAIR, within_default
 from .task import (
     LOOK,
@@ -40,6 +42,8 @@ from .task import (
 from .verdict import Verdict, out_of_reach, verdict_of
 
 Method: TypeAlias = Literal["genetic", "cma-es"]
+Loop: TypeAlias = Literal["speed", "position"]
+LOOPS = ("speed", "position")
 
 _ENDED_BY = {
     "evaluations": "their number",
@@ -91,6 +95,8 @@ class TuningResult:
         The comparison with a rival; None without one, or if no gains suit it.
     lead : Led or None
         What the feedforward is worth, with the PID alone; None if none was asked for.
+    position : PositionTuning or None
+        The position loop, whose controller is then `controller`; None if none was asked for.
     """
 
     controller: SampledController
@@ -108,6 +114,7 @@ class TuningResult:
     verdict: Verdict = field(default_factory=Verdict)
     opinion: SecondOpinion | None = None
     lead: Led | None = None
+    position: PositionTuning | None = None
 
     @property
     def grade(self) -> str:
@@ -126,14 +133,20 @@ class TuningResult:
 
     @property
     def pid(self) -> Controller:
-        """The controller as a PID.
+        """The controller as a PID; under a position loop that of the speed.
 
         Raises
         ------
         SettingError
             For a controller of another kind.
         """
-        return pid_of(self.controller, "what comes next")
+        return pid_of(self._speed, "what comes next")
+
+    @property
+    def _speed(self) -> SampledController:
+        """The controller of the speed."""
+        own = self.controller
+        return own.speed if isinstance(own, PositionController) else own
 
     @property
     def evaluations(self) -> int:
@@ -167,7 +180,7 @@ class TuningResult:
         """
         from ..plotting import Trace, loop_drawing
 
-        after = run(self.controller, on, reference)
+        after = run(self._speed, on, reference)
         traces = [Trace.of(after.columns(), "measured", "tuned")]
         with contextlib.suppress(FitError):
             before = run(self.start, on, reference)
@@ -190,7 +203,8 @@ class TuningResult:
 
     def _remarks(self) -> list[tuple[str, str]]:
         forward = ("forward", None if self.lead is None else str(self.lead))
-        pairs = (("in time", self.cut), forward, ("verdict", str(self.verdict)))
+        position = ("position", None if self.position is None else str(self.position))
+        pairs = (("in time", self.cut), forward, position, ("verdict", str(self.verdict)))
         return [(name, text) for name, text in pairs if text is not None]
 
     def __str__(self) -> str:
@@ -227,6 +241,7 @@ def tune(
     disturbances: Sequence[ArrayLike] | None = None,
     rival: Plants | None = None,
     feedforward: Lead = "preview",
+    loop: Loop = "speed",
     method: Method = "genetic",
     evaluations: int = 3000,
     time_budget: float | None = None,
@@ -305,6 +320,9 @@ def tune(
         takes the place of alpha and beta if they are searched; the gains stay. The result has it
         only if following the references costs less over all plants, and no more on any of them in
         any variation.
+    loop : "speed" or "position"
+        With a position loop over the speed loop (`sewfast.PositionController`): its gain, and how
+        hard a move may brake, by simulated stops on every model. The speed must be counted.
     method : "genetic" or "cma-es"
         A genetic algorithm with local refinement, or CMA-ES with restarts.
     evaluations : int
@@ -346,6 +364,10 @@ def tune(
         raise SettingError(
             name="feedforward", expected=f"one of {', '.join(LEADS)}", received=repr(feedforward)
         )
+    if loop not in LOOPS:
+        raise SettingError(name="loop", expected=f"one of {', '.join(LOOPS)}", received=repr(loop))
+    if isinstance(start, PositionController):
+        start = start.speed
     if isinstance(start, Controller):
         # a feedforward is made anew, of these models
         start = replace(start, feedforward=None)
@@ -380,7 +402,14 @@ def tune(
         verdict = verdict_of(task, result.controller, time, limit=task.constraints.Ms, others=known)
     except KeyboardInterrupt:
         raise Interrupted(result.controller) from None
-    return replace(result, lost=tuple(time.lost), verdict=verdict)
+    result = replace(result, lost=tuple(time.lost), verdict=verdict)
+    if loop == "speed":
+        return result
+    try:
+        position = with_position(task, result)
+    except KeyboardInterrupt:
+        raise Interrupted(result.controller) from None
+    return replace(result, controller=position.controller, position=position)
 
 
 @dataclass(frozen=True)

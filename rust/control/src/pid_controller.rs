@@ -32,6 +32,23 @@ pub struct Numbers<T> {
     pub ramp: T,
 }
 
+/// An output that an outer loop asks for beyond the reference.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Correction<T> {
+    /// By how much \[y\].
+    pub y: T,
+    /// Whether the integral term takes it up.
+    pub integrates: bool,
+}
+
+impl<T: Real> Correction<T> {
+    /// None.
+    pub const NONE: Self = Self {
+        y: T::ZERO,
+        integrates: true,
+    };
+}
+
 /// Feedback filter, reference ramp, feedforward, biquads, gain schedule and PID in one step.
 #[derive(Clone, Debug)]
 pub struct PidController<T> {
@@ -118,8 +135,17 @@ impl<T: Real> PidController<T> {
     }
 
     /// [`step`](Self::step) with a command added before the limits.
+    #[inline]
     pub fn step_with(&mut self, r: T, y: T, feedforward: T) -> T {
-        if !y.is_finite() {
+        self.step_corrected(r, y, feedforward, Correction::NONE)
+    }
+
+    /// [`step_with`](Self::step_with) with what an outer loop asks for beyond the reference. It is taken off the filtered
+    /// measurement, so that it passes neither the feedback's filter nor set-point weights. A correction that is not finite
+    /// skips the sample as a lost measurement does.
+    #[inline]
+    pub fn step_corrected(&mut self, r: T, y: T, feedforward: T, correction: Correction<T>) -> T {
+        if !(y.is_finite() && correction.y.is_finite()) {
             return self.pass(r);
         }
         let filtered = self.filter.step(y);
@@ -127,6 +153,8 @@ impl<T: Real> PidController<T> {
             self.filter.reset();
             return self.pass(r);
         }
+        // x - 0 is x for every x, even for -0
+        let filtered = filtered - correction.y;
         let sections = self.design.biquads.sections();
         if !self.of_y.started {
             self.of_y.rest_at(filtered);
@@ -144,7 +172,11 @@ impl<T: Real> PidController<T> {
             Some(table) => table.at(self.filtered),
             None => self.pid.terms(),
         };
-        self.pid.step_by(terms, r, self.filtered, feedforward)
+        let u = self.pid.step_by(terms, r, self.filtered, feedforward);
+        if !correction.integrates {
+            self.pid.absorb(-(terms.ki * correction.y));
+        }
+        u
     }
 
     /// From the reference to that of the PID before the biquads, and the command of the feedforward if there is one.
@@ -173,6 +205,11 @@ impl<T: Real> PidController<T> {
             feedforward: Feedforward::NONE,
             ..self.design
         }
+    }
+
+    /// The newest reference after the ramp; `None` before the first one.
+    pub(crate) fn ramped(&self) -> Option<T> {
+        self.ramp.newest()
     }
 
     /// The filtered feedback if `y` were the first measurement.

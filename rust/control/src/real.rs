@@ -40,6 +40,10 @@ pub trait Real:
     fn to_f64(self) -> f64;
     /// The hyperbolic tangent ([`model::tanh`](crate::model::tanh)).
     fn tanh(self) -> Self;
+    /// The square root to within one unit in the last place; 0 for what is not above 0.
+    fn sqrt(self) -> Self;
+    /// The largest whole number that is not above it, for magnitudes below 2^53.
+    fn floor(self) -> Self;
 
     /// The nearest value in `[low, high]`; NaN stays NaN. Always two comparisons.
     fn limit(self, low: Self, high: Self) -> Self {
@@ -64,7 +68,7 @@ pub(crate) fn one_minus_exp<T: Real>(x: T) -> T {
 }
 
 macro_rules! real {
-    ($($float:ident $tanh:ident),*) => {$(
+    ($($float:ident $tanh:ident $half:literal),*) => {$(
         impl Real for $float {
             const ZERO: Self = 0.0;
             const ONE: Self = 1.0;
@@ -85,11 +89,23 @@ macro_rules! real {
             fn tanh(self) -> Self {
                 crate::model::tanh::$tanh(self)
             }
+            fn sqrt(self) -> Self {
+                if !(self > 0.0 && self < $float::INFINITY) {
+                    return if self > 0.0 { self } else { 0.0 };
+                }
+                // half the exponent gives the root within 7 %; each of Newton's (Heron's) steps doubles the number of digits
+                let first = $float::from_bits((self.to_bits() >> 1) + $half);
+                (0..4).fold(first, |root, _| 0.5 * (root + self / root))
+            }
+            fn floor(self) -> Self {
+                let whole = self as i64 as $float;
+                if whole > self { whole - 1.0 } else { whole }
+            }
         }
     )*};
 }
 
-real!(f32 single, f64 double);
+real!(f32 single 0x1fc0_0000, f64 double 0x1ff8_0000_0000_0000);
 
 #[cfg(test)]
 mod tests {
@@ -106,6 +122,27 @@ mod tests {
             let exact = f64::exp_m1(-f64::from(x as f32)).abs();
             prop_assert!((f64::from(single) - exact).abs() <= 8.0 * f64::from(f32::EPSILON) * exact);
         }
+    }
+
+    proptest! {
+        #[test]
+        fn roots_and_whole_numbers_are_those_of_the_library(x in 0.0..1e12_f64, small in 0.0..1e-6_f64) {
+            for x in [x, small] {
+                let root = x.sqrt();
+                prop_assert!((Real::sqrt(x) - root).abs() <= f64::EPSILON * root);
+                let (x, root) = (x as f32, (x as f32).sqrt());
+                prop_assert!((Real::sqrt(x) - root).abs() <= f32::EPSILON * root);
+            }
+            prop_assert_eq!(Real::floor(x), x.floor());
+            prop_assert_eq!(Real::floor(-x), (-x).floor());
+        }
+    }
+
+    #[test]
+    fn roots_know_their_ends() {
+        assert_eq!(Real::sqrt(-1.0), 0.0);
+        assert_eq!(Real::sqrt(f64::NAN), 0.0);
+        assert_eq!(Real::sqrt(f64::INFINITY), f64::INFINITY);
     }
 
     #[test]
@@ -209,6 +246,12 @@ pub(crate) mod counted {
         }
         fn tanh(self) -> Self {
             panic!("a controller has no tanh")
+        }
+        fn sqrt(self) -> Self {
+            Self(self.0.sqrt())
+        }
+        fn floor(self) -> Self {
+            Self(self.0.floor())
         }
     }
 }

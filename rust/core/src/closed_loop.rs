@@ -59,7 +59,11 @@ pub fn encoder(counts_per_unit: f64, phase: f64) -> Result<Option<Encoder>> {
 /// Counts of the plant's encoder, else of the loop's, extrapolated by the time `since` at the present output; `None`
 /// without an encoder.
 #[inline(always)]
-fn counts(plant: &(impl Plant + ?Sized), encoder: Option<&Encoder>, since: f64) -> Option<f64> {
+pub(crate) fn counts(
+    plant: &(impl Plant + ?Sized),
+    encoder: Option<&Encoder>,
+    since: f64,
+) -> Option<f64> {
     let encoder = plant.encoder().or(encoder)?;
     // With `since` = -Ts, before the first sample: the counter is assumed to have run at this output until now. The
     // first difference then gives the output's speed, not 0.

@@ -49,6 +49,7 @@ pub mod neural_ss;
 pub mod oe;
 pub mod orders;
 pub mod output_error;
+pub mod position;
 pub mod profile;
 pub mod proposal;
 pub mod random;

@@ -20,7 +20,7 @@ use sewfast_control::{Biquad, CAPACITY, Cascade, Refused, Standard};
 use crate::{Error, Result};
 
 pub(crate) use margins::weakening;
-pub use margins::{Margins, margins, peak_sensitivity};
+pub use margins::{Margins, margins, peak_sensitivity, position_sensitivity};
 pub use plant::{Measured, Plant};
 pub use tolerance::{Change, Changing};
 
@@ -97,6 +97,8 @@ pub struct Path {
     pub biquads: Cascade<f64>,
     /// Whether the output is measured as a difference of positions: the mean over the last sample.
     pub encoder: bool,
+    /// Gain of a position loop around it, whose position is the sum of what is measured \[1/s\]; 0 for none.
+    pub position: f64,
     /// Sample time \[s\].
     pub ts: f64,
 }
@@ -113,6 +115,7 @@ impl Path {
             observer_time: 0.0,
             biquads: Cascade::NONE,
             encoder: false,
+            position: 0.0,
             ts,
         }
     }
@@ -138,6 +141,13 @@ impl Path {
         )?;
         unless(self.n > 0.0, "N", "a number above 0, or inf", self.n)?;
         unless(self.slope.is_finite(), "slope", "a finite gain", self.slope)?;
+        let position = self.position >= 0.0 && self.position.is_finite();
+        unless(
+            position,
+            "position gain",
+            "a finite gain of 0 or more",
+            self.position,
+        )?;
         unless(
             average,
             "filter_samples",
@@ -187,8 +197,8 @@ impl Path {
     /// From the measured output to the command, with reversed sign:
     ///
     /// ```text
-    /// R = (Kp + slope + Ki/(1 - 1/z) + Kd (1 - 1/z)/(1 - pole/z)) F,
-    /// F = (1 - z^-n)/(n (1 - 1/z))  w/(1 - (1 - w)/z)  ((1 - theta)/(1 - theta/z))^2  H,
+    /// R = (Kp + slope + Ki/(1 - 1/z) + Kd (1 - 1/z)/(1 - pole/z)) (F + position Ts/(1 - 1/z)) H,
+    /// F = (1 - z^-n)/(n (1 - 1/z))  w/(1 - (1 - w)/z)  ((1 - theta)/(1 - theta/z))^2,
     /// H = product of 1 + (1 - 1/z) (c0 + c1/z)/(1 + a1/z + a2/z^2) over the biquads
     /// ```
     pub(super) fn response(&self, at: &Place) -> Complex<f64> {
@@ -200,6 +210,8 @@ impl Path {
         if self.ki() != 0.0 {
             response += one * self.ki() / d;
         }
+        // the position does not pass the filters of the speed
+        let outer = response * (self.position * self.ts);
         // at frequency 0 the mean is 1
         if self.filter_samples > 1 && at.theta > 0.0 {
             let n = self.filter_samples as f64;
@@ -211,6 +223,9 @@ impl Path {
         if self.observer_time > 0.0 {
             let once = lag(self.theta());
             response *= once * once;
+        }
+        if self.position > 0.0 {
+            response += outer / d;
         }
         for &Biquad { c0, c1, a1, a2 } in self.biquads.sections() {
             let poles = one + at.back * a1 + at.back * at.back * a2;
@@ -301,8 +316,8 @@ impl States {
 struct Memory<'a> {
     path: &'a Path,
     plant: &'a Plant,
-    /// Start of each part: plant, encoder, average, lag, observer, biquads, integral, derivative.
-    at: [usize; 9],
+    /// Start of each part: plant, encoder, average, lag, observer, biquads, integral, derivative, position.
+    at: [usize; 10],
 }
 
 impl<'a> Memory<'a> {
@@ -318,8 +333,9 @@ impl<'a> Memory<'a> {
             3 * path.biquads.sections().len(),
             one(path.ki() != 0.0),
             2 * one(path.kd() != 0.0),
+            one(path.position > 0.0),
         ];
-        let mut at = [0; 9];
+        let mut at = [0; 10];
         for (i, size) in sizes.into_iter().enumerate() {
             at[i + 1] = at[i] + size;
         }
@@ -327,7 +343,7 @@ impl<'a> Memory<'a> {
     }
 
     fn size(&self) -> usize {
-        self.at[8]
+        self.at[9]
     }
 
     /// One sample with reference 0: returns the command, and `x` becomes the next state.
@@ -338,10 +354,15 @@ impl<'a> Memory<'a> {
             y = 0.5 * (y + before);
         }
         y += noise;
+        let mut moved = 0.0;
+        if let [position] = &mut x[self.at[8]..self.at[9]] {
+            *position += self.path.ts * y;
+            moved = self.path.position * *position;
+        }
         y = self.averaged(&mut x[self.at[2]..self.at[3]], y);
         y = self.lagged(&mut x[self.at[3]..self.at[4]], y);
         y = self.observed(&mut x[self.at[4]..self.at[5]], y);
-        y = self.notched(&mut x[self.at[5]..self.at[6]], y);
+        y = self.notched(&mut x[self.at[5]..self.at[6]], y + moved);
         let u = self.commanded(x, y);
         self.advance(&mut x[..self.at[1]], u);
         u

@@ -209,7 +209,11 @@ impl Ran {
 }
 
 /// Applies `work` to all, over threads, in order.
-fn each<T: Sync, R: Send>(all: &[T], threads: usize, work: impl Fn(&T) -> R + Sync) -> Vec<R> {
+pub(crate) fn each<T: Sync, R: Send>(
+    all: &[T],
+    threads: usize,
+    work: impl Fn(&T) -> R + Sync,
+) -> Vec<R> {
     search::each(&mut vec![(); threads.max(1)], all, |(), one| work(one))
 }
 

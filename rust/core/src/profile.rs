@@ -129,7 +129,7 @@ impl Reach {
             common.high = common.high.min(other.high);
             common.jerk = common.jerk.min(other.jerk);
             for (i, level) in common.levels.iter().enumerate() {
-                let (up, down) = other.rates(*level);
+                let (up, down) = other.at(*level);
                 common.up[i] = common.up[i].min(up);
                 common.down[i] = common.down[i].min(down);
             }
@@ -153,7 +153,7 @@ impl Reach {
     }
 
     /// Largest rates up and down at a level.
-    fn rates(&self, y: f64) -> (f64, f64) {
+    pub fn at(&self, y: f64) -> (f64, f64) {
         let next = self.levels.partition_point(|level| *level <= y);
         let last = self.levels.len() - 1;
         let (i, j) = (next.saturating_sub(1), next.min(last));
@@ -200,9 +200,9 @@ impl Reach {
             // the first sample stands where the reference begins
             if k > 0 {
                 let bound = if wanted >= y {
-                    self.rates(y).0
+                    self.at(y).0
                 } else {
-                    self.rates(y).1
+                    self.at(y).1
                 };
                 let free = stopping(wanted - y, step, ts);
                 let held = free.clamp(-bound, bound);
@@ -399,7 +399,7 @@ mod tests {
         let reach = Reach::of(&mut plant, TS, (-8.0, 8.0), (-3000.0, 3000.0)).unwrap();
         assert_eq!((reach.low, reach.high), (-3000.0, 3000.0));
         for y in [-2000.0, 0.0, 2500.0] {
-            let (up, down) = reach.rates(y);
+            let (up, down) = reach.at(y);
             let exact = |limit: f64| (490.0 * limit - y).abs() / 0.05;
             assert!(
                 (up / exact(8.0) - 1.0).abs() < 0.05,
@@ -424,13 +424,13 @@ mod tests {
     fn the_reach_of_the_machine_has_its_current_limit() {
         let mut machine = Machine::new(Parameters::default()).unwrap();
         let reach = Reach::of(&mut machine, TS, (-20.0, 20.0), (0.0, 3000.0)).unwrap();
-        let (up, down) = reach.rates(1500.0);
+        let (up, down) = reach.at(1500.0);
         assert!((20_000.0..35_000.0).contains(&up), "{up}");
         assert!((20_000.0..40_000.0).contains(&down), "{down}");
         assert!(reach.jerk > up && reach.jerk < up / TS, "{}", reach.jerk);
         // twice the voltage brings nearly nothing, as the current is limited
         let twice = Reach::of(&mut machine, TS, (-40.0, 40.0), (0.0, 3000.0)).unwrap();
-        assert!(twice.rates(1500.0).0 < 1.1 * up);
+        assert!(twice.at(1500.0).0 < 1.1 * up);
     }
 
     #[test]

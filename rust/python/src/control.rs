@@ -3,6 +3,7 @@
 
 pub mod controller;
 pub mod moves;
+pub mod position;
 pub mod tuning;
 
 use std::sync::Arc;

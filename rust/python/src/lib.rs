@@ -39,6 +39,10 @@ mod _core {
     #[pymodule_export]
     use crate::control::moves::{MoveLearner, constant_reach, plan_move, profile, reach};
     #[pymodule_export]
+    use crate::control::position::{
+        PositionController, approach, judge_stops, position_rates, position_run,
+    };
+    #[pymodule_export]
     use crate::control::tuning::{cost_terms, pareto, tune, tuning_costs, tuning_loads};
     #[pymodule_export]
     use crate::control::{
@@ -70,7 +74,9 @@ mod _core {
     #[pymodule_export]
     use crate::link::{LinkBodies, LinkClient, LinkReceiver, LinkUpload, link_frame};
     #[pymodule_export]
-    use crate::loop_transfer::{LoopPath, loop_response, margins, sampled_fopdt, tolerance};
+    use crate::loop_transfer::{
+        LoopPath, loop_response, margins, position_sensitivity, sampled_fopdt, tolerance,
+    };
     #[pymodule_export]
     use crate::models::linear::{
         HammersteinWiener, HammersteinWienerFit, LinearFit, LinearModel, fit_arx,

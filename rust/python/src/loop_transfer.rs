@@ -17,7 +17,7 @@ pub struct LoopPath(pub Path);
 #[pymethods]
 impl LoopPath {
     #[new]
-    #[pyo3(signature = (*, Kp, Ti, Td, N, Ts, filter_samples, filter_time, observer_time, encoder, slope=0.0, biquads=Vec::new()))]
+    #[pyo3(signature = (*, Kp, Ti, Td, N, Ts, filter_samples, filter_time, observer_time, encoder, slope=0.0, biquads=Vec::new(), position=0.0))]
     fn new(
         py: Python<'_>,
         Kp: f64,
@@ -31,6 +31,7 @@ impl LoopPath {
         encoder: bool,
         slope: f64,
         biquads: Vec<Section>,
+        position: f64,
     ) -> PyResult<Self> {
         let gains = Standard {
             kp: Kp,
@@ -47,6 +48,7 @@ impl LoopPath {
             observer_time,
             biquads,
             encoder,
+            position,
             ts: Ts,
         }))
     }
@@ -141,6 +143,24 @@ pub fn margins<'py>(
     dict.set_item("gain_crossovers", found.gain_crossovers)?;
     dict.set_item("phase_crossovers", found.phase_crossovers)?;
     Ok(dict)
+}
+
+/// Largest sensitivity of the position loop of a path, broken at its error.
+#[pyfunction]
+#[pyo3(signature = (path, num, den))]
+pub fn position_sensitivity(
+    py: Python<'_>,
+    path: &LoopPath,
+    num: Values<'_>,
+    den: Values<'_>,
+) -> PyResult<f64> {
+    let (num, den) = (slice(&num, "num")?, slice(&den, "den")?);
+    let found = py.detach(|| {
+        let plant = Plant::new(num, den)?;
+        let closed = Loop::new(&path.0, &plant)?;
+        Ok(loop_transfer::position_sensitivity(&closed))
+    });
+    found.map_err(|e| raise(py, e))
 }
 
 /// Largest sensitivity after a change, factor on the gain, additional delay, factor on the resonances.

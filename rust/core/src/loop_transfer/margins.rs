@@ -7,7 +7,7 @@ use std::f64::consts::{FRAC_1_SQRT_2, PI};
 use nalgebra::Complex;
 use sewfast_control::Biquad;
 
-use super::{Loop, Place, States};
+use super::{Loop, Path, Place, States};
 
 /// Initial points per decade.
 const DENSITY: f64 = 16.0;
@@ -123,7 +123,11 @@ fn lowest(closed: &Loop<'_>) -> f64 {
         .map(|p| (p - 1.0).norm())
         .filter(|c| *c >= 1e-9);
     let slowest = corners
-        .chain([path.ts / path.gains.ti.max(path.ts), 1.0])
+        .chain([
+            path.ts / path.gains.ti.max(path.ts),
+            path.ts * path.position,
+            1.0,
+        ])
         .filter(|c| *c > 0.0);
     let mut theta = 0.01 * slowest.fold(1.0, f64::min);
     // a closed-loop pole near 1 turns 1 + L below every corner of the open loop
@@ -149,7 +153,8 @@ fn from_rest(closed: &Loop<'_>, l: Complex<f64>) -> f64 {
 }
 
 fn integrators(closed: &Loop<'_>) -> usize {
-    closed.plant.integrators + usize::from(closed.path.ki() != 0.0)
+    let own = [closed.path.ki() != 0.0, closed.path.position > 0.0];
+    closed.plant.integrators + own.into_iter().map(usize::from).sum::<usize>()
 }
 
 /// Unstable poles by the argument principle: over the upper half circle `1 + L` turns by `(q/2 + P - N) pi`, with `q`
@@ -272,6 +277,28 @@ pub fn peak_sensitivity(closed: &Loop<'_>) -> f64 {
         Some(0) => peak(closed, &curve.points, sensitivity).0,
         _ => f64::INFINITY,
     }
+}
+
+/// `max |S|` of the position loop alone, broken at its error while the speed loop is closed: `(1 + L0)/(1 + L)`, with `L0` the loop
+/// without it. Infinite if either loop is unstable.
+pub fn position_sensitivity(closed: &Loop<'_>) -> f64 {
+    let inner = Path {
+        position: 0.0,
+        ..*closed.path
+    };
+    let inner = Loop {
+        path: &inner,
+        ..*closed
+    };
+    let curve = Curve::of(closed);
+    if curve.unstable != Some(0) || Curve::of(&inner).unstable != Some(0) {
+        return f64::INFINITY;
+    }
+    let sizes = curve.points.iter().map(|point| {
+        let alone = inner.at(&Place::at(point.theta));
+        ((alone + 1.0) / (point.l + 1.0)).norm()
+    });
+    sizes.filter(|size| size.is_finite()).fold(0.0, f64::max)
 }
 
 fn sensitivity(l: Complex<f64>) -> f64 {

@@ -397,3 +397,45 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn a_position_loop_is_in_the_path_and_its_poles_are_those_of_the_locus() {
+    let speed = Path {
+        filter_samples: 8,
+        encoder: true,
+        ..path(0.004, 0.1, 0.0)
+    };
+    let mut last = 0.0;
+    for gain in [2.0, 5.0, 10.0, 20.0] {
+        let path = Path {
+            position: gain,
+            ..speed
+        };
+        let found = margins_of(&path, &drive());
+        assert!(found.stable && found.largest_pole < 1.0, "{gain}");
+        let plant = drive();
+        let closed = Loop::new(&path, &plant).unwrap();
+        let own = position_sensitivity(&closed);
+        assert!(
+            found.ms.0 > last && own > 1.0 && own.is_finite(),
+            "{gain} {own}"
+        );
+        last = found.ms.0;
+        // R at one frequency by hand
+        let place = Place::at(0.1);
+        let filter = speed.response(&place);
+        let pid = Path {
+            filter_samples: 1,
+            ..speed
+        };
+        let by_hand = filter + pid.response(&place) * (gain * TS) / place.difference;
+        assert!((path.response(&place) - by_hand).norm() < 1e-12 * by_hand.norm());
+    }
+    let wild = Path {
+        position: 500.0,
+        ..speed
+    };
+    assert!(!margins_of(&wild, &drive()).stable);
+    let plant = drive();
+    assert!(position_sensitivity(&Loop::new(&wild, &plant).unwrap()).is_infinite());
+}

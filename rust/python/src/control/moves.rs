@@ -134,10 +134,29 @@ impl MoveLearner {
 // --- References within the reach of a drive ---
 
 /// Least and largest level, levels, rates up and down at each, jerk.
-type Reached = (f64, f64, Vec<f64>, Vec<f64>, Vec<f64>, f64);
+pub(super) type Reached = (f64, f64, Vec<f64>, Vec<f64>, Vec<f64>, f64);
 
 fn told(of: Reach) -> Reached {
     (of.low, of.high, of.levels, of.up, of.down, of.jerk)
+}
+
+pub(super) fn reached((low, high, levels, up, down, jerk): Reached) -> Result<Reach> {
+    if levels.is_empty() || up.len() != levels.len() || down.len() != levels.len() {
+        return Err(Error::setting(format!(
+            "expected rates at one or more levels, got {} and {} at {}; take those of a reach",
+            up.len(),
+            down.len(),
+            levels.len()
+        )));
+    }
+    Ok(Reach {
+        low,
+        high,
+        levels,
+        up,
+        down,
+        jerk,
+    })
 }
 
 /// What all of these plants can do by a share of their rates.
@@ -190,24 +209,8 @@ pub fn profile<'py>(
     jerk: f64,
 ) -> PyResult<(Vector<'py>, [bool; 3])> {
     let reference = slice(&reference, "reference")?;
-    let (least, most, levels, up, down, own) = reach;
     let found = watched(py, None, |_| {
-        if levels.is_empty() || up.len() != levels.len() || down.len() != levels.len() {
-            return Err(Error::setting(format!(
-                "expected rates at one or more levels, got {} and {} at {}; take those of a reach",
-                up.len(),
-                down.len(),
-                levels.len()
-            )));
-        }
-        let reach = Reach {
-            low: least,
-            high: most,
-            levels,
-            up,
-            down,
-            jerk: own,
-        };
+        let reach = reached(reach)?;
         reach.within(low, high, rate, jerk).profile(reference, Ts)
     })?;
     Ok((array1(py, found.r), found.bounds))

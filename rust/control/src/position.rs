@@ -1,0 +1,556 @@
+//! A position loop over the speed loop: the profile of a move, the feedback of the position, and the stop at an angle.
+//!
+//! ```text
+//! goal ─> profile ─┬─ its speed ────────────────────────────> r(k+p) ─┐
+//!                  └─ its position, as late as the counts             ├─> PidController, unchanged ─> command
+//!                       └─ minus counts, times the gain ─> correction ┘
+//! ```
+//!
+//! The profile is as fast as the drive can be: its speed rises and falls at the rates that the drive has at that speed
+//! ([`Rates`]), and a mean over some samples bounds the jerk (Biagiotti and Melchiorri, FIR filters for online trajectory
+//! planning with time- and frequency-domain specifications, Control Engineering Practice 20, 2012). It meets a goal that
+//! stands exactly and without passing it. The speed loop follows the profile's speed with its own feedforward, which needs it
+//! `p` samples early; the position is compared with the profile's `p` samples ago.
+//!
+//! Where the profile stands and the counts are within one of it, the integral of the speed loop lets go of the position error: it
+//! would rise until dry friction gives way, and the shaft would be pushed to and fro for ever.
+
+use crate::pid_controller::Correction;
+use crate::{Controller, PidController, Real, Refused};
+
+/// The most rows of rates.
+pub const RATES: usize = 8;
+/// The longest mean over the samples of a profile.
+pub const SMOOTHED: usize = 31;
+/// Samples kept: the longest preview or mean, and one more.
+const KEPT: usize = 32;
+
+/// How fast a drive's speed can change from a speed on.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rate<T> {
+    /// Speed, as a magnitude \[y\].
+    pub speed: T,
+    /// Largest rate away from rest \[y/s\].
+    pub up: T,
+    /// Largest rate towards rest \[y/s\].
+    pub down: T,
+}
+
+/// Rates over the speed, the same in both directions; each holds from its speed to the next one.
+///
+/// ```
+/// use sewfast_control::{Rate, Rates};
+///
+/// let rates = Rates::new(&[
+///     Rate { speed: 0.0, up: 20e3, down: 20e3 },
+///     Rate { speed: 1e3, up: 10e3, down: 25e3 },
+/// ])?;
+/// assert_eq!(rates.way(1e3), 25.0);
+/// assert_eq!(rates.way(2e3), 25.0 + 60.0);
+/// # Ok::<(), sewfast_control::Refused>(())
+/// ```
+#[derive(Clone, Copy, Debug)]
+pub struct Rates<T> {
+    rows: [Rate<T>; RATES],
+    /// The way from the speed of each row to rest \[y s\].
+    ways: [T; RATES],
+    count: u8,
+}
+
+impl<T: Real> Rates<T> {
+    /// Rates by growing speeds, the first of which is 0.
+    ///
+    /// # Errors
+    /// No row or more than [`RATES`], speeds that do not grow from 0, rates that are not above 0 and finite.
+    pub fn new(rows: &[Rate<T>]) -> Result<Self, Refused> {
+        let refuse = |holds, expected, received: T| {
+            Refused::unless(holds, "rates", expected, received.to_f64())
+        };
+        let none = Rate {
+            speed: T::ZERO,
+            up: T::ZERO,
+            down: T::ZERO,
+        };
+        let mut made = Self {
+            rows: [none; RATES],
+            ways: [T::ZERO; RATES],
+            count: rows.len() as u8,
+        };
+        let some = (1..=RATES).contains(&rows.len());
+        refuse(some, "1 to 8 rows", T::from_count(rows.len()))?;
+        let (mut before, mut way): (Option<Rate<T>>, T) = (None, T::ZERO);
+        let places = made.rows.iter_mut().zip(&mut made.ways);
+        for (row, (place, passed)) in rows.iter().zip(places) {
+            let grows = before.map_or(row.speed == T::ZERO, |last| row.speed > last.speed);
+            refuse(
+                grows && row.speed.is_finite(),
+                "growing speeds from 0 on",
+                row.speed,
+            )?;
+            for rate in [row.up, row.down] {
+                refuse(
+                    rate > T::ZERO && rate.is_finite(),
+                    "finite rates above 0",
+                    rate,
+                )?;
+            }
+            if let Some(last) = before {
+                way += (row.speed * row.speed - last.speed * last.speed) / (last.down + last.down);
+            }
+            (*place, *passed, before) = (*row, way, Some(*row));
+        }
+        refuse(way.is_finite(), "a finite way to rest", way)?;
+        Ok(made)
+    }
+
+    /// The rows, by growing speed.
+    pub fn rows(&self) -> &[Rate<T>] {
+        self.rows.get(..self.count.into()).unwrap_or_default()
+    }
+
+    /// The row at a speed, as a magnitude, and the way from its own speed to rest.
+    fn at(&self, speed: T) -> (Rate<T>, T) {
+        self.last(|row, _| row.speed <= speed)
+    }
+
+    /// The last row that holds, with its way; the first one if none does.
+    fn last(&self, holds: impl Fn(&Rate<T>, T) -> bool) -> (Rate<T>, T) {
+        let ([first, ..], [none, ..]) = (self.rows, self.ways);
+        let known = self.rows().iter().zip(self.ways);
+        known
+            .filter(|(row, way)| holds(row, *way))
+            .last()
+            .map_or((first, none), |(row, way)| (*row, way))
+    }
+
+    /// The way from a speed, as a magnitude, to rest \[y s\].
+    pub fn way(&self, speed: T) -> T {
+        let (row, way) = self.at(speed);
+        way + (speed * speed - row.speed * row.speed) / (row.down + row.down)
+    }
+
+    /// The speed of the next sample from which a distance of 0 or more ends at rest, if the speed then falls from sample to sample
+    /// at these rates: it solves `way(v) + v ts/2 = distance`, and is exact for sampled steps of one rate.
+    fn from(&self, distance: T, ts: T) -> T {
+        let half = T::ONE / (T::ONE + T::ONE);
+        let ([first, ..], last) = (self.rows, distance / ts);
+        // the last step of the speed, in which the distance is met in one sample
+        if last <= first.down * ts {
+            return last;
+        }
+        let (row, way) = self.last(|row, way| way + half * row.speed * ts <= distance);
+        let (lost, left) = (half * row.down * ts, distance - way);
+        let v = (lost * lost + row.speed * row.speed + (row.down + row.down) * left).sqrt() - lost;
+        v.limit(T::ZERO, last)
+    }
+}
+
+impl<T: PartialEq> PartialEq for Rates<T> {
+    fn eq(&self, other: &Self) -> bool {
+        self.rows.get(..self.count.into()) == other.rows.get(..other.count.into())
+    }
+}
+
+/// The settings of a position loop.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PositionDesign<T> {
+    /// Speed that a position error calls for, over this error \[1/s\].
+    pub gain: T,
+    /// Counts per unit of the output and second.
+    pub counts_per_unit: T,
+    /// Largest speed of a move, and the largest from which a stop begins \[y\].
+    pub speed: T,
+    /// Rates of the speed.
+    pub rates: Rates<T>,
+    /// Samples in which the rate of the speed comes up, 1 to [`SMOOTHED`].
+    pub smoothing: usize,
+    /// The last part of a move, passed at the speed `creep`: what braking still makes swing dies away before the goal \[counts\];
+    /// 0 for none.
+    pub landing: T,
+    /// Speed of that part \[y\].
+    pub creep: T,
+    /// Whether the command goes to 0 once the shaft has come to rest at its goal; otherwise it holds it.
+    pub releases: bool,
+}
+
+impl<T: Real> PositionDesign<T> {
+    /// By how much the landing makes a way longer \[y s\].
+    fn crept(&self) -> T {
+        let more = self.landing / self.counts_per_unit - self.rates.way(self.creep);
+        if more > T::ZERO { more } else { T::ZERO }
+    }
+
+    /// The speed of the next sample towards a goal at a distance of 0 or more.
+    fn towards(&self, distance: T, ts: T) -> T {
+        let last = self.rates.from(distance, ts);
+        let more = self.crept();
+        if more == T::ZERO {
+            return last;
+        }
+        let first = if distance > more {
+            self.rates.from(distance - more, ts)
+        } else {
+            T::ZERO
+        };
+        let slow = if last < self.creep { last } else { self.creep };
+        if first > slow { first } else { slow }
+    }
+}
+
+/// The last values, newest first.
+#[derive(Clone, Debug)]
+struct Ring<T> {
+    kept: [T; KEPT],
+    newest: usize,
+}
+
+impl<T: Real> Ring<T> {
+    fn filled(value: T) -> Self {
+        Self {
+            kept: [value; KEPT],
+            newest: 0,
+        }
+    }
+
+    fn push(&mut self, value: T) {
+        self.newest = (self.newest + 1) % KEPT;
+        if let Some(place) = self.kept.get_mut(self.newest) {
+            *place = value;
+        }
+    }
+
+    fn at(&self, age: usize) -> T {
+        let place = (self.newest + KEPT - age % KEPT) % KEPT;
+        self.kept.get(place).copied().unwrap_or(T::ZERO)
+    }
+}
+
+/// What the loop does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Mode<T> {
+    /// References are speeds \[y\].
+    Speed,
+    /// References are goals \[counts\].
+    Goals,
+    /// It goes to this count.
+    Stop(T),
+}
+
+/// A position loop over a speed loop, in counts of an encoder.
+///
+/// It begins as the speed loop alone. [`follow`](Self::follow) and [`stop`](Self::stop) take over without a bump.
+#[derive(Clone, Debug)]
+pub struct PositionLoop<T> {
+    design: PositionDesign<T>,
+    speed: PidController<T>,
+    mode: Mode<T>,
+    /// Counts of one sample at a speed of one unit.
+    per_sample: T,
+    /// Counts since the reset.
+    counts: T,
+    /// Positions before the mean \[counts\].
+    path: Ring<T>,
+    /// Positions of the profile, the newest `preview` samples ahead \[counts\].
+    places: Ring<T>,
+    /// Speed before the mean \[y\].
+    rate: T,
+    /// Goal of the last sample \[counts\], and its own speed \[y\].
+    goal: T,
+    carried: T,
+    /// Largest speed of this move \[y\].
+    fastest: T,
+    /// Samples since the last count.
+    still: usize,
+}
+
+impl<T: Real> PositionLoop<T> {
+    /// A loop at rest over a speed loop.
+    ///
+    /// # Errors
+    /// The first setting that is outside its range.
+    pub fn new(design: PositionDesign<T>, speed: PidController<T>) -> Result<Self, Refused> {
+        let ts = speed.settings().ts;
+        let above = |value: T| value > T::ZERO && value.is_finite();
+        let finite = "a finite number above 0";
+        for (name, value) in [
+            ("position gain", design.gain),
+            ("counts_per_unit", design.counts_per_unit),
+            ("speed", design.speed),
+            ("creep", design.creep),
+        ] {
+            Refused::unless(above(value), name, finite, value.to_f64())?;
+        }
+        let landing = design.landing >= T::ZERO && design.landing.is_finite();
+        Refused::unless(
+            landing,
+            "landing",
+            "a finite distance of 0 or more",
+            design.landing.to_f64(),
+        )?;
+        Refused::unless(
+            (1..=SMOOTHED).contains(&design.smoothing),
+            "smoothing",
+            "1 to 31 samples",
+            design.smoothing as f64,
+        )?;
+        Ok(Self {
+            mode: Mode::Speed,
+            per_sample: ts * design.counts_per_unit,
+            counts: T::ZERO,
+            path: Ring::filled(T::ZERO),
+            places: Ring::filled(T::ZERO),
+            rate: T::ZERO,
+            goal: T::ZERO,
+            carried: T::ZERO,
+            fastest: design.speed,
+            still: 0,
+            design,
+            speed,
+        })
+    }
+
+    /// Back to the state before the first sample, as the speed loop alone, with the counts at 0.
+    pub fn reset(&mut self) {
+        self.speed.reset();
+        self.mode = Mode::Speed;
+        (self.counts, self.rate, self.goal) = (T::ZERO, T::ZERO, T::ZERO);
+        (self.carried, self.still) = (T::ZERO, 0);
+        (self.path, self.places) = (Ring::filled(T::ZERO), Ring::filled(T::ZERO));
+        self.fastest = self.design.speed;
+    }
+
+    /// From the reference and the counts `moved` since the last sample to the command. The reference is a speed \[y\], after
+    /// [`follow`](Self::follow) a goal \[counts\], and does nothing after [`stop`](Self::stop).
+    ///
+    /// A number of counts that is not finite is a lost measurement: the position is then unknown, and the command stays.
+    pub fn step(&mut self, reference: T, moved: T) -> T {
+        self.counts += moved;
+        self.still = if moved == T::ZERO {
+            (self.still + 1).min(KEPT)
+        } else {
+            0
+        };
+        let y = moved / self.per_sample;
+        let goal = match self.mode {
+            Mode::Speed => {
+                let u = self.speed.step(reference, y);
+                let referred = self.speed.ramped().unwrap_or(T::ZERO);
+                let place = self.places.at(0) + referred * self.per_sample;
+                self.places.push(place);
+                self.rate = referred;
+                return u;
+            }
+            Mode::Goals => reference,
+            Mode::Stop(goal) => goal,
+        };
+        self.advance(goal);
+        let samples = self.design.smoothing;
+        let (newest, oldest) = (self.path.at(0), self.path.at(samples));
+        let speed = (newest - oldest) / (T::from_count(samples) * self.per_sample);
+        self.places.push(self.mean());
+        let error = self.place() - self.counts;
+        let (one, stands) = (T::ONE, self.stands());
+        let near = error <= one && error >= -one;
+        if stands && near && self.design.releases && self.still >= KEPT {
+            // always finite
+            let _ = self.speed.set_manual(T::ZERO);
+        }
+        let correction = Correction {
+            y: self.design.gain * error / self.design.counts_per_unit,
+            integrates: !(stands && near),
+        };
+        self.speed.step_corrected(speed, y, -T::ZERO, correction)
+    }
+
+    /// From the next sample on references are goals: positions in counts since the reset. One that stands is gone to within
+    /// the bounds; one that moves as the drive can is followed as it is.
+    pub fn follow(&mut self) {
+        self.take_over();
+        self.goal = self.path.at(0);
+        self.carried = self.rate;
+        self.fastest = self.design.speed;
+        self.mode = Mode::Goals;
+    }
+
+    /// From the next sample on it goes to a place that differs from `angle` by whole `turn`s, both in counts, and stays there; returns the count.
+    ///
+    /// Moving `onward` it is the first one that is reached without turning back, at no more than the present speed;
+    /// otherwise the one that is nearest to where the shaft can be at rest first. From rest it goes forwards, or the shorter way.
+    ///
+    /// # Errors
+    /// An angle or a turn that is not finite, a turn that is not above 0, a present speed above [`PositionDesign::speed`].
+    pub fn stop(&mut self, angle: T, turn: T, onward: bool) -> Result<T, Refused> {
+        let rate = self.rate;
+        let fast = if rate < T::ZERO { -rate } else { rate };
+        Refused::unless(angle.is_finite(), "angle", "a finite angle", angle.to_f64())?;
+        Refused::unless(
+            turn > T::ZERO && turn.is_finite(),
+            "turn",
+            "counts of a turn above 0",
+            turn.to_f64(),
+        )?;
+        Refused::unless(
+            fast <= self.design.speed,
+            "speed",
+            "a speed within the position loop's",
+            fast.to_f64(),
+        )?;
+        self.take_over();
+        let half = T::ONE / (T::ONE + T::ONE);
+        let ts = self.speed.settings().ts;
+        // the speed falls from the next sample on
+        let way = self.design.rates.way(fast) - half * fast * ts;
+        let braked = if way > T::ZERO { way } else { T::ZERO };
+        let creeps = if fast > self.design.creep {
+            self.design.crept()
+        } else {
+            T::ZERO
+        };
+        let way = (braked + creeps) * self.design.counts_per_unit;
+        let (forwards, from) = (rate >= T::ZERO, self.path.at(0));
+        let earliest = if forwards { from + way } else { from - way };
+        let turns = (earliest - angle) / turn;
+        let whole = if !onward {
+            (turns + half).floor()
+        } else if forwards {
+            // a shaft that stands within a count of the angle stays
+            let near = if fast > T::ZERO {
+                T::ZERO
+            } else {
+                T::ONE / turn
+            };
+            -(near - turns).floor()
+        } else {
+            turns.floor()
+        };
+        // whole counts can be met exactly
+        let goal = (angle + whole * turn + half).floor();
+        (self.goal, self.carried) = (goal, T::ZERO);
+        self.fastest = if fast > T::ZERO && onward {
+            fast
+        } else {
+            self.design.speed
+        };
+        self.mode = Mode::Stop(goal);
+        Ok(goal)
+    }
+
+    /// The profile goes on from the reference of the speed loop, whose position is now that of the counts.
+    fn take_over(&mut self) {
+        if self.mode != Mode::Speed {
+            return;
+        }
+        let shift = self.counts - self.place();
+        for place in &mut self.places.kept {
+            *place += shift;
+        }
+        let (step, samples) = (self.rate * self.per_sample, self.design.smoothing);
+        let half = T::ONE / (T::ONE + T::ONE);
+        let newest = self.places.at(0) + half * T::from_count(samples - 1) * step;
+        for age in (0..KEPT).rev() {
+            self.path.push(newest - T::from_count(age) * step);
+        }
+    }
+
+    /// The position before the mean, one sample on towards a goal.
+    fn advance(&mut self, goal: T) {
+        let goal = if goal.is_finite() { goal } else { self.goal };
+        let (ts, rate) = (self.speed.settings().ts, self.rate);
+        let size = |x: T| if x < T::ZERO { -x } else { x };
+        let (row, _) = self.design.rates.at(size(rate));
+        let (up, down) = (row.up * ts, row.down * ts);
+        // a goal that moves as the drive can is followed at its own speed
+        let own = (goal - self.goal) / self.per_sample;
+        let follows = size(own) <= self.fastest && size(own - self.carried) <= up + down;
+        self.carried = if follows { own } else { T::ZERO };
+        self.goal = goal;
+        let at = self.path.at(0);
+        let left = (goal - at) / self.design.counts_per_unit - self.carried * ts;
+        let towards = self.design.towards(size(left), ts);
+        let wanted = self.carried + if left < T::ZERO { -towards } else { towards };
+        let wanted = wanted.limit(-self.fastest, self.fastest);
+        // on its way to a goal the speed may fall by the rate of the row below, and by an eighth more just before it, where the
+        // last samples do not divide the way evenly
+        let brakes = size(wanted) <= size(rate) && wanted * rate >= T::ZERO;
+        let (next, _) = self.design.rates.at(size(wanted));
+        let steeper = if next.down > row.down {
+            next.down * ts
+        } else {
+            down
+        };
+        let down = if brakes {
+            steeper + steeper / T::from_count(8)
+        } else {
+            down
+        };
+        let (low, high) = if rate > T::ZERO {
+            (rate - down, rate + up)
+        } else if rate < T::ZERO {
+            (rate - up, rate + down)
+        } else {
+            (-up, up)
+        };
+        self.rate = wanted.limit(low, high);
+        // exactly, for which no rounding must be left
+        let met = self.carried + left / ts == self.rate;
+        self.path.push(if met {
+            goal
+        } else {
+            at + self.rate * self.per_sample
+        });
+    }
+
+    /// The mean over the newest positions of the path; exactly the goal if all are.
+    fn mean(&self) -> T {
+        let samples = self.design.smoothing;
+        let off = (0..samples).fold(T::ZERO, |sum, age| sum + (self.path.at(age) - self.goal));
+        self.goal + off / T::from_count(samples)
+    }
+
+    /// The profile's position at this sample \[counts\]. The speed of a sample is the mean over it, and the speed loop takes it
+    /// for that at its end, so the position is half a sample later.
+    pub fn place(&self) -> T {
+        let preview = self.speed.design().feedforward.preview();
+        let (now, before) = (self.places.at(preview), self.places.at(preview + 1));
+        now + (before - now) / (T::ONE + T::ONE)
+    }
+
+    /// Whether the profile stands at its goal.
+    pub fn stands(&self) -> bool {
+        let goal = |place: &T| *place == self.goal;
+        self.mode != Mode::Speed && self.places.kept.iter().all(goal)
+    }
+
+    /// The goal \[counts\]; of a speed loop 0.
+    pub fn goal(&self) -> T {
+        self.goal
+    }
+
+    /// Counts since the reset.
+    pub fn counts(&self) -> T {
+        self.counts
+    }
+
+    /// Samples by which a reference of the position arrives early: the speed loop's preview and half of the mean.
+    pub fn early(&self) -> usize {
+        self.speed.design().feedforward.preview() + self.design.smoothing / 2
+    }
+
+    /// The settings.
+    pub fn design(&self) -> &PositionDesign<T> {
+        &self.design
+    }
+
+    /// The speed loop.
+    pub fn speed(&self) -> &PidController<T> {
+        &self.speed
+    }
+
+    /// The filtered feedback of the last step \[y\].
+    pub fn filtered(&self) -> T {
+        Controller::filtered(&self.speed)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,256 @@
+"""Position loops: stops at an angle and moves, on models, machines and on the command line."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lags import PI, RAMP, drive
+from refusals import refuses
+from sewfast import (
+    DataError,
+    Feedforward,
+    LinkError,
+    ModelFileError,
+    PositionController,
+    SettingError,
+    StateFeedback,
+    VirtualMachine,
+    follow_positions,
+    load_controller,
+    run,
+    stop_at,
+    tune,
+)
+from sewfast.cli import main
+from sewfast.commissioning import SteppedBench
+from sewfast.control.position import position_of
+
+LEVELS = ((-3000.0, -6.6), (-1.0, -0.5), (0.0, 0.0), (1.0, 0.5), (3000.0, 6.6))
+SPEED = replace(PI, feedforward=Feedforward(8, 0.5, LEVELS, (0.05,) * 8))
+RATES = ((0.0, 15e3, 15e3), (2000.0, 15e3, 18e3))
+LAW = PositionController(
+    SPEED, gain=20.0, fastest=4000.0, rates=RATES, share=0.9, smoothing=4, landing=10.0, creep=15.0
+)
+
+
+class Counted:
+    """A virtual machine that shows its counts and nothing else."""
+
+    def __init__(self, **options: Any) -> None:
+        self.machine = VirtualMachine(**options)
+        self.lost: int | None = None
+        self.steps = 0
+
+    @property
+    def counts(self) -> float:
+        return math.nan if self.steps == self.lost else float(self.machine.counts)
+
+    def reset(self) -> None:
+        self.machine.reset()
+        self.steps = 0
+
+    def step(self, u: float) -> None:
+        self.steps += 1
+        self.last = u
+        self.machine.step(u)
+
+
+def bench(machine: Counted | None = None, **options: Any) -> SteppedBench:
+    return SteppedBench(machine or Counted(), 0.001, 1572.0, 20.0, **options)
+
+
+@pytest.mark.parametrize("way", ["onward", "shortest"])
+@pytest.mark.parametrize("speed", [-1500.0, 0.0, 700.0, 3000.0])
+def test_a_machine_stops_at_an_angle(speed: float, way: Any) -> None:
+    found = stop_at(LAW, VirtualMachine(), "90deg", speed=speed, way=way, after=2.0)
+    m = found.metrics()
+    assert abs(m["counts_off"] or 0.0) <= 2.0
+    assert (found.goal[-1] - 393.0) % 1572.0 == 0.0
+    assert m["rest_counts"] is not None
+    assert m["rest_counts"] <= 1.0
+    assert m["off"] == pytest.approx(0.0, abs=0.5)
+    moved = np.diff(found.place[found.start :])
+    if way == "onward":
+        forwards = speed >= 0.0
+        assert np.all(moved >= -1e-6 if forwards else moved <= 1e-6), "it turned back"
+    else:
+        assert m["turns"] is not None
+        assert m["turns"] < 6.0
+    assert "0.000 turns" not in str(found)
+    assert "stop at 90deg from" in str(found)
+
+
+def test_the_same_bits_on_a_model_a_machine_and_sample_by_sample() -> None:
+    own = stop_at(LAW, VirtualMachine(), ".4turns", speed=2000.0)
+    stepped = stop_at(LAW, bench(), ".4turns", speed=2000.0)
+    for name in ("u", "counts", "place", "goal"):
+        np.testing.assert_array_equal(getattr(own, name), getattr(stepped, name))
+    goals = np.repeat([0.0, 90.0, -20.0], [50, 400, 400])
+    own, stepped = (
+        follow_positions(LAW, on, goals, unit="deg") for on in (VirtualMachine(), bench())
+    )
+    for name in ("u", "counts", "place", "goal"):
+        np.testing.assert_array_equal(getattr(own, name), getattr(stepped, name))
+
+
+def test_goals_in_every_unit_are_gone_to() -> None:
+    goals = np.repeat([0.0, 0.5], [100, 900])
+    runs = [
+        follow_positions(LAW, VirtualMachine(), goals * factor, unit=unit)
+        for unit, factor in (("turns", 1.0), ("deg", 360.0), ("rad", 2 * np.pi), ("counts", 1572.0))
+    ]
+    for one in runs:
+        np.testing.assert_allclose(one.goal, runs[0].goal, atol=1e-9)
+        assert abs(one.counts[-1] - 786.0) <= 1.0
+    assert runs[1].metrics()["off"] == pytest.approx(
+        360.0 * (runs[0].metrics()["off"] or 0.0), abs=0.05
+    )
+
+
+def test_an_s_curve_is_followed_as_it_is() -> None:
+    # 3 turns within the rates
+    t = np.clip((np.arange(1200) - 100) * 1e-3 / 0.8, 0.0, 1.0)
+    turns = 3.0 * t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
+    found = follow_positions(LAW, VirtualMachine(), turns, unit="turns")
+    late = np.abs(found.place[200:] - 1572.0 * turns[200:])
+    # rounded by the mean of the profile only
+    assert np.max(late) < 3.0
+    assert (found.metrics()["rms"] or 1.0) < 0.05
+
+
+def test_it_holds_against_a_load_or_lets_go() -> None:
+    held = stop_at(LAW, drive(), "0deg", speed=0.0, after=2.0, disturbance=np.full(2501, 1.0))
+    assert abs(held.metrics()["counts_off"] or 0.0) <= 1.0
+    assert held.u[-1] == pytest.approx(-1.0, abs=0.2)
+    released = stop_at(LAW, VirtualMachine(), "90deg", speed=1000.0, after=2.0, release=True)
+    assert released.u[-1] == 0.0
+    assert abs(released.metrics()["counts_off"] or 0.0) <= 2.0
+
+
+def test_a_file_holds_everything(tmp_path: Path) -> None:
+    LAW.save(tmp_path / "position.json")
+    assert load_controller(tmp_path / "position.json") == LAW
+    PI.save(tmp_path / "speed.json")
+    assert load_controller(tmp_path / "speed.json") == PI
+    text = (tmp_path / "position.json").read_text().replace('"share"', '"portion"')
+    (tmp_path / "wrong.json").write_text(text)
+    with pytest.raises(ModelFileError):
+        load_controller(tmp_path / "wrong.json")
+
+
+def test_what_cannot_be_is_refused_by_name() -> None:
+    machine = VirtualMachine()
+    states = StateFeedback.from_model(drive(), counts_per_rev=1572.0)
+    with refuses(SettingError, name="controller"):
+        stop_at(PI, machine, "90deg")  # type: ignore[arg-type]
+    with refuses(SettingError, name="controller"):
+        run(LAW, machine, RAMP)
+    with refuses(SettingError, name="controller"):
+        LAW.sent()
+    with refuses(SettingError, name="controller"):
+        tune(drive(), controller="position")
+    with refuses(SettingError, name="controller"):
+        PositionController(states, gain=20.0, fastest=4000.0, rates=RATES)  # type: ignore[arg-type]
+    with refuses(SettingError, name="speed"):
+        replace(LAW, speed=replace(SPEED, counts_per_rev=None))
+    for angle in ("90", "ninety deg", "deg"):
+        with refuses(SettingError, name="position"):
+            stop_at(LAW, machine, angle)
+    with refuses(SettingError, name="unit"):
+        stop_at(LAW, machine, "90mm")
+    with refuses(SettingError, name="speed"):
+        stop_at(LAW, machine, "90deg", speed=4500.0)
+    with refuses(SettingError, name="way"):
+        stop_at(LAW, machine, "90deg", way="back")  # type: ignore[arg-type]
+    with refuses(SettingError, name="on"):
+        stop_at(LAW, SteppedBench(Counted(), 0.001, 4096.0, 20.0), "90deg")
+    with refuses(SettingError, name="disturbance"):
+        stop_at(LAW, machine, "90deg", disturbance=np.ones(9))
+    with refuses(SettingError, name="share"):
+        replace(LAW, share=1.2)
+    for bad in ({"gain": 0.0}, {"gain": math.nan}, {"smoothing": 40}, {"fastest": -1.0},
+                {"landing": -1.0},
+        {"creep": 0.0},
+        {"rates": ()}, {"rates": ((1.0, 2.0, 3.0),)}):  # fmt: skip
+        with pytest.raises(SettingError):
+            replace(LAW, **bad)  # type: ignore[arg-type]
+    for goals in ([], [math.nan], [0.0, math.inf]):
+        with pytest.raises(DataError):
+            follow_positions(LAW, machine, goals, unit="deg")
+
+
+def test_lost_counts_and_too_much_speed_end_a_run_with_no_command() -> None:
+    machine = Counted()
+    machine.lost = 800
+    with pytest.raises(DataError, match="position is lost"):
+        stop_at(LAW, bench(machine), "90deg", speed=1000.0)
+    assert machine.last == 0.0
+    machine = Counted()
+    with pytest.raises(LinkError):
+        stop_at(LAW, bench(machine, speed=900.0), "90deg", speed=1500.0)
+    assert machine.last == 0.0
+
+
+def test_positions_are_read_with_their_units() -> None:
+    assert position_of(" -90 ° ") == (-90.0, "°")
+    assert position_of("1.5e1counts") == (15.0, "counts")
+    assert position_of(".25rev") == (0.25, "rev")
+
+
+def test_the_pages_are_drawn(tmp_path: Path) -> None:
+    found = stop_at(LAW, VirtualMachine(), "90deg", speed=1000.0, after=0.3)
+    assert len(found.plot(file=tmp_path / "stop.svg")) == 4
+    assert set(found.columns()) == set(found.units)
+
+
+@pytest.fixture(scope="module")
+def tuned() -> Any:
+    return tune(drive(), [RAMP], counts_per_rev=1572.0, loop="position", evaluations=200)
+
+
+def test_a_search_finds_gain_and_share_within_its_limits(tuned: Any) -> None:
+    law, position = tuned.controller, tuned.position
+    assert isinstance(law, PositionController)
+    assert tuned.pid == law.speed
+    assert position.Ms_position <= 1.81
+    assert position.passed <= 1.0
+    assert position.off <= 1.5
+    assert "position" in str(tuned)
+    assert position.to_json()["gain"] == law.gain
+    m = stop_at(law, drive(), "90deg", speed=2500.0).metrics()
+    assert abs(m["counts_off"] or 0.0) <= 1.0
+    assert (m["passed"] or 0.0) <= 360.0 / 1572.0
+
+
+def test_the_command_line_tunes_stops_and_moves(
+    tuned: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, law = tmp_path / "drive.json", tmp_path / "position.json"
+    drive().save(model)
+    tuned.controller.save(law)
+    out, picture = tmp_path / "stop.csv", tmp_path / "stop.png"
+    given = ["run", str(law), "--on", "virtual", "--stop-at", "90deg", "--speed", "2000"]
+    assert main([*given, "-o", str(out), "--plot", str(picture)]) == 0
+    assert out.exists()
+    assert picture.exists()
+    assert "turns; passed" in capsys.readouterr().out
+    moves = tmp_path / "moves.csv"
+    rows = "\n".join(f"{0.001 * k:.3f},{90.0 * (k > 20)}" for k in range(500))
+    moves.write_text("t [s],r [deg]\n" + rows)
+    assert main(["run", str(law), str(model), "--positions", str(moves), "--json"]) == 0
+    assert '"off"' in capsys.readouterr().out
+    for refused, words in (
+        (["--on", "virtual", "--stop-at", "90"], "with a unit"),
+        (["--on", "virtual", "--stop-at", "90deg", "--speed", "9000"], "the rates of the drive"),
+        (["--on", "/dev/ttyS77", "--stop-at", "90deg"], "no device has positions"),
+        (["--on", "virtual", "--stop-at", "90deg", "--table", "a.json"], "two"),
+        (["--on", "virtual", "--reference", "trapezoid"], "stop_at"),
+    ):
+        assert main(["run", str(law), *refused]) == 2
+        assert words in capsys.readouterr().err
