@@ -26,10 +26,10 @@ def _levels(n: int, seed: int, size: float, hold: int) -> Any:
     return np.repeat(rng.uniform(-size, size, n // hold + 1), hold)[:n]
 
 
-def _servo(n: int, seed: int, *, reach: float = 9.0) -> Dataset:
+def _servo(n: int, seed: int, *, reach: float = 9.0, u: Any = None) -> Dataset:
     """Angle in 12-bit steps of a joint with k_p / J = 400 1/s^2 behind its controller: friction .02
     rad, gravity .06 rad, late by 15 ms; all in units of the position error."""
-    u = _levels(n, seed, 0.9, 60)
+    u = _levels(n, seed, 0.9, 60) if u is None else u
     y, q, w, h = np.zeros(n), 0.0, 0.0, TS / SUBSTEPS
     for k in range(n * SUBSTEPS):
         if k % SUBSTEPS == 0:
@@ -95,6 +95,18 @@ def test_a_limit_that_is_reached_is_found() -> None:
     gains = joint.inner_gains(5.0)
     assert gains.reach == pytest.approx(0.3 / gains.kp_factor, rel=0.05)
     assert "at its limit from an error" in str(gains)
+
+
+def test_slow_moves_give_a_joint_that_quick_ones_do_not_throw_off() -> None:
+    n = 500
+    slow = 0.9 * np.sin(2.0 * math.pi * 0.15 * TS * np.arange(n))
+    joint = physics(_servo(n, 4, u=slow))
+    assert joint.inside
+    quick = _servo(500, 5)
+    e = quick.experiments[0]
+    core = joint.to_model().core
+    run = core.simulate(e.u, core.estimate_initial_state(e.u[:20], e.y[:20]))
+    assert np.sqrt(np.mean((run - e.y) ** 2)) < 0.3 * np.std(e.y)
 
 
 def test_counts_do_not_say_what_a_simulator_needs() -> None:

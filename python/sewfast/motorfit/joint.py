@@ -57,6 +57,8 @@ EXPONENTS = (0.5, 3.0)
 ITERATIONS, ENOUGH = 30, 1.0
 FLOOR = 1e-3
 """Least part of a start that a positive parameter keeps."""
+RESOLVED = 4.0
+"""Integration steps in which the fastest of the dynamics may turn by one radian at most."""
 SETTLED = 1e-2
 """Squared distances to the minimum in standard errors, at which a descent and the last one end."""
 NEARBY, NEAR = 6, 0.02
@@ -199,7 +201,9 @@ class _Fit:
                 cost = squares(core, self.pieces, core.first_states(_arrays(self.pieces)))
                 if cost < least:
                     best, least = core, cost
-                    self.least = {"k_a": FLOOR * k_a}
+                    # what turns faster than the integration can follow is not told apart
+                    h = RESOLVED * self.data.Ts / core.settings["steps"]
+                    self.least = {"k_a": max(FLOOR * k_a, h * (known["k_e"] + h * k_q))}
         if best is None:
             raise FitError(
                 name="data", expected="a position that follows its command as a joint does",
