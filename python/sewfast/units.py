@@ -54,7 +54,7 @@ def revolutions_per_second(unit: str) -> float | None:
 
 
 ANGLES: dict[str, float] = {
-    "rad": 1.0, "deg": math.pi / 180.0, "°": math.pi / 180.0, "rev": math.tau, "turn": math.tau,
+    "rad": 1.0, "deg": math.pi / 180.0, "rev": math.tau, "turn": math.tau,
     "turns": math.tau, "mrad": 1e-3,
 }  # fmt: skip
 """Factor from each unit of an angle to rad."""

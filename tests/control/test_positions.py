@@ -198,7 +198,7 @@ def test_lost_counts_and_too_much_speed_end_a_run_with_no_command() -> None:
 
 
 def test_positions_are_read_with_their_units() -> None:
-    assert position_of(" -90 ° ") == (-90.0, "°")
+    assert position_of(" -90 ° ") == (-90.0, "deg")
     assert position_of("1.5e1counts") == (15.0, "counts")
     assert position_of(".25rev") == (0.25, "rev")
 
