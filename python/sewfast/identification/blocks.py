@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -15,6 +15,8 @@ from .. import _core
 from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.experiment import weights_of
 from ..dynamic_model import INIT, Core
+from ..errors import DataError, FitError
+from ..models import Model
 from .folds import (
     ERROR_BLOCKS,
     Errors,
@@ -28,7 +30,7 @@ from .folds import (
     with_run_up,
 )
 from .linear import LEAST_GAIN
-from .task import Provenance, finite, sources
+from .task import Provenance, Task, finite, sources
 
 COUNT = 4
 """Blocks. Eight take twice the time and gain nothing: geometric mean of test errors .384 of output
@@ -150,6 +152,23 @@ class Blocks:
             np.array([float(squares[b].sum()) for b in blocks]),
             np.array([float(self.weights[b].sum()) for b in blocks]),
         )
+
+
+def unseen(task: Task, fitted: Callable[[Task], Model]) -> tuple[Split, float] | None:
+    """All blocks and the error on them [output unit], each of the model fitted to the rest.
+    None if there are no blocks, if one of these fits fails or runs away, or without time for them.
+    """
+    folds, cores = blocked(task.data), []
+    for fold in folds:
+        if not task.clock.can_close:
+            return None
+        try:
+            cores.append(fitted(replace(task, data=fold.fitted, progress=None)).core)
+        except (DataError, FitError):
+            return None
+    blocks = Blocks(task.data, folds)
+    residual = blocks.residual(cores) if cores else None
+    return None if residual is None else (blocks.together, blocks.errors(residual).rmse)
 
 
 @dataclass(frozen=True, eq=False)
