@@ -287,18 +287,29 @@ def noise_of(outputs: Sequence[FloatArray]) -> float:
 
 def grade_of(fit: float, rmse: float, noise: float) -> str:
     """`good`, `fair`, `poor` or `useless`; empty for a constant output.
-    An error at the level of the noise is good even with a low fit: no model can do better. If the
-    output itself is hardly larger than its noise, that is no evidence, so a fit below `POOR` is
-    useless in any case. `fit` is that of the free run [%]; its error `rmse` and the output's white
-    measurement noise `noise` are in one unit.
+    The grade is that of the fit to the output without its white measurement noise, which no model
+    explains. If the output itself is hardly larger than its noise, that is no evidence, so a fit
+    below `POOR` is useless in any case. `fit` is that of the free run [%]; its error `rmse` and the
+    output's `noise` are in one unit.
     """
     if not math.isfinite(fit):
         return ""
-    # an error below this multiple of the measurement noise cannot be improved
-    explained = fit >= POOR and rmse <= 1.5 * noise
-    if fit >= GOOD or explained:
-        return "good"
-    return "fair" if fit >= FAIR else "poor" if fit >= POOR else "useless"
+    if fit < POOR:
+        return "useless"
+    own = _without_noise(fit, rmse, noise)
+    return "good" if own >= GOOD else "fair" if own >= FAIR else "poor"
+
+
+def _without_noise(fit: float, rmse: float, noise: float) -> float:
+    """The fit [%] to the output without independent noise, which adds its variance to that of the
+    error and to that of the output.
+    """
+    if not noise > 0.0:
+        return fit
+    if rmse <= noise:
+        return 100.0
+    lost = (1.0 - (noise / rmse) ** 2) / ((1.0 - fit / 100.0) ** -2 - (noise / rmse) ** 2)
+    return 100.0 * (1.0 - math.sqrt(lost))
 
 
 def _beside_a_constant(scores: Scores) -> str:

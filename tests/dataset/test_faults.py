@@ -215,7 +215,7 @@ def test_identify_leaves_a_dead_stretch_out(tmp_path: Path) -> None:
     api.write_table(tmp_path / "x.csv", {"t": 0.01 * np.arange(4000), "u": u, "y": y})
     said = sewfast(tmp_path, "identify", "x.csv", "--model", "arx", "-o", "m.json").out
     assert said.count("in samples 2000:4000, 50% of the record") == 1
-    assert "of its own training data (rmse 0.5" in said
+    assert "of data not trained on (rmse 0.5" in said
     options = ("--speed-unit", "rpm", "--structure", "delay,coulomb", "--json")
     motor = sewfast(tmp_path, "physics", "x.csv", *options)
     assert "in samples 2000:4000" in motor.err

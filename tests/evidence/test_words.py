@@ -55,7 +55,10 @@ def test_a_pair_of_poles_has_a_frequency() -> None:
         (95.0, 1.0, 0.1, "good"),
         (75.0, 1.0, 0.1, "fair"),
         (40.0, 1.0, 0.1, "poor"),
-        (40.0, 1.0, 0.9, "good"),  # nothing but noise is left
+        (40.0, 1.0, 0.999, "good"),  # nothing but noise is left
+        (40.0, 1.0, 1.1, "good"),
+        (80.0, 1.0, 0.9, "good"),  # without the noise it is 91 %
+        (40.0, 1.0, 0.9, "poor"),  # the rest is a third of what the noise does not explain
         (2.0, 1.0, 0.9, "useless"),  # the output itself is nothing but noise
         (-328.0, 4.0, float("nan"), "useless"),
         (float("nan"), 1.0, 0.1, ""),

@@ -377,7 +377,10 @@ def test_a_kind_by_name_gets_a_verdict_too(kind: Any) -> None:
     options: dict[str, Any] = {"starts": 2, "iterations": 20} if kind == "neural_oe" else {}
     own = identify(linear_data(800), model=kind, **options).training["verdict"]
     assert own["grade"] == "good"
-    assert "of its own training data" in own["text"]
+    # linear models are fitted again without each block, others take too long for that
+    on_blocks = kind in ("arx", "iv", "oe")
+    where = "of data not trained on" if on_blocks else "of its own training data"
+    assert where in own["text"]
     given = identify(
         linear_data(800), model=kind, validation=linear_data(400, seed=5), **options
     ).training["verdict"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -15,8 +15,11 @@ from .. import _core
 from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.experiment import weights_of
 from ..dynamic_model import INIT, Core
+from ..errors import DataError, FitError
+from ..models import Model
 from .folds import (
     ERROR_BLOCKS,
+    LEAST_HELD_OUT,
     Errors,
     Split,
     compared,
@@ -28,7 +31,7 @@ from .folds import (
     with_run_up,
 )
 from .linear import LEAST_GAIN
-from .task import Provenance, finite, sources
+from .task import Provenance, Task, finite, sources
 
 COUNT = 4
 """Blocks. Eight take twice the time and gain nothing: geometric mean of test errors .384 of output
@@ -38,8 +41,6 @@ ENOUGH = 5_000
 spread over the record. Short stretches resemble what is beside them: of records with few events
 long blocks tell more (`bldc_cigan`: error on its last part 12.3 with two stretches of 625 samples a
 block, 9.9 with blocks of 1,250, 9.2 of the best linear model)."""
-LEAST = 2 * INIT
-"""Samples of a block of one experiment."""
 AS_GOOD, BY_LUCK = 0.05, 10.0
 """Fewer structures suffice if their error is larger by at most a standard error, or by this number
 over that of samples, up to the first bound: the best of dozens of structures leads by luck."""
@@ -76,13 +77,19 @@ def _without(data: Dataset, stretches: Sequence[tuple[int, int]]) -> Split | Non
     first = 0
     for e in data.experiments:
         within = [(max(low - first, 0), min(high - first, len(e))) for low, high in stretches]
-        able = [(a, b) for a, b in within if b - a >= LEAST and measured(e.y[a:b]) >= LEAST]
+        able = [
+            (a, b)
+            for a, b in within
+            if b - a >= LEAST_HELD_OUT and measured(e.y[a:b]) >= LEAST_HELD_OUT
+        ]
         first += len(e)
         held += [with_run_up(e, a, b) for a, b in able]
         parts += [e.cut(a, b) for a, b in able]
         edges = [0, *itertools.chain(*able), len(e)]
         around = zip(edges[::2], edges[1::2], strict=True)
-        fitted += [e.cut(a, b) for a, b in around if not able or measured(e.y[a:b]) >= LEAST]
+        fitted += [
+            e.cut(a, b) for a, b in around if not able or measured(e.y[a:b]) >= LEAST_HELD_OUT
+        ]
     if not (held and fitted):
         return None
     pieces = (replace(data, experiments=tuple(p)) for p in (fitted, held, parts))
@@ -150,6 +157,23 @@ class Blocks:
             np.array([float(squares[b].sum()) for b in blocks]),
             np.array([float(self.weights[b].sum()) for b in blocks]),
         )
+
+
+def unseen(task: Task, fitted: Callable[[Task], Model]) -> tuple[Split, float] | None:
+    """All blocks and the error on them [output unit], each of the model fitted to the rest.
+    None if there are no blocks, if one of these fits fails or runs away, or without time for them.
+    """
+    folds, cores = blocked(task.data), []
+    for fold in folds:
+        if not task.clock.can_close:
+            return None
+        try:
+            cores.append(fitted(replace(task, data=fold.fitted, progress=None)).core)
+        except (DataError, FitError):
+            return None
+    blocks = Blocks(task.data, folds)
+    residual = blocks.residual(cores) if cores else None
+    return None if residual is None else (blocks.together, blocks.errors(residual).rmse)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,6 +24,7 @@ from ..progress import shown_in_notebooks
 from ..threads import Workers, available, require_workers
 from ..validation import doubling
 from . import further, grey_box, lagged, linear, mixture
+from .blocks import unseen
 from .folds import TEXTS, UNSEEN_DATA, Split, unstable_verdict, verdict
 from .outputs import OUTPUTS
 from .rest import for_loops
@@ -230,7 +231,7 @@ def identify(
         found = with_provenance(found, {"notes": said})
     try:
         if "verdict" not in found.training:
-            own = _verdict(found, task.data, task.validation)
+            own = _verdict(found, task)
             found = with_provenance(found, {"verdict": own})
         found = _judged_by(found, faults)
         excerpt = _excerpt(found, task.data, clock)
@@ -354,14 +355,23 @@ def _judged_by(model: Model, faults: Sequence[Fault]) -> Model:
     return with_provenance(model, {"verdict": own})
 
 
-def _verdict(model: Model, data: Dataset, validation: Dataset | None) -> Provenance:
-    """The verdict on a kind requested by name, on validation, else on training data."""
-    part = Split(data, validation or data, is_given=validation is not None)
+def _verdict(model: Model, task: Task) -> Provenance:
+    """The verdict on a kind requested by name, on validation data; of a linear model else on
+    blocks of the record, each by a fit to the rest, or else on the training data.
+    """
+    data, validation = task.data, task.validation
+    is_linear = model.kind in ("arx", "iv", "oe")
+    part, error = Split(data, validation or data, is_given=validation is not None), None
     where = UNSEEN_DATA if part.is_given else "its own training data"
     if doubling(model) is not None:
         return unstable_verdict(model, part, where)
-    found = verdict(model, data, part, where=where)
-    if model.kind in ("arx", "iv", "oe") and found["grade"] in ("good", "fair"):
+    if is_linear and not part.is_given:
+        orders = model.orders
+        alike = replace(task, na=orders["na"], nb=orders["nb"], nk=orders["nk"])
+        if (found_unseen := unseen(alike, _KINDS[model.kind])) is not None:
+            (part, error), where = found_unseen, UNSEEN_DATA
+    found = verdict(model, data, part, error, where=where)
+    if is_linear and found["grade"] in ("good", "fair"):
         slowest, longest = linear.time_constant(model.core), max(len(e) for e in data.experiments)
         # a real integrator is not a superfluous pole
         if slowest > linear.UNSEEN * longest and diagnose(data).find("integrator") is None:

@@ -37,6 +37,10 @@ memorises the record; a later part is the honest test if there are many data.
 FOLDS = 3
 """Number of later parts on which models are judged, each trained on the data before the part."""
 LEAST_HELD_OUT = 2 * INIT
+"""Samples of a held-out part, and of what is left to fit."""
+WORTH_IT = 0.98
+"""A larger structure has to bring the error below this part of the smaller one's to count as a
+gain, however significant it is."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from ..motorfit.estimation import Normal, minimised
 from ..motorfit.joint import changed, weights
 from ..progress import TimeUp
 from ..units import is_position, revolutions_per_second
-from .folds import Errors, Split, compared, errors_of, folds, free_runs
+from .folds import WORTH_IT, Errors, Split, compared, errors_of, folds, free_runs
 from .task import Look, Pool, Provenance, R, Task, finite
 
 TERMS = ("lag", "delay", "coulomb", "offset", "drop", "stribeck", "limit")
@@ -43,8 +43,6 @@ ARGUMENTS, OUTPUTS = 3.0, 0.1
 the record gives no information, and count as much as a single residual."""
 CREDIBLE = 2.0
 """Standard errors by which the network has to reduce the held-out error."""
-WORTH_IT = math.log(0.98)
-"""Least reduction of the logarithm of that error."""
 NOISES = tuple(10.0**e for e in range(-10, -1))
 """Process noises to try, in squares of the scales."""
 UNEXPLAINED = 0.01
@@ -257,7 +255,7 @@ def _judged(core: _core.GreyBox, part: Split) -> MotorCandidate:
 def _is_better(more: MotorCandidate, alone: MotorCandidate) -> bool:
     """Whether a network makes the motor credibly better."""
     ratio, deviation = compared(more.errors, alone.errors)
-    return ratio < min(-CREDIBLE * deviation, WORTH_IT)
+    return ratio < min(-CREDIBLE * deviation, math.log(WORTH_IT))
 
 
 # --- Their fits -----------------------------------------------------------------------------------

@@ -11,11 +11,10 @@ import numpy as np
 
 from .. import _core
 from ..dataset import Dataset, Experiment
-from ..dynamic_model import INIT
 from ..errors import FitError, Interrupted
 from ..models import LinearOE, Model, NeuralOE
 from ..models.base import Fitted, StructuredModel
-from .folds import Errors, compared, errors_of, folds, free_runs
+from .folds import LEAST_HELD_OUT, WORTH_IT, Errors, compared, errors_of, folds, free_runs
 from .linear import is_misled, oe, raised
 from .task import (
     Progress,
@@ -30,14 +29,11 @@ from .task import (
     wrap,
 )
 
-LEAST_BLOCK = 2 * INIT
 DECAYS = (1e-2, 1e-4)
 """Weight decays of the default network, the strongest first."""
 LINEAR_SHARE = 0.4
 """Share of a time budget for the linear fits, so that some is left for the network."""
 _LINEAR_FITS = "linear fits at which the network begins"
-WORTH_IT = 0.98
-"""The network must reduce the free-run error to below this part of the linear model's."""
 
 
 def paper(task: Task) -> Model:
@@ -188,7 +184,7 @@ class Networks:
         """Free-run errors on data not trained on, the choice and its reason."""
         asked = "a lagged network was asked for"
         if held is None:
-            short = f"too short to hold out blocks of {LEAST_BLOCK} samples to compare on"
+            short = f"too short to hold out blocks of {LEAST_HELD_OUT} samples to compare on"
             reason = f"{asked}; the record is {short}"
             return {"chosen": "neural_oe", "reason": reason, "is_better": False}
         data = self.task.data
@@ -273,13 +269,13 @@ def _with_blocks_held_out(data: Dataset, lag: int) -> tuple[Dataset, Dataset | N
     held: list[Experiment] = []
     for e in data.experiments:
         edges = [round(i * len(e) / blocks) for i in range(blocks + 1)]
-        if edges[1] < LEAST_BLOCK + lag:
+        if edges[1] < LEAST_HELD_OUT + lag:
             return data, None
         held += [e.cut(edges[i], edges[i + 1]) for i in held_out]
         starts, stops = (0, *(i + 1 for i in held_out)), (*held_out, blocks)
         kept += [e.cut(edges[i], edges[j]) for i, j in zip(starts, stops, strict=True)]
     # pieces in which enough outputs were measured
-    able = [[e for e in some if len(e) - e.unmeasured > LEAST_BLOCK] for some in (kept, held)]
+    able = [[e for e in some if len(e) - e.unmeasured > LEAST_HELD_OUT] for some in (kept, held)]
     if not all(able):
         return data, None
     fitted, judged = (replace(data, experiments=tuple(some)) for some in able)
@@ -289,8 +285,6 @@ def _with_blocks_held_out(data: Dataset, lag: int) -> tuple[Dataset, Dataset | N
 # --- Static curves: kinds with several structures, chosen on held-out data, then fitted to all ----
 
 
-_BETTER = math.log(0.98)
-"""A structure with more parameters must reduce the held-out error to this part of the best."""
 SHARE_OF_CHOICE = 0.45
 """Share of a time budget for the choice; the rest is for the fit to all data."""
 _CHOICE = "structures"
@@ -364,14 +358,14 @@ def _chosen(
     try:
         for structure in structures:
             found = tested(structure)
-            if found and (least is None or compared(found[1], least)[0] < _BETTER):
+            if found and (least is None or compared(found[1], least)[0] < math.log(WORTH_IT)):
                 best, (kept, least) = structure, found
         if least is not None and task.na > 1 and not task.is_order_given:
             smaller = {**best, "na": task.na - 1}
             found = tested(smaller)
             if found:
                 ratio, deviation = compared(found[1], least)
-                best = smaller if ratio <= max(deviation, -_BETTER) else best
+                best = smaller if ratio <= max(deviation, -math.log(WORTH_IT)) else best
     except KeyboardInterrupt:
         if task.clock.over(SHARE_OF_CHOICE, _CHOICE):
             return best

@@ -21,6 +21,7 @@ from .delays import delay, reach
 from .folds import (
     RUNAWAY,
     UNSEEN_DATA,
+    WORTH_IT,
     Errors,
     Split,
     compared,
@@ -218,13 +219,11 @@ DELAYS = (2, 3, 4, 5, 6)
 LATE_ORDERS = (1, 2, 3)
 """Orders tried with an estimated dead time beyond these delays."""
 SAMPLES_OF_DELAY = 2_000
-"""Confidence level of that estimate."""
+"""Samples for that estimate."""
 SAMPLES = 6_000
 HELD_OUT = 10 * SAMPLES
 """Samples of a fit that is only used for a decision: blocks spread over the record."""
 ITERATIONS = 60
-WORTH_AN_ORDER = 0.98
-"""A larger order has to reduce the error to below this part to count as a gain."""
 PATIENCE = 2
 """Number of orders without gain after which larger ones are skipped."""
 MISLED = 1.2
@@ -308,7 +307,7 @@ class LinearTable:
             self.add(((o, self.nk) for o in some), until)
             for order in some:
                 error = self.error(order, self.nk)
-                idle = 0 if error < WORTH_AN_ORDER * best else idle + 1
+                idle = 0 if error < WORTH_IT * best else idle + 1
                 best = min(best, error)
             if self._is_over(until):
                 break

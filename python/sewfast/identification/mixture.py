@@ -23,8 +23,8 @@ from ..models import Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from ..models.base import EnsembleCore
 from ..models.grey_box import GreyBox
 from . import grey_box
-from .blocks import LEAST, Blocks, Mixture, Row, blocked, combined
-from .folds import TEXTS, Split, verdict, what_to_record
+from .blocks import Blocks, Mixture, Row, blocked, combined
+from .folds import LEAST_HELD_OUT, TEXTS, Split, verdict, what_to_record
 from .grey_box import or_none
 from .linear import LinearCandidate, linear_provenance, short
 from .table import SHARE_OF_REFIT, TRAINING, Table
@@ -51,8 +51,8 @@ def searched(task: Task, *, wants_network: bool = False) -> Model:
     folds = blocked(task.data, task.validation)
     if not folds:
         reason = (
-            f"the record is too short for blocks of {LEAST} samples, each held out once, to "
-            "compare on; or nothing moves outside them, or only once"
+            f"the record is too short for blocks of {LEAST_HELD_OUT} samples, each held out once, "
+            "to compare on; or nothing moves outside them, or only once"
         )
         if wants_network:
             raise FitError(f"{task.data.source}: {reason}; record longer, or give validation data")
