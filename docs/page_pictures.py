@@ -316,6 +316,16 @@ def joints(file: Path) -> None:
         bottom.set_xlabel("time [s]")
 
 
+def positions(file: Path) -> None:
+    """The README's drive stops at an angle from 3,000 RPM."""
+    machine = sewfast.VirtualMachine()
+    record = runpy.run_path(str(DOCS / "free_run.py"))["record"]
+    training = sewfast.Dataset.concat(map(record, ("chirp_lo_hi", "saturating")))
+    model = sewfast.identify(training, model="grey_box", seed=0)
+    found = sewfast.tune(model, counts_per_rev=machine.counts_per_rev, loop="position")
+    sewfast.stop_at(found.controller, machine, "90deg", speed=3000.0, after=0.7).plot(file=file)
+
+
 def live(file: Path) -> None:
     """The speed of a view, from the counts of the last 20 ms, and that of the recording."""
     machine = sewfast.VirtualMachine()
@@ -344,6 +354,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "feedforward": feedforward,
     "moves": moves,
     "joints": joints,
+    "positions": positions,
     "live": live,
 }
 

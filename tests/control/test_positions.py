@@ -155,6 +155,10 @@ def test_what_cannot_be_is_refused_by_name() -> None:
         LAW.sent()
     with refuses(SettingError, name="controller"):
         tune(drive(), controller="position")
+    with refuses(SettingError, name="counts_per_rev"):
+        tune(drive(), loop="position", counts_per_rev=None)
+    with refuses(SettingError, name="loop"):
+        tune(drive(), loop="angle")  # type: ignore[arg-type]
     with refuses(SettingError, name="controller"):
         PositionController(states, gain=20.0, fastest=4000.0, rates=RATES)  # type: ignore[arg-type]
     with refuses(SettingError, name="speed"):
@@ -235,7 +239,18 @@ def test_the_command_line_tunes_stops_and_moves(
     drive().save(model)
     tuned.controller.save(law)
     out, picture = tmp_path / "stop.csv", tmp_path / "stop.png"
-    given = ["run", str(law), "--on", "virtual", "--stop-at", "90deg", "--speed", "2000"]
+    given = [
+        "run",
+        str(law),
+        "--on",
+        "virtual",
+        "--stop-at",
+        "90deg",
+        "--speed",
+        "2000",
+        "--share",
+        ".6",
+    ]
     assert main([*given, "-o", str(out), "--plot", str(picture)]) == 0
     assert out.exists()
     assert picture.exists()
@@ -251,6 +266,7 @@ def test_the_command_line_tunes_stops_and_moves(
         (["--on", "/dev/ttyS77", "--stop-at", "90deg"], "no device has positions"),
         (["--on", "virtual", "--stop-at", "90deg", "--table", "a.json"], "two"),
         (["--on", "virtual", "--reference", "trapezoid"], "stop_at"),
+        (["--on", "virtual", "--speed", "900"], "beside them"),
     ):
         assert main(["run", str(law), *refused]) == 2
         assert words in capsys.readouterr().err

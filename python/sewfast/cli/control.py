@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -169,6 +170,11 @@ def _add_positions(parser: argparse.ArgumentParser) -> None:
         "--after", type=float, default=1.0, metavar="S", help="time from the stop on (1 s)"
     )
     group.add_argument(
+        "--share", type=float, metavar="PART",
+        help="part of what the models can do that a move uses (the controller's own); less of it "
+        "leaves room for a load that came later",
+    )  # fmt: skip
+    group.add_argument(
         "--release", action="store_true",
         help="take the command away once the shaft has come to rest, in place of holding it",
     )  # fmt: skip
@@ -182,6 +188,8 @@ def _run_positions(args: argparse.Namespace, controller: SampledController) -> N
     if is_port(args.on):
         position.sent()
     require_no_drive_options(args)
+    if args.share is not None:
+        position = replace(position, share=args.share)
     on: Any = machine_of(args.on) if is_fmu(args.on) else plant_of(args.on)
     if args.stop_at is not None:
         reference = _wanted(args, position.speed)
@@ -265,6 +273,12 @@ def _settle_plant(args: argparse.Namespace) -> None:
             name="--" + moves[0].replace("_", "-"),
             expected="one of --stop-at, --positions, --table, --reference, --host-loop",
             received="two", remedy="leave one of them out",
+        )  # fmt: skip
+    alone = args.speed is None and args.share is None and not args.release
+    if not moves and not alone:
+        raise SettingError(
+            name="--speed, --share, --release", expected="--stop-at or --positions beside them",
+            received="neither", remedy="leave them out for a run along a speed",
         )  # fmt: skip
     needed = (is_port(args.on) and not moves) or args.host_loop is not None
     if args.reference is None and args.table is None and needed:

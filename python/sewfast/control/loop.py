@@ -303,7 +303,8 @@ def run(
     if controller.LOOP != "speed":
         raise SettingError(
             name="controller", expected="a controller of the output", received="one of positions",
-            remedy="stop_at and follow_positions run it, or run its speed loop (controller.speed)",
+            remedy="run it by stop_at (--stop-at) or follow_positions (--positions), or run its "
+            "speed loop (controller.speed)",
         )  # fmt: skip
     if table is not None:
         played = _setpoint(table, controller, reference)

@@ -388,6 +388,11 @@ def tune(
         threads_or_all(threads), progress,
         1.0 - LOOK - SHARE * (rival is not None) - LEADING * (feedforward != "none"),
     )  # fmt: skip
+    if loop == "position" and task.start.counts_per_rev is None:
+        raise SettingError(
+            name="counts_per_rev", expected="an encoder, whose counts are the position",
+            received="none", remedy="give that of the drive (--counts-per-rev)",
+        )  # fmt: skip
     # check the rival before the search, which may take long
     other = None if rival is None else replace(task, plants=_rivals(rival, task))
     task = task.with_loops(time)
