@@ -335,8 +335,8 @@ tracking: $(VENV)/bench.stamp ## what a feedforward is worth, beside simple-pid 
 moves: $(VENV)/bench.stamp ## what a table of a known move brings, and what repetitions add (SEEDS=5 MACHINES=8, RUNS=200 on changed machines)
 	$(BIN)/python benches/moves.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES)) $(if $(RUNS),--runs $(RUNS))
 
-positions: $(VENV)/bench.stamp ## stops at an angle and standstill on virtual machines (SEEDS=1 MACHINES=8 STOPS=100)
-	$(BIN)/python benches/positions.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES)) $(if $(STOPS),--stops $(STOPS))
+positions: $(VENV)/bench.stamp ## stops at an angle and standstill on virtual machines (SEEDS=1 MACHINES=8 STOPS=100 MODEL=grey_box)
+	$(BIN)/python benches/positions.py $(if $(MODEL),--model $(MODEL)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES)) $(if $(STOPS),--stops $(STOPS))
 
 joints: $(VENV)/bench.stamp ## positions: drives like EMPS, smart servos and MuJoCo joints (KIND=servos SEEDS="0 1" PHYSICS=1 HELD=1; SAGE=folder of real motions, TRAIN=multisine)
 	$(BIN)/python benches/joints.py $(if $(SAGE),--sage $(SAGE)) $(if $(TRAIN),--train $(TRAIN)) $(if $(KIND),--kind $(KIND)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(PHYSICS),--physics) $(if $(HELD),--held)
