@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -187,6 +188,38 @@ def test_what_cannot_be_is_refused_by_name() -> None:
     for goals in ([], [math.nan], [0.0, math.inf]):
         with pytest.raises(DataError):
             follow_positions(LAW, machine, goals, unit="deg")
+
+
+def test_what_would_move_a_shaft_unasked_is_refused() -> None:
+    machine = VirtualMachine()
+    for angle in ("1e300deg", "1e400turns"):
+        with refuses(SettingError, name="angle"):
+            stop_at(LAW, machine, angle)
+    with refuses(SettingError, name="goals"):
+        follow_positions(LAW, machine, [1e30], unit="turns")
+    with refuses(SettingError, name="after"):
+        stop_at(LAW, machine, "90deg", after=1e12)
+    # a loop that has let go would not take the next goal up
+    with refuses(SettingError, name="release"):
+        follow_positions(LAW, machine, np.repeat([0.25, 0.5], 900), unit="turns", release=True)
+    follow_positions(LAW, machine, np.repeat([0.1], 60), unit="turns", release=True)
+    with refuses(SettingError, name="reference"):
+        stop_at(LAW, machine, "90deg", reference=[*np.full(300, 2000.0), 0.0])
+    with refuses(SettingError, name="speed"):
+        stop_at(LAW, machine, "90deg", reference=[*np.full(300, 9000.0), 2000.0])
+    for load in (np.zeros(3), np.full(1500, np.nan)):
+        with refuses(DataError, name="disturbance"):
+            follow_positions(LAW, drive(), np.zeros(1500), unit="deg", disturbance=load)
+
+
+def test_a_file_with_another_loop_inside_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "position.json"
+    LAW.save(path)
+    whole = json.loads(path.read_text())
+    for change in ({"kind": "position"}, {"version": 99}):
+        path.write_text(json.dumps(whole | {"speed": whole["speed"] | change}))
+        with pytest.raises(ModelFileError):
+            load_controller(path)
 
 
 def test_lost_counts_and_too_much_speed_end_a_run_with_no_command() -> None:

@@ -132,7 +132,7 @@ def test_gains_of_the_controller_inside_for_a_bandwidth() -> None:
     assert "kp times 2.4" in str(gains)
     with pytest.raises(SettingError, match="command that drives the joint"):
         _joint("axis").inner_gains(5.0)
-    with pytest.raises(SettingError, match="above 0"):
+    with pytest.raises(SettingError, match="from 1e-06"):
         _joint("servo").inner_gains(0.0)
 
 

@@ -189,4 +189,4 @@ def test_the_command_line_exports_and_checks(
     shown = capsys.readouterr().out
     assert "of the span" in shown
     assert "<actuator>" in place.read_text()
-    assert main(["physics", str(tmp_path / "moves.csv"), "--check", "mujoco"]) != 0
+    assert main(["physics", str(tmp_path / "moves.csv"), "--inertia", "0.02"]) == 2

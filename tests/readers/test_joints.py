@@ -168,6 +168,25 @@ def test_what_is_no_joint_is_none() -> None:
     assert joint_columns(read_table(table)) == {}
 
 
+def test_joints_of_several_words_keep_their_columns() -> None:
+    columns = {f"{side}_elbow_{kind}": U[:, k] for side in ("left", "right")
+               for k, kind in enumerate(("cmd", "pos"))}  # fmt: skip
+    assert set(joint_columns(read_table(columns))) == {"left_elbow", "right_elbow"}
+    mixed = {"left_elbow_cmd": U[:, 0], "left_wrist_pos": Q[:, 0]}
+    assert joint_columns(read_table(mixed)) == {}
+    error = {"elbow.target_pos": U[:, 0], "elbow.pos_error": Q[:, 0]}
+    assert joint_columns(read_table(error)) == {}
+    turned = {"cmd_elbow": U[:, 0], "pos_elbow": Q[:, 0]}
+    assert list(joint_columns(read_table(turned))) == ["elbow"]
+    units = {"t": T, "elbow.command [rad]": U[:, 0], "elbow.position [m]": Q[:, 0]}
+    with pytest.raises(SettingError, match="rad and m"):
+        read_joints(units)
+    units["elbow.position [rad]"] = units.pop("elbow.position [m]")
+    with pytest.raises(SettingError, match="deg beside rad"):
+        read_joints(units, unit="deg")
+    assert list(read_joints(units, joints="elbow")) == ["elbow"]
+
+
 def test_unknown_joints_and_units_are_refused(tmp_path: Path) -> None:
     folder = _sage(tmp_path / "motion")
     with pytest.raises(SettingError, match="Rotation, Elbow"):

@@ -31,7 +31,7 @@ from .drive import (
     recording_place,
     require_no_drive_options,
 )
-from .output import print_json, write_columns
+from .output import note, print_json, write_columns
 
 if TYPE_CHECKING:
     from ..control.controller import Controller, SampledController
@@ -203,11 +203,23 @@ def _run_positions(args: argparse.Namespace, controller: SampledController) -> N
             zero=args.zero, after=args.after, release=args.release,
         )  # fmt: skip
     else:
+        of_stops = {
+            "--zero": args.zero != 0.0, "--way": args.way != "onward", "--after": args.after != 1.0,
+            "--speed": args.speed is not None,
+        }  # fmt: skip
+        if beside := [name for name, given in of_stops.items() if given]:
+            raise SettingError(
+                name=beside[0], expected="--stop-at", received="--positions",
+                remedy="leave it out: goals are counted from where the run begins",
+            )  # fmt: skip
         goals, unit = _goals(args.positions, position.Ts)
         name = Path(args.positions).stem
         found = follow_positions(position, on, goals, unit=unit, release=args.release, name=name)
     summary: dict[str, Any] = {"plant": found.plant, "asked": found.name, "unit": found.unit}
     summary |= {"n": len(found.t), "Ts": found.Ts, **found.metrics()}
+    summary["warnings"] = found.warnings
+    for text in found.warnings:
+        note(f"warning: {text}")
     lines = str(found).splitlines()
     if args.plot is not None:
         found.plot(file=args.plot)

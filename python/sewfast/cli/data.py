@@ -366,6 +366,7 @@ def _show_columns(tables: list[Table], args: argparse.Namespace) -> None:
     if args.json:
         print_json({path: [vars(c) for c in found] for path, found in columns.items()})
         return
+    from ..readers import joint_columns
     from .output import print_rows
 
     for table, (path, found) in zip(tables, columns.items(), strict=True):
@@ -375,7 +376,13 @@ def _show_columns(tables: list[Table], args: argparse.Namespace) -> None:
         print_rows([header, *map(_row, found)])
         for name, reason in table.unusable.items():
             print(f"not a column of numbers: {name}, {reason}")
-    print(f"to see more, {_how_to_name(tables[0])}")
+    named = joint_columns(tables[0])
+    how = f"--joint NAME, of {', '.join(named)}" if named else "--input COL --output COL"
+    print(
+        f"name a joint, or the input and the output to see more: {how}"
+        if named
+        else f"name the input and the output to see more: {how}"
+    )
 
 
 def _columns(table: Table) -> list[ColumnSummary]:

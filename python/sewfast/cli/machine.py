@@ -381,7 +381,9 @@ def physics_command(args: argparse.Namespace) -> None:
     if args.structure in (None, "joint") and (joints := _joints(args)):
         for name, wanted in (
             ("--plot", args.plot), ("--export", target), ("--check", args.check),
-            ("--model", args.model), ("-o", args.out),
+            ("--model", args.model), ("-o", args.out), ("--bandwidth", args.bandwidth),
+            ("--inertia", args.inertia), ("--volts", args.volts), ("--current", args.current),
+            ("--winding", args.winding), ("--intervals profile", args.intervals == "profile"),
         ):  # fmt: skip
             if wanted:
                 raise SettingError(
@@ -434,6 +436,7 @@ def physics_command(args: argparse.Namespace) -> None:
         speed_unit=args.speed_unit,
         intervals=args.intervals,
     )
+    gains = None if args.bandwidth is None else motor.inner_gains(args.bandwidth)
     own = {"inertia": args.inertia} if is_joint else {"winding": args.winding, "gear": args.gear}
     text = "" if target is None else motor.export(target, **own)
     if args.out is not None:
@@ -441,7 +444,6 @@ def physics_command(args: argparse.Namespace) -> None:
     if text:
         storage.replace(place, text)
     replay = motor.check(data, inertia=args.inertia) if args.check else None
-    gains = None if args.bandwidth is None else motor.inner_gains(args.bandwidth)
     if args.model is not None:
         motor.to_model().save(args.model)
     if args.plot is not None:

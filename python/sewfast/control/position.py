@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from .. import _core
 from ..arrays import FloatArray
-from ..errors import SettingError
+from ..errors import DataError, SettingError
 from ..gains import real, vector, whole
 from ..machine import VirtualMachine
 from ..models import Model
@@ -250,7 +250,7 @@ class PositionController(SampledController):
         for row in rows:
             row.require_only(("speed", "up", "down"))
         return cls(
-            speed=Controller.read(fields.object("speed")),
+            speed=_speed_in(fields.object("speed")),
             gain=fields.number("gain"),
             fastest=fields.number("fastest"),
             rates=tuple((r.number("speed"), r.number("up"), r.number("down")) for r in rows),
@@ -272,6 +272,32 @@ class PositionController(SampledController):
         ]
         notes = [f"  notes     {self.notes}"] if self.notes else []
         return "\n".join([*lines, *notes, f"over a {self.speed}"])
+
+
+def _speed_in(fields: Fields) -> Controller:
+    """The speed loop inside a file."""
+    version = fields.integer("version")
+    if version > Controller.VERSION:
+        raise fields.refuse("version", f"at most {Controller.VERSION}", version)
+    if (kind := fields.values.get("kind", Controller.KIND)) != Controller.KIND:
+        raise fields.refuse("kind", repr(Controller.KIND), repr(kind))
+    return Controller.read(fields)
+
+
+FARTHEST = 2.0**50
+"""Largest count that is told from its neighbours with room."""
+RELEASED = 32
+"""Samples without a move after which a loop lets go (`KEPT` in the crate)."""
+LONGEST = 10_000_000
+"""Most samples after a stop."""
+
+
+def _within(name: str, counts: FloatArray | float) -> None:
+    if np.any(np.abs(counts) > FARTHEST):
+        raise SettingError(
+            name=name, expected=f"a place within {FARTHEST:.3g} counts",
+            received=f"{float(np.max(np.abs(counts))):.3g} counts", remedy="give it in its turn",
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -392,6 +418,21 @@ class PositionRun(Plotted):
             "u_rms": found["u_rms"],
             "du_rms": found["du_rms"],
         }
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a stop onward, or the last move, did that its models do not."""
+        m, unit = self.metrics(), self.unit
+        count = abs(self._in_unit(1.0))
+        found = []
+        if (passed := m["passed"]) is not None and passed > 2.0 * count:
+            found.append(
+                f"passed its goal by {passed:.3g} {unit}: the drive brakes less than its models; "
+                "use less of what they can do (share), or identify it again"
+            )
+        if m["time"] is None and m["rest_counts"] is not None:
+            found.append(f"does not stay within a count: rests {m['off']:.3g} {unit} off")
+        return found
 
     def drawing(self) -> Drawing:
         """Speed, way left, error about the goal and command over the time."""
@@ -530,9 +571,11 @@ def stop_at(
     if way not in WAYS:
         raise SettingError(name="way", expected=" or ".join(WAYS), received=repr(way))
     after = real("after", after)
-    if not position.Ts <= after < math.inf:
+    if not position.Ts <= after <= LONGEST * position.Ts:
         raise SettingError(
-            name="after", expected="a finite time above a sample [s]", received=f"{after:g}"
+            name="after",
+            expected=f"a time from a sample to {LONGEST * position.Ts:g} s",
+            received=f"{after:g}",
         )
     if reference is not None and speed is not None:
         raise SettingError(
@@ -547,10 +590,19 @@ def stop_at(
         name = f"stop at {angle} from {wanted:.5g} {position.y_unit}".rstrip()
     else:
         before, name = vector("reference", reference).copy(), f"stop at {angle}"
-        _require_reach(position, before[-1:])
+        _require_reach(position, before)
+        steepest = position.Ts * max(max(up, down) for _, up, down in position.rows())
+        if len(before) > 1 and not abs(before[-1] - before[-2]) <= steepest:
+            raise SettingError(
+                name="reference", expected="a speed that the drive has before the stop, changing "
+                f"by at most {steepest:.4g} {position.y_unit} a sample",
+                received=f"{abs(before[-1] - before[-2]):.4g} at its end",
+                remedy="hold the last speed for as long as the drive needs to reach it",
+            )  # fmt: skip
     start = len(before)
     r = np.append(before, np.full(round(after / position.Ts), before[-1] if start else 0.0))
     counts = real("zero", zero) + counts_of(value, unit, per_rev)
+    _within("angle", counts)
     stop = (start, counts, per_rev, way == "onward")
     found = _played(position, on, r, name, stop, release, disturbance)
     return replace(found, unit=unit)
@@ -598,6 +650,15 @@ def follow_positions(
     assert position.counts_per_rev is not None
     known = position_unit(unit)
     r = vector("goals", goals) * counts_of(1.0, known, position.counts_per_rev)
+    _within("goals", r[np.isfinite(r)])
+    if release:
+        # a loop that has let go does not take the next goal up
+        changes = np.concatenate([[0], np.flatnonzero(np.diff(r)) + 1])
+        if np.any(np.diff(changes) >= RELEASED):
+            raise SettingError(
+                name="release", expected="goals that stand at the end only", received="others",
+                remedy="leave it out, or release after each run",
+            )  # fmt: skip
     found = _played(position, on, r, name, None, release, disturbance)
     return replace(found, unit=known)
 
@@ -658,10 +719,16 @@ def _played(
                 remedy="load a virtual machine by its set_load",
             )  # fmt: skip
         _require_counts(controller, on)
+        load = None if disturbance is None else vector("disturbance", disturbance)
+        if load is not None and not (len(load) == len(r) and np.isfinite(load).all()):
+            raise DataError(
+                name="disturbance", expected=f"{len(r)} finite numbers, one for each sample",
+                received=f"{len(load)}", remedy="0 where there is no load",
+            )  # fmt: skip
         record: dict[str, Any] = _core.position_run(
             single_core(on, rest), playing.about(rest).core(), r,
             counts_per_unit=controller.counts_per_unit,
-            disturbance=None if disturbance is None else vector("disturbance", disturbance),
+            disturbance=load,
         )  # fmt: skip
         record["u"] = record["u"] + rest.u[0]
         return PositionRun(**common, **record, plant=plant_name(on), is_stop=stop is not None)

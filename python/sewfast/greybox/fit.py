@@ -148,6 +148,18 @@ def physics(
     identification. Errors are those of the free run.
     """
     if isinstance(data, Mapping):
+        beside = {
+            "current": current, "volts": volts, "speed_unit": speed_unit, "equations": equations,
+            "parameters": parameters,
+            "structure": None if structure in (None, "joint", ["joint"]) else structure,
+            "intervals": None if intervals == "curvature" else intervals,
+        }  # fmt: skip
+        for name, value in beside.items():
+            if value is not None:
+                raise SettingError(
+                    name=name, expected="none for several joints", received=repr(value),
+                    remedy="fit one of them: physics(joints['NAME'], ...)",
+                )  # fmt: skip
         return joints_of({name: _positions(one) for name, one in data.items()})
     if equations is not None or parameters is not None:
         if equations is None or parameters is None or structure is not None or current is not None:

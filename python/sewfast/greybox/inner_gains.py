@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from ..errors import SettingError
+from ..gains import real
 from ..tables import significant
 
 if TYPE_CHECKING:
@@ -85,10 +86,13 @@ def inner_gains(joint: Joint, bandwidth: float, damping_ratio: float) -> InnerGa
             name="joint", expected="a controller inside, whose command is a position",
             received="a command that drives the joint", remedy="tune a controller: sewfast.tune",
         )  # fmt: skip
-    for name, value in (("bandwidth", bandwidth), ("damping_ratio", damping_ratio)):
-        if not (math.isfinite(value) and value > 0.0):
+    bandwidth, damping_ratio = real("bandwidth", bandwidth), real("damping_ratio", damping_ratio)
+    for name, value, least, most in (
+        ("bandwidth", bandwidth, 1e-6, 1e6), ("damping_ratio", damping_ratio, 1e-3, 1e3),
+    ):  # fmt: skip
+        if not least <= value <= most:
             raise SettingError(
-                name=name, expected="a finite number above 0", received=f"{value}",
+                name=name, expected=f"a number from {least:g} to {most:g}", received=f"{value:g}",
                 remedy="bandwidth in Hz, damping_ratio 1 for no overshoot",
             )  # fmt: skip
     k_a = joint.value("inertia")

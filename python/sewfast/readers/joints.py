@@ -12,7 +12,7 @@ from typing import Any
 
 from ..dataset import Dataset
 from ..errors import SettingError
-from ..units import is_position
+from ..units import is_position, radians, spelled
 from .containers import Table, freeze
 from .recording import read_columns, read_table
 
@@ -25,8 +25,8 @@ _POSITION = frozenset(
 _OTHER = frozenset(
     re.split(
         " ",
-        "acceleration accelerations current effort load speed temperature torque torques vel "
-        "velocities velocity voltage",
+        "acceleration accelerations current effort err error load speed temperature torque torques "
+        "vel velocities velocity voltage",
     )
 )
 """Words in names of columns; one of the last sort says that it is no position."""
@@ -37,17 +37,15 @@ _WORD = re.compile(r"[A-Za-z]+")
 def joint_columns(table: Table) -> dict[str, tuple[str, str]]:
     """Columns of the position command and of the position of each joint, by the joint's name.
 
-    A column belongs to the joint that its last part names (`control.positions.Elbow`), or its first
-    (`elbow/command`). Only joints with one command and one position count.
+    A column belongs to the joint that its last part names (`control.positions.Elbow`), or the words
+    that say neither command nor position (`left_elbow_cmd`). Only joints with one command and one
+    position count.
     """
-    for last in (True, False):
+    for parted in (_by_last, _by_words):
         found: dict[str, dict[str, list[str]]] = {}
         for name in table.names:
-            parts = [p for p in re.split(r"[./]" if last else r"[./_ ]", name) if p]
-            if len(parts) < 2:
-                continue
-            joint, rest = (parts[-1], parts[:-1]) if last else (parts[0], parts[1:])
-            if (kind := _kind(rest)) and not joint.isdigit():
+            joint, rest = parted(name)
+            if joint and not joint.isdigit() and (kind := _kind(rest)):
                 found.setdefault(joint, {}).setdefault(kind, []).append(name)
         whole = {
             joint: (of["command"][0], of["position"][0]) for joint, of in found.items()
@@ -56,6 +54,17 @@ def joint_columns(table: Table) -> dict[str, tuple[str, str]]:
         if whole:
             return whole
     return {}
+
+
+def _by_last(name: str) -> tuple[str, Sequence[str]]:
+    *rest, joint = re.split(r"[./]", name)
+    return (joint, rest) if rest else ("", ())
+
+
+def _by_words(name: str) -> tuple[str, Sequence[str]]:
+    words = [w for w in re.split(r"[./_ ]+", name) if w]
+    own = [w for w in words if w.lower() not in _COMMAND | _POSITION]
+    return "_".join(own), words
 
 
 def _kind(parts: Sequence[str]) -> str | None:
@@ -116,12 +125,16 @@ def read_joints(
     SAGE states rad. Messages of ROS are in rad or m by the kind of joint (REP 103), which they do
     not state; LeRobot's are in degrees or in percent of a range.
     """
-    if unit and not is_position(unit):
+    if unit != "" and not (isinstance(unit, str) and is_position(unit)):
         raise SettingError(
             name="unit", expected="an angle or a length: rad, deg, rev, m, mm, counts",
             received=repr(unit), remedy="name the unit of command and position",
         )  # fmt: skip
+    if isinstance(joints, str):
+        joints = (joints,)
     several = isinstance(path, Sequence) and not isinstance(path, str)
+    if several and not len(path):
+        raise SettingError(name="path", expected="one record or more", received="none")
     tables = [p if isinstance(p, Table) else read_table(p) for p in (path if several else [path])]
     names = list(joints or joint_columns(tables[0])) or [""]
     return {
@@ -133,7 +146,16 @@ def read_joints(
 def _dataset(table: Table, joint: str, unit: str, Ts: float | None) -> Dataset:
     command, position = columns_of(table, joint)
     data = read_columns(table, inputs=command, output=position, Ts=Ts)
-    units = {"input_units": (data.input_units[0] or unit,), "output_unit": data.output_unit or unit}
+    given, known = data.input_units[0] or unit, data.output_unit or unit
+    other = [stated for stated in (given, known) if unit and spelled(stated) != spelled(unit)]
+    kinds = {radians(u) is None for u in (given, known) if is_position(u)}
+    if other or len(kinds) > 1:
+        raise SettingError(
+            name="unit", expected="one that command and position of a joint share",
+            received=f"{unit} beside {other[0]} in the file" if other else f"{given} and {known}",
+            remedy="leave it out" if other else "name the columns of one joint",
+        )  # fmt: skip
+    units = {"input_units": (given,), "output_unit": known}
     return replace(data, **units)  # type: ignore[arg-type]
 
 
