@@ -17,25 +17,13 @@ from typing import Any
 import numpy as np
 
 import sewfast
-from sewfast import PositionController, VirtualMachine, signals
+from moves import recorded
+from sewfast import PositionController, VirtualMachine
 
 LOWEST, HIGHEST = 500.0, 4000.0
 """Speeds of the stops [RPM]."""
 STANDS = 11.0
 """Time from a stop on of which the last ten seconds are standstill [s]."""
-
-
-def recorded(machine: VirtualMachine) -> sewfast.Dataset:
-    """The training record of the README's example."""
-    parts = []
-    for name in ("chirp_lo_hi", "saturating"):
-        machine.reset()
-        u = signals.excitation(name)
-        y = sewfast.speed_from_counts(machine.run(u).counts, machine.Ts, machine.counts_per_rev)
-        parts.append(
-            sewfast.Dataset.from_arrays(u, y, machine.Ts, input_units="V", output_unit="RPM")
-        )
-    return sewfast.Dataset.concat(parts)
 
 
 def tuned(machine: VirtualMachine, seed: int, kind: str, kept: Path | None) -> PositionController:

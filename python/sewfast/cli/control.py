@@ -16,6 +16,7 @@ from .arguments import (
     TABLES,
     Commands,
     add_command,
+    add_options,
     add_output,
     add_overwrite,
     add_plot,
@@ -141,43 +142,26 @@ def run_command(args: argparse.Namespace) -> int | None:
     return None
 
 
+POSITIONS_OPTIONS = """\
+--stop-at ANGLE  text  run at a speed, then stop at this angle of the turn: 90deg, 1.57rad,
+    .25turns, 393counts; the loop then holds it
+--positions FILE  text  goals to go to, a CSV with columns t [s], r [deg, rad, turns or counts]
+--speed Y  float  speed from which it stops (half of the largest known one); or give --reference
+--way  {onward,shortest}=onward  to the angle that is reached first without turning back, or the
+    shorter way (onward)
+--zero COUNTS  float=0.0  the encoder's count at the angle 0, from where the run begins (0)
+--after S  float=1.0  time from the stop on (1 s)
+--share PART  float  part of what the models can do that a move uses (the controller's own); less of
+    it leaves room for a load that came later
+--release  flag  take the command away once the shaft has come to rest, in place of holding it
+"""
+
+
 def _add_positions(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         "positions", "With a controller of positions, on a model, a virtual machine or an FMU."
     )
-    group.add_argument(
-        "--stop-at", metavar="ANGLE",
-        help="run at a speed, then stop at this angle of the turn: 90deg, 1.57rad, .25turns, "
-        "393counts; the loop then holds it",
-    )  # fmt: skip
-    group.add_argument(
-        "--positions", metavar="FILE",
-        help="goals to go to, a CSV with columns t [s], r [deg, rad, turns or counts]",
-    )  # fmt: skip
-    group.add_argument(
-        "--speed", type=float, metavar="Y",
-        help="speed from which it stops (half of the largest known one); or give --reference",
-    )  # fmt: skip
-    group.add_argument(
-        "--way", choices=("onward", "shortest"), default="onward",
-        help="to the angle that is reached first without turning back, or the shorter way (onward)",
-    )  # fmt: skip
-    group.add_argument(
-        "--zero", type=float, default=0.0, metavar="COUNTS",
-        help="the encoder's count at the angle 0, from where the run begins (0)",
-    )  # fmt: skip
-    group.add_argument(
-        "--after", type=float, default=1.0, metavar="S", help="time from the stop on (1 s)"
-    )
-    group.add_argument(
-        "--share", type=float, metavar="PART",
-        help="part of what the models can do that a move uses (the controller's own); less of it "
-        "leaves room for a load that came later",
-    )  # fmt: skip
-    group.add_argument(
-        "--release", action="store_true",
-        help="take the command away once the shaft has come to rest, in place of holding it",
-    )  # fmt: skip
+    add_options(group, POSITIONS_OPTIONS)
 
 
 def _run_positions(args: argparse.Namespace, controller: SampledController) -> None:
@@ -217,8 +201,8 @@ def _run_positions(args: argparse.Namespace, controller: SampledController) -> N
         found = follow_positions(position, on, goals, unit=unit, release=args.release, name=name)
     summary: dict[str, Any] = {"plant": found.plant, "asked": found.name, "unit": found.unit}
     summary |= {"n": len(found.t), "Ts": found.Ts, **found.metrics()}
-    summary["warnings"] = found.warnings
-    for text in found.warnings:
+    summary["warnings"] = warnings = found.warnings
+    for text in warnings:
         note(f"warning: {text}")
     lines = str(found).splitlines()
     if args.plot is not None:
@@ -230,6 +214,17 @@ def _run_positions(args: argparse.Namespace, controller: SampledController) -> N
 
 def _goals(path: str, Ts: float) -> tuple[FloatArray, str]:
     """Goals of a file with columns t, r, and their unit."""
+    goals, unit = _samples(path, Ts)
+    if not unit:
+        raise DataError(
+            name=path, expected="a unit of r: deg, rad, turns or counts", received="none",
+            remedy="name the column 'r [deg]'",
+        )  # fmt: skip
+    return goals, unit
+
+
+def _samples(path: str, Ts: float) -> tuple[FloatArray, str]:
+    """The column r of a file with columns t, r at the loop's sample time, and its unit."""
     from ..readers import read_columns
 
     data = read_columns(path, inputs="r")
@@ -237,15 +232,9 @@ def _goals(path: str, Ts: float) -> tuple[FloatArray, str]:
     if abs(data.Ts - Ts) > 0.01 * Ts:
         raise DataError(
             name=path, expected=f"the loop's sample time of {Ts:g} s", received=f"{data.Ts:g} s",
-            remedy="resample the goals",
+            remedy="resample the column r",
         )  # fmt: skip
-    unit = data.input_units[0]
-    if not unit:
-        raise DataError(
-            name=path, expected="a unit of r: deg, rad, turns or counts", received="none",
-            remedy="name the column 'r [deg]'",
-        )  # fmt: skip
-    return data.experiments[0].u[:, 0].copy(), unit
+    return data.experiments[0].u[:, 0].copy(), data.input_units[0]
 
 
 def _settle_plant(args: argparse.Namespace) -> None:
@@ -344,7 +333,6 @@ def _wanted(args: argparse.Namespace, controller: SampledController) -> Any:
 
 def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
     """The name of a reference, or the samples of a file with columns t, r."""
-    from ..readers import read_columns
     from ..signals import REFERENCES
     from ..units import spelled
 
@@ -355,19 +343,12 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
             f"--reference {text}: expected a CSV file with columns t, r, or one of "
             f"{', '.join(REFERENCES)}; received neither"
         )
-    data = read_columns(text, inputs="r")
-    data.require_inputs()
-    if abs(data.Ts - Ts) > 0.01 * Ts:
-        raise DataError(
-            name=text, expected=f"the loop's sample time of {Ts:g} s", received=f"{data.Ts:g} s",
-            remedy="resample the reference",
-        )  # fmt: skip
-    given = data.input_units[0]
+    samples, given = _samples(text, Ts)
     if given and unit and spelled(given) != spelled(unit):
         raise DataError(
             f"{text}: expected r in {unit}, the loop's unit, got {given}; convert the column"
         )
-    return data.experiments[0].u[:, 0].copy()
+    return samples
 
 
 # --- `sewfast run --host-loop`: the controller on this computer, for slow plants ------------------

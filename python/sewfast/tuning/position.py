@@ -17,7 +17,7 @@ import numpy as np
 
 from .. import _core
 from ..control.controller import Controller
-from ..control.loop import each_plant
+from ..control.loop import cores_about, each_plant
 from ..control.margins import loop_path, sampled
 from ..control.position import RATES, SMOOTHED, PositionController
 from ..errors import FitError, SettingError
@@ -267,7 +267,7 @@ def _stops(
     assert one.counts_per_rev is not None
     designs = [(c.gain, c.rows(), c.smoothing, c.landing, c.creep) for c in made]
     found = _core.judge_stops(
-        [p.about(rest) if hasattr(p, "about") else p.core for p in each_plant(task.plants)],
+        cores_about(rest, each_plant(task.plants)),
         one.speed.about(rest).core(), designs,
         counts_per_unit=one.counts_per_unit, fastest=one.fastest, turn=one.counts_per_rev,
         speeds=[part * one.fastest for part in SPEEDS], before=round(BEFORE / one.Ts),

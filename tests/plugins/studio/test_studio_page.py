@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -467,10 +468,8 @@ def test_the_first_rows_of_a_file_are_shown(studio: Studio, browser: Any) -> Non
         browser.save_screenshot(str(Path(os.environ["STUDIO_PICTURES"]) / "rows.png"))
 
 
-@pytest.mark.nightly("a browser")
-@pytest.mark.alone
-def test_a_refusal_stands_at_its_field(tuned: Studio, browser: Any) -> None:
-    from selenium.webdriver.common.keys import Keys
+def _searching(browser: Any, tuned: Studio, evaluations: str, button: str) -> Callable[[str], Any]:
+    """Opens the step Tune and begins a search; finds its elements by their ids."""
 
     def at(name: str) -> Any:
         return browser.find_element("id", name)
@@ -479,9 +478,22 @@ def test_a_refusal_stands_at_its_field(tuned: Studio, browser: Any) -> None:
     browser.get(tuned.address)
     until(lambda: browser.execute_script(NUMBER, "Ms"))
     browser.execute_script(FOLDS)
+    _search(at, evaluations, button)
+    return at
+
+
+def _search(at: Callable[[str], Any], evaluations: str, button: str) -> None:
+    from selenium.webdriver.common.keys import Keys
+
     at("evaluations").clear()
-    at("evaluations").send_keys("5")
-    at("search").send_keys(Keys.ENTER)
+    at("evaluations").send_keys(evaluations)
+    at(button).send_keys(Keys.ENTER)
+
+
+@pytest.mark.nightly("a browser")
+@pytest.mark.alone
+def test_a_refusal_stands_at_its_field(tuned: Studio, browser: Any) -> None:
+    at = _searching(browser, tuned, "5", "search")
     until(lambda: browser.find_elements("css selector", ".refused"))
     assert not at("tune-error").is_displayed()
     assert at("evaluations").get_attribute("aria-invalid") == "true"
@@ -489,27 +501,16 @@ def test_a_refusal_stands_at_its_field(tuned: Studio, browser: Any) -> None:
     if "STUDIO_PICTURES" in os.environ:
         browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", at("evaluations"))
         browser.save_screenshot(str(Path(os.environ["STUDIO_PICTURES"]) / "refused.png"))
-    at("evaluations").clear()
-    at("evaluations").send_keys("20")
-    at("search").send_keys(Keys.ENTER)
+    _search(at, "20", "search")
     until(lambda: not browser.find_elements("css selector", ".refused"))
 
 
 @pytest.mark.nightly("searches from a browser")
 @pytest.mark.alone
 def test_two_sliders_move_along_the_trade_off(tuned: Studio, browser: Any) -> None:
-    def at(name: str) -> Any:
-        return browser.find_element("id", name)
-
     from selenium.webdriver.common.keys import Keys
 
-    browser.set_window_size(1280, 900)
-    browser.get(tuned.address)
-    until(lambda: browser.execute_script(NUMBER, "Ms"))
-    browser.execute_script(FOLDS)
-    at("evaluations").clear()
-    at("evaluations").send_keys("80")
-    at("trade").send_keys(Keys.ENTER)
+    at = _searching(browser, tuned, "80", "trade")
     until(lambda: at("front").is_displayed())
     assert not at("knobs").is_displayed()  # gains are the second layer
     at("front-response").send_keys(Keys.HOME)
