@@ -31,7 +31,7 @@ def shifted(data: Dataset, args: argparse.Namespace) -> Dataset:
 
 
 def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) -> Dataset:
-    from ..readers import columns_of, left_out, parse_source, read_columns, read_table
+    from ..readers import left_out, of_joint, parse_source, read_columns, read_table
 
     path, inputs, output = parse_source(source)
     table = with_units(read_table(path), args)
@@ -44,9 +44,8 @@ def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) 
                     filter(None, (*inputs, output, counts))
                 ), remedy="leave one of them out",
             )  # fmt: skip
-        command, output = columns_of(table, joint)
+        table, command, output = of_joint(table, joint, args.unit or "")
         inputs = (command,)
-        table = _in_unit(table, (command, output), args.unit)
     if not inputs or not (output or counts):
         found = _recognised(table, args, inputs, output)
         if found is None:
@@ -81,14 +80,6 @@ def _how_to_name(table: Table) -> str:
     if joints := joint_columns(table):
         return f"name a joint: --joint NAME, of {', '.join(joints)}"
     return "name them: --input COL, --output COL, or --counts COL --counts-per-rev N"
-
-
-def _in_unit(table: Table, names: Sequence[str], unit: str | None) -> Table:
-    """A table with a unit for columns that have none."""
-    from dataclasses import replace
-
-    more = {n: unit for n in names if unit and not table.units.get(n)}
-    return replace(table, units={**table.units, **more}) if more else table
 
 
 def _recognised(
@@ -376,13 +367,10 @@ def _show_columns(tables: list[Table], args: argparse.Namespace) -> None:
         print_rows([header, *map(_row, found)])
         for name, reason in table.unusable.items():
             print(f"not a column of numbers: {name}, {reason}")
-    named = joint_columns(tables[0])
-    how = f"--joint NAME, of {', '.join(named)}" if named else "--input COL --output COL"
-    print(
-        f"name a joint, or the input and the output to see more: {how}"
-        if named
-        else f"name the input and the output to see more: {how}"
-    )
+    if named := ", ".join(joint_columns(tables[0])):
+        print(f"name a joint, or the input and the output to see more: --joint NAME, of {named}")
+    else:
+        print("name the input and the output to see more: --input COL --output COL")
 
 
 def _columns(table: Table) -> list[ColumnSummary]:

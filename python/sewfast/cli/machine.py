@@ -371,8 +371,8 @@ def physics_command(args: argparse.Namespace) -> None:
     from ..dataset.faults import sound
     from ..greybox import physics
     from ..greybox.exports import BOARDS, Target
+    from ..greybox.fit import is_joint
     from ..greybox.joint_exports import JointTarget, simulator
-    from ..units import is_position
 
     require_place(args.out, (".json",))
     _require_place_of_model(args.model)
@@ -395,17 +395,15 @@ def physics_command(args: argparse.Namespace) -> None:
     data, found = sound(_motor_data(args))
     for fault in found:
         note(fault.warning)
-    is_joint = args.structure == "joint" or (
-        args.structure is None and args.speed_unit is None and is_position(data.output_unit)
-    )
-    if is_joint and args.plot:
+    of_joint = is_joint(data, args.structure, args.speed_unit)
+    if of_joint and args.plot:
         raise SettingError(
             name="--plot", expected="none for a joint", received="a file",
             remedy="write the joint (-o), or it as a model (--model)",
         )  # fmt: skip
     of_joints = {"--check": args.check, "--inertia": args.inertia, "--bandwidth": args.bandwidth}
     given = [name for name, value in of_joints.items() if value is not None]
-    if not is_joint and given:
+    if not of_joint and given:
         raise SettingError(
             name=given[0], expected="a position as output",
             received=data.output_unit or "an output without a unit", remedy="leave it out for a "
@@ -416,8 +414,8 @@ def physics_command(args: argparse.Namespace) -> None:
             name="--inertia", expected="--export or --check, whose forces are then in N m",
             received="neither", remedy="leave it out, or add --export mujoco joint.xml",
         )  # fmt: skip
-    if target not in (None, *get_args(JointTarget if is_joint else Target)):
-        names = ", ".join(get_args(JointTarget if is_joint else Target))
+    if target not in (None, *get_args(JointTarget if of_joint else Target)):
+        names = ", ".join(get_args(JointTarget if of_joint else Target))
         raise SettingError(f"--export: expected one of {names}, received {target!r}")
     if target in BOARDS and args.winding is None:
         raise SettingError(
@@ -430,14 +428,14 @@ def physics_command(args: argparse.Namespace) -> None:
         simulator()
     motor: Any = physics(
         data,
-        structure="joint" if is_joint else (args.structure or "dcmotor").split(","),
+        structure="joint" if of_joint else (args.structure or "dcmotor").split(","),
         current=args.current,
         volts=args.volts,
         speed_unit=args.speed_unit,
         intervals=args.intervals,
     )
     gains = None if args.bandwidth is None else motor.inner_gains(args.bandwidth)
-    own = {"inertia": args.inertia} if is_joint else {"winding": args.winding, "gear": args.gear}
+    own = {"inertia": args.inertia} if of_joint else {"winding": args.winding, "gear": args.gear}
     text = "" if target is None else motor.export(target, **own)
     if args.out is not None:
         motor.save(args.out)

@@ -20,6 +20,7 @@ from .joints import Joints, joints_of
 from .motor import Motor, motor_of
 
 Intervals: TypeAlias = Literal["curvature", "profile"]
+_Given: TypeAlias = dict[str, object]
 
 STRUCTURES = {
     "dcmotor": tuple(t for t in TERMS if t not in OPTIONAL),
@@ -148,18 +149,10 @@ def physics(
     identification. Errors are those of the free run.
     """
     if isinstance(data, Mapping):
-        beside = {
-            "current": current, "volts": volts, "speed_unit": speed_unit, "equations": equations,
-            "parameters": parameters,
-            "structure": None if structure in (None, "joint", ["joint"]) else structure,
-            "intervals": None if intervals == "curvature" else intervals,
-        }  # fmt: skip
-        for name, value in beside.items():
-            if value is not None:
-                raise SettingError(
-                    name=name, expected="none for several joints", received=repr(value),
-                    remedy="fit one of them: physics(joints['NAME'], ...)",
-                )  # fmt: skip
+        beside: _Given = {"equations": equations, "parameters": parameters}
+        if structure not in (None, "joint", ["joint"]):
+            beside["structure"] = structure
+        _require_none(beside | _of_motors(current, volts, speed_unit, intervals), "several joints")
         return joints_of({name: _positions(one) for name, one in data.items()})
     if equations is not None or parameters is not None:
         if equations is None or parameters is None or structure is not None or current is not None:
@@ -170,13 +163,10 @@ def physics(
             )  # fmt: skip
         records = records_of(data, None, speed_unit)
         return fit_equations(records, equations, parameters, states=states, substeps=substeps)
-    if structure is None:
-        is_joint = (
-            isinstance(data, Dataset) and speed_unit is None and is_position(data.output_unit)
-        )
-        structure = "joint" if is_joint else "dcmotor"
-    if structure in ("joint", ["joint"]):
-        return _joint(data, current, volts, speed_unit, intervals)
+    if is_joint(data, structure, speed_unit):
+        _require_none(_of_motors(current, volts, speed_unit, intervals), "a joint")
+        return joint_of(sound(_positions(data))[0])
+    structure = "dcmotor" if structure is None else structure
     if intervals not in get_args(Intervals):
         raise SettingError(
             name="intervals", expected="curvature or profile", received=repr(intervals),
@@ -194,19 +184,29 @@ def physics(
     return motor_of(found, volts, profile=intervals == "profile")
 
 
-def _joint(
-    data: Recording | Dataset, current: object, volts: object, speed_unit: object, intervals: str
-) -> Joint:
-    given = {"current": current, "volts": volts, "speed_unit": speed_unit}
-    if intervals != "curvature":
-        given["intervals"] = intervals
+def is_joint(data: object, structure: object, speed_unit: str | None) -> bool:
+    """Whether the data are those of a joint: as `structure` says, else if the output is a position
+    that `speed_unit` does not call a speed.
+    """
+    if structure is None:
+        stated = data.output_unit if isinstance(data, Dataset) else ""
+        return speed_unit is None and is_position(stated)
+    return structure in ("joint", ["joint"])
+
+
+def _of_motors(current: object, volts: object, speed_unit: object, intervals: str) -> _Given:
+    """The settings that a joint has not, None where they are left out."""
+    own = None if intervals == "curvature" else intervals
+    return {"current": current, "volts": volts, "speed_unit": speed_unit, "intervals": own}
+
+
+def _require_none(given: _Given, what: str) -> None:
     for name, value in given.items():
         if value is not None:
             raise SettingError(
-                name=name, expected="none for a joint, which is fitted to command and position",
+                name=name, expected=f"none for {what}, fitted to command and position",
                 received=repr(value), remedy="leave it out",
             )  # fmt: skip
-    return joint_of(sound(_positions(data))[0])
 
 
 def _positions(data: object) -> Dataset:

@@ -7,16 +7,16 @@ Read in this order: `recording` (`read`, `read_table`, formats that other packag
 """
 
 from .containers import Table
-from .joints import columns_of, joint_columns, read_joints
+from .joints import joint_columns, of_joint, read_joints
 from .recording import parse_source, read, read_columns, read_table
 from .roles import Roles, left_out, roles
 
 __all__ = [
     "Roles",
     "Table",
-    "columns_of",
     "joint_columns",
     "left_out",
+    "of_joint",
     "parse_source",
     "read",
     "read_columns",

@@ -144,9 +144,16 @@ def read_joints(
 
 
 def _dataset(table: Table, joint: str, unit: str, Ts: float | None) -> Dataset:
+    table, command, position = of_joint(table, joint, unit)
+    return read_columns(table, inputs=command, output=position, Ts=Ts)
+
+
+def of_joint(table: Table, joint: str, unit: str = "") -> tuple[Table, str, str]:
+    """The table with `unit` where it states none, and the joint's columns of command and position.
+    Raises `SettingError` for an unknown joint, and for units that do not go together.
+    """
     command, position = columns_of(table, joint)
-    data = read_columns(table, inputs=command, output=position, Ts=Ts)
-    given, known = data.input_units[0] or unit, data.output_unit or unit
+    given, known = (table.unit(name) or unit for name in (command, position))
     other = [stated for stated in (given, known) if unit and spelled(stated) != spelled(unit)]
     kinds = {radians(u) is None for u in (given, known) if is_position(u)}
     if other or len(kinds) > 1:
@@ -155,8 +162,8 @@ def _dataset(table: Table, joint: str, unit: str, Ts: float | None) -> Dataset:
             received=f"{unit} beside {other[0]} in the file" if other else f"{given} and {known}",
             remedy="leave it out" if other else "name the columns of one joint",
         )  # fmt: skip
-    units = {"input_units": (given,), "output_unit": known}
-    return replace(data, **units)  # type: ignore[arg-type]
+    units = {name: u for name, u in ((command, given), (position, known)) if u}
+    return replace(table, units={**table.units, **units}), command, position
 
 
 def _parts(table: Table) -> Iterator[Table]:
