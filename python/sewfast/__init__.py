@@ -21,13 +21,9 @@ if TYPE_CHECKING:
     from .control.loop import ClosedLoopRun, run
     from .control.machine import Machine, record
     from .control.margins import Margins, margins, operating_point
-    from .control.position import (
-        PositionController,
-        PositionRun,
-        follow_positions,
-        stop_at,
-    )
+    from .control.position import PositionController
     from .control.state_feedback import StateFeedback
+    from .control.stops import PositionRun, follow_positions, stop_at
     from .dataset import Dataset, Diagnosis, Experiment, diagnose
     from .errors import (
         DataError,
@@ -203,7 +199,8 @@ _HOMES = {
     "recording": "Recording",
     "moves": "Learned MoveTable Profile Reach Repetition learn load_table plan profile",
     "control.margins": "Margins margins operating_point",
-    "control.position": "PositionController PositionRun follow_positions stop_at",
+    "control.position": "PositionController",
+    "control.stops": "PositionRun follow_positions stop_at",
     "speed": "speed_from_counts",
     "validation": "Validation validate",
     "storage": "write_table",

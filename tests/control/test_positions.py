@@ -30,7 +30,7 @@ from sewfast import (
 )
 from sewfast.cli import main
 from sewfast.commissioning import SteppedBench
-from sewfast.control.position import position_of
+from sewfast.control.stops import position_of
 
 LEVELS = ((-3000.0, -6.6), (-1.0, -0.5), (0.0, 0.0), (1.0, 0.5), (3000.0, 6.6))
 SPEED = replace(PI, feedforward=Feedforward(8, 0.5, LEVELS, (0.05,) * 8))

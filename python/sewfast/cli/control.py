@@ -166,7 +166,8 @@ def _add_positions(parser: argparse.ArgumentParser) -> None:
 
 def _run_positions(args: argparse.Namespace, controller: SampledController) -> None:
     from ..commissioning.fmu import is_fmu
-    from ..control.position import follow_positions, require_position, stop_at
+    from ..control.position import require_position
+    from ..control.stops import follow_positions, stop_at
 
     position = require_position(controller, "run --stop-at")
     if is_port(args.on):
