@@ -34,8 +34,6 @@ Way: TypeAlias = Literal["onward", "shortest"]
 WAYS = ("onward", "shortest")
 FARTHEST = 2.0**50
 """Largest count that is told from its neighbours with room."""
-RELEASED = 32
-"""Samples without a move after which a loop lets go (`KEPT` in the crate)."""
 LONGEST = 10_000_000
 """Most samples after a stop."""
 
@@ -381,7 +379,8 @@ def follow_positions(
     unit : str
         Their unit: ``deg``, ``rad``, ``turns`` or ``counts``.
     release : bool
-        Whether the command goes to 0 once the shaft has come to rest; by default the loop holds it.
+        Whether the command goes to 0 once the shaft has come to rest, until the next goal; by
+        default the loop holds it.
     disturbance : array, shape (N,), optional
         As for `stop_at`.
     name : str
@@ -399,14 +398,6 @@ def follow_positions(
     known = position_unit(unit)
     r = vector("goals", goals) * counts_of(1.0, known, position.counts_per_rev)
     _within("goals", r[np.isfinite(r)])
-    if release:
-        # a loop that has let go does not take the next goal up
-        changes = np.concatenate([[0], np.flatnonzero(np.diff(r)) + 1])
-        if np.any(np.diff(changes) >= RELEASED):
-            raise SettingError(
-                name="release", expected="goals that stand at the end only", received="others",
-                remedy="leave it out, or release after each run",
-            )  # fmt: skip
     found = _played(position, on, r, name, None, release, disturbance)
     return replace(found, unit=known)
 

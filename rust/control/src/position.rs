@@ -169,7 +169,7 @@ pub struct PositionDesign<T> {
     pub landing: T,
     /// Speed of that part \[y\].
     pub creep: T,
-    /// Whether the command goes to 0 once the shaft has come to rest at its goal; otherwise it holds it.
+    /// Whether the command goes to 0 once the shaft has come to rest at its goal, until the next one; otherwise it holds it.
     pub releases: bool,
 }
 
@@ -343,6 +343,11 @@ impl<T: Real> PositionLoop<T> {
             Mode::Goals => reference,
             Mode::Stop(goal) => goal,
         };
+        let begins_again = self.speed.is_manual() && goal != self.goal;
+        if begins_again {
+            // the shaft may have been turned by hand
+            self.shift();
+        }
         self.advance(goal);
         let samples = self.design.smoothing;
         let (newest, oldest) = (self.path.at(0), self.path.at(samples));
@@ -359,7 +364,12 @@ impl<T: Real> PositionLoop<T> {
             y: self.design.gain * error / self.design.counts_per_unit,
             integrates: !(stands && near),
         };
-        self.speed.step_corrected(speed, y, -T::ZERO, correction)
+        let u = self.speed.step_corrected(speed, y, -T::ZERO, correction);
+        if begins_again {
+            // its integral term is now that of a command of 0 here
+            self.speed.set_automatic();
+        }
+        u
     }
 
     /// From the next sample on references are goals: positions in counts since the reset. One that stands is gone to within
@@ -440,15 +450,20 @@ impl<T: Real> PositionLoop<T> {
         if self.mode != Mode::Speed {
             return;
         }
-        let shift = self.counts - self.place();
-        for place in &mut self.places.kept {
-            *place += shift;
-        }
+        self.shift();
         let (step, samples) = (self.rate * self.per_sample, self.design.smoothing);
         let half = T::ONE / (T::ONE + T::ONE);
         let newest = self.places.at(0) + half * T::from_count(samples - 1) * step;
         for age in (0..KEPT).rev() {
             self.path.push(newest - T::from_count(age) * step);
+        }
+    }
+
+    /// Moves the profile to where the counts are.
+    fn shift(&mut self) {
+        let shift = self.counts - self.place();
+        for place in self.path.kept.iter_mut().chain(&mut self.places.kept) {
+            *place += shift;
         }
     }
 

@@ -266,6 +266,22 @@ fn at_rest_it_lets_go_if_asked() {
         motor.advance(u);
     }
     assert_eq!(u, 0.0);
+    // somebody turns the shaft, and a new goal is gone to from there
+    for _ in 0..100 {
+        motor.position += 5.0 / PER;
+        assert_eq!(law.step(400.4, motor.moved()), 0.0);
+    }
+    for _ in 0..20 {
+        law.step(400.4, 0.0);
+    }
+    let mut steepest = 0.0_f64;
+    for _ in 0..3000 {
+        let moved = motor.moved();
+        let before = std::mem::replace(&mut u, law.step(1100.0, moved));
+        steepest = steepest.max((u - before).abs());
+        motor.advance(u);
+    }
+    assert!((motor.before - 1100.0).abs() <= 1.0 && u == 0.0 && steepest < 2.0, "{steepest}");
     law.reset();
     assert_eq!((law.counts(), law.stands()), (0.0, false));
 }
