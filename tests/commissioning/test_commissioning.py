@@ -47,6 +47,7 @@ from sewfast.commissioning import STAGES, Refusal, gains, training, verification
 from sewfast.commissioning.bench import DriveBench, MachineBench, bench_of
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.gains import Requirements
+from sewfast.commissioning.positions import position_loop, unmet, verified_stops
 from sewfast.errors import LinkError
 from sewfast.link import VirtualDevice, connect
 from sewfast.report import commissioned, report
@@ -268,6 +269,52 @@ def test_a_drives_volt_limit_is_lowered_as_long_as_it_lasts() -> None:
             assert isinstance(bench, DriveBench)
             assert bench.volt == pytest.approx(7.0)
         assert drive.limits().volt == before
+
+
+def test_a_position_loop_stops_where_it_is_predicted(whole: Commissioning, tmp_path: Path) -> None:
+    controller, models, cost = whole.controller, whole.models, whole.cost
+    assert isinstance(controller, Controller)
+    assert models is not None
+    assert cost is not None
+    practice = {c.reference: c.predicted.r for c in whole.comparisons}
+    position = position_loop(controller, models, practice, cost, None, 1500.0)
+    assert position.controller.fastest == 1500.0
+    bench, kept = MachineBench(VirtualMachine(), speed=3000.0), []
+    stops = verified_stops(position.controller, bench, models, 2000.0, kept.append)
+    assert kept[-1] == stops
+    assert unmet(stops) == ""
+    assert all(s.measured is not None and s.measured.metrics()["passed"] < 0.5 for s in stops)
+    # a drive that brakes less than its models is not verified
+    weak = VirtualMachine(parameters={"inertia": 0.003})
+    missed = verified_stops(position.controller, MachineBench(weak), models, 2000.0, kept.append)
+    assert "passed its goal" in unmet(missed)
+    found = replace(whole, position=position, stops=stops)
+    page = found.save(tmp_path / "positions").read_text()
+    assert "Stops at an angle" in page
+    assert "270deg from 1500 RPM" in page
+    assert "270deg from 1500 RPM" in str(found)
+    law = load_controller(tmp_path / "positions/controllers/position.json")
+    assert law == position.controller
+    slow = replace(controller, Ts=1e-4, filter_samples=1, feedforward=None)
+    with pytest.raises(Refusal, match="slow drive"):
+        position_loop(slow, models, practice, cost, None, 1500.0)
+
+
+def test_positions_are_asked_for_by_name_and_not_of_a_device() -> None:
+    with pytest.raises(SettingError, match="loop"):
+        commission(VirtualMachine(), loop="angle")  # type: ignore[arg-type]
+    with VirtualDevice(fast=True) as device, connect(device.port) as drive:
+        drive.set_limits()
+        with pytest.raises(SettingError, match="no device has positions"):
+            commission(drive, loop="position")
+        assert drive.outcome is None
+
+
+@pytest.mark.nightly("a commissioning of its own")
+def test_positions_are_commissioned() -> None:
+    found = commission(VirtualMachine(), loop="position", **SMALL)
+    assert found.is_verified
+    assert len(found.stops) == 3
 
 
 def test_a_run_of_which_the_link_lost_samples_is_made_once_more() -> None:

@@ -52,6 +52,8 @@ OPTIONS = """\
     tenth of --u-max; 0: not required)
 --Ms MS  float  largest sensitivity allowed (1.8; inf: no limit)
 --time-budget S  float  time of the search for gains (no limit)
+--loop  {speed,position}=speed  with a position loop over that of the speed, verified by stops at an
+    angle
 --seed N  int=0  seed of the random signals, the networks and the search (0)
 --resume  flag  continue from the recordings of an attempt with the same settings in DIR
 """
@@ -124,6 +126,7 @@ def _commissioned(args: argparse.Namespace) -> Commissioning:
             "load": args.load,
             **({} if args.Ms is None else {"Ms": args.Ms}),
             "time_budget": args.time_budget,
+            "loop": args.loop,
             "seed": args.seed,
             "progress": lambda done, total, stage: progress.say(stage),
             "folder": args.out,

@@ -15,6 +15,7 @@ from ..errors import FitError, SettingError
 from ..gains import real, whole
 from ..report.commissioned import file_name
 from ..tuning.objective import LARGEST_MS, Constraints
+from ..tuning.search import LOOPS
 from ..tuning.task import budget
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ class Demands:
     those of `excitations.standard`. `members` models make the ensemble, and the search tries
     `evaluations` controllers for `time_budget` [s]. `load` is a step of command [V] (None: a share
     of `u_max`; 0: not required), `Ms` the largest sensitivity on the small signals; above `stated`
-    [RPM] the machine ends a run.
+    [RPM] the machine ends a run. `positions`: whether there is to be a position loop.
     """
 
     u_max: float
@@ -74,6 +75,7 @@ class Demands:
     Ms: float | None = LARGEST_MS
     time_budget: float | None = None
     stated: float = math.inf
+    positions: bool = False
 
     @property
     def top(self) -> float:
@@ -95,9 +97,12 @@ def demands(
     load: float | None = None,
     Ms: float | None = LARGEST_MS,
     time_budget: float | None = None,
+    loop: str = "speed",
 ) -> Demands:
     """The demands, checked against the machine's limits."""
     _require_machine(machine)
+    if loop not in LOOPS:
+        raise SettingError(name="loop", expected=f"one of {', '.join(LOOPS)}", received=repr(loop))
     volt = machine.volt if u_max is None else real("u_max", u_max)
     if not 0.0 < volt < math.inf:
         raise SettingError(
@@ -139,6 +144,7 @@ def demands(
         None if Ms in (None, math.inf) else Constraints(Ms=Ms).Ms,
         None if time_budget is None else budget(time_budget),
         machine.speed,
+        loop == "position",
     )
 
 

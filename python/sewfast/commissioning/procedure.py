@@ -29,10 +29,10 @@ from ..recording import Recording
 from ..rules import Fopdt
 from ..threads import available
 from ..tuning.objective import LARGEST_MS, Cost
-from ..tuning.search import TuningResult
+from ..tuning.search import Loop, TuningResult
 from ..tuning.task import GAINS
 from . import excitations
-from .bench import RecordedBench, bench_of, description_of
+from .bench import DriveBench, RecordedBench, bench_of, description_of
 from .checkpoint import STAGES, Checkpoint
 from .demands import Demands, Refusal, demands, require
 from .excitations import first_motion, lost_motion, standard, step_response
@@ -49,6 +49,7 @@ from .gains import (
     sensible,
     start_of,
 )
+from .positions import position_loop, unmet, verified_stops
 from .result import UNREACHED, VERIFIED, VERIFIED_POORLY, Commissioning, require_own
 from .shaking import margins_at_work
 from .slow import Thinning, TurnLoad, turn_load
@@ -85,6 +86,7 @@ def commission(
     load: float | None = None,
     Ms: float | None = LARGEST_MS,
     time_budget: float | None = None,
+    loop: Loop = "speed",
     seed: int = 0,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -138,6 +140,9 @@ def commission(
     time_budget : float, optional
         Time of the search [s], after which the best gains so far are used. Then the same seed no
         longer gives the same gains.
+    loop : "speed" or "position"
+        With a position loop over the verified speed loop (`Commissioning.position`), verified by
+        stops at an angle from three speeds.
     seed : int
         Seed of the random signals, the networks' initial weights and the search.
     threads : int, optional
@@ -184,6 +189,12 @@ def commission(
     """
     _require_kinds(cost, progress, cancel, between)
     with bench_of(on, u_max, cancel) as machine:
+        if loop == "position" and isinstance(machine, DriveBench):
+            raise SettingError(
+                name="loop", expected="'speed', as no device has positions", received="'position'",
+                remedy="commission the speed loop; positions run on virtual machines, FMUs and "
+                "your own Machine",
+            )  # fmt: skip
         asked = demands(
             machine,
             u_max=u_max,
@@ -197,6 +208,7 @@ def commission(
             load=load,
             Ms=Ms,
             time_budget=time_budget,
+            loop=loop,
         )
         journal = Journal(machine.name, progress, cancel, between)
         if resume and folder is None:
@@ -394,11 +406,20 @@ def _carry_out(
             journal.keep(margins=at_work[0], response=at_work[1])
         else:
             journal.say(f"the margins could not be measured at {speed:g} RPM")
-    journal.finish()
     if missed := unreached(journal.result(VERIFIED).comparisons):
         if why := journal.cause or _cause(machine):
             journal.keep(cause=why)
         return journal.result(UNREACHED, f"{missed}; {why}" if why else missed)
+    if asked.positions:
+        model = None if small is None else small.model
+        position = position_loop(controller, ensemble, practice, weights, model, asked.top)
+        journal.keep(position=position)
+        stops = verified_stops(
+            position.controller, machine, ensemble, asked.speed, lambda new: journal.keep(stops=new)
+        )
+        if missed := unmet(stops):
+            return journal.result(UNREACHED, missed)
+    journal.finish()
     found = journal.result(VERIFIED)
     return replace(found, verdict=VERIFIED_POORLY) if found.is_predicted_poorly else found
 

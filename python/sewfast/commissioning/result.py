@@ -31,9 +31,11 @@ from ..storage import write_table
 from ..tables import Shown
 from ..trust import Judgement
 from ..tuning.objective import Cost
+from ..tuning.position import PositionTuning
 from ..tuning.search import TuningResult
 from .checkpoint import clear, prepare, require_repeatable
 from .excitations import Motion
+from .positions import Stop
 from .slow import Thinning, TurnLoad
 from .small_signal import SmallSignal
 from .training import Rival
@@ -105,6 +107,10 @@ class Commissioning(Shown):
         lowered.
     recorded_in : Path or None
         The folder in which each recording was written as it was taken.
+    position : PositionTuning or None
+        The position loop over the controller's kind of gains, if one was asked for.
+    stops : tuple of Stop
+        Stops at an angle that verify it: predicted by each model, and measured.
     cause : Cause or None
         What is wrong with the machine, if it was refused or missed its target and a run shows why.
     """
@@ -137,6 +143,8 @@ class Commissioning(Shown):
     notes: tuple[str, ...] = ()
     recorded_in: Path | None = None
     cause: Cause | None = None
+    position: PositionTuning | None = None
+    stops: tuple[Stop, ...] = ()
 
     @property
     def is_verified(self) -> bool:
@@ -260,6 +268,8 @@ class Commissioning(Shown):
         lines += [f"  note           {note}" for note in self.notes]
         lines += _evidence(self)
         lines += [_comparison(c) for c in self.comparisons]
+        if self.position is not None:
+            lines += [f"  position loop  {self.position}", *map(str, self.stops)]
         if self.measured_cost is not None and self.predicted_cost is not None:
             lines.append(
                 f"  cost           predicted {self.predicted_cost:.4g}, measured "
@@ -412,6 +422,8 @@ def _artefacts(found: Commissioning, folder: Path) -> None:
     for name, controller in (("tuned", found.controller), ("first", found.first)):
         if controller is not None:
             controller.save(folder / "controllers" / f"{name}.json")
+    if found.position is not None:
+        found.position.controller.save(folder / "controllers" / "position.json")
     if found.models is not None:
         found.models.save(folder / "models" / "ensemble.json")
     tables: list[Callable[[], object]] = [
@@ -424,6 +436,12 @@ def _artefacts(found: Commissioning, folder: Path) -> None:
         for kind, loop in (("predicted", c.predicted), ("measured", c.measured))
         if loop is not None
     ]
+    tables += [
+        partial(write_table, folder / run_file(f"stop_{stop.name}", "measured"),
+                stop.measured.columns())
+        for stop in found.stops
+        if stop.measured is not None
+    ]  # fmt: skip
     failures: list[Exception] = []
     for table in tables:
         try:
@@ -522,6 +540,9 @@ def numbers(c: Commissioning) -> dict[str, Any]:
         "predicted_cost": c.predicted_cost,
         "measured_cost": c.measured_cost,
         "references": {x.reference: _comparison_numbers(x) for x in c.comparisons},
+        "position": None
+        if c.position is None
+        else {**c.position.to_json(), "stops": [stop.to_json() for stop in c.stops]},
     }
 
 

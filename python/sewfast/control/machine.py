@@ -365,6 +365,11 @@ class MachineBench:
     def follow(
         self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
+        if controller.LOOP != "speed":
+            stepped = SteppedBench(
+                self.machine, self.Ts, self.counts_per_rev, self.volt, self.name, self.speed
+            )
+            return stepped.follow(controller, r, name, watch=watch)
         # the machine is deterministic: run it again with the same commands for its counts
         found = run(controller, self.machine, r, name=name)
         recording = self.excite(found.u, name)
@@ -400,7 +405,7 @@ class Stepped(Protocol):
     def reset(self) -> None:
         """Bring it to rest."""
 
-    def step(self, u: float) -> None:
+    def step(self, u: float) -> object:
         """Hold a command [V] for one sample."""
 
 

@@ -64,6 +64,7 @@ def context(folder: Path) -> dict[str, Any]:
             "verified": _verified(found),
             "analysed": section(folder),
             "margins": _predicted_and_measured(found),
+            "stops": _stops(found),
             "response": _response(folder),
             "motor": motor_section(folder),
             "loops": [_picture(folder, name, n) for name, n in found["references"].items()],
@@ -166,6 +167,32 @@ def _predicted_and_measured(found: Mapping[str, Any]) -> Table | None:
     )
     caption = f"Margins about {rpm(margins['speed'])}; of Ms the 95 % band."
     return Table(caption, ("margin", "predicted", "measured on the machine"), rows)
+
+
+def _stops(found: Mapping[str, Any]) -> Table | None:
+    """Stops at an angle as predicted and as measured; None without a position loop."""
+    position = found.get("position")
+    if not position:
+        return None
+
+    def shown(value: float | None) -> str:
+        return "–" if value is None else significant(value)
+
+    rows = tuple(
+        (
+            stop["name"],
+            shown(stop["predicted"]["off"]),
+            *(shown((stop["measured"] or {}).get(name)) for name in ("off", "passed", "turns")),
+        )
+        for stop in position["stops"]
+    )
+    caption = (
+        f"Position gain {significant(position['gain'])} 1/s, "
+        f"{percent(100.0 * position['share'], 0)} of what the models can do; Ms of both loops "
+        f"{shown(position['Ms'])}."
+    )
+    header = ("stop", "off, predicted [deg]", "off [deg]", "passed by [deg]", "turns")
+    return Table(caption, header, rows)
 
 
 def _response(folder: Path) -> Picture | None:

@@ -119,18 +119,16 @@ class _Judged:
         return self.passed <= 1.0
 
 
-def with_position(task: TuningTask, result: TuningResult) -> PositionTuning:
-    """The position loop over a tuned speed loop.
+def with_position(task: TuningTask, speed: Controller) -> PositionTuning:
+    """The position loop over a speed loop that was tuned on the same plants.
 
     Raises
     ------
     SettingError
-        For a speed loop of another kind, without encoder or unfit, models that are poor, and plants
-        whose output is no speed that is 0 at rest.
+        If there is no steady speed to take Ms at.
     FitError
         If no gain keeps the limits of Ms.
     """
-    speed = _sound(task, result)
     reach = Reach.of(task.plants, u_min=speed.u_min, u_max=speed.u_max, share=1.0)
     rates, fastest = _core.position_rates(reach.core())
     rise = max(max(up, down) for _, up, down in rates) / (reach.jerk * speed.Ts)
@@ -166,8 +164,15 @@ def with_position(task: TuningTask, result: TuningResult) -> PositionTuning:
     )
 
 
-def _sound(task: TuningTask, result: TuningResult) -> Controller:
-    """The speed loop, if a position loop may stand on it."""
+def sound_speed_loop(task: TuningTask, result: TuningResult) -> Controller:
+    """The speed loop of a search, if a position loop may stand on it.
+
+    Raises
+    ------
+    SettingError
+        For one of another kind or unfit, models that are poor, and plants whose output is no speed
+        that is 0 at rest.
+    """
     if result.grade in ("poor", "useless"):
         raise SettingError(
             name="loop", expected="models that predict the drive", received=f"{result.grade} ones",

@@ -23,7 +23,7 @@ from ..tables import Table, significant
 from .lead import LEADING, LEADS, PART, WEIGHTS, Effort, Lead, Led, with_lead
 from .objective import Constraints, Cost, LoadStep
 from .opinion import SHARE, SecondOpinion, second_opinion
-from .position import PositionTuning, with_position
+from .position import PositionTuning, sound_speed_loop, with_position
 from .robustness import HAIR, within_default
 from .task import (
     LOOK,
@@ -411,7 +411,7 @@ def tune(
     if loop == "speed":
         return result
     try:
-        position = with_position(task, result)
+        position = with_position(task, sound_speed_loop(task, result))
     except KeyboardInterrupt:
         raise Interrupted(result.controller) from None
     return replace(result, controller=position.controller, position=position)
