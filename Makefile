@@ -29,7 +29,7 @@ MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest n
   night-bits night-logs night-computing night-waiting night-budgets
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo pictures publishable accuracy assumptions battery strangers commissioning tracking moves positions joints drives faults nonsense motors fleet interrupts fuzz-logs mutations screens studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed parting laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help dev demo pictures publishable accuracy assumptions battery strangers commissioning tracking moves positions axes joints drives faults nonsense motors fleet interrupts fuzz-logs mutations screens studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed parting laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -332,11 +332,14 @@ physics: $(VENV)/bench.stamp ## parameters of motors whose truth is known (docs/
 tracking: $(VENV)/bench.stamp ## what a feedforward is worth, beside simple-pid and a linear-quadratic regulator (SEEDS=5 MACHINES=8)
 	$(BIN)/python benches/tracking.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES))
 
-moves: $(VENV)/bench.stamp ## what a table of a known move brings, and what repetitions add (SEEDS=5 MACHINES=8, RUNS=200 on changed machines)
-	$(BIN)/python benches/moves.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES)) $(if $(RUNS),--runs $(RUNS))
+moves: $(VENV)/bench.stamp ## what a table of a known move brings, and what repetitions add (SEEDS=5 MACHINES=8, MOTORS=20 of MuJoCo, RUNS=200 on changed machines)
+	$(BIN)/python benches/moves.py $(if $(MOTORS),--motors $(MOTORS)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES)) $(if $(RUNS),--runs $(RUNS))
 
 positions: $(VENV)/bench.stamp ## stops at an angle and standstill on virtual machines (SEEDS=1 MACHINES=8 STOPS=100 MODEL=grey_box)
 	$(BIN)/python benches/positions.py $(if $(MODEL),--model $(MODEL)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES)) $(if $(STOPS),--stops $(STOPS))
+
+axes: $(VENV)/bench.stamp ## position loops on 20 axes of MuJoCo beside LinuxCNC's autotuned pid (Debian's linuxcnc-uspace, if it is there; ONLY="0 4")
+	$(BIN)/python benches/axes.py $(if $(ONLY),--only $(ONLY))
 
 joints: $(VENV)/bench.stamp ## positions: drives like EMPS, smart servos and MuJoCo joints (KIND=servos SEEDS="0 1" PHYSICS=1 HELD=1; SAGE=folder of real motions, TRAIN=multisine)
 	$(BIN)/python benches/joints.py $(if $(SAGE),--sage $(SAGE)) $(if $(TRAIN),--train $(TRAIN)) $(if $(KIND),--kind $(KIND)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(PHYSICS),--physics) $(if $(HELD),--held)

@@ -4,6 +4,9 @@ Each machine is recorded as in the README's example, a model identified and gain
 a table of the trapezoid is planned on the model (`plan`), played on the machine, and learned on for
 eight repetitions (`learn`). Errors are those of the true speed [RPM rms]; learning sees counts.
 
+`--motors` does the same with motors of MuJoCo, on trapezoids to their working speed that take half
+again as long as the motor can.
+
 `--runs` repeats learning on machines that changed after identification: inertia a quarter off
 either way, noise on the load that no two runs share, and a further load from repetition 5 on.
 """
@@ -20,7 +23,9 @@ from typing import Any
 
 import numpy as np
 
+import mujoco_motors
 import sewfast
+from mujoco_motors import Motor
 from sewfast import Controller, MoveTable, VirtualMachine, learn, plan, run, signals
 from sewfast.commissioning import SteppedBench
 from sewfast.models import Model
@@ -45,7 +50,9 @@ def error(loop: sewfast.ClosedLoopRun) -> float:
     return float(np.sqrt(np.mean((loop.y - loop.r) ** 2)))
 
 
-def drive_of(seed: int, machine: VirtualMachine, kept: Path | None) -> Drive:
+def drive_of(
+    seed: int, machine: VirtualMachine | SteppedBench, kept: Path | None, kind: str = "auto"
+) -> Drive:
     """Model and gains, with feedforward and without; taken from a folder if they are there."""
     names = ("model", "with", "alone")
     if kept is not None:
@@ -53,7 +60,11 @@ def drive_of(seed: int, machine: VirtualMachine, kept: Path | None) -> Drive:
         if all(f.exists() for f in files):
             pids = map(sewfast.load_controller, files[1:])
             return sewfast.load_model(files[0]), *pids  # type: ignore[return-value]
-    model = sewfast.identify(recorded(machine), seed=seed)
+    if isinstance(machine, VirtualMachine):
+        data = recorded(machine)
+    else:
+        data = mujoco_motors.recorded(machine)
+    model = sewfast.identify(data, model=kind, seed=seed)
     tuned = sewfast.tune(model, counts_per_rev=machine.counts_per_rev, seed=seed)
     alone = tuned.pid if tuned.lead is None else tuned.lead.alone
     if kept is not None:
@@ -64,14 +75,15 @@ def drive_of(seed: int, machine: VirtualMachine, kept: Path | None) -> Drive:
 
 
 def row(
-    model: Model, led: Controller, alone: Controller, machine: VirtualMachine
-) -> dict[str, Any]:
+    model: Model, led: Controller, alone: Controller, machine: VirtualMachine | SteppedBench,
+    reference: str | np.ndarray = "trapezoid",
+) -> dict[str, Any]:  # fmt: skip
     """Errors on one machine, and the seconds that a plan took."""
-    plain = run(alone, machine, "trapezoid")
-    found: dict[str, Any] = {"alone": error(plain), "with": error(run(led, machine, "trapezoid"))}
+    plain = run(alone, machine, reference)
+    found: dict[str, Any] = {"alone": error(plain), "with": error(run(led, machine, reference))}
     for name, controller in (("table", led), ("table alone", alone)):
         began = time.perf_counter()
-        table = plan(controller, model, "trapezoid")
+        table = plan(controller, model, reference)
         found[f"{name} s"] = time.perf_counter() - began
         played = run(controller, machine, table=table)
         found[name] = error(played)
@@ -81,6 +93,14 @@ def row(
         found[f"{name} change"] = float(np.std(np.diff(best.u)) / np.std(np.diff(plain.u)))
         found[f"{name} played"] = len(learned.repetitions)
     return found
+
+
+def trapezoid(motor: Motor) -> np.ndarray:
+    """To the working speed, half of that without load, and back [RPM]."""
+    ramp = 1.5 * math.log(2.0) * max(motor.lag, 0.02)
+    times = np.cumsum([0.1, ramp, 0.4, ramp, 0.3])
+    t = np.arange(round(times[-1] / 1e-3)) * 1e-3
+    return np.interp(t, times[:4], [0.0, motor.speed, motor.speed, 0.0])
 
 
 class Shaken:
@@ -141,18 +161,27 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=5, help="on the nominal machine (5)")
     parser.add_argument("--machines", type=int, default=8, help="virtual:1 to this, seed 0 (8)")
+    parser.add_argument("--motors", type=int, default=0, help="of MuJoCo in their place (0)")
+    parser.add_argument("--model", default="auto", help="kind of the models (auto)")
     parser.add_argument("--runs", type=int, default=0, help="on changed machines (0)")
     parser.add_argument("--first", type=int, default=0, help="the first of these runs (0)")
     parser.add_argument("--kept", type=Path, help="folder that keeps models and gains")
     args = parser.parse_args()
-    cases = [(f"virtual, seed {s}", s, VirtualMachine()) for s in range(args.seeds)]
-    cases += [(f"virtual:{k}", 0, VirtualMachine(k)) for k in range(1, args.machines + 1)]
-    drives = {title: (drive_of(s, m, args.kept), m) for title, s, m in cases}
+    cases: list[tuple[str, int, Any, Any]] = []
+    if args.motors:
+        for motor in map(mujoco_motors.drawn, range(args.motors)):
+            bench = mujoco_motors.bench_of(motor)
+            cases.append((motor.name, 0, bench, trapezoid(motor)))
+    else:
+        cases += [(f"virtual, seed {s}", s, VirtualMachine(), None) for s in range(args.seeds)]
+        cases += [(f"virtual:{k}", 0, VirtualMachine(k), None) for k in range(1, args.machines + 1)]
     if args.runs:
-        return changed(list(drives.values()), range(args.first, args.first + args.runs))
+        drives = [(drive_of(s, m, args.kept, args.model), m) for _, s, m, _ in cases]
+        return changed(drives, range(args.first, args.first + args.runs))
     rows = {}
-    for title, (drive, machine) in drives.items():
-        found = rows[title] = row(*drive, machine)
+    for title, seed, machine, reference in cases:
+        drive = drive_of(seed, machine, args.kept, args.model)
+        found = rows[title] = row(*drive, machine, "trapezoid" if reference is None else reference)
         print(
             f"{title:16} alone {found['alone']:5.1f} RPM, feedforward {found['with']:5.1f}, "
             f"table {found['table']:5.1f} ({found['table s']:.2f} s), learned "

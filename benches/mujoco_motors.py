@@ -23,7 +23,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from sewfast import commission
+from sewfast import Dataset, commission, signals
 from sewfast.commissioning import Refusal, SteppedBench
 
 MOTORS = 20
@@ -154,6 +154,15 @@ def bench_of(motor: Motor) -> SteppedBench:
     return SteppedBench(
         machine, Ts=1e-3, counts_per_rev=motor.counts, volt=motor.volt, name=motor.name
     )
+
+
+def recorded(bench: SteppedBench) -> Dataset:
+    """The motor under the signals of README's example, scaled to its largest command."""
+    parts = []
+    for name in ("chirp_lo_hi", "saturating"):
+        u = signals.excitation(name)
+        parts.append(bench.excite(u * (0.9 * bench.volt / np.max(np.abs(u))), name).dataset())
+    return Dataset.concat(parts)
 
 
 # --- figures --------------------------------------------------------------------------------------
