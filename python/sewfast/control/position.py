@@ -54,7 +54,8 @@ class PositionController(SampledController):
     share : float
         Part of these rates that a profile uses, above 0 to 1: the rest is the feedback's.
     smoothing : int
-        Samples in which a rate comes up, 1 to 31: a mean of the profile, which bounds its jerk.
+        Samples in which a rate comes up, 1 to 31: a mean of the profile, which bounds its jerk. If
+        they are odd, a goal that moves is followed half a sample late.
     landing, creep : float
         The last part of a move [counts] and the speed at which it is passed [y]: what braking makes
         swing dies away before the goal. 0 for no such part.

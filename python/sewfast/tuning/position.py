@@ -134,7 +134,8 @@ def with_position(task: TuningTask, speed: Controller) -> PositionTuning:
     rise = max(max(up, down) for _, up, down in rates) / (reach.jerk * speed.Ts)
     first = PositionController(
         speed, gain=GAINS[0], fastest=fastest, rates=tuple(rates[:RATES]), share=SHARES[0],
-        smoothing=int(min(max(1.0, round(rise)), SMOOTHED)), creep=fastest,
+        # an even mean delays a goal that moves by whole samples
+        smoothing=2 * int(min(max(1.0, round(0.5 * rise)), SMOOTHED // 2)), creep=fastest,
         notes="position loop tuned by simulated stops" + task.assumed,
     )  # fmt: skip
     stiff = list(_within_limits(task, first))
