@@ -633,4 +633,6 @@ def test_the_studio_offers_logs_and_no_models(tmp_path: Path) -> None:
     u = np.repeat([1.0, 2.0, 0.0, 3.0], 100)
     data = sewfast.Dataset.from_arrays(u[1:], 0.5 * u[:-1] + 0.01 * np.sin(np.arange(399)), 0.01)
     sewfast.identify(data, model="arx").save(tmp_path / "model.json")
+    with refuses(DataError, received="sewfast.model"):
+        read_table(tmp_path / "model.json")
     assert Project(tmp_path).recordings() == ["a.log", "b.jsonl", "c.json"]

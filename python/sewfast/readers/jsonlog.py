@@ -38,6 +38,13 @@ def read_json(path: Path, raw: bytes) -> Table:
         rows, lines = _rows(found), None
     except (ValueError, RecursionError):
         rows, lines, notes = _of_lines(path, text)
+    kind = found.get("format") if isinstance(found, dict) else None
+    if isinstance(kind, str) and kind.startswith("sewfast."):
+        raise DataError(
+            name=str(path), expected="a recording", received=f"a file of kind {kind!r}",
+            remedy="name the recording; such a file goes where a model, a controller or a result "
+            "is asked for",
+        )  # fmt: skip
     table = _by_row(path, rows, lines) if any(rows) else _by_column(path, found)
     return Table(
         path, table.columns, table.units, table.unusable, lines, notes=notes, moments=table.moments
