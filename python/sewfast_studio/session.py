@@ -212,8 +212,8 @@ _MESSAGES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     **dict.fromkeys(("columns", "look", "validate", "identify"), (_STEP, ("file",))),
     "commission": ({"machine": NAME, **_EFFORT}, ()),
     "tune_open": (_TUNE, ("model",)),
-    "tune_move": (_TUNE, ("model", "values")),
-    "tune_costs": (_TUNE, ("model", "values")),
+    "tune_move": ({**_TUNE, "noise": {"type": "boolean"}}, ("model", "values")),
+    **dict.fromkeys(("tune_costs", "tune_verdict"), (_TUNE, ("model", "values"))),
     **dict.fromkeys(("tune_search", "tune_front"), _SEARCH),
     "loop": ({**_TUNE, "response": {"type": ["integer", "null"]}}, ("model", "values")),
     "bode": (
