@@ -502,7 +502,7 @@ def test_a_refusal_stands_at_its_field(tuned: Studio, browser: Any) -> None:
     until(lambda: browser.find_elements("css selector", ".refused"))
     assert not at("tune-error").is_displayed()
     assert at("evaluations").get_attribute("aria-invalid") == "true"
-    assert at(at("evaluations").get_attribute("aria-describedby")).text.startswith("expected")
+    assert at(at("evaluations").get_attribute("aria-describedby")).text.startswith("Expected")
     if "STUDIO_PICTURES" in os.environ:
         browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", at("evaluations"))
         browser.save_screenshot(str(Path(os.environ["STUDIO_PICTURES"]) / "refused.png"))
