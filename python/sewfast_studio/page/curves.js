@@ -51,7 +51,8 @@ export class Chart {
     if (!w || !h) return;
     if (canvas.width !== Math.round(w * scale)) canvas.width = w * scale;
     if (canvas.height !== Math.round(h * scale)) canvas.height = h * scale;
-    const g = canvas.getContext("2d");
+    // a processor paints a few lines sooner than they take to a graphics card and back, above all where there is none
+    const g = canvas.getContext("2d", { willReadFrequently: true });
     g.setTransform(scale, 0, 0, scale, 0, 0); g.clearRect(0, 0, w, h);
     this.picture(g, w, h, printing ? TOKENS.map((_, k) => k === PAPER ? "#fff" : k === 1 ? "#888" : "#000") : this.colours ??= this.resolved());
   }

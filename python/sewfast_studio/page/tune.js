@@ -232,15 +232,23 @@ export function mount(root, { ask, on, mark = () => {} }) {
 
   const text = v => v === null || v === undefined ? "none" : Number(v.toPrecision(3)).toString();
 
+  /** The table is made when its columns change; a move only writes into it, which the browser lays out sooner. */
   function numbers(shown) {
-    const table = $("numbers"), head = document.createElement("tr"), unit = { u: opened.u_unit, y: opened.y_unit, "u/y": `${opened.u_unit}/${opened.y_unit}` };
-    for (const title of ["number", ...shown.map(([label]) => label), "unit"]) { const th = document.createElement("th"); th.scope = "col"; th.textContent = title; head.append(th); }
-    table.replaceChildren(head, ...NUMBERS.map(([name, title, of]) => {
-      const row = document.createElement("tr"), th = document.createElement("th"); th.scope = "row"; th.textContent = title; row.append(th);
-      for (const [, f] of shown) { const td = row.insertCell(); td.textContent = text(f[name]); td.className = "n"; }
-      row.insertCell().textContent = unit[of] ?? of;
-      return row;
-    }));
+    const table = $("numbers"), titles = shown.map(([label]) => label), unit = { u: opened.u_unit, y: opened.y_unit, "u/y": `${opened.u_unit}/${opened.y_unit}` };
+    const head = ["number", ...titles, "unit"], rows = NUMBERS.map(([name, title, of]) => [title, ...shown.map(([, f]) => text(f[name])), unit[of] ?? of]);
+    if (table.rows.length !== rows.length + 1 || table.rows[0].cells.length !== head.length) {
+      table.replaceChildren(...[head, ...rows].map((cells, k) => {
+        const row = document.createElement("tr");
+        row.append(...cells.map((_, i) => {
+          const cell = document.createElement(k && i ? "td" : "th");
+          if (k && i && i <= titles.length) cell.className = "n";
+          if (!k || !i) cell.scope = k ? "row" : "col";
+          return cell;
+        }));
+        return row;
+      }));
+    }
+    [head, ...rows].forEach((cells, k) => cells.forEach((said, i) => { const cell = table.rows[k].cells[i]; if (cell.textContent !== said) cell.textContent = said; }));
   }
 
   const limitMs = () => parseFloat($("limit-Ms").value) || 1.8, KINDS = { good: "good", fair: "warn", poor: "bad", unfit: "bad" };
@@ -252,9 +260,14 @@ export function mount(root, { ask, on, mark = () => {} }) {
     if (Number.isFinite(over)) rows.push([`overshoot at most ${over} %`, !now.diverges && now.overshoot_percent <= over, text(now.overshoot_percent)]);
     if (Number.isFinite(most)) rows.push([`command at most ${most} ${opened.u_unit}`, !now.diverges && now.u_peak <= most, text(now.u_peak)]);
     if (limit > 1) $("Ms-means").textContent = `Ms ${limit} leaves a gain margin of at least ${text(limit / (limit - 1))} and a phase margin of at least ${text(2 * Math.asin(.5 / limit) * 180 / Math.PI)} degrees.`;
-    const chip = (text, kind) => { const li = document.createElement("li"); li.textContent = text; li.className = `chip ${kind}`; return li; };
-    $("lights").replaceChildren(chip(`gains: ${verdict ? verdict.grade : "being judged"}`, verdict ? KINDS[verdict.grade] : ""),
-      ...rows.map(([what, ok, found]) => chip(`${ok ? "kept" : "broken"}: ${what} (${found})`, ok ? "good" : "bad")));
+    const chips = [[`gains: ${verdict ? verdict.grade : "being judged"}`, verdict ? KINDS[verdict.grade] : ""],
+      ...rows.map(([what, ok, found]) => [`${ok ? "kept" : "broken"}: ${what} (${found})`, ok ? "good" : "bad"])];
+    while ($("lights").children.length > chips.length) $("lights").lastChild.remove();
+    chips.forEach(([said, kind], k) => {
+      const li = $("lights").children[k] ?? $("lights").appendChild(document.createElement("li"));
+      if (li.textContent !== said) li.textContent = said;
+      li.className = `chip ${kind}`;
+    });
     const broken = rows.find(([, ok]) => !ok), judged = verdict && verdict.grade !== "good";
     mark("tune", broken ? "limit broken" : judged ? verdict.grade : `Ms ${text(now.Ms)}`, broken ? "bad" : judged ? KINDS[verdict.grade] : "good");
   }
