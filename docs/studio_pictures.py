@@ -73,6 +73,7 @@ def _tune(page: Any, file: Path) -> Path:
     _press(page, "search")
     _until(lambda: _text(page, "tune-progress").startswith("found"))
     _until(lambda: "(-" in _text(page, "cost"))
+    _until(lambda: "being judged" not in _text(page, "lights"))
     return _taken(page, file)
 
 

@@ -371,7 +371,9 @@ class Steps:
         if name == "tune_open":
             return tuning.opened()
         if name == "tune_move":
-            return tuning.move(values)
+            return tuning.move(values, noise=fields.get("noise", False))
+        if name == "tune_verdict":
+            return tuning.verdict(values)
         if name == "tune_costs":
             return {"costs": tuning.costs([{}, values], fields.get("weights"))}
         if name in ("tune_search", "tune_front"):

@@ -212,8 +212,8 @@ _MESSAGES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     **dict.fromkeys(("columns", "look", "validate", "identify"), (_STEP, ("file",))),
     "commission": ({"machine": NAME, **_EFFORT}, ()),
     "tune_open": (_TUNE, ("model",)),
-    "tune_move": (_TUNE, ("model", "values")),
-    "tune_costs": (_TUNE, ("model", "values")),
+    "tune_move": ({**_TUNE, "noise": {"type": "boolean"}}, ("model", "values")),
+    **dict.fromkeys(("tune_costs", "tune_verdict"), (_TUNE, ("model", "values"))),
     **dict.fromkeys(("tune_search", "tune_front"), _SEARCH),
     "loop": ({**_TUNE, "response": {"type": ["integer", "null"]}}, ("model", "values")),
     "bode": (
@@ -329,9 +329,10 @@ def _check(field: str, value: Any, rule: dict[str, Any]) -> None:
         # a whole number in JSON can have thousands of digits, too many for a float
         finite = -sys.float_info.max <= value <= sys.float_info.max
         if not (finite and low <= value <= high and value > above):
-            least, most = max(low, above), high
-            bounds = f" from {least:g} to {most:g}" if math.isfinite(least) else ""
-            raise _refusal(field, f"a finite number{bounds}", value)
+            least = f"above {above:g}" if above > low else f"from {low:,g}"
+            most = f" to {high:,g}" if math.isfinite(high) else ""
+            bounded = math.isfinite(max(low, above))
+            raise _refusal(field, f"a number {least}{most}" if bounded else "a number", value)
 
 
 def _is(value: Any, kind: str) -> bool:
@@ -341,4 +342,4 @@ def _is(value: Any, kind: str) -> bool:
 
 
 def _refusal(field: str, expected: str, value: object) -> SettingError:
-    return SettingError(f"{field[:40]}: expected {expected}, received {str(value)[:80]!r}")
+    return SettingError(f"{field[:40]}: expected {expected}, received {repr(value)[:80]}")

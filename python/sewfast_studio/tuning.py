@@ -12,6 +12,7 @@ import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,9 +23,11 @@ if TYPE_CHECKING:
     from sewfast.analysis.points import LoopBode
     from sewfast.analysis.responses import Responses
     from sewfast.control.controller import Controller
+    from sewfast.control.feedforward import Feedforward
     from sewfast.dataset import FloatArray
     from sewfast.models import Model
     from sewfast.tuning import Constraints, Cost
+    from sewfast.tuning.lead import Lead
 
 MOST_MEMBERS = 16
 FRONT = ("cost", "Ms")
@@ -141,7 +144,8 @@ class Tuning:
         n, lag = self.start.filter_samples, self.start.filter_time
         knobs.append(Knob("filter_samples", "samples", n, 1, 64, whole=True))
         knobs.append(Knob("filter_time", "s", lag, 0.0, max(20.0 * Ts, lag)))
-        return knobs + self._notch_knobs()
+        leads = float(self.start.feedforward is not None)
+        return [*knobs, *self._notch_knobs(), Knob("feedforward", "", leads, 0, 1, whole=True)]
 
     def _notch_knobs(self) -> list[Knob]:
         knobs = []
@@ -159,6 +163,8 @@ class Tuning:
 
     def opened(self) -> dict[str, Any]:
         """The values for the page before anything is moved."""
+        from sewfast.control.loop import noise_in_loop
+
         gains = self.start.gains
         return {
             "model": self.name,
@@ -172,6 +178,8 @@ class Tuning:
             "u_unit": gains.u_unit,
             "y_unit": gains.y_unit,
             "notes": self.start.notes,
+            "noise": max(noise_in_loop(self.start, member) for member in self.members),
+            "counts": self.start.counts_per_unit > 0.0,
         }
 
     def controller(self, values: Mapping[str, Any]) -> Controller:
@@ -189,7 +197,23 @@ class Tuning:
         unmoved = {knob.name: knob.value for knob in self.knobs}
         if all(wanted.get(name, value) == value for name, value in unmoved.items()):
             return self.start
-        return self.start.with_values(wanted, "tuned by hand in the studio")
+        start, leads = self.start, wanted.pop("feedforward", None)
+        if leads is not None and bool(leads) != (start.feedforward is not None):
+            start = replace(start, feedforward=self.lead if leads else None)
+        return start.with_values(wanted, "tuned by hand in the studio")
+
+    @cached_property
+    def lead(self) -> Feedforward:
+        """The feedforward that `sewfast.tune` adds to the start; a `SettingError` if none helps."""
+        from sewfast.tuning import led
+
+        controller, worth = led(self.start, self.model)
+        if controller.feedforward is None:
+            raise SettingError(
+                name="feedforward", expected="one that helps on every model",
+                received=f"none: {worth.reason}", remedy="go on without",
+            )  # fmt: skip
+        return controller.feedforward
 
     def _checked(self, values: Mapping[str, Any]) -> dict[str, float]:
         known = {knob.name: knob for knob in self.knobs}
@@ -202,13 +226,23 @@ class Tuning:
                 raise SettingError(f"{name}: expected a number, received {str(value)[:40]!r}")
             if known[name].whole and value != int(value):
                 raise SettingError(f"{name}: expected a whole number, received {value}")
+            if name == "feedforward" and value not in (0, 1):
+                raise SettingError(f"{name}: expected 0 for off or 1 for on, received {value}")
             wanted[name] = float(value)
         return wanted
 
     # --- The loop ---------------------------------------------------------------------------------
 
-    def move(self, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, FloatArray]]:
+    def move(
+        self, values: Mapping[str, Any], *, noise: bool = False
+    ) -> tuple[dict[str, Any], dict[str, FloatArray]]:
         """Step responses, L, S, T and figures of the loop with these values.
+
+        Parameters
+        ----------
+        values : dict
+        noise : bool
+            Whether the steps measure the noise of each member's record.
 
         Returns
         -------
@@ -224,7 +258,8 @@ class Tuning:
         (bode,) = loop_bodes(controller, [self.points], self.slowest)
         numbers, curves = {**_margins(bode), "stamp": self.stamp}, bode_curves(bode)
         try:
-            tracked, upset = responses(controller, self.members, self.titles, self.steps)
+            measured = None if noise else 0.0
+            tracked, upset = responses(controller, self.members, self.titles, self.steps, measured)
         except FitError:
             return {**numbers, "diverges": True}, curves
         for kind, found in (("reference", tracked), ("disturbance", upset)):
@@ -239,7 +274,7 @@ class Tuning:
         return {**numbers, "diverges": False}, curves
 
     def costs(
-        self, several: list[Mapping[str, Any]], weights: Mapping[str, float] | None = None
+        self, several: Sequence[Mapping[str, Any]], weights: Mapping[str, float] | None = None
     ) -> list[float]:
         """Costs of controllers on the model, as in `sewfast.tune`; inf if one diverges.
 
@@ -256,6 +291,13 @@ class Tuning:
         controllers = [self.controller(values) for values in several]
         found = costs(controllers, self.model, cost=Cost(**(weights or {})))
         return [float(cost) for cost in found]
+
+    def verdict(self, values: Mapping[str, Any]) -> dict[str, str]:
+        """Grade and reasons of these gains, as `sewfast.tune` says them."""
+        from sewfast.tuning import verdict_on
+
+        found = verdict_on(self.controller(values), self.model)
+        return {"grade": found.grade, "text": str(found)}
 
     def check(self, search: Search) -> None:
         """Check the settings of a search.
@@ -293,10 +335,12 @@ class Tuning:
         from sewfast.tuning import tune
 
         start = self.controller(values)
+        if start.feedforward is not None:
+            search = replace(search, feedforward="preview")
         try:
             result = tune(
                 self.model, start=start, cost=search.cost(),
-                constraints=search.limits(), feedforward="none",
+                constraints=search.limits(), feedforward=search.feedforward,
                 evaluations=search.evaluations, time_budget=search.seconds, seed=search.seed,
                 progress=progress,
             )  # fmt: skip
@@ -329,15 +373,17 @@ class Tuning:
             if not isinstance(stopped.best, ParetoFront):
                 raise
             found = stopped.best
-        rows = zip(found.controllers, found.values.tolist(), strict=True)
-        calmest_first = sorted(rows, key=lambda row: -row[1][0])
-        return {
-            "front": [
-                {"values": self._values_of(c), **dict(zip(FRONT, numbers, strict=True))}
-                for c, numbers in calmest_first
-            ],
-            "unit": found.units[FRONT[0]],
-        }
+        each = [self._values_of(c) for c in found.controllers]
+        # the costs that the page shows: those of the front are of the mean terms of all runs
+        costs = self.costs(each, search.weights)
+        quickest_first = sorted(
+            zip(each, costs, found.values[:, 1].tolist(), strict=True), key=lambda row: row[1]
+        )
+        front: list[dict[str, Any]] = []
+        for named, cost, Ms in quickest_first:
+            if not front or Ms < front[-1]["Ms"]:
+                front.append({"values": named, "cost": cost, "Ms": Ms})
+        return {"front": front[::-1], "unit": found.units[FRONT[0]]}
 
     def keep(self, found: Found) -> dict[str, Any]:
         """Store a search, so that its copy repeats it; return its result for the page."""
@@ -354,6 +400,7 @@ class Tuning:
 
     def _values_of(self, controller: Controller) -> dict[str, float]:
         values = {**vars(controller), **controller.gains.to_dict()}
+        values["feedforward"] = controller.feedforward is not None
         for k, biquad in enumerate(controller.biquads):
             if biquad.kind == "notch":
                 values |= {f"notch_{name}[{k}]": x for name, x in biquad.named().items()}
@@ -460,9 +507,13 @@ def _call(controller: Controller) -> str:
 
 
 def _number(value: Any) -> str:
+    from sewfast.control.feedforward import Feedforward
+
     if isinstance(value, tuple):  # of biquads
         parts = [f"sewfast.Biquad({b.kind!r}, {b.numbers!r})" for b in value]
         return f"({', '.join(parts)},)"
+    if isinstance(value, Feedforward):
+        return f"sewfast.{value!r}"
     if isinstance(value, float) and math.isinf(value):
         return "math.inf" if value > 0 else "-math.inf"
     return repr(value)
@@ -494,6 +545,7 @@ class Search:
     seconds: float | None = None
     weights: Mapping[str, float] = field(default_factory=dict)
     constraints: Mapping[str, float] = field(default_factory=dict)
+    feedforward: Lead = "none"
 
     def cost(self) -> Cost:
         """The weights; those that are not given are the defaults."""
@@ -509,7 +561,9 @@ class Search:
 
     def python(self) -> str:
         """Arguments of `sewfast.tune`."""
-        words = [f"feedforward='none', evaluations={self.evaluations}, seed={self.seed}"]
+        words = [
+            f"feedforward={self.feedforward!r}, evaluations={self.evaluations}, seed={self.seed}"
+        ]
         if self.weights:
             words.append(f"cost=sewfast.Cost({_named(self.weights)})")
         if self.constraints:
@@ -518,7 +572,8 @@ class Search:
 
     def command(self) -> str:
         """Options of `sewfast tune`."""
-        words = ["--no-feedforward", f"--evaluations={self.evaluations}", f"--seed={self.seed}"]
+        lead = "--no-feedforward" if self.feedforward == "none" else "--feedforward=preview"
+        words = [lead, f"--evaluations={self.evaluations}", f"--seed={self.seed}"]
         words += [f"--cost {name}={value!r}" for name, value in self.weights.items()]
         words += [f"--constraint {name}={value!r}" for name, value in self.constraints.items()]
         return " ".join(words)

@@ -32,6 +32,7 @@ ALLOWED = (
     "tune_open",
     "tune_move",
     "tune_costs",
+    "tune_verdict",
     "tune_search",
     "tune_front",
     "tune_save",

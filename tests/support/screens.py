@@ -1,7 +1,7 @@
 """Renders every step of the studio in its states, a report and the page of the design at four
-widths, light and dark, and measures them.
+widths, at 200 % zoom, light and dark, and on paper, and measures them.
 
-    python tests/support/screens.py [FOLDER] [--only WORD]
+    python tests/support/screens.py [FOLDER] [--only WORD] [--axe axe.min.js]
 
 Pictures go to the folder (target/screens), a table of what is wrong to standard output; exit code 1
 if anything is. Measured by boxes and colours, not by pixels:
@@ -13,7 +13,10 @@ if anything is. Measured by boxes and colours, not by pixels:
 - grid: a control whose height is no multiple of 4 px;
 - primary: not exactly one visible main action in a step, or one that needs scrolling;
 - STOP: anywhere but at its place;
-- console: a message of the browser.
+- cut: on paper, a figure that may break over two sheets, or is higher than one;
+- console: a message of the browser;
+- request: something that the page loads from elsewhere;
+- axe: a violation that axe-core finds, if its file is given (the one in axe-playwright-python).
 """
 
 from __future__ import annotations
@@ -33,43 +36,95 @@ from sewfast_studio import Project, Studio, make_demo
 
 WIDTHS = (360, 768, 1280, 1920)
 HEIGHT = 800
+ZOOM = 2
+"""Of a window of 1280 x 800: what a person who sees little sets."""
+SHEET = (718, 1047)
+"""CSS pixels of A4 within margins of 1 cm."""
+PAPER = ("report", "tune-searched", "data-looked", "model-done", "verify-done")
+"""States that are printed as well."""
 STEPS = ("drive", "data", "model", "tune", "commission", "deploy")
 PATIENCE = 180.0
 UNFOLD = "document.querySelectorAll('main details:not(.menu)').forEach(d => { d.open = true })"
 
+AXE = """
+const done = arguments[0];
+axe.run(document, { preload: false, resultTypes: ["violations"] }).then(found => done(
+  found.violations.flatMap(v => v.nodes.map(n => `${v.id}: ${n.target.join(" ")}`))));
+"""
+ELSEWHERE = """
+return performance.getEntriesByType("resource").map(e => e.name).filter(
+  name => !name.startsWith(location.origin) && !/^(data|blob|file):/.test(name));
+"""
+CUT = """
+const figures = [...document.querySelectorAll("canvas, svg, figure")];
+const kept = e => e && (getComputedStyle(e).breakInside === "avoid" || kept(e.parentElement));
+// a picture is of one piece, which a browser moves to the next sheet
+const holds = e => e.tagName !== "FIGURE" || kept(e);
+return figures.filter(e => e.checkVisibility()).filter(
+  e => e.getBoundingClientRect().height > arguments[0] || !holds(e)
+).map(e => e.outerHTML.slice(0, 60));
+"""
 MEASURE = (Path(__file__).parent / "screens.js").read_text(encoding="utf-8")
 
 
 class Screens:
     """Pictures and faults of a browser's page."""
 
-    def __init__(self, browser: Any, folder: Path) -> None:
-        self.browser, self.folder = browser, folder
+    def __init__(self, browser: Any, folder: Path, axe: str = "") -> None:
+        self.browser, self.folder, self.axe = browser, folder, axe
         self.faults: list[tuple[str, str, str]] = []
         self.stops: set[tuple[float, ...]] = set()
         self.count = 0
 
     def take(self, name: str) -> None:
         """Every width and scheme of what the page shows."""
-        for width in WIDTHS:
-            self.size(width)
+        for width in (*WIDTHS, 0):
+            if width:
+                self.size(width)
+            else:
+                self.size(1280 // ZOOM, HEIGHT // ZOOM, ZOOM)
             self.browser.execute_script("scrollTo(0, 0)")
             for scheme in ("light", "dark"):
                 self.scheme(scheme)
-                place = f"{name}-{width}-{scheme}"
+                place = f"{name}-{width or 'zoom'}-{scheme}"
                 found = self.browser.execute_script(MEASURE)
                 self.faults += [(place, kind, what) for kind, what in found["faults"]]
                 if found["stop"]:
                     self.stops.add(tuple(found["stop"]))
                 self.picture(place)
                 self.count += 1
+                if width == 1280 and self.axe:
+                    self.browser.execute_script(self.axe)
+                    found = self.browser.execute_async_script(AXE)
+                    self.faults += [(place, "axe", what) for what in found]
+        self.faults += [(name, "request", e) for e in self.browser.execute_script(ELSEWHERE)]
+        if name in PAPER:
+            self.paper(name)
         self.size(1280)
         self.scheme("light")
         for entry in self.browser.get_log("browser"):
             self.faults.append((name, "console", entry["message"][:120]))
 
-    def size(self, width: int, height: int = HEIGHT) -> None:
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    def paper(self, name: str) -> None:
+        """The sheets as a PDF, and what is wrong with them."""
+        place = f"{name}-paper"
+        self.size(*SHEET)
+        self.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+        time.sleep(0.3)
+        found = self.browser.execute_script(MEASURE)
+        on_paper = ("clipped", "overlap", "contrast")
+        self.faults += [(place, kind, what) for kind, what in found["faults"] if kind in on_paper]
+        self.faults += [(place, "cut", what) for what in self.browser.execute_script(CUT, SHEET[1])]
+        self.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+        inch = 1 / 2.54
+        size = {"paperWidth": 21 * inch, "paperHeight": 29.7 * inch, "preferCSSPageSize": True}
+        margins = {f"margin{side}": inch for side in ("Top", "Bottom", "Left", "Right")}
+        pdf = self.browser.execute_cdp_cmd("Page.printToPDF", {**size, **margins})
+        (self.folder / f"{place}.pdf").write_bytes(base64.b64decode(pdf["data"]))
+        self.count += 1
+
+    def size(self, width: int, height: int = HEIGHT, scale: int = 1) -> None:
+        size = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": False}
         self.browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         time.sleep(0.25)  # curves follow the size of the window
 
@@ -102,6 +157,9 @@ def states(browser: Any, folder: Path) -> Iterator[str]:
         until(lambda: at(name).is_displayed() and at(name).is_enabled(), name)
         at(name).click()
 
+    def not_old() -> bool:
+        return not browser.find_elements("css selector", "#cost.old, #reasons.old")
+
     nothing = folder / "nothing"
     nothing.mkdir()
     with Studio(Project(nothing)) as studio:
@@ -116,7 +174,27 @@ def states(browser: Any, folder: Path) -> Iterator[str]:
     with Studio(Project(demo, demo=True)) as studio:
         browser.get(studio.address)
         until(lambda: at("cost").text.startswith("cost"), "the cost")
+        until(lambda: "being" not in at("lights").text, "the verdict")
         yield "tune"
+        at("noise").click()
+        at("knob-feedforward-value").click()
+        until(lambda: "(" in at("cost").text and not_old(), "the feedforward")
+        yield "tune-feedforward"
+        at("knob-Kp").send_keys("\ue012" * 6)
+        browser.execute_script("document.getElementById('evaluations').value = 200")
+        press("trade")
+        yield "tune-working"
+        until(lambda: at("front").is_displayed() and not_old(), "the trade-offs")
+        yield "tune-front"
+        browser.refresh()
+        until(lambda: at("cost").text.startswith("cost"), "the cost once more")
+        browser.execute_script(UNFOLD)
+        browser.execute_script("document.getElementById('evaluations').value = 5")
+        press("search")
+        until(lambda: browser.find_elements("class name", "refused"), "a refusal at its field")
+        yield "tune-refused-field"
+        browser.refresh()
+        until(lambda: at("cost").text.startswith("cost"), "the cost then")
         browser.execute_script(UNFOLD)
         at("notch-hz").send_keys("60000")
         press("add-notch")
@@ -212,10 +290,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Renders and measures the pages.")
     parser.add_argument("folder", nargs="?", type=Path, default=Path("target/screens"))
     parser.add_argument("--only", default="", help="states with this word in their name")
+    parser.add_argument("--axe", type=Path, help="axe.min.js, to count its violations as well")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     browser = open_browser(1280, 800)
-    screens = Screens(browser, given.folder)
+    browser.set_script_timeout(60)
+    axe = given.axe.read_text(encoding="utf-8") if given.axe else ""
+    screens = Screens(browser, given.folder, axe)
     screens.size(1280)
     try:
         with tempfile.TemporaryDirectory() as place:

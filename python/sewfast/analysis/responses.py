@@ -302,29 +302,32 @@ class Steps:
 
 
 def responses(
-    controller: Controller, plants: Sequence[Plant], names: Sequence[str], steps: Steps
-) -> tuple[Responses, Responses]:
-    """Reference step and disturbance step with encoder, filters and limits, without noise."""
+    controller: Controller, plants: Sequence[Plant], names: Sequence[str], steps: Steps,
+    noise: float | None = 0.0,
+) -> tuple[Responses, Responses]:  # fmt: skip
+    """Reference step and disturbance step with encoder, filters, limits; `noise` as for `run`."""
     n = steps.samples
     lead = 3 * n
     ramp = np.interp(np.arange(lead), [0, n], [common_rest(plants).y, steps.level])
     r = np.concatenate([ramp, np.full(n, steps.level)])
     raised = np.concatenate([ramp, np.full(n, steps.level + steps.step)])
     d = np.where(np.arange(len(r)) < lead, 0.0, steps.disturbance)
-    tracked = [run(controller, p, raised, noise=0.0, name="reference step") for p in plants]
-    upset = [_disturbed(controller, p, r, d) for p in plants]
+    tracked = [run(controller, p, raised, noise=noise, name="reference step") for p in plants]
+    upset = [_disturbed(controller, p, r, d, noise) for p in plants]
     first = lead - n // 2
     made = [_cut(raised, tracked, lead, first, steps, names, "reference")]
     made.append(_cut(r, upset, lead, first, steps, names, "disturbance"))
     return made[0], replace(made[1], disturbance=steps.disturbance)
 
 
-def _disturbed(controller: Controller, plant: Plant, r: FloatArray, d: FloatArray) -> ClosedLoopRun:
+def _disturbed(
+    controller: Controller, plant: Plant, r: FloatArray, d: FloatArray, noise: float | None
+) -> ClosedLoopRun:
     """Run with a disturbance; on a machine it is a load torque of opposite sign."""
     if isinstance(plant, VirtualMachine):
         load = torque_of(plant, 1.0) * -d
         return run_under_load(controller, plant, r, load, name="disturbance step")
-    return run(controller, plant, r, disturbance=d, noise=0.0, name="disturbance step")
+    return run(controller, plant, r, disturbance=d, noise=noise, name="disturbance step")
 
 
 def _cut(

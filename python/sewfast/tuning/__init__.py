@@ -7,7 +7,7 @@ opinion), `verdict`, `front` (`pareto`).
 
 from .front import ParetoFront, pareto
 from .objective import Constraints, Cost, LoadStep
-from .search import TuningResult, costs, recoveries, tune
+from .search import TuningResult, costs, led, recoveries, tune, verdict_on
 from .task import default_variations, first_controller
 
 __all__ = [
@@ -19,7 +19,9 @@ __all__ = [
     "costs",
     "default_variations",
     "first_controller",
+    "led",
     "pareto",
     "recoveries",
     "tune",
+    "verdict_on",
 ]

@@ -613,6 +613,38 @@ def costs(
     return np.array([cost for cost, _ in judged])
 
 
+def verdict_on(controller: SampledController, models: Plants) -> Verdict:
+    """The verdict that `tune` gives on its gains, on those of a controller.
+
+    Parameters
+    ----------
+    controller : Controller or StateFeedback
+    models : Model, VirtualMachine or sequence of them
+
+    Raises
+    ------
+    SettingError
+        If sample times or units disagree.
+    """
+    time = Budget(None)
+    task = _task_of(controller, models).with_loops(time)
+    return verdict_of(task, controller, time, searched=False)
+
+
+def led(controller: Controller, models: Plants) -> tuple[Controller, Led]:
+    """The controller with the feedforward that `tune` adds to it, and what that is worth. It is the
+    controller alone if none helps on every model.
+    """
+    return with_lead(_task_of(controller, models), controller, "preview")
+
+
+def _task_of(controller: SampledController, models: Plants) -> TuningTask:
+    return TuningTask.of(
+        models, None, start=controller, first={}, cost=None, aggregate="mean", constraints=None,
+        variations=None, loads=(),
+    )  # fmt: skip
+
+
 def recoveries(
     controller: SampledController,
     models: Plants,

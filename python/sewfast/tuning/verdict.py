@@ -142,12 +142,13 @@ def verdict_of(
     *,
     limit: float | None = None,
     others: Sequence[Objection] = (),
+    searched: bool = True,
 ) -> Verdict:
     """The verdict on gains for a task, whose references are run on its models as they are.
     Without `time` for the runs, they are among what it lost. `limit` is the user's own limit of Ms;
-    `others` are the objections known otherwise.
+    `others` are the objections known otherwise; `searched` is False for gains set by hand.
     """
-    found = [*others, *_of_loops(task, controller, limit)]
+    found = [*others, *_of_loops(task, controller, _calmer(limit, searched))]
     if time.over("the runs for the verdict"):
         text = "the time budget left no time to run the references on the models"
         found.append(Objection("fair", text, "give more time, or run them (sewfast run)"))
@@ -160,9 +161,7 @@ def verdict_of(
 # --- Ms -------------------------------------------------------------------------------------------
 
 
-def _of_loops(
-    task: TuningTask, controller: SampledController, limit: float | None
-) -> Iterator[Objection]:
+def _of_loops(task: TuningTask, controller: SampledController, remedy: str) -> Iterator[Objection]:
     """An Ms above the default limit."""
     Ms, level = task.loops.worst(controller)
     if Ms <= HAIR * LARGEST_MS:
@@ -181,10 +180,19 @@ def _of_loops(
         "fair" if Ms <= HAIR * LIVELY else "poor",
         f"Ms is {Ms:.3g}{place}: at one frequency the loop amplifies disturbances {Ms:.3g} times, "
         "which is close to instability",
+        remedy,
+    )
+
+
+def _calmer(limit: float | None, searched: bool) -> str:
+    """What to do about an Ms above the default limit."""
+    if not searched:
+        return "lower Kp or Td, or search from here"
+    if limit is not None:
+        return f"without a limit of its own the search keeps to {LARGEST_MS:g}"
+    return (
         f"no gains with at most {LARGEST_MS:g} were found: search more variables, give more "
         "evaluations, or take delay out of the loop"
-        if limit is None
-        else f"without a limit of its own the search keeps to {LARGEST_MS:g}",
     )
 
 

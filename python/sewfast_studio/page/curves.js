@@ -7,7 +7,7 @@ const CHARTS = new Set(), FONT = "12px system-ui, 'DejaVu Sans', sans-serif", LE
 let printing = false;
 
 function every(act) { for (const c of CHARTS) c.canvas.isConnected ? act(c) : CHARTS.delete(c); }
-// on paper every curve is black and distinct by its dashes, whatever the theme of the screen
+// on paper every curve is black and distinct by its dashes, a predicted one grey, whatever the theme of the screen
 function print(on) { printing = on; every(c => c.paint()); }
 addEventListener("beforeprint", () => print(true));
 addEventListener("afterprint", () => print(false));
@@ -15,9 +15,10 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => ever
 
 /** A chart in `place`, painted again when its size changes. */
 export class Chart {
-  /** `axes`: x and y (titles), log (of x), marks (levels of y that mean something), floor (least y that is shown). */
+  /** `axes`: x and y (titles), log (of x), marks (levels of y that mean something), floor and roof (of the y that is shown), along (for a
+   * path, whose x does not grow: the title of what grows along it). */
   constructor(place, axes) {
-    this.axes = { x: "time [s]", y: "", log: false, marks: [], floor: -Infinity, ...axes };
+    this.axes = { x: "time [s]", y: "", log: false, marks: [], floor: -Infinity, roof: Infinity, along: "", ...axes };
     this.series = []; this.marks = []; this.view = null; this.colours = null;
     CHARTS.add(this);
     const plot = document.createElement("div"); plot.className = "plot";
@@ -30,17 +31,18 @@ export class Chart {
     new ResizeObserver(() => this.paint()).observe(this.canvas);
   }
 
-  /** Draws series {name, x, y, low, high, style, dots}: arrays, NaN is a gap; low and high make a band; marks {x, y, label}. */
+  /** Draws series {name, x, y, low, high, style, dots}: arrays, NaN is a gap; low and high make a band; marks {x, y, label}. A path has `along`,
+   * and `box`: least and largest x and y at each of its points. */
   draw(series, says, marks = []) {
     this.series = series; this.marks = marks;
     this.canvas.setAttribute("aria-label", says); this.canvas.parentNode.classList.toggle("none", !series.length);
     this.paint();
   }
 
-  /** Charts with the same x axis in the same group: their cursors and windows move together. */
-  linked() {
-    const group = this.canvas.closest(".linked"), found = [this];
-    if (group) every(c => { if (c !== this && c.axes.x === this.axes.x && c.canvas.closest(".linked") === group) found.push(c); });
+  /** Charts with the same x axis in the same group: their cursors and windows move together. Cursors move along paths, too. */
+  linked(cursor = false) {
+    const group = this.canvas.closest(".linked"), found = [this], key = c => cursor && c.axes.along || c.axes.x;
+    if (group) every(c => { if (c !== this && key(c) === key(this) && c.canvas.closest(".linked") === group) found.push(c); });
     return found;
   }
 
@@ -49,9 +51,10 @@ export class Chart {
     if (!w || !h) return;
     if (canvas.width !== Math.round(w * scale)) canvas.width = w * scale;
     if (canvas.height !== Math.round(h * scale)) canvas.height = h * scale;
-    const g = canvas.getContext("2d");
+    // a processor paints a few lines sooner than they take to a graphics card and back, above all where there is none
+    const g = canvas.getContext("2d", { willReadFrequently: true });
     g.setTransform(scale, 0, 0, scale, 0, 0); g.clearRect(0, 0, w, h);
-    this.picture(g, w, h, printing ? TOKENS.map((_, k) => k === PAPER ? "#fff" : "#000") : this.colours ??= this.resolved());
+    this.picture(g, w, h, printing ? TOKENS.map((_, k) => k === PAPER ? "#fff" : k === 1 ? "#888" : "#000") : this.colours ??= this.resolved());
   }
 
   /** The sheet's colours of a scheme, or of the page's own. */
@@ -68,8 +71,9 @@ export class Chart {
     this.at = null; g.font = FONT;
     if (!series.length) return;
     const whole = range(series.map(s => s.x)), [from, to] = this.view || whole;
-    let [low, high] = range(series.flatMap(s => { const [i, j] = inside(s.x, from, to); return [s.y, s.low, s.high].map(v => v && [v, i, j]); }), true);
-    low = Math.max(low, axes.floor);
+    const part = s => axes.along ? [0, s.x.length] : inside(s.x, from, to);
+    let [low, high] = range(series.flatMap(s => { const [i, j] = part(s); return [s.y, s.low, s.high].map(v => v && [v, i, j]); }), true);
+    low = Math.max(low, axes.floor); high = Math.min(high, axes.roof);
     if (!(high >= low)) return;
     if (high - low < 1e-9 * Math.max(1, Math.abs(high))) { high += 1; low -= 1; }
     const room = .04 * (high - low); low -= room; high += room;
@@ -81,9 +85,10 @@ export class Chart {
     this.grid(g, w, h);
     g.save(); g.beginPath(); g.rect(LEFT, top - 2, right - LEFT, bottom - top + 4); g.clip();
     series.forEach((s, i) => {
-      const style = styleOf(s, i), [begin, end] = inside(s.x, from, to);
+      const style = styleOf(s, i), [begin, end] = part(s);
       g.strokeStyle = g.fillStyle = colours[style];
       if (s.low) { g.globalAlpha = .22; band(g, s, X, Y); g.globalAlpha = 1; }
+      if (s.box) { g.globalAlpha = .22; boxes(g, s.box, X, Y); g.globalAlpha = 1; }
       g.lineWidth = style ? 1.6 : 1.8; g.setLineDash(DASHES[style]); s.dots ? dots(g, s, X, Y) : trace(g, s, X, Y, begin, end, right - LEFT);
     });
     g.restore();
@@ -100,9 +105,11 @@ export class Chart {
     }
     for (const v of this.axes.marks) if (v > low && v < high) { g.globalAlpha = .7; line(g, left, Y(v), right, Y(v)); g.globalAlpha = 1; }
     g.textAlign = "center";
+    let free = 0;  // a narrow picture leaves out the labels that would touch
     for (const v of this.axes.log ? decades(from, to) : ticks(from, to)) {
       g.globalAlpha = .14; line(g, X(v), top, X(v), bottom); g.globalAlpha = 1;
-      const text = number(v); g.fillText(text, Math.min(X(v), w - g.measureText(text).width / 2), bottom + 12);
+      const text = number(v), half = g.measureText(text).width / 2, x = Math.min(X(v), w - half);
+      if (x - half >= free) { g.fillText(text, x, bottom + 12); free = x + half + 6; }
     }
     g.fillText(this.axes.x, (left + right) / 2, h - 8);
   }
@@ -156,7 +163,8 @@ export class Chart {
     canvas.addEventListener("pointermove", event => {
       if (!this.at) return;
       const x = px(event);
-      if (start === null) return this.cursor(x);
+      if (start === null) return this.cursor(x, event.clientY - canvas.getBoundingClientRect().top);
+      this.line.classList.remove("spot"); this.line.style.top = "";
       if (pans) this.window(began.back(began.left + start - x), began.back(began.right + start - x));
       else { this.line.hidden = false; this.line.style.left = `${Math.min(start, x)}px`; this.line.style.width = `${Math.abs(x - start)}px`; this.line.style.opacity = .25; }
     });
@@ -167,7 +175,7 @@ export class Chart {
       this.cursor(x);
     };
     canvas.addEventListener("pointerup", end); canvas.addEventListener("pointercancel", () => { start = null; });
-    canvas.addEventListener("pointerleave", () => { if (start === null) for (const c of this.linked()) c.line.hidden = c.read.hidden = true; });
+    canvas.addEventListener("pointerleave", () => { if (start === null) for (const c of this.linked(true)) c.line.hidden = c.read.hidden = true; });
     canvas.addEventListener("dblclick", () => this.window(-Infinity, Infinity));
     canvas.addEventListener("wheel", event => {
       if (!event.ctrlKey || !this.at) return;  // the page scrolls as ever
@@ -176,17 +184,32 @@ export class Chart {
   }
 
   /** Values at a place of this chart, in all that are linked with it. */
-  cursor(x) {
-    const at = this.at, value = at.back(Math.min(Math.max(x, at.left), at.right));
-    for (const c of this.linked()) {
+  cursor(x, y = 0) {
+    const at = this.at, value = this.axes.along ? this.along(x, y) : at.back(Math.min(Math.max(x, at.left), at.right));
+    for (const c of this.linked(true)) {
       if (!c.at) continue;
-      const place = c.at.X(value), said = [`${c.axes.x.split(" [")[0]} ${short(value)}`];
-      for (const s of c.series) { const y = s.y[nearest(s.x, value)]; if (y !== undefined && !Number.isNaN(y)) said.push(`${s.name || c.axes.y.split(" [")[0]} ${short(y)}`); }
-      c.line.hidden = c.read.hidden = place < c.at.left || place > c.at.right; c.line.style.left = `${place}px`;
+      const { along } = c.axes, said = [`${(along || c.axes.x).split(" [")[0]} ${short(value)}`];
+      let place = c.at.X(value), top = "";
+      for (const s of c.series) {
+        const k = along && !s.along ? -1 : nearest(s.along ?? s.x, value), v = s.y[k];
+        if (v === undefined || Number.isNaN(v)) continue;
+        if (along && s === c.series[0]) { place = c.at.X(s.x[k]); top = `${c.at.Y(v) - 4}px`; }
+        said.push(`${s.name || c.axes.y.split(" [")[0]} ${short(v)}${along ? ` at ${short(s.x[k])}` : ""}`);
+      }
+      c.line.classList.toggle("spot", Boolean(along)); c.line.style.top = top;
+      c.line.hidden = c.read.hidden = !(place >= c.at.left && place <= c.at.right) || Boolean(along && !top); c.line.style.left = `${along ? place - 4 : place}px`;
       c.read.textContent = said.join("\n");
       const over = place > (c.at.left + c.at.right) / 2;
       c.read.style.left = over ? "" : `${place + 8}px`; c.read.style.right = over ? `${c.canvas.clientWidth - place + 8}px` : "";
     }
+  }
+
+  /** What grows along the first path, at its point nearest to a place. */
+  along(x, y) {
+    const [s] = this.series, { X, Y } = this.at;
+    let least = Infinity, found = 0;
+    for (let k = 0; k < s.x.length; k++) { const d = Math.hypot(X(s.x[k]) - x, Y(s.y[k]) - y); if (d < least) { least = d; found = k; } }
+    return s.along[found];
   }
 
   /** Shows x from one value to another, in all linked charts; nothing beyond what is recorded. */
@@ -316,6 +339,13 @@ function trace(g, { x, y }, X, Y, begin, end, pixels) {
 
 function dots(g, { x, y }, X, Y) {
   for (let k = 0; k < y.length; k++) if (!Number.isNaN(y[k])) g.fillRect(X(x[k]) - 1, Y(y[k]) - 1, 2.5, 2.5);
+}
+
+/** Boxes as one shape. */
+function boxes(g, [left, right, low, high], X, Y) {
+  g.beginPath();
+  for (let k = 0; k < left.length; k++) if (!Number.isNaN(left[k])) g.rect(X(left[k]), Y(high[k]), Math.max(1, X(right[k]) - X(left[k])), Math.max(1, Y(low[k]) - Y(high[k])));
+  g.fill();
 }
 
 function band(g, { x, low, high }, X, Y) {

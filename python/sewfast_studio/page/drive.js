@@ -25,7 +25,7 @@ on("closed", () => { $("drive-state").textContent = "no connection: use the emer
 on("stopped", m => {
   drive = { ...drive, armed: false }; state(); enable();
   if (!m.moving) return;
-  $("stopped").textContent = m.error || `${m.why}: output off, confirmed after ${m.off_ms.toFixed(0)} ms; at rest after ${(m.rest_ms / 1000).toFixed(2)} s. Arm to go on.`;
+  $("stopped").textContent = m.error || `${m.why.charAt(0).toUpperCase()}${m.why.slice(1)}: output off, confirmed after ${m.off_ms.toFixed(0)} ms. At rest after ${(m.rest_ms / 1000).toFixed(2)} s. Arm to go on.`;
 });
 
 // --- what there is ---

@@ -1,6 +1,6 @@
 // The step Model: identify from the recording of Look, then judge on a recording that the model has not seen.
 import { ask, on, mark } from "/server.js";
-import { teller } from "/tell.js";
+import { sentences, teller } from "/tell.js";
 import { copies } from "/copies.js";
 import { panels } from "/look.js";
 import { chosen, fill, open } from "/data.js";
@@ -77,7 +77,7 @@ async function validate() {
   tell(null); $("validate").disabled = true;
   try {
     const f = await ask("validate", step($("against").value));
-    $("verdict").textContent = f.verdict; $("verdict").className = `chip ${f.grade}`; panels($("free"), shown(f));
+    $("verdict").textContent = sentences(f.verdict); $("verdict").className = `chip ${f.grade}`; panels($("free"), shown(f));
     const lines = table(["question", "found", "limit", "verdict", "what it means"], f.lines.map(l => [l.name, l.shown, l.limit, chip(l.verdict, GRADES[l.verdict]), l.meaning]));
     lines.className = "blocks"; lines.createCaption().textContent = `Report card on ${$("against").value}`;
     $("card").replaceChildren(lines); copies($("validate-copy"), f); $("validated").hidden = false;

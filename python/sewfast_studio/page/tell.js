@@ -1,5 +1,11 @@
 // What a step says where it is refused: below the field that the message names, else in the step's toast.
 
+/** A refusal as sentences: "expected a, received b; do c" is "Expected a, received b. Do c." Names of files stay as they are. */
+export function sentences(text) {
+  const upper = s => s.charAt(0).toUpperCase() + s.slice(1), parts = text.split("; ");
+  return parts.map((s, k) => k || /^(expected|the|this|on|no) /.test(s) ? upper(s) : s).join(". ").replace(/([^.!?])$/, "$1.");
+}
+
 /** A function that shows an error, or takes it away; `root` holds the step's fields, `id` is its toast's. */
 export function teller(root, id) {
   let beside = null;
@@ -10,11 +16,14 @@ export function teller(root, id) {
     const field = named && toast.parentNode.querySelector(`[id="${name}"], [id="knob-${name}-value"], [data-name="${name}"]`);
     if (field && field.checkVisibility()) {
       const text = document.createElement("small");
-      text.className = "refused"; text.id = `${id}-beside`; text.setAttribute("role", "alert"); text.textContent = error.message.slice(named[0].length);
+      text.className = "refused"; text.id = `${id}-beside`; text.setAttribute("role", "alert"); text.textContent = sentences(error.message.slice(named[0].length));
       (field.closest("label") ?? field).after(text);
       field.setAttribute("aria-invalid", "true"); field.setAttribute("aria-describedby", text.id);
       beside = { field, text }; text.scrollIntoView({ block: "nearest" });
     }
-    toast.textContent = error ? error.message : ""; toast.hidden = !error || beside !== null;
+    // a field that is folded away is named as on the page
+    const label = field && field.closest("label")?.firstChild.textContent.trim();
+    toast.textContent = error ? sentences(label ? `${label}: ${error.message.slice(named[0].length)}` : error.message) : "";
+    toast.hidden = !error || beside !== null;
   };
 }

@@ -1,8 +1,8 @@
 // The step Tune: sliders whose every move is a question to the server, and at most one under way; the latest wins.
 import { Chart } from "/curves.js";
-import { teller } from "/tell.js";
+import { sentences, teller } from "/tell.js";
 
-const PINS = ["A", "B"], MOST_NOTCHES = 4;
+const PINS = ["A", "B"], MOST_NOTCHES = 4, DEEPEST = -30, CALM = 700;
 const WEIGHTS = [["tracking", "per y"], ["chatter", "per u"], ["effort", "per u"], ["overshoot", "per %"], ["rise", "per ms"], ["lag", "per ms"], ["saturation", "per share"]];
 const KNOBS = { alpha: "weight alpha", beta: "weight beta", N: "derivative filter N", filter_samples: "speed filter", filter_time: "feedback filter" };
 const NUMBERS = [ // name, title, unit
@@ -25,9 +25,11 @@ export function mount(root, { ask, on, mark = () => {} }) {
     step: new Chart($("step-plot"), {}), command: new Chart($("command-plot"), {}), load: new Chart($("load-plot"), {}),
     loop: new Chart($("loop-plot"), { x: "frequency [Hz]", y: "|L| [dB]", log: true, marks: [0], floor: -60 }),
     phase: new Chart($("phase-plot"), { x: "frequency [Hz]", y: "phase of L [deg]", log: true, marks: [-180] }),
+    nichols: new Chart($("nichols-plot"), { x: "phase of L [deg]", y: "Nichols: |L| [dB]", along: "frequency [Hz]", marks: [0], floor: DEEPEST, roof: 40 }),
+    upset: new Chart($("upset-plot"), {}),
     sensitivity: new Chart($("sens-plot"), { x: "frequency [Hz]", y: "|S|, |T| [dB]", log: true, marks: [0], floor: -60 }),
   };
-  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, saving = false, notches = [], failed = "", front = [];
+  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, saving = false, notches = [], failed = "", front = [], before = null, verdict = null, weighing = 0;
 
   const question = more => ({ model: $("tune-model").value, controller: $("tune-start").value || null, values, notches, ...more });
   const given = pairs => Object.fromEntries(pairs.map(([name, id]) => [name, $(id).valueAsNumber]).filter(([, v]) => Number.isFinite(v)));
@@ -41,15 +43,19 @@ export function mount(root, { ask, on, mark = () => {} }) {
       opened = await ask("tune_open", question({ values: {} }));
       const start = Object.fromEntries(opened.knobs.map(k => [k.name, k.value]));
       values = { ...start, ...Object.fromEntries(Object.entries(kept).filter(([name]) => name in start)) };
-      history = []; pins = {}; first = null; now = null; front = []; $("front").hidden = true;
-      if (Object.keys(kept).length) first = { ...await ask("tune_move", question({ values: start })), values: start };
-      $("tune-members").textContent = opened.members > 1 ? `${opened.members} members: median and band` : "one model"; $("limit-unit").textContent = `[${opened.u_unit}]`;
+      history = []; pins = {}; first = before = now = verdict = null; front = []; $("front").hidden = true;
+      if (Object.keys(kept).length) first = await loopOf(start);
+      $("tune-members").textContent = opened.members > 1 ? `${opened.members} models. A curve is their median. Its band holds all of them.` : "one model"; $("limit-unit").textContent = `[${opened.u_unit}]`;
+      const measures = opened.counts || !opened.noise;
+      $("noise").disabled = measures; $("noise").checked = opened.counts || (!measures && $("noise").checked);
+      $("noise-what").textContent = opened.counts ? "Noise of the encoder's counts" : opened.noise ? `Noise of ${text(opened.noise)} ${opened.y_unit}, as recorded` : "Noise: none was recorded";
+      $("knob-feedforward-value").disabled = false;
       sliders(); move(); listNotches();
     } catch (error) { opened = null; $("knobs").replaceChildren(); tell(error); }
   }
 
   function sliders() {
-    knobs = opened.knobs.map(k => {
+    knobs = opened.knobs.filter(k => k.name !== "feedforward").map(k => {
       const label = document.createElement("label"), slider = document.createElement("input"), field = document.createElement("input");
       label.textContent = (KNOBS[k.name] ?? k.name.replaceAll("_", " ")) + (k.unit ? ` [${k.unit}]` : ""); label.htmlFor = `knob-${k.name}`;
       const to = v => k.log ? Math.log(v / k.low) / Math.log(k.high / k.low) : (v - k.low) / (k.high - k.low);
@@ -72,6 +78,8 @@ export function mount(root, { ask, on, mark = () => {} }) {
       return { show, nodes: [label, slider, field] };
     });
     $("knobs").replaceChildren(...knobs.flatMap(k => k.nodes));
+    const lead = () => { $("knob-feedforward-value").checked = values.feedforward === 1; };
+    knobs.push({ show: lead }); lead();
   }
 
   /** The sliders of the trade-off: one front, and either end of it; the calmest controller is the first. */
@@ -110,27 +118,39 @@ export function mount(root, { ask, on, mark = () => {} }) {
     if (!opened) { const said = $("tune-error").textContent; notches = before; await open(kept); tell(new Error(said)); }
   }
 
-  function keep(v) { tell(null); history.push({ ...v }); if (history.length > 200) history.shift(); enable(); }
+  function keep(v) { tell(null); before = now; history.push({ ...v }); if (history.length > 200) history.shift(); enable(); }
   function set(v) { keep(values); values = { ...v }; knobs.forEach(k => k.show()); move(); }
-  function undo() { tell(null); if (history.length) { values = history.pop(); knobs.forEach(k => k.show()); move(); } }
+  function undo() { tell(null); if (history.length) { before = now; values = history.pop(); knobs.forEach(k => k.show()); move(); } }
 
   /** Asks for the loop with the present values; while one question is under way only the latest waits. */
   async function move(began = performance.now()) {
     enable();
     if (asking) { again = began; return; }
-    asking = true; clearTimeout(resting); $("cost").classList.add("old");
+    asking = true; clearTimeout(resting); clearTimeout(weighing); $("cost").classList.add("old"); $("reasons").classList.add("old");
     const asked = values;
     try {
-      const found = await ask("tune_move", question());
+      const found = await loopOf(asked);
       if (found.stamp !== opened.stamp) return await anew();
-      now = { ...found, values: asked }; first ??= now; paint();
+      now = found; first ??= now; verdict = null; paint();
       // what something else has said stays until a person goes on
       if (failed && $("tune-error").textContent === failed) tell(null);
       failed = "";
       requestAnimationFrame(() => setTimeout(() => document.dispatchEvent(new CustomEvent("drawn", { detail: performance.now() - began }))));
-    } catch (error) { failed = error.message; tell(error); }
+    } catch (error) { tell(error); failed = $("tune-error").textContent; }
     asking = false;
     if (again !== null) { const since = again; again = null; move(since); } else resting = setTimeout(cost, 250);
+  }
+
+  async function loopOf(values) { return { ...await ask("tune_move", question({ values, noise: $("noise").checked && !opened.counts })), values }; }
+
+  /** Curves that stand beside the present ones, with noise or without as those. */
+  async function withNoise() {
+    try {
+      const fresh = new Map([[null, null]]);
+      for (const f of [first, before, pins.A, pins.B]) if (f && !fresh.has(f)) fresh.set(f, await loopOf(f.values));
+      first = fresh.get(first); before = fresh.get(before); for (const p of PINS) if (pins[p]) pins[p] = fresh.get(pins[p]);
+    } catch (error) { tell(error); }
+    move();
   }
 
   /** A file of this name is another one now: what is shown of it begins again, with the numbers as they stand. */
@@ -149,16 +169,47 @@ export function mount(root, { ask, on, mark = () => {} }) {
       if (asked !== values) return;
       const said = c => c === null ? "diverges" : `${c.toPrecision(4)} ${opened.y_unit}`;
       $("cost").textContent = `cost ${said(here)}, start ${said(start)}` + (here !== null && start ? ` (${(100 * (here / start - 1)).toFixed(1)} %)` : "");
-      $("cost").classList.remove("old");
+      $("cost").classList.remove("old"); weighing = setTimeout(weigh, CALM);
     } catch (error) { tell(error); }
   }
 
-  const STYLES = { now: 0, A: 1, B: 3, start: 5 };
-  const each = () => [["now", now], ...PINS.filter(p => pins[p]).map(p => [p, pins[p]]), ["start", first]].filter(([, f], i) => i === 0 || f !== now);
+  /** The verdict of the core on these gains; it runs the references, so it waits for a longer rest. */
+  async function weigh() {
+    if (asking || !opened) return;
+    const asked = values;
+    try {
+      const found = await ask("tune_verdict", question());
+      if (asked !== values) return;
+      verdict = found; const said = found.text.slice(found.grade.length + 2);
+      $("reasons").textContent = said ? sentences(said) : ""; $("reasons").classList.remove("old"); lights();
+    } catch (error) { tell(error); }
+  }
+
+  const STYLES = { now: 0, A: 1, B: 3, before: 5, start: 5 };
+  const each = () => {
+    const beside = $("compare").value, other = beside === "before" && before !== first ? before : beside ? first : null;
+    return [["now", now], ...PINS.filter(p => pins[p]).map(p => [p, pins[p]]), [other === first ? "start" : "before", other]].filter(([, f], i) => i === 0 || (f && f !== now));
+  };
 
   function series(x, name, f, label, style) {
     const c = f.curves;
     return c[name] ? [{ name: label, x: c[x], y: c[name], low: f === now ? c[`${name}_low`] : null, high: c[`${name}_high`], style }] : [];
+  }
+
+  /** L as a path through gain and phase; of an ensemble each frequency has a box that holds all members. */
+  function nichols(label, f, style) {
+    const c = f.curves, end = c.L_db.findIndex(v => v < DEEPEST), cut = name => c[name]?.slice(0, end > 0 ? end : undefined);
+    const box = f === now && c.L_db_low ? [cut("L_deg_low"), cut("L_deg_high"), cut("L_db_low"), cut("L_db_high")] : null;
+    return { name: label, x: cut("L_deg"), y: cut("L_db"), along: cut("hertz"), box, style };
+  }
+  /** Where |S| is at its limit: 1 + L lies on a circle about 0. */
+  function circle(Ms) {
+    const x = [], y = [];
+    for (let k = 0; k <= 90; k++) {
+      const a = k * Math.PI / 45, re = 1 - Math.cos(a) / Ms, im = -Math.sin(a) / Ms;
+      x.push(-180 + Math.atan2(im, re) * 180 / Math.PI); y.push(20 * Math.log10(Math.hypot(re, im)));
+    }
+    return { name: `Ms ${Ms}`, x, y, style: 4 };
   }
 
   function paint() {
@@ -169,6 +220,9 @@ export function mount(root, { ask, on, mark = () => {} }) {
     charts.step.draw(now.diverges ? [] : all("reference_t", "reference_y"), `step response, ${says}`);
     charts.command.draw(now.diverges ? [] : all("reference_t", "reference_u"), "command of the step");
     charts.load.draw(now.diverges ? [] : all("disturbance_t", "disturbance_y"), `disturbance response, recovery ${text(now.recovery_ms)} ms`);
+    charts.upset.axes.y = `command, disturbed [${u}]`; charts.upset.draw(now.diverges ? [] : all("disturbance_t", "disturbance_u"), "command against the disturbance");
+    const limit = limitMs();
+    charts.nichols.draw([...shown.map(([label, f]) => nichols(label, f, style(label))), ...limit > 1 ? [circle(limit)] : []], `Nichols chart of L, and where Ms is ${limit}`, [{ x: -180, y: 0, label: "\u22121" }]);
     charts.loop.draw(all("hertz", "L_db"), "size of L over frequency");
     charts.phase.draw(all("hertz", "L_deg"), "phase of L over frequency");
     charts.sensitivity.draw([...series("hertz", "S_db", now, "S", 0), ...series("hertz", "T_db", now, "T", 4),
@@ -178,29 +232,44 @@ export function mount(root, { ask, on, mark = () => {} }) {
 
   const text = v => v === null || v === undefined ? "none" : Number(v.toPrecision(3)).toString();
 
+  /** The table is made when its columns change; a move only writes into it, which the browser lays out sooner. */
   function numbers(shown) {
-    const table = $("numbers"), head = document.createElement("tr"), unit = { u: opened.u_unit, y: opened.y_unit, "u/y": `${opened.u_unit}/${opened.y_unit}` };
-    for (const title of ["", ...shown.map(([label]) => label), "unit"]) { const th = document.createElement("th"); th.scope = "col"; th.textContent = title; head.append(th); }
-    table.replaceChildren(head, ...NUMBERS.map(([name, title, of]) => {
-      const row = document.createElement("tr"), th = document.createElement("th"); th.scope = "row"; th.textContent = title; row.append(th);
-      for (const [, f] of shown) { const td = row.insertCell(); td.textContent = text(f[name]); td.className = "n"; }
-      row.insertCell().textContent = unit[of] ?? of;
-      return row;
-    }));
+    const table = $("numbers"), titles = shown.map(([label]) => label), unit = { u: opened.u_unit, y: opened.y_unit, "u/y": `${opened.u_unit}/${opened.y_unit}` };
+    const head = ["number", ...titles, "unit"], rows = NUMBERS.map(([name, title, of]) => [title, ...shown.map(([, f]) => text(f[name])), unit[of] ?? of]);
+    if (table.rows.length !== rows.length + 1 || table.rows[0].cells.length !== head.length) {
+      table.replaceChildren(...[head, ...rows].map((cells, k) => {
+        const row = document.createElement("tr");
+        row.append(...cells.map((_, i) => {
+          const cell = document.createElement(k && i ? "td" : "th");
+          if (k && i && i <= titles.length) cell.className = "n";
+          if (!k || !i) cell.scope = k ? "row" : "col";
+          return cell;
+        }));
+        return row;
+      }));
+    }
+    [head, ...rows].forEach((cells, k) => cells.forEach((said, i) => { const cell = table.rows[k].cells[i]; if (cell.textContent !== said) cell.textContent = said; }));
   }
 
-  /** Limits as words and signs, never by colour alone. */
+  const limitMs = () => parseFloat($("limit-Ms").value) || 1.8, KINDS = { good: "good", fair: "warn", poor: "bad", unfit: "bad" };
+
+  /** The verdict and the limits as words and signs, never by colour alone. */
   function lights() {
-    const limit = parseFloat($("limit-Ms").value) || 1.8, over = parseFloat($("limit-overshoot").value), most = parseFloat($("limit-u").value);
+    const limit = limitMs(), over = parseFloat($("limit-overshoot").value), most = parseFloat($("limit-u").value);
     const rows = [["stable", now.stable && !now.diverges, now.stable ? "yes" : "no"], [`Ms at most ${limit}`, now.stable && now.Ms <= limit, text(now.Ms)]];
     if (Number.isFinite(over)) rows.push([`overshoot at most ${over} %`, !now.diverges && now.overshoot_percent <= over, text(now.overshoot_percent)]);
     if (Number.isFinite(most)) rows.push([`command at most ${most} ${opened.u_unit}`, !now.diverges && now.u_peak <= most, text(now.u_peak)]);
     if (limit > 1) $("Ms-means").textContent = `Ms ${limit} leaves a gain margin of at least ${text(limit / (limit - 1))} and a phase margin of at least ${text(2 * Math.asin(.5 / limit) * 180 / Math.PI)} degrees.`;
-    $("lights").replaceChildren(...rows.map(([what, ok, found]) => {
-      const li = document.createElement("li"); li.textContent = `${ok ? "kept" : "broken"}: ${what} (${found})`; li.className = `chip ${ok ? "good" : "bad"}`; return li;
-    }));
-    const broken = rows.find(([, ok]) => !ok);
-    mark("tune", broken ? "limit broken" : `Ms ${text(now.Ms)}`, broken ? "bad" : "good");
+    const chips = [[`gains: ${verdict ? verdict.grade : "being judged"}`, verdict ? KINDS[verdict.grade] : ""],
+      ...rows.map(([what, ok, found]) => [`${ok ? "kept" : "broken"}: ${what} (${found})`, ok ? "good" : "bad"])];
+    while ($("lights").children.length > chips.length) $("lights").lastChild.remove();
+    chips.forEach(([said, kind], k) => {
+      const li = $("lights").children[k] ?? $("lights").appendChild(document.createElement("li"));
+      if (li.textContent !== said) li.textContent = said;
+      li.className = `chip ${kind}`;
+    });
+    const broken = rows.find(([, ok]) => !ok), judged = verdict && verdict.grade !== "good";
+    mark("tune", broken ? "limit broken" : judged ? verdict.grade : `Ms ${text(now.Ms)}`, broken ? "bad" : judged ? KINDS[verdict.grade] : "good");
   }
 
   function enable() {
@@ -235,7 +304,14 @@ export function mount(root, { ask, on, mark = () => {} }) {
     $(`pin-${p}`).onclick = () => { pins[p] = now; enable(); paint(); };
     $(`take-${p}`).onclick = () => set(pins[p].values);
   }
-  for (const id of ["limit-Ms", "limit-overshoot", "limit-u"]) $(id).oninput = () => { if (now) lights(); };
+  for (const id of ["limit-Ms", "limit-overshoot", "limit-u", "compare"]) $(id).oninput = () => { if (now) paint(); };
+  $("noise").onchange = withNoise;
+  let alone = null;  // the weights of the reference, whose work a feedforward does
+  $("knob-feedforward-value").onchange = event => {
+    const on = event.target.checked, { alpha, beta } = values;
+    set({ ...values, ...on ? { alpha: 0, beta: 0 } : alone, feedforward: on ? 1 : 0 });
+    alone = on ? { alpha, beta } : null;
+  };
   $("search").onclick = () => search("tune_search");
   $("trade").onclick = () => search("tune_front");
   async function search(what) {
@@ -280,7 +356,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
     front = m.found.front; const most = front.length - 1;
     for (const id of ["front-response", "front-robust"]) $(id).max = most;
     $("front").hidden = false; $("knobs-fold").open = false;
-    $("tune-progress").textContent = `${front.length} controllers, none better than another in both`;
+    $("tune-progress").textContent = `Found ${front.length} controllers. Each is better than every other in response or in robustness.`;
     // where it begins: the fastest that keeps the limit
     const limit = parseFloat($("limit-Ms").value) || 1.8, kept = front.map((f, k) => f.Ms <= limit ? k : 0);
     set({ ...values, ...trade(Math.max(...kept)) });

@@ -24,7 +24,7 @@ from cli import PROGRAM, environment
 from effort import FULL
 from moments import until
 from sewfast.errors import SettingError
-from sewfast.tuning import costs, first_controller
+from sewfast.tuning import costs, first_controller, led, verdict_on
 from sewfast_studio import Project, Step, Studio
 from sewfast_studio.requests import envelope
 from studio_page import EVIL, Page, websockets
@@ -159,7 +159,7 @@ def test_one_page_writes_and_others_look_on(studio: Studio, page: Page) -> None:
 # --- Tuning ---------------------------------------------------------------------------------------
 
 
-MOVE = {"model": "drive.json", "values": {"Kp": 0.03, "Ti": 0.07}}
+MOVE: dict[str, Any] = {"model": "drive.json", "values": {"Kp": 0.03, "Ti": 0.07}}
 
 
 def test_a_move_gives_what_the_library_gives(tuned: Studio) -> None:
@@ -194,9 +194,39 @@ def test_costs_are_those_of_tune(tuned: Studio) -> None:
     assert second != first
 
 
+def test_noise_and_feedforward_are_those_of_the_library(tuned: Studio) -> None:
+    model = sewfast.load_model(tuned.project.folder / "drive.json")
+    tuning, start = tuned.project.tuning("drive.json"), first_controller(model)
+    with Page(tuned) as page:
+        calm = page.ask("tune_move", **MOVE)["curves"]
+        noisy = page.ask("tune_move", **MOVE, noise=True)["curves"]
+    assert np.array_equal(noisy["L_db"], calm["L_db"])
+    assert not np.array_equal(noisy["reference_u"], calm["reference_u"])
+    wanted, _ = led(start, model)
+    assert wanted.feedforward is not None
+    with_lead = tuning.controller({"feedforward": 1, "alpha": 0.0, "beta": 0.0})
+    assert replace(with_lead, notes=wanted.notes) == wanted
+    with_lead.save(tuned.project.folder / "led.json")
+    other = tuned.project.tuning("drive.json", "led.json")
+    assert other.controller({}).feedforward == wanted.feedforward
+    assert other.controller({"feedforward": 0}).feedforward is None
+
+
+def test_the_verdict_is_that_of_tune(tuned: Studio) -> None:
+    tuning = tuned.project.tuning("drive.json")
+    found = sewfast.tune(tuning.model, evaluations=60, feedforward="none")
+    assert verdict_on(found.controller, tuning.model) == found.verdict
+    with Page(tuned) as page:
+        hot = page.ask("tune_verdict", **{**MOVE, "values": {"Kp": 0.1}})["found"]
+    assert hot["grade"] == "poor"
+    assert "Ms is" in hot["text"]
+    assert "lower Kp" in hot["text"]
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
+        {"values": {"feedforward": 2}},
         {"values": {"Kp": "1"}},
         {"values": {"Kp": float("inf")}},
         {"values": {"Kp": True}},
@@ -257,19 +287,22 @@ def _run_copies(folder: Path, script: str, commands: str) -> list[bytes]:
 
 
 @pytest.mark.nightly("a search, made twice")
-def test_copies_of_a_controller_give_the_same_file(tuned: Studio) -> None:
-    folder = tuned.project.folder
+@pytest.mark.parametrize("lead", [0, 1])
+def test_copies_of_a_controller_give_the_same_file(tuned: Studio, lead: int) -> None:
+    folder, values = tuned.project.folder, {**MOVE["values"], "feedforward": lead}
     with Page(tuned) as page:
-        said = page.ask("tune_save", file="controller.json", **MOVE)["found"]
+        asked = {**MOVE, "values": values}
+        said = page.ask("tune_save", file="controller.json", **asked)["found"]
     written = (folder / "controller.json").read_bytes()
     assert _run_copies(folder, said["python"], said["commands"]) == [written, written]
 
 
 @pytest.mark.nightly("a search, made twice; controllers' copies run in `make test`")
-def test_copies_of_a_search_give_the_same_file(tuned: Studio) -> None:
-    folder = tuned.project.folder
+@pytest.mark.parametrize("lead", [0, 1])
+def test_copies_of_a_search_give_the_same_file(tuned: Studio, lead: int) -> None:
+    folder, values = tuned.project.folder, {**MOVE["values"], "feedforward": lead}
     with Page(tuned) as page:
-        page.ask("tune_search", evaluations=60, seed=3, **MOVE)
+        page.ask("tune_search", evaluations=60, seed=3, **{**MOVE, "values": values})
         assert page.event("progress")["of"] == "searched"
         found = page.event("searched")["found"]
         assert found["cost"] < found["start_cost"]

@@ -390,8 +390,13 @@ def test_pictures_share_a_cursor_and_become_files(tuned: Studio, browser: Any) -
     canvas = browser.find_element("css selector", "#command-plot canvas")
     ActionChains(browser).move_to_element(canvas).perform()
     shown = [text for hidden, text in browser.execute_script(SEEN) if not hidden]
-    assert len(shown) == 3  # those over time, and none over frequency
+    assert len(shown) == 4  # those over time, and none over frequency
     assert all(text.startswith("time ") and "now " in text for text in shown)
+    canvas = browser.find_element("css selector", "#nichols-plot canvas")
+    ActionChains(browser).move_to_element(canvas).perform()
+    shown = [text for hidden, text in browser.execute_script(SEEN) if not hidden]
+    assert len(shown) == 4  # Nichols and the three over frequency
+    assert all(text.startswith("frequency ") for text in shown)
     intact, texts, kind, part, whole = browser.execute_async_script(FILES)
     assert intact
     assert texts > 10
@@ -497,12 +502,47 @@ def test_a_refusal_stands_at_its_field(tuned: Studio, browser: Any) -> None:
     until(lambda: browser.find_elements("css selector", ".refused"))
     assert not at("tune-error").is_displayed()
     assert at("evaluations").get_attribute("aria-invalid") == "true"
-    assert at(at("evaluations").get_attribute("aria-describedby")).text.startswith("expected")
+    assert at(at("evaluations").get_attribute("aria-describedby")).text.startswith("Expected")
     if "STUDIO_PICTURES" in os.environ:
         browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", at("evaluations"))
         browser.save_screenshot(str(Path(os.environ["STUDIO_PICTURES"]) / "refused.png"))
     _search(at, "20", "search")
     until(lambda: not browser.find_elements("css selector", ".refused"))
+
+
+TITLES = "return [...document.querySelectorAll('#numbers th[scope=col]')].map(e => e.textContent)"
+
+
+PICTURE = "return document.querySelector('#command-plot canvas').toDataURL()"
+
+
+@pytest.mark.nightly("a browser")
+@pytest.mark.alone
+def test_before_and_after_feedforward_noise_and_reasons(tuned: Studio, browser: Any) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    browser.get(tuned.address)
+    until(lambda: "gains: fair" in at("lights").text)
+    assert at("reasons").text == "The model is graded fair."
+    at("knob-feedforward-value").click()
+    until(lambda: "start" in browser.execute_script(TITLES))
+    first = at("knob-alpha-value").get_attribute("value")
+    assert float(first) == 0.0  # its work is done
+    at("knob-Kp").send_keys(Keys.ARROW_RIGHT)
+    until(lambda: "before" in browser.execute_script(TITLES))
+    at("compare").send_keys("the start")
+    until(lambda: "start" in browser.execute_script(TITLES))
+    calm = browser.execute_script(PICTURE)
+    at("noise").click()
+    until(lambda: browser.execute_script(PICTURE) != calm)
+    at("knob-feedforward-value").click()
+    until(lambda: float(at("knob-alpha-value").get_attribute("value")) > 0.0)
+    at("undo").click()
+    until(lambda: at("knob-feedforward-value").is_selected())
+    assert browser.get_log("browser") == []
 
 
 @pytest.mark.nightly("searches from a browser")

@@ -101,6 +101,9 @@ def test_the_trade_off_is_a_front_from_calm_to_quick(tuned: Studio) -> None:
         errors, peaks = ([f[name] for f in front] for name in ("cost", "Ms"))
         assert errors == sorted(errors, reverse=True)
         assert peaks == sorted(peaks)
+        for point in front[:: len(front) - 1]:
+            costs = page.ask("tune_costs", **{**MOVE, "values": point["values"]})["found"]["costs"]
+            assert costs[1] == point["cost"]
         shown = page.ask("tune_move", **{**MOVE, "values": front[0]["values"]})["found"]
         assert shown["stable"]
 
