@@ -372,6 +372,41 @@ def test_a_useless_model_is_called_useless() -> None:
     assert verdict["next"]
 
 
+def test_a_hum_hides_nothing_that_a_model_lacks() -> None:
+    data = bent_data(800)
+    (e,) = data.experiments
+    hum = 0.2 * e.y.std() * np.sqrt(2.0) * np.sin(2.0 * np.pi * 0.4 * np.arange(800))
+    white = 0.2 * e.y.std() * np.random.default_rng(0).standard_normal(800)
+    for noise in (hum, white):
+        noisy = Dataset.from_arrays(e.u, e.y + noise, 0.01)
+        assert identify(noisy, model="oe").training["verdict"]["grade"] != "good"
+    (e,) = linear_data(800).experiments
+    noisy = Dataset.from_arrays(e.u, e.y + 0.2 * e.y.std() * white / white.std(), 0.01)
+    assert identify(noisy, model="oe").training["verdict"]["grade"] == "good"
+
+
+def test_what_differs_without_a_part_of_the_record_is_not_praised() -> None:
+    # a slow pole explains the noise of a short record, another one in each part
+    rng = np.random.default_rng(29)
+    u, y = np.repeat(rng.uniform(-1.0, 1.0, 15), 20), np.zeros(300)
+    for k in range(1, 300):
+        y[k] = 0.97 * y[k - 1] + u[k - 1]
+    drift = np.cumsum(rng.standard_normal(300))
+    data = Dataset.from_arrays(u, y + 0.2 * y.std() * drift / drift.std(), 0.01)
+    own = identify(data, model="oe", na=3, nb=3).training["verdict"]
+    assert own["grade"] != "good"
+    assert "without one of its parts" in own["text"]
+
+
+def test_a_record_that_nothing_can_be_held_out_of_is_not_praised() -> None:
+    data = linear_data(75)
+    own = identify(data, model="oe").training["verdict"]
+    assert own["grade"] == "fair"
+    assert "nothing of the record can be held out" in own["text"]
+    longer = identify(linear_data(100), model="oe").training["verdict"]
+    assert (longer["grade"], "of data not trained on" in longer["text"]) == ("good", True)
+
+
 @pytest.mark.parametrize("kind", ["arx", "iv", "oe", "neural_oe", "hammerstein_wiener"])
 def test_a_kind_by_name_gets_a_verdict_too(kind: Any) -> None:
     options: dict[str, Any] = {"starts": 2, "iterations": 20} if kind == "neural_oe" else {}

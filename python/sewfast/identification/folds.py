@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -273,38 +274,93 @@ TEXTS = {
     "poor": "not good enough to tune a controller on",
     "useless": "useless",
 }
+RANKS = tuple(reversed(TEXTS))
+"""Grades, the worst first; an output that hardly moves has none."""
 UNSEEN_DATA = "data not trained on"
 
 
-def verdict(
-    model: Model,
-    data: Dataset,
-    part: Split,
-    error: float | None = None,
-    where: str = UNSEEN_DATA,
-) -> Provenance:
-    """Whether the model is good enough to tune a controller on, in words and as values.
-    `data` are its training data, and `part` those to judge by, described by `where`; the free-run
-    error of other samples, `error` [output unit], counts instead of that of the part. The result
-    has `grade` ("good", "fair", "poor" or "useless"), `fit_percent`, `text`, and `next`: a list of
-    things to do, the most important one first.
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Free runs over a part of the data by which a model is judged.
+    `error` is their root mean square error, `residuals` what they leave of the outputs of each
+    experiment, NaN where it is not scored. `apart` is the standard error of the model's own free
+    run, from models of the data without each block. All in the output's unit.
     """
-    # `error` can come from other samples; the share explained by the input needs the same ones
+
+    part: Split
+    error: float
+    residuals: Sequence[FloatArray]
+    apart: float = 0.0
+
+
+def tried(model: Model, part: Split) -> Trial:
+    """The model's own free run over a part."""
+    try:
+        runs = scored_runs(model, part.held, INIT)
+    except (DataError, FitError):
+        return Trial(part, math.inf, ())
+    residuals = [e.y - run for run, e in zip(runs, part.held.experiments, strict=True)]
+    for residual, e in zip(residuals, part.held.experiments, strict=True):
+        residual[: e.initial_samples(INIT)] = np.nan
+    return Trial(part, free_run_error(model, part.held, INIT), residuals)
+
+
+FreeRuns: TypeAlias = Callable[[Split], Sequence[FloatArray] | None]
+"""Free runs over the held-out part, one for each experiment; None if one diverges."""
+
+
+def apart(model: Model, data: Dataset, without: Sequence[FreeRuns]) -> float:
+    """Standard error of a model's free run [output unit]; infinite if one diverges.
+    `without` are models of the same data without one block each: the grouped jackknife (Efron and
+    Tibshirani 1993, section 11.5). They run over the inputs of the data, and on with the same
+    backwards: where a record was, its outputs hold even a pole together that is the noise's.
+    """
+    further = []
+    for e in data.experiments:
+        u, unknown = np.concatenate([e.u, e.u[::-1]]), np.full(len(e), np.nan)
+        longer = replace(e, u=u, y=np.concatenate([e.y, unknown]), channels={}, weights=None)
+        further.append(longer)
+    on = Split(data, replace(data, experiments=tuple(further)))
+    try:
+        own = np.concatenate(model.simulate(on.held))
+    except FitError:
+        return math.inf
+    squares, n = 0.0, len(without)
+    for run in without:
+        if (runs := run(on)) is None:
+            return math.inf
+        squares += float(np.mean((np.concatenate(runs) - own) ** 2))
+    return math.sqrt((n - 1) / n * squares) if n else 0.0
+
+
+def verdict(model: Model, data: Dataset, trial: Trial, where: str = UNSEEN_DATA) -> Provenance:
+    """Whether the model is good enough to tune a controller on, in words and as values.
+    `data` are its training data, and those of the trial are described by `where`. The result has
+    `grade` ("good", "fair", "poor" or "useless"), `fit_percent`, `text`, and `next`: a list of
+    things to do, the most important one first. The grade is that of the error on the trial or, if
+    that is larger, of the model's own standard error. Without unseen data none is "good".
+    """
+    part, error, spread = trial.part, trial.error, trial.part.spread
     own = free_run_error(model, part.held, INIT)
-    error = own if error is None else error
-    spread = part.spread
     fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")
-    noise = noise_of([e.y for e in data.experiments])
+    noise = noise_of([e.y for e in data.experiments], trial.residuals)
     share = by_input(own, without_input(model, part.held, INIT))
-    grade, resting = judged(fit, error, noise, share)
+    grade, remark = judged(fit, error, noise, share)
+    steady = grade_of(100.0 * (1.0 - trial.apart / spread), trial.apart, 0.0) if grade else ""
+    if RANKS.index(steady) < RANKS.index(grade):
+        grade = steady
+        remark = (
+            f"{remark}, but models without one of its parts differ from it by "
+            f"{100.0 * trial.apart / spread:.0f} %"
+        )
     unit = f" {data.output_unit}" if data.output_unit else ""
     rmse = f"rmse {error:.3g}{unit}"
     text, todo = TEXTS[grade], []
     if not np.isfinite(error):
         text = "useless: its free run leaves the finite numbers"
     elif grade:
-        text += f": free run explains {fit:.1f} % of {where} ({rmse}){resting}"
-        if grade == "useless" and not resting:
+        text += f": free run explains {fit:.1f} % of {where} ({rmse}){remark}"
+        if grade == "useless" and not remark:
             text += "; a constant would do about as well"
     else:
         text += f" ({rmse})"
