@@ -387,15 +387,15 @@ def test_a_hum_hides_nothing_that_a_model_lacks() -> None:
 
 def test_what_differs_without_a_part_of_the_record_is_not_praised() -> None:
     # a slow pole explains the noise of a short record, another one in each part
-    rng = np.random.default_rng(29)
-    u, y = np.repeat(rng.uniform(-1.0, 1.0, 15), 20), np.zeros(300)
+    rng = np.random.default_rng(6)
+    u, y = np.repeat(rng.uniform(-1.0, 1.0, 10), 30), np.zeros(300)
     for k in range(1, 300):
-        y[k] = 0.97 * y[k - 1] + u[k - 1]
-    drift = np.cumsum(rng.standard_normal(300))
-    data = Dataset.from_arrays(u, y + 0.2 * y.std() * drift / drift.std(), 0.01)
+        y[k] = 0.93 * y[k - 1] + u[k - 1]
+    data = Dataset.from_arrays(u, y + 0.2 * y.std() * rng.standard_normal(300), 0.01)
     own = identify(data, model="oe", na=3, nb=3).training["verdict"]
-    assert own["grade"] != "good"
+    assert own["grade"] == "fair"
     assert "without one of its parts" in own["text"]
+    assert identify(data, model="oe", na=1, nb=1).training["verdict"]["grade"] == "good"
 
 
 def test_a_record_that_nothing_can_be_held_out_of_is_not_praised() -> None:

@@ -249,6 +249,19 @@ class Mixture:
         residual = residuals @ weights
         return cls(tuple(rows), weights, residual, blocks.errors(residual))
 
+    def unseen(self, blocks: Blocks) -> FloatArray:
+        """What they leave on each block with weights from the others: errors of rows cancel where
+        their weights were found, and not on another recording.
+        """
+        if len(self.rows) == 1 or len(blocks.sizes) == 1:
+            return self.residual
+        residuals, left = np.column_stack([r.residual for r in self.rows]), self.residual.copy()
+        fold = np.repeat(np.arange(len(blocks.sizes)), blocks.sizes)
+        for own in (fold == i for i in range(len(blocks.sizes))):
+            others = _core.convex_weights(residuals[~own], blocks.weights[~own])
+            left[own] = residuals[own] @ others
+        return left
+
 
 def combined(rows: Sequence[Row], blocks: Blocks) -> Mixture:
     """The fewest rows that do as well as all of them, within a standard error or two per cent.

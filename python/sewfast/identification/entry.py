@@ -387,7 +387,7 @@ def _verdict(model: Model, task: Task) -> Provenance:
             f"{TEXTS['fair']}: nothing of the record can be held out to judge by; {measured}"
         )
         found["next"] = what_to_record(data)
-    if is_linear and found["grade"] in ("good", "fair"):
+    if is_linear and found["grade"] != "useless":
         slowest, longest = linear.time_constant(model.core), max(len(e) for e in data.experiments)
         # a real integrator is not a superfluous pole
         if slowest > linear.UNSEEN * longest and diagnose(data).find("integrator") is None:

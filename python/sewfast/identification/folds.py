@@ -274,8 +274,6 @@ TEXTS = {
     "poor": "not good enough to tune a controller on",
     "useless": "useless",
 }
-RANKS = tuple(reversed(TEXTS))
-"""Grades, the worst first; an output that hardly moves has none."""
 UNSEEN_DATA = "data not trained on"
 
 
@@ -337,8 +335,8 @@ def verdict(model: Model, data: Dataset, trial: Trial, where: str = UNSEEN_DATA)
     """Whether the model is good enough to tune a controller on, in words and as values.
     `data` are its training data, and those of the trial are described by `where`. The result has
     `grade` ("good", "fair", "poor" or "useless"), `fit_percent`, `text`, and `next`: a list of
-    things to do, the most important one first. The grade is that of the error on the trial or, if
-    that is larger, of the model's own standard error. Without unseen data none is "good".
+    things to do, the most important one first. A model whose own standard error is larger than a
+    good model's error is "fair" at best.
     """
     part, error, spread = trial.part, trial.error, trial.part.spread
     own = free_run_error(model, part.held, INIT)
@@ -346,13 +344,9 @@ def verdict(model: Model, data: Dataset, trial: Trial, where: str = UNSEEN_DATA)
     noise = noise_of([e.y for e in data.experiments], trial.residuals)
     share = by_input(own, without_input(model, part.held, INIT))
     grade, remark = judged(fit, error, noise, share)
-    steady = grade_of(100.0 * (1.0 - trial.apart / spread), trial.apart, 0.0) if grade else ""
-    if RANKS.index(steady) < RANKS.index(grade):
-        grade = steady
-        remark = (
-            f"{remark}, but models without one of its parts differ from it by "
-            f"{100.0 * trial.apart / spread:.0f} %"
-        )
+    if grade == "good" and (loose := 100.0 * trial.apart / spread) > 100.0 - GOOD:
+        grade = "fair"
+        remark += f", but models without one of its parts differ from it by {loose:.0f} %"
     unit = f" {data.output_unit}" if data.output_unit else ""
     rmse = f"rmse {error:.3g}{unit}"
     text, todo = TEXTS[grade], []

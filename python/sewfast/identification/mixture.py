@@ -25,7 +25,7 @@ from ..models.base import EnsembleCore
 from ..models.grey_box import GreyBox
 from . import grey_box
 from .blocks import Blocks, Mixture, Row, blocked, combined
-from .folds import LEAST_HELD_OUT, TEXTS, Trial, apart, verdict, what_to_record
+from .folds import LEAST_HELD_OUT, TEXTS, WORTH_IT, Trial, apart, verdict, what_to_record
 from .grey_box import or_none
 from .linear import LinearCandidate, linear_provenance, short
 from .table import SHARE_OF_REFIT, TRAINING, Table
@@ -38,9 +38,6 @@ REFIT = 15
 """Iterations on all data of a network that was trained without a block."""
 MOST_MEMBERS = 15
 """Members of an ensemble: a controller is tuned on each, and a median of more is hardly better."""
-WORTH_IT = 0.9
-"""A network that was asked for says so if its error is not below this part of the best linear
-model's."""
 _CLASSES: dict[type, type[Model]] = {
     _core.LinearModel: LinearOE, _core.GreyBox: GreyBox, _core.NeuralOE: NeuralOE,
     _core.NeuralSS: NeuralSS,
@@ -128,7 +125,9 @@ class Ending:
         """What the mixture leaves on the blocks, and how far it is apart without each of them."""
         folds = [] if self.table.folds[0].is_given else range(len(self.table.folds))
         without = [partial(mixture.runs, i) for i in folds]
-        return self.table.blocks.trial(mixture.residual, apart(model, self.task.data, without))
+        return self.table.blocks.trial(
+            mixture.unseen(self.table.blocks), apart(model, self.task.data, without)
+        )
 
     def _with_blocks(self, model: Model, mixture: Mixture) -> Model:
         """The verdict with the fit of each block, which shows how far the figure can be trusted."""
@@ -138,7 +137,8 @@ class Ending:
         if not np.isfinite(mixture.residual).all():
             return model
         ends = np.cumsum(sizes)[:-1]
-        squares = np.split(self.table.blocks.weights * mixture.residual**2, ends)
+        left = mixture.unseen(self.table.blocks)
+        squares = np.split(self.table.blocks.weights * left**2, ends)
         counts = np.split(self.table.blocks.weights, ends)
         fits = [
             100.0 * (1.0 - math.sqrt(float(p.sum() / w.sum())) / spread)
