@@ -17,13 +17,13 @@ from sewfast.dataset import diagnose
 from sewfast.errors import DataError, FitError, Interrupted, SettingError
 from sewfast.identification import table
 from sewfast.identification.folds import (
-    FOLDS,
     RUNAWAY,
     Errors,
+    Split,
     compared,
     errors_of,
-    folds,
     free_runs,
+    later_part,
 )
 from sewfast.identification.linear import DELAYS, LinearTable, raised
 from sewfast.identification.task import Clock, Pool, Stopped, Task
@@ -49,34 +49,36 @@ def pool() -> Pool:
 # --- what is held out -----------------------------------------------------------------------------
 
 
-def test_every_fold_is_later_than_what_it_is_judged_by() -> None:
+def part_of(data: Dataset, validation: Dataset | None = None) -> Split:
+    part = later_part(data, validation)
+    assert part is not None
+    return part
+
+
+def test_what_a_model_is_judged_by_is_later_than_what_it_is_fitted_to() -> None:
     data = Dataset.concat([linear_data(1000, name="a"), linear_data(500, name="b")])
-    found = folds(data)
-    assert len(found) == FOLDS
-    ranges = [[s["range"] for s in f.sources] for f in found]
-    assert ranges == [["800:1000", "400:500"], ["600:800", "300:400"], ["400:600", "200:300"]]
-    for fold, stop in zip(found, (800, 600, 400), strict=True):
-        assert [len(e) for e in fold.fitted.experiments] == [stop, stop // 2]
-        assert fold.scored == 300
+    part = part_of(data)
+    assert [s["range"] for s in part.sources] == ["800:1000", "400:500"]
+    assert [len(e) for e in part.fitted.experiments] == [800, 400]
+    assert part.scored == 300
 
 
-def test_given_validation_data_are_the_only_fold() -> None:
-    (only,) = folds(linear_data(400), linear_data(300, seed=3))
-    assert only.is_given
-    assert len(only.fitted) == 400
+def test_given_validation_data_are_the_part_to_judge_by() -> None:
+    part = part_of(linear_data(400), linear_data(300, seed=3))
+    assert part.is_given
+    assert len(part.fitted) == 400
 
 
-def test_a_short_record_has_fewer_folds() -> None:
-    assert folds(linear_data(60)) == ()
-    assert len(folds(linear_data(210))) == FOLDS
+def test_a_short_record_has_no_later_part() -> None:
+    assert later_part(linear_data(60)) is None
+    assert later_part(linear_data(210)) is not None
 
 
 def test_of_many_short_experiments_the_last_ones_are_held_out() -> None:
     data = Dataset.concat([linear_data(60, seed=i, name=str(i)) for i in range(10)])
-    found = folds(data)
-    held = [[s["name"] for s in f.sources] for f in found]
-    assert held == [["8", "9"], ["6", "7"], ["4", "5"]]
-    assert [len(f.fitted.experiments) for f in found] == [8, 6, 4]
+    part = part_of(data)
+    assert [s["name"] for s in part.sources] == ["8", "9"]
+    assert len(part.fitted.experiments) == 8
 
 
 @pytest.mark.skipif(not FULL, reason="a search over networks of half a minute: SEWFAST_SOAK=1")
@@ -102,7 +104,7 @@ def errors(squares: F) -> Errors:
 
 def test_errors_are_those_of_the_free_run_after_its_initial_samples() -> None:
     data = linear_data(1000, noise=0.3)
-    split = folds(data)[0]
+    split = part_of(data)
     core = _core.fit_arx([(e.u, e.y) for e in data.experiments], na=2, nb=2, nk=1, offset=True)
     runs = free_runs(core, split)
     assert runs is not None
@@ -156,7 +158,7 @@ def test_a_small_order_and_the_delay_are_found(delay: int) -> None:
     orders = []
     for seed in range(5):
         data = first_order(seed, delay, noise=0.1)
-        table = LinearTable(task(data).nk, folds(data)[:1], pool())
+        table = LinearTable(task(data).nk, [part_of(data)], pool())
         table.search(None)
         orders.append(table.choice.order)
         assert table.choice.rmse < 1.01 * table.best.rmse
@@ -170,7 +172,7 @@ def test_a_small_order_and_the_delay_are_found(delay: int) -> None:
 def test_a_dead_time_beyond_the_usual_delays_is_not_feigned_by_a_large_order(delay: int) -> None:
     for seed in range(3):
         data = first_order(seed, delay, noise=0.03)
-        table = LinearTable(task(data).nk, folds(data)[:1], pool())
+        table = LinearTable(task(data).nk, [part_of(data)], pool())
         table.search(None)
         assert table.choice.order <= 3
         assert abs(table.choice.nk - delay) <= 2
@@ -182,7 +184,7 @@ def test_a_dead_time_beyond_the_usual_delays_is_not_feigned_by_a_large_order(del
 def test_without_a_dead_time_no_long_delay_is_looked_at() -> None:
     for seed in range(3):
         data = first_order(seed, 1, noise=0.1)
-        table = LinearTable(task(data).nk, folds(data)[:1], pool())
+        table = LinearTable(task(data).nk, [part_of(data)], pool())
         table.search(None)
         assert max(nk for _, nk in table.candidates) == max(DELAYS)
 

@@ -62,7 +62,7 @@ def blocked(
     the held one. Validation data, if given, are the only fold.
     """
     if validation is not None:
-        return given(data, validation)
+        return (given(data, validation),)
     if moves_once(data):
         return ()
     count = min(blocks, math.ceil(blocks * ENOUGH / len(data)))

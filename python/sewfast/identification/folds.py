@@ -35,8 +35,6 @@ SHARE = 0.2
 Short blocks inside a record lie where the drive was before and after, and favour a network that
 memorises the record; a later part is the honest test if there are many data.
 """
-FOLDS = 3
-"""Number of later parts on which models are judged, each trained on the data before the part."""
 LEAST_HELD_OUT = 2 * INIT
 """Samples of a held-out part, and of what is left to fit."""
 WORTH_IT = 0.98
@@ -79,29 +77,25 @@ class Split:
         return replace(self, fitted=thinned(self.fitted, fitted), held=_shortened(self.held, held))
 
 
-def split(data: Dataset, skipped: float = 0.0) -> Split | None:
+def _split(data: Dataset) -> Split | None:
     """Hold out the end of every experiment that is long enough; None if none is.
     A short experiment is used for training as a whole; if all are short, the last ones are held out
-    whole. `skipped` is the part of every experiment, at its end, that is left out altogether.
+    whole.
     """
     fitted: list[Experiment] = []
     held: list[Experiment] = []
     parts: list[Experiment] = []
     for e in data.experiments:
-        stop = round((1.0 - skipped) * len(e))
-        at = stop - round(SHARE * len(e))
-        if stop - at < LEAST_HELD_OUT or at < LEAST_HELD_OUT:
+        at = len(e) - round(SHARE * len(e))
+        # a long gap can leave too little on one side for a split
+        if min(measured(e.y[:at]), measured(e.y[at:])) < LEAST_HELD_OUT:
             fitted.append(e)
             continue
-        if min(measured(e.y[:at]), measured(e.y[at:stop])) < LEAST_HELD_OUT:
-            # a long gap leaves too little on one side for a split
-            fitted.append(e.cut(0, stop))
-            continue
         fitted.append(e.cut(0, at))
-        held.append(with_run_up(e, at, stop))
-        parts.append(e.cut(at, stop))
+        held.append(with_run_up(e, at, len(e)))
+        parts.append(e.cut(at, len(e)))
     if not held:
-        fitted, held = _whole(data, skipped)
+        fitted, held = _whole(data)
         parts = held
     if not held:
         return None
@@ -110,31 +104,27 @@ def split(data: Dataset, skipped: float = 0.0) -> Split | None:
     return Split(fitted_data, held_data, sources=tuple(sources(scored)))
 
 
-def _whole(data: Dataset, skipped: float) -> tuple[list[Experiment], list[Experiment]]:
+def _whole(data: Dataset) -> tuple[list[Experiment], list[Experiment]]:
     """Many short experiments split into those before the last fifth, and that fifth."""
     able = [e for e in data.experiments if measured(e.y) >= LEAST_HELD_OUT]
-    stop = round((1.0 - skipped) * len(able))
-    at = stop - round(SHARE * len(able))
-    return able[:at], able[at:stop] if at > 0 else []
+    at = len(able) - round(SHARE * len(able))
+    return able[:at], able[at:] if at > 0 else []
 
 
-def folds(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]:
-    """Forward chaining: the last fifth after all data before it, then the fifth before, and so on.
-    The newest fold comes first; there is none if experiments are too short, or if the inputs move
-    only once: what follows a single step is its response, in the fitted part as in the held one.
-    Validation data, if given, are the only fold.
+def later_part(data: Dataset, validation: Dataset | None = None) -> Split | None:
+    """The last fifth, after all data before it; validation data, if given.
+    None if experiments are too short, or if the inputs move only once: what follows a single step
+    is its response, in the fitted part as in the held one.
     """
     if validation is not None:
         return given(data, validation)
-    if moves_once(data):
-        return ()
-    found = (split(data, skipped=i * SHARE) for i in range(FOLDS))
-    return tuple(f for f in found if f is not None and f.scored and is_moving(f.fitted))
+    found = None if moves_once(data) else _split(data)
+    return found if found is not None and found.scored and is_moving(found.fitted) else None
 
 
-def given(data: Dataset, validation: Dataset) -> tuple[Split, ...]:
-    """Validation data as the only fold."""
-    return (Split(data, validation, is_given=True, sources=tuple(sources(validation))),)
+def given(data: Dataset, validation: Dataset) -> Split:
+    """Validation data as the part to judge by."""
+    return Split(data, validation, is_given=True, sources=tuple(sources(validation)))
 
 
 def moves_once(data: Dataset) -> bool:

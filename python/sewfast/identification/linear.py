@@ -26,8 +26,8 @@ from .folds import (
     Split,
     compared,
     errors_of,
-    folds,
     free_runs,
+    later_part,
     moves_once,
     unstable_verdict,
     with_run_up,
@@ -114,7 +114,7 @@ def held_by_a_loop(task: Task) -> Model | None:
 
     try:
         model = plant(task.data)
-        part = next(iter(folds(task.data, task.validation)), None)
+        part = later_part(task.data, task.validation)
         try:
             earlier = model if part is None else plant(part.fitted)
         except KeyboardInterrupt:
