@@ -12,8 +12,8 @@ gaps: the same with every ninth output missing.
 steps: one step after 3 to 20 standing samples, one or two lags, a dead time, any level at rest. It
 counts against `identify` if a model graded good or fair has a steady gain more than 10 % off.
 
-coloured: records of the battery with a coloured noise (AR(1) of .9, drift, mains hum) of 3 to 20 %.
-It counts against `identify` if a model graded good has a test fit below 80 %.
+coloured: records of the battery with a coloured noise (AR(1) of .9, drift, hum, hum of .4 cycles a
+sample) of 3 to 20 %. It counts against `identify` if a model graded good has a test fit below 80 %.
 
 praised: the same records, each with white and with coloured noise, output error only; beside it how
 many of those with a test fit above 90 % are graded good.
@@ -218,8 +218,8 @@ def steps(drawn: range) -> int:
 def colour(rng: np.random.Generator, kind: str, n: int, Ts: float) -> FloatArray:
     """Noise of deviation 1."""
     white = rng.standard_normal(n)
-    if kind == "hum":
-        f = 50.0 if Ts < 0.008 else 0.13 / Ts
+    if kind in ("hum", "buzz"):
+        f = 0.4 / Ts if kind == "buzz" else 50.0 if Ts < 0.008 else 0.13 / Ts
         noise = np.sin(2.0 * np.pi * (f * Ts * np.arange(n) + rng.uniform())) + 0.1 * white
     elif kind == "drift":
         noise = np.cumsum(white)
@@ -259,7 +259,7 @@ def coloured(drawn: range) -> int:
         errors: dict[tuple[str, str], float] = {}
         words: list[str] = []
         of = what = ""
-        for case, of, share, data in noisy(seed, ("AR(1)", "drift", "hum")):
+        for case, of, share, data in noisy(seed, ("AR(1)", "drift", "hum", "buzz")):
             what = f"{case.family}, {of} of {share:.0%}"
             for model in ("oe",) if of == "white" else ("oe", "auto"):
                 try:
@@ -291,7 +291,7 @@ def praised(drawn: range) -> int:
     """Output error graded good whose test fit is below 80 %."""
     found: list[tuple[bool, float]] = []
     for seed in drawn:
-        for case, of, share, data in noisy(seed, ("AR(1)", "drift", "hum", "drift", "AR(1)")):
+        for case, of, share, data in noisy(seed, ("AR(1)", "drift", "hum", "buzz", "AR(1)")):
             try:
                 model = identify(data, model="oe", threads=1)
             except SewfastError:

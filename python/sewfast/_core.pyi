@@ -1044,6 +1044,9 @@ def parameter_test(experiments: list[_Experiment], *, trained: int) -> _Tested:
 def coloured_information(experiments: list[_Experiment], *, spent: float) -> _F:
     """Psi'R Psi, R the covariance matrix of the residuals, of which parameters took ``spent`` degrees of freedom."""
 
+def innovation(series: list[_F]) -> float:
+    """Standard deviation of what the past of the series does not tell, pooled; NaN is not known."""
+
 def fit_shaft(
     hertz: _F, value: NDArray[np.complex128], sigma: _F, *, Ts: float, counted: bool,
     resonance: bool | None,

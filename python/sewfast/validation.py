@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from . import _core
 from .dataset import Dataset, Experiment, FloatArray, labelled, require_dataset
 from .dataset.experiment import in_effect, mean_square, weights_of, without_weightless
 from .dataset.outliers import white_noise
@@ -70,6 +71,13 @@ class ExperimentErrors:
     def error(self) -> FloatArray:
         """Free-run error y - yhat, shape (N,)."""
         return self.y - self.simulated
+
+    @property
+    def scored_error(self) -> FloatArray:
+        """The same, NaN where it is not scored."""
+        error = self.error
+        error[: self.init] = np.nan
+        return error
 
     @property
     def one_step_error(self) -> FloatArray:
@@ -156,7 +164,7 @@ class Validation(Plotted):
     @property
     def noise(self) -> float:
         """White measurement noise of the scored output [unit]; NaN if unknown."""
-        return noise_of([e.y for e in self.experiments])
+        return noise_of([e.y for e in self.experiments], [e.scored_error for e in self.experiments])
 
     @property
     def grade(self) -> str:
@@ -278,11 +286,15 @@ class Validation(Plotted):
         return "\n".join([*lines, *notes, f"verdict: {self.verdict}"])
 
 
-def noise_of(outputs: Sequence[FloatArray]) -> float:
-    """White measurement noise of outputs (N,), pooled; NaN if unknown."""
+def noise_of(outputs: Sequence[FloatArray], errors: Sequence[FloatArray] = ()) -> float:
+    """White measurement noise of outputs (N,), pooled; NaN if unknown.
+    It is in the free runs' `errors` too (NaN: not scored), and there nothing tells it in advance:
+    what their own past tells is no white noise, but a hum, a drift, or what the model lacks.
+    """
     found = [white_noise(y) for y in outputs]
     known = [n for n in found if math.isfinite(n)]
-    return math.sqrt(sum(n * n for n in known) / len(known)) if known else math.nan
+    noise = math.sqrt(sum(n * n for n in known) / len(known)) if known else math.nan
+    return min(noise, _core.innovation(list(errors))) if errors else noise
 
 
 def grade_of(fit: float, rmse: float, noise: float) -> str:

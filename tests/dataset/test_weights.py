@@ -13,7 +13,7 @@ import cli
 import sewfast
 from sewfast import Dataset, Experiment, _core, identify
 from sewfast.errors import DataError, SettingError
-from sewfast.identification.folds import errors_of, split
+from sewfast.identification.folds import errors_of, later_part
 
 A, B, OFFSET = (-1.6, 0.66), (0.05, 0.03), 0.1
 N, BAD = 1500, slice(700, 900)
@@ -258,7 +258,7 @@ def test_errors_on_what_is_held_out_are_weighted() -> None:
     u, y = recording()
     w = np.ones(N)
     w[1400:] = 0.5
-    part = split(dataset(u, y, w))
+    part = later_part(dataset(u, y, w))
     assert part is not None
     (held,) = part.held.experiments
     # off by 1 in the last hundred of the 300 samples, which count half

@@ -17,13 +17,13 @@ from sewfast.dataset import diagnose
 from sewfast.errors import DataError, FitError, Interrupted, SettingError
 from sewfast.identification import table
 from sewfast.identification.folds import (
-    FOLDS,
     RUNAWAY,
     Errors,
+    Split,
     compared,
     errors_of,
-    folds,
     free_runs,
+    later_part,
 )
 from sewfast.identification.linear import DELAYS, LinearTable, raised
 from sewfast.identification.task import Clock, Pool, Stopped, Task
@@ -49,34 +49,36 @@ def pool() -> Pool:
 # --- what is held out -----------------------------------------------------------------------------
 
 
-def test_every_fold_is_later_than_what_it_is_judged_by() -> None:
+def part_of(data: Dataset, validation: Dataset | None = None) -> Split:
+    part = later_part(data, validation)
+    assert part is not None
+    return part
+
+
+def test_what_a_model_is_judged_by_is_later_than_what_it_is_fitted_to() -> None:
     data = Dataset.concat([linear_data(1000, name="a"), linear_data(500, name="b")])
-    found = folds(data)
-    assert len(found) == FOLDS
-    ranges = [[s["range"] for s in f.sources] for f in found]
-    assert ranges == [["800:1000", "400:500"], ["600:800", "300:400"], ["400:600", "200:300"]]
-    for fold, stop in zip(found, (800, 600, 400), strict=True):
-        assert [len(e) for e in fold.fitted.experiments] == [stop, stop // 2]
-        assert fold.scored == 300
+    part = part_of(data)
+    assert [s["range"] for s in part.sources] == ["800:1000", "400:500"]
+    assert [len(e) for e in part.fitted.experiments] == [800, 400]
+    assert part.scored == 300
 
 
-def test_given_validation_data_are_the_only_fold() -> None:
-    (only,) = folds(linear_data(400), linear_data(300, seed=3))
-    assert only.is_given
-    assert len(only.fitted) == 400
+def test_given_validation_data_are_the_part_to_judge_by() -> None:
+    part = part_of(linear_data(400), linear_data(300, seed=3))
+    assert part.is_given
+    assert len(part.fitted) == 400
 
 
-def test_a_short_record_has_fewer_folds() -> None:
-    assert folds(linear_data(60)) == ()
-    assert len(folds(linear_data(210))) == FOLDS
+def test_a_short_record_has_no_later_part() -> None:
+    assert later_part(linear_data(60)) is None
+    assert later_part(linear_data(210)) is not None
 
 
 def test_of_many_short_experiments_the_last_ones_are_held_out() -> None:
     data = Dataset.concat([linear_data(60, seed=i, name=str(i)) for i in range(10)])
-    found = folds(data)
-    held = [[s["name"] for s in f.sources] for f in found]
-    assert held == [["8", "9"], ["6", "7"], ["4", "5"]]
-    assert [len(f.fitted.experiments) for f in found] == [8, 6, 4]
+    part = part_of(data)
+    assert [s["name"] for s in part.sources] == ["8", "9"]
+    assert len(part.fitted.experiments) == 8
 
 
 @pytest.mark.skipif(not FULL, reason="a search over networks of half a minute: SEWFAST_SOAK=1")
@@ -102,7 +104,7 @@ def errors(squares: F) -> Errors:
 
 def test_errors_are_those_of_the_free_run_after_its_initial_samples() -> None:
     data = linear_data(1000, noise=0.3)
-    split = folds(data)[0]
+    split = part_of(data)
     core = _core.fit_arx([(e.u, e.y) for e in data.experiments], na=2, nb=2, nk=1, offset=True)
     runs = free_runs(core, split)
     assert runs is not None
@@ -156,7 +158,7 @@ def test_a_small_order_and_the_delay_are_found(delay: int) -> None:
     orders = []
     for seed in range(5):
         data = first_order(seed, delay, noise=0.1)
-        table = LinearTable(task(data).nk, folds(data)[:1], pool())
+        table = LinearTable(task(data).nk, [part_of(data)], pool())
         table.search(None)
         orders.append(table.choice.order)
         assert table.choice.rmse < 1.01 * table.best.rmse
@@ -170,7 +172,7 @@ def test_a_small_order_and_the_delay_are_found(delay: int) -> None:
 def test_a_dead_time_beyond_the_usual_delays_is_not_feigned_by_a_large_order(delay: int) -> None:
     for seed in range(3):
         data = first_order(seed, delay, noise=0.03)
-        table = LinearTable(task(data).nk, folds(data)[:1], pool())
+        table = LinearTable(task(data).nk, [part_of(data)], pool())
         table.search(None)
         assert table.choice.order <= 3
         assert abs(table.choice.nk - delay) <= 2
@@ -182,7 +184,7 @@ def test_a_dead_time_beyond_the_usual_delays_is_not_feigned_by_a_large_order(del
 def test_without_a_dead_time_no_long_delay_is_looked_at() -> None:
     for seed in range(3):
         data = first_order(seed, 1, noise=0.1)
-        table = LinearTable(task(data).nk, folds(data)[:1], pool())
+        table = LinearTable(task(data).nk, [part_of(data)], pool())
         table.search(None)
         assert max(nk for _, nk in table.candidates) == max(DELAYS)
 
@@ -370,6 +372,41 @@ def test_a_useless_model_is_called_useless() -> None:
     verdict = identify(Dataset.from_arrays(u, y, 0.01)).training["verdict"]
     assert verdict["grade"] == "useless"
     assert verdict["next"]
+
+
+def test_a_hum_hides_nothing_that_a_model_lacks() -> None:
+    data = bent_data(800)
+    (e,) = data.experiments
+    hum = 0.2 * e.y.std() * np.sqrt(2.0) * np.sin(2.0 * np.pi * 0.4 * np.arange(800))
+    white = 0.2 * e.y.std() * np.random.default_rng(0).standard_normal(800)
+    for noise in (hum, white):
+        noisy = Dataset.from_arrays(e.u, e.y + noise, 0.01)
+        assert identify(noisy, model="oe").training["verdict"]["grade"] != "good"
+    (e,) = linear_data(800).experiments
+    noisy = Dataset.from_arrays(e.u, e.y + 0.2 * e.y.std() * white / white.std(), 0.01)
+    assert identify(noisy, model="oe").training["verdict"]["grade"] == "good"
+
+
+def test_what_differs_without_a_part_of_the_record_is_not_praised() -> None:
+    # a slow pole explains the noise of a short record, another one in each part
+    rng = np.random.default_rng(6)
+    u, y = np.repeat(rng.uniform(-1.0, 1.0, 10), 30), np.zeros(300)
+    for k in range(1, 300):
+        y[k] = 0.93 * y[k - 1] + u[k - 1]
+    data = Dataset.from_arrays(u, y + 0.2 * y.std() * rng.standard_normal(300), 0.01)
+    own = identify(data, model="oe", na=3, nb=3).training["verdict"]
+    assert own["grade"] == "fair"
+    assert "without one of its parts" in own["text"]
+    assert identify(data, model="oe", na=1, nb=1).training["verdict"]["grade"] == "good"
+
+
+def test_a_record_that_nothing_can_be_held_out_of_is_not_praised() -> None:
+    data = linear_data(75)
+    own = identify(data, model="oe").training["verdict"]
+    assert own["grade"] == "fair"
+    assert "nothing of the record can be held out" in own["text"]
+    longer = identify(linear_data(100), model="oe").training["verdict"]
+    assert (longer["grade"], "of data not trained on" in longer["text"]) == ("good", True)
 
 
 @pytest.mark.parametrize("kind", ["arx", "iv", "oe", "neural_oe", "hammerstein_wiener"])

@@ -38,7 +38,8 @@ def test_a_step_soon_after_the_start_tells_its_gain(seed: int, kind: str) -> Non
     model = identify(data, model=kind, threads=1)
     assert isinstance(model, LinearOE)
     assert model.dc_gain[0] == pytest.approx(gain, rel=0.05)
-    assert model.training["verdict"]["grade"] == "good"
+    # nothing of a single step can be held out to judge by
+    assert model.training["verdict"]["grade"] == "fair"
 
 
 def test_the_rest_of_a_record_is_kept_in_its_model() -> None:

@@ -23,7 +23,7 @@ from .. import _core
 from ..control.machine import Machine
 from ..dataset import Dataset, FloatArray
 from ..errors import DataError, FitError
-from ..identification.folds import Errors, Split, compared, errors_of, folds, free_runs
+from ..identification.folds import Errors, Split, compared, errors_of, free_runs, later_part
 from ..identification.task import arrays, wrap
 from ..models import LinearOE, Model
 from ..recording import Recording
@@ -175,7 +175,9 @@ def shaking(
 def explained(shaken: Shaken, fopdt: Fopdt) -> SmallSignal | None:
     """The simplest linear model of a record."""
     data = shaken.dataset()
-    part, smooth = folds(data)[0], _smooth(shaken)
+    part, smooth = later_part(data), _smooth(shaken)
+    if part is None:
+        return None
     tried = {order: fitted(part, order, smooth) for order in ORDERS}
     found = {order: fit for order, fit in tried.items() if fit is not None}
     if not found or not min(errors.rmse for _, errors in found.values()) < part.spread:

@@ -15,7 +15,7 @@ from ..dataset.sensor import measuring
 from ..errors import FitError
 from ..evidence import ReportCard, check, with_training_evidence
 from ..identification import seeded
-from ..identification.folds import folds
+from ..identification.folds import later_part
 from ..identification.task import wrap
 from ..models import Ensemble, LinearOE, Model
 from ..recording import Recording
@@ -217,10 +217,10 @@ def linear_rival(
     if not found:
         return None
     data = thinned(replace(whole, experiments=tuple(found)), MOST_SAMPLES)
-    parts = folds(data)
-    if not parts:
+    part = later_part(data)
+    if part is None:
         return None
-    tried = {order: fitted(parts[0], order) for order in orders}
+    tried = {order: fitted(part, order) for order in orders}
     fits = {order: fit for order, fit in tried.items() if fit is not None}
     if not fits:
         return None

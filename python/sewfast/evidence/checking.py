@@ -96,7 +96,8 @@ def check(
     scores = horizon_scores(model, data, free)
     unit = free.unit
     on_training = training is data or (training is None and is_training_data(model, data))
-    noise = noise_of([r.y[r.counts] for r in free.runs])
+    errors = [np.where(r.counts, r.error, np.nan) for r in free.runs]
+    noise = noise_of([r.y[r.counts] for r in free.runs], errors)
     rmse = scores.pooled["free run"].rmse
     share = by_input(rmse, without_input(model, data, init))
     lines = verdicts.accuracy(scores, unit, noise, share) + verdicts.record(data)

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,14 @@ from ..dataset.experiment import weights_of
 from ..dynamic_model import INIT, Core
 from ..errors import DataError, FitError
 from ..models import Model
+from ..models.base import EnsembleCore
 from .folds import (
     ERROR_BLOCKS,
     LEAST_HELD_OUT,
     Errors,
     Split,
+    Trial,
+    apart,
     compared,
     free_runs,
     given,
@@ -49,22 +52,24 @@ FAR = 2.0
 errors of bad models can cancel on some blocks, but a median of members does not cancel them."""
 
 
-def blocked(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]:
-    """The experiments one after another in blocks, each held out once, in order.
+def blocked(
+    data: Dataset, validation: Dataset | None = None, blocks: int = COUNT
+) -> tuple[Split, ...]:
+    """The experiments one after another in so many blocks, each held out once, in order.
     What is left of an experiment around its blocks is fitted. On many data only the last folds are
     given, those that are enough to judge by. There are none if the data are too short, or if
     the inputs move only once: what follows a single step is its response, in the fitted part as in
     the held one. Validation data, if given, are the only fold.
     """
     if validation is not None:
-        return given(data, validation)
+        return (given(data, validation),)
     if moves_once(data):
         return ()
-    count = min(COUNT, math.ceil(COUNT * ENOUGH / len(data)))
-    edges = np.linspace(0, len(data), COUNT * math.ceil(COUNT / count) + 1).round().astype(int)
+    count = min(blocks, math.ceil(blocks * ENOUGH / len(data)))
+    edges = np.linspace(0, len(data), blocks * math.ceil(blocks / count) + 1).round().astype(int)
     stretches = list(itertools.pairwise(edges.tolist()))
     # the first of all is the last to be held out: nothing before it gives its state
-    found = (_without(data, stretches[i::COUNT]) for i in range(COUNT - count, COUNT))
+    found = (_without(data, stretches[i::blocks]) for i in range(blocks - count, blocks))
     parts = tuple(f for f in found if f is not None and f.scored and is_moving(f.fitted))
     return parts if len(parts) > 1 or count == 1 else ()
 
@@ -149,6 +154,14 @@ class Blocks:
         known = np.isfinite(self._outputs)
         return np.asarray((self._outputs - np.concatenate(runs))[known])
 
+    def trial(self, residual: FloatArray, apart: float) -> Trial:
+        """What is left on all blocks, and how far models without one are apart."""
+        whole = np.full(len(self._outputs), np.nan)
+        whole[np.isfinite(self._outputs)] = residual
+        ends = np.cumsum([len(e) for e in self.together.held.experiments])[:-1]
+        pieces = np.split(whole, ends)
+        return Trial(self.together, self.errors(residual).rmse, pieces, apart)
+
     def errors(self, residual: FloatArray) -> Errors:
         """Its squares, block by block."""
         squares, edges = self.weights * residual**2, np.arange(len(residual))
@@ -159,11 +172,13 @@ class Blocks:
         )
 
 
-def unseen(task: Task, fitted: Callable[[Task], Model]) -> tuple[Split, float] | None:
-    """All blocks and the error on them [output unit], each of the model fitted to the rest.
-    None if there are no blocks, if one of these fits fails or runs away, or without time for them.
+def unseen(model: Model, task: Task, fitted: Callable[[Task], Model]) -> Trial | None:
+    """Free runs over all blocks, each of the model fitted to the rest.
+    Short records have fewer blocks. None if there are none, if one of these fits fails or runs
+    away, or without time for them.
     """
-    folds, cores = blocked(task.data), []
+    fewer = max(2, min(COUNT, len(task.data) // LEAST_HELD_OUT))
+    folds, cores = blocked(task.data, blocks=fewer), []
     for fold in folds:
         if not task.clock.can_close:
             return None
@@ -173,7 +188,9 @@ def unseen(task: Task, fitted: Callable[[Task], Model]) -> tuple[Split, float] |
             return None
     blocks = Blocks(task.data, folds)
     residual = blocks.residual(cores) if cores else None
-    return None if residual is None else (blocks.together, blocks.errors(residual).rmse)
+    if residual is None:
+        return None
+    return blocks.trial(residual, apart(model, task.data, [partial(free_runs, c) for c in cores]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,6 +213,11 @@ class Row:
         """Root mean square error on all blocks."""
         return self.errors.rmse
 
+    def core(self, fold: int) -> Core:
+        """Its models without one block as one: their median."""
+        models = self.models[fold]
+        return models[0] if len(models) == 1 else EnsembleCore(models, "median")
+
     def to_json(self, weight: float) -> Provenance:
         """The row of the table of candidates, with its weight in the model if it has one."""
         row = {**self.found.to_json(), "free_run_rmse": finite(self.rmse)}
@@ -211,6 +233,14 @@ class Mixture:
     residual: FloatArray
     errors: Errors
 
+    def runs(self, fold: int, part: Split) -> list[FloatArray] | None:
+        """Free runs over a part by the models without one block; None if one diverges."""
+        found = [free_runs(r.core(fold), part) for r in self.rows]
+        if any(runs is None for runs in found):
+            return None
+        experiments = zip(*(runs for runs in found if runs is not None), strict=True)
+        return [np.average(runs, axis=0, weights=self.weights) for runs in experiments]
+
     @classmethod
     def of(cls, rows: Sequence[Row], blocks: Blocks) -> Mixture:
         """Convex weights of least squares on the blocks."""
@@ -218,6 +248,19 @@ class Mixture:
         weights = _core.convex_weights(residuals, blocks.weights)
         residual = residuals @ weights
         return cls(tuple(rows), weights, residual, blocks.errors(residual))
+
+    def unseen(self, blocks: Blocks) -> FloatArray:
+        """What they leave on each block with weights from the others: errors of rows cancel where
+        their weights were found, and not on another recording.
+        """
+        if len(self.rows) == 1 or len(blocks.sizes) == 1:
+            return self.residual
+        residuals, left = np.column_stack([r.residual for r in self.rows]), self.residual.copy()
+        fold = np.repeat(np.arange(len(blocks.sizes)), blocks.sizes)
+        for own in (fold == i for i in range(len(blocks.sizes))):
+            others = _core.convex_weights(residuals[~own], blocks.weights[~own])
+            left[own] = residuals[own] @ others
+        return left
 
 
 def combined(rows: Sequence[Row], blocks: Blocks) -> Mixture:

@@ -25,7 +25,15 @@ from ..threads import Workers, available, require_workers
 from ..validation import doubling
 from . import further, grey_box, lagged, linear, mixture
 from .blocks import unseen
-from .folds import TEXTS, UNSEEN_DATA, Split, unstable_verdict, verdict
+from .folds import (
+    TEXTS,
+    UNSEEN_DATA,
+    Split,
+    tried,
+    unstable_verdict,
+    verdict,
+    what_to_record,
+)
 from .outputs import OUTPUTS
 from .rest import for_loops
 from .task import Clock, Progress, Provenance, Task, with_provenance
@@ -357,21 +365,29 @@ def _judged_by(model: Model, faults: Sequence[Fault]) -> Model:
 
 def _verdict(model: Model, task: Task) -> Provenance:
     """The verdict on a kind requested by name, on validation data; of a linear model else on
-    blocks of the record, each by a fit to the rest, or else on the training data.
+    blocks of the record, each by a fit to the rest. Else it is that on the training data, and a
+    linear model, which a short record hardly proves wrong, is "fair" at best.
     """
     data, validation = task.data, task.validation
-    is_linear = model.kind in ("arx", "iv", "oe")
-    part, error = Split(data, validation or data, is_given=validation is not None), None
+    is_linear, trial = model.kind in ("arx", "iv", "oe"), None
+    part = Split(data, validation or data, is_given=validation is not None)
     where = UNSEEN_DATA if part.is_given else "its own training data"
     if doubling(model) is not None:
         return unstable_verdict(model, part, where)
     if is_linear and not part.is_given:
         orders = model.orders
         alike = replace(task, na=orders["na"], nb=orders["nb"], nk=orders["nk"])
-        if (found_unseen := unseen(alike, _KINDS[model.kind])) is not None:
-            (part, error), where = found_unseen, UNSEEN_DATA
-    found = verdict(model, data, part, error, where=where)
-    if is_linear and found["grade"] in ("good", "fair"):
+        trial = unseen(model, alike, _KINDS[model.kind])
+        where = where if trial is None else UNSEEN_DATA
+    found = verdict(model, data, trial or tried(model, part), where=where)
+    if is_linear and where != UNSEEN_DATA and found["grade"] == "good":
+        found["grade"] = "fair"
+        measured = found["text"].partition(": ")[2]
+        found["text"] = (
+            f"{TEXTS['fair']}: nothing of the record can be held out to judge by; {measured}"
+        )
+        found["next"] = what_to_record(data)
+    if is_linear and found["grade"] != "useless":
         slowest, longest = linear.time_constant(model.core), max(len(e) for e in data.experiments)
         # a real integrator is not a superfluous pole
         if slowest > linear.UNSEEN * longest and diagnose(data).find("integrator") is None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -34,8 +35,6 @@ SHARE = 0.2
 Short blocks inside a record lie where the drive was before and after, and favour a network that
 memorises the record; a later part is the honest test if there are many data.
 """
-FOLDS = 3
-"""Number of later parts on which models are judged, each trained on the data before the part."""
 LEAST_HELD_OUT = 2 * INIT
 """Samples of a held-out part, and of what is left to fit."""
 WORTH_IT = 0.98
@@ -78,29 +77,25 @@ class Split:
         return replace(self, fitted=thinned(self.fitted, fitted), held=_shortened(self.held, held))
 
 
-def split(data: Dataset, skipped: float = 0.0) -> Split | None:
+def _split(data: Dataset) -> Split | None:
     """Hold out the end of every experiment that is long enough; None if none is.
     A short experiment is used for training as a whole; if all are short, the last ones are held out
-    whole. `skipped` is the part of every experiment, at its end, that is left out altogether.
+    whole.
     """
     fitted: list[Experiment] = []
     held: list[Experiment] = []
     parts: list[Experiment] = []
     for e in data.experiments:
-        stop = round((1.0 - skipped) * len(e))
-        at = stop - round(SHARE * len(e))
-        if stop - at < LEAST_HELD_OUT or at < LEAST_HELD_OUT:
+        at = len(e) - round(SHARE * len(e))
+        # a long gap can leave too little on one side for a split
+        if min(measured(e.y[:at]), measured(e.y[at:])) < LEAST_HELD_OUT:
             fitted.append(e)
             continue
-        if min(measured(e.y[:at]), measured(e.y[at:stop])) < LEAST_HELD_OUT:
-            # a long gap leaves too little on one side for a split
-            fitted.append(e.cut(0, stop))
-            continue
         fitted.append(e.cut(0, at))
-        held.append(with_run_up(e, at, stop))
-        parts.append(e.cut(at, stop))
+        held.append(with_run_up(e, at, len(e)))
+        parts.append(e.cut(at, len(e)))
     if not held:
-        fitted, held = _whole(data, skipped)
+        fitted, held = _whole(data)
         parts = held
     if not held:
         return None
@@ -109,31 +104,27 @@ def split(data: Dataset, skipped: float = 0.0) -> Split | None:
     return Split(fitted_data, held_data, sources=tuple(sources(scored)))
 
 
-def _whole(data: Dataset, skipped: float) -> tuple[list[Experiment], list[Experiment]]:
+def _whole(data: Dataset) -> tuple[list[Experiment], list[Experiment]]:
     """Many short experiments split into those before the last fifth, and that fifth."""
     able = [e for e in data.experiments if measured(e.y) >= LEAST_HELD_OUT]
-    stop = round((1.0 - skipped) * len(able))
-    at = stop - round(SHARE * len(able))
-    return able[:at], able[at:stop] if at > 0 else []
+    at = len(able) - round(SHARE * len(able))
+    return able[:at], able[at:] if at > 0 else []
 
 
-def folds(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]:
-    """Forward chaining: the last fifth after all data before it, then the fifth before, and so on.
-    The newest fold comes first; there is none if experiments are too short, or if the inputs move
-    only once: what follows a single step is its response, in the fitted part as in the held one.
-    Validation data, if given, are the only fold.
+def later_part(data: Dataset, validation: Dataset | None = None) -> Split | None:
+    """The last fifth, after all data before it; validation data, if given.
+    None if experiments are too short, or if the inputs move only once: what follows a single step
+    is its response, in the fitted part as in the held one.
     """
     if validation is not None:
         return given(data, validation)
-    if moves_once(data):
-        return ()
-    found = (split(data, skipped=i * SHARE) for i in range(FOLDS))
-    return tuple(f for f in found if f is not None and f.scored and is_moving(f.fitted))
+    found = None if moves_once(data) else _split(data)
+    return found if found is not None and found.scored and is_moving(found.fitted) else None
 
 
-def given(data: Dataset, validation: Dataset) -> tuple[Split, ...]:
-    """Validation data as the only fold."""
-    return (Split(data, validation, is_given=True, sources=tuple(sources(validation))),)
+def given(data: Dataset, validation: Dataset) -> Split:
+    """Validation data as the part to judge by."""
+    return Split(data, validation, is_given=True, sources=tuple(sources(validation)))
 
 
 def moves_once(data: Dataset) -> bool:
@@ -276,35 +267,84 @@ TEXTS = {
 UNSEEN_DATA = "data not trained on"
 
 
-def verdict(
-    model: Model,
-    data: Dataset,
-    part: Split,
-    error: float | None = None,
-    where: str = UNSEEN_DATA,
-) -> Provenance:
-    """Whether the model is good enough to tune a controller on, in words and as values.
-    `data` are its training data, and `part` those to judge by, described by `where`; the free-run
-    error of other samples, `error` [output unit], counts instead of that of the part. The result
-    has `grade` ("good", "fair", "poor" or "useless"), `fit_percent`, `text`, and `next`: a list of
-    things to do, the most important one first.
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Free runs over a part of the data by which a model is judged.
+    `error` is their root mean square error, `residuals` what they leave of the outputs of each
+    experiment, NaN where it is not scored. `apart` is the standard error of the model's own free
+    run, from models of the data without each block. All in the output's unit.
     """
-    # `error` can come from other samples; the share explained by the input needs the same ones
+
+    part: Split
+    error: float
+    residuals: Sequence[FloatArray]
+    apart: float = 0.0
+
+
+def tried(model: Model, part: Split) -> Trial:
+    """The model's own free run over a part."""
+    try:
+        runs = scored_runs(model, part.held, INIT)
+    except (DataError, FitError):
+        return Trial(part, math.inf, ())
+    residuals = [e.y - run for run, e in zip(runs, part.held.experiments, strict=True)]
+    for residual, e in zip(residuals, part.held.experiments, strict=True):
+        residual[: e.initial_samples(INIT)] = np.nan
+    return Trial(part, free_run_error(model, part.held, INIT), residuals)
+
+
+FreeRuns: TypeAlias = Callable[[Split], Sequence[FloatArray] | None]
+"""Free runs over the held-out part, one for each experiment; None if one diverges."""
+
+
+def apart(model: Model, data: Dataset, without: Sequence[FreeRuns]) -> float:
+    """Standard error of a model's free run [output unit]; infinite if one diverges.
+    `without` are models of the same data without one block each: the grouped jackknife (Efron and
+    Tibshirani 1993, section 11.5). They run over the inputs of the data, and on with the same
+    backwards: where a record was, its outputs hold even a pole together that is the noise's.
+    """
+    further = []
+    for e in data.experiments:
+        u, unknown = np.concatenate([e.u, e.u[::-1]]), np.full(len(e), np.nan)
+        longer = replace(e, u=u, y=np.concatenate([e.y, unknown]), channels={}, weights=None)
+        further.append(longer)
+    on = Split(data, replace(data, experiments=tuple(further)))
+    try:
+        own = np.concatenate(model.simulate(on.held))
+    except FitError:
+        return math.inf
+    squares, n = 0.0, len(without)
+    for run in without:
+        if (runs := run(on)) is None:
+            return math.inf
+        squares += float(np.mean((np.concatenate(runs) - own) ** 2))
+    return math.sqrt((n - 1) / n * squares) if n else 0.0
+
+
+def verdict(model: Model, data: Dataset, trial: Trial, where: str = UNSEEN_DATA) -> Provenance:
+    """Whether the model is good enough to tune a controller on, in words and as values.
+    `data` are its training data, and those of the trial are described by `where`. The result has
+    `grade` ("good", "fair", "poor" or "useless"), `fit_percent`, `text`, and `next`: a list of
+    things to do, the most important one first. A model whose own standard error is larger than a
+    good model's error is "fair" at best.
+    """
+    part, error, spread = trial.part, trial.error, trial.part.spread
     own = free_run_error(model, part.held, INIT)
-    error = own if error is None else error
-    spread = part.spread
     fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")
-    noise = noise_of([e.y for e in data.experiments])
+    noise = noise_of([e.y for e in data.experiments], trial.residuals)
     share = by_input(own, without_input(model, part.held, INIT))
-    grade, resting = judged(fit, error, noise, share)
+    grade, remark = judged(fit, error, noise, share)
+    if grade == "good" and (loose := 100.0 * trial.apart / spread) > 100.0 - GOOD:
+        grade = "fair"
+        remark += f", but models without one of its parts differ from it by {loose:.0f} %"
     unit = f" {data.output_unit}" if data.output_unit else ""
     rmse = f"rmse {error:.3g}{unit}"
     text, todo = TEXTS[grade], []
     if not np.isfinite(error):
         text = "useless: its free run leaves the finite numbers"
     elif grade:
-        text += f": free run explains {fit:.1f} % of {where} ({rmse}){resting}"
-        if grade == "useless" and not resting:
+        text += f": free run explains {fit:.1f} % of {where} ({rmse}){remark}"
+        if grade == "useless" and not remark:
             text += "; a constant would do about as well"
     else:
         text += f" ({rmse})"

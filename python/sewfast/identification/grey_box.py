@@ -22,7 +22,7 @@ from ..motorfit.estimation import Normal, minimised
 from ..motorfit.joint import changed, weights
 from ..progress import TimeUp
 from ..units import is_position, revolutions_per_second
-from .folds import WORTH_IT, Errors, Split, compared, errors_of, folds, free_runs
+from .folds import WORTH_IT, Errors, Split, compared, errors_of, free_runs, later_part
 from .task import Look, Pool, Provenance, R, Task, finite
 
 TERMS = ("lag", "delay", "coulomb", "offset", "drop", "stribeck", "limit")
@@ -69,7 +69,7 @@ def grey_box(task: Task) -> Model:
 
     found: MotorCandidate | None = None
     try:
-        for part in folds(task.data, task.validation)[:1] if is_open else ():
+        if is_open and (part := later_part(task.data, task.validation)) is not None:
             found = motors.alone(part, look)
             tried = [found.held_out()]
             more = motors.beside(found, part, look)

@@ -14,7 +14,7 @@ from ..dataset import Dataset, Experiment
 from ..errors import FitError, Interrupted
 from ..models import LinearOE, Model, NeuralOE
 from ..models.base import Fitted, StructuredModel
-from .folds import LEAST_HELD_OUT, WORTH_IT, Errors, compared, errors_of, folds, free_runs
+from .folds import LEAST_HELD_OUT, WORTH_IT, Errors, compared, errors_of, free_runs, later_part
 from .linear import is_misled, oe, raised
 from .task import (
     Progress,
@@ -31,8 +31,9 @@ from .task import (
 
 DECAYS = (1e-2, 1e-4)
 """Weight decays of the default network, the strongest first."""
-LINEAR_SHARE = 0.4
-"""Share of a time budget for the linear fits, so that some is left for the network."""
+SHARE_OF_CHOICE = 0.4
+"""Share of a time budget for linear fits, or for a choice among structures; the rest is for the fit
+of the model to all data."""
 _LINEAR_FITS = "linear fits at which the network begins"
 
 
@@ -94,7 +95,7 @@ class Networks:
     def of(cls, task: Task) -> Networks:
         """The networks of a task, whose linear models are fitted here."""
         brief = replace(
-            task, progress=task.clock.limited(task.progress, LINEAR_SHARE, _LINEAR_FITS)
+            task, progress=task.clock.limited(task.progress, SHARE_OF_CHOICE, _LINEAR_FITS)
         )
         try:
             linear = _linear(brief)
@@ -224,7 +225,7 @@ def _linear(task: Task) -> _core.LinearModel:
     try:
         best: _core.LinearModel = oe(task).core
     except KeyboardInterrupt as e:
-        if not task.clock.over(LINEAR_SHARE, _LINEAR_FITS):
+        if not task.clock.over(SHARE_OF_CHOICE, _LINEAR_FITS):
             raise
         if not isinstance(e, Interrupted):
             return _core.fit_arx(arrays(task.data), **task.orders, offset=True)
@@ -238,10 +239,10 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
     """
     orders = task.orders
     na, nb = orders["na"] - 1, orders["nb"] - 1
-    parts = folds(task.data, task.validation)
-    if na < 1 or nb < 1 or not parts or task.clock.over(LINEAR_SHARE, _LINEAR_FITS):
+    part = later_part(task.data, task.validation)
+    if na < 1 or nb < 1 or part is None or task.clock.over(SHARE_OF_CHOICE, _LINEAR_FITS):
         return linear
-    learned = arrays(parts[0].fitted)
+    learned = arrays(part.fitted)
     models = []
     for a, b in ((na, nb), (orders["na"], orders["nb"])):
         try:
@@ -252,12 +253,12 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
             return linear
         except KeyboardInterrupt:
             # Ctrl-C, or the end of the linear fits' share of a time budget
-            if not task.clock.over(LINEAR_SHARE, _LINEAR_FITS):
+            if not task.clock.over(SHARE_OF_CHOICE, _LINEAR_FITS):
                 raise
             return linear
         models.append(fit.model)
     smaller, own = models
-    return raised(smaller, orders["na"]) if is_misled(own, smaller, parts[0]) else linear
+    return raised(smaller, orders["na"]) if is_misled(own, smaller, part) else linear
 
 
 def _with_blocks_held_out(data: Dataset, lag: int) -> tuple[Dataset, Dataset | None]:
@@ -285,8 +286,6 @@ def _with_blocks_held_out(data: Dataset, lag: int) -> tuple[Dataset, Dataset | N
 # --- Static curves: kinds with several structures, chosen on held-out data, then fitted to all ----
 
 
-SHARE_OF_CHOICE = 0.45
-"""Share of a time budget for the choice; the rest is for the fit to all data."""
 _CHOICE = "structures"
 
 
@@ -333,10 +332,10 @@ def _chosen(
     Unless the order was given, one pole less is tried too: a superfluous pole follows trends and
     spoils the steady gain. If the share of a time budget is used up, it is the best so far.
     """
-    parts = folds(task.data, task.validation)[:1]
-    if len(structures) == 1 or not parts:
+    part = later_part(task.data, task.validation)
+    if len(structures) == 1 or part is None:
         return structures[-1]
-    (held,) = parts
+    held = part
     progress = task.clock.limited(task.progress, SHARE_OF_CHOICE, _CHOICE)
     best = structures[0]
     kept: Fitted | None = None

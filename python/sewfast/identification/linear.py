@@ -26,8 +26,8 @@ from .folds import (
     Split,
     compared,
     errors_of,
-    folds,
     free_runs,
+    later_part,
     moves_once,
     unstable_verdict,
     with_run_up,
@@ -114,7 +114,7 @@ def held_by_a_loop(task: Task) -> Model | None:
 
     try:
         model = plant(task.data)
-        part = next(iter(folds(task.data, task.validation)), None)
+        part = later_part(task.data, task.validation)
         try:
             earlier = model if part is None else plant(part.fitted)
         except KeyboardInterrupt:
@@ -361,13 +361,24 @@ class LinearTable:
     @property
     def eligible(self) -> list[LinearCandidate]:
         """Models that can be chosen.
-        Direct feedthrough is only a network's start, unless requested. A delay makes a model
-        smaller, and is accepted only if it does as well as the best model without.
+        Direct feedthrough is only a network's start, unless requested. A delay stands for a larger
+        order: it is accepted only if it does as well as the best model without, and better than
+        those of up to one order more by a standard error. The best of a dozen delays leads by luck:
+        on short records (`short_*` of the battery's rules, systems 0 to 5) the worst test error was
+        1.85 times the best of output error with orders 2, 3, 4 in hindsight without the last
+        condition, and is 1.52 times with it.
         """
         usual = [c for c in self.candidates.values() if c.nk == self.nk]
         least = min((self._pooled(c).rmse for c in usual), default=math.inf) * math.exp(LEAST_GAIN)
         delayed = [c for c in self.candidates.values() if c.nk > self.nk]
-        return usual + [c for c in delayed if self._pooled(c).rmse <= least]
+        able = [c for c in delayed if self._pooled(c).rmse <= least]
+        return usual + [
+            c for c in able if all(self._leads(c, o) for o in usual if o.order <= c.order + 1)
+        ]
+
+    def _leads(self, one: LinearCandidate, other: LinearCandidate) -> bool:
+        ratio, deviation = compared(self._pooled(one), self._pooled(other))
+        return ratio < -deviation
 
     @property
     def best(self) -> LinearCandidate:

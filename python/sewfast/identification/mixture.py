@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from ..models.base import EnsembleCore
 from ..models.grey_box import GreyBox
 from . import grey_box
 from .blocks import Blocks, Mixture, Row, blocked, combined
-from .folds import LEAST_HELD_OUT, TEXTS, Split, verdict, what_to_record
+from .folds import LEAST_HELD_OUT, TEXTS, WORTH_IT, Trial, apart, verdict, what_to_record
 from .grey_box import or_none
 from .linear import LinearCandidate, linear_provenance, short
 from .table import SHARE_OF_REFIT, TRAINING, Table
@@ -37,9 +38,6 @@ REFIT = 15
 """Iterations on all data of a network that was trained without a block."""
 MOST_MEMBERS = 15
 """Members of an ensemble: a controller is tuned on each, and a median of more is hardly better."""
-WORTH_IT = 0.9
-"""A network that was asked for says so if its error is not below this part of the best linear
-model's."""
 _CLASSES: dict[type, type[Model]] = {
     _core.LinearModel: LinearOE, _core.GreyBox: GreyBox, _core.NeuralOE: NeuralOE,
     _core.NeuralSS: NeuralSS,
@@ -114,15 +112,22 @@ class Ending:
             "cost": cost_of(model, self.task.data),
             "choice": self._choice(mixture, reasons),
         }
-        error = mixture.errors.rmse
         linear = self._linear_error()
         model = closed(
             self.task.documented(model, {**model.training, **provenance}), self.task,
-            self.table.blocks.together, error, linear=linear, wants_network=self.wants_network,
+            self._trial(model, mixture), linear=linear, wants_network=self.wants_network,
             diagnosed=self._diagnosed,
         )  # fmt: skip
         model = self._with_blocks(model, mixture)
         return replace(model, alternatives=tuple(self._alternatives(model)))
+
+    def _trial(self, model: Model, mixture: Mixture) -> Trial:
+        """What the mixture leaves on the blocks, and how far it is apart without each of them."""
+        folds = [] if self.table.folds[0].is_given else range(len(self.table.folds))
+        without = [partial(mixture.runs, i) for i in folds]
+        return self.table.blocks.trial(
+            mixture.unseen(self.table.blocks), apart(model, self.task.data, without)
+        )
 
     def _with_blocks(self, model: Model, mixture: Mixture) -> Model:
         """The verdict with the fit of each block, which shows how far the figure can be trusted."""
@@ -132,7 +137,8 @@ class Ending:
         if not np.isfinite(mixture.residual).all():
             return model
         ends = np.cumsum(sizes)[:-1]
-        squares = np.split(self.table.blocks.weights * mixture.residual**2, ends)
+        left = mixture.unseen(self.table.blocks)
+        squares = np.split(self.table.blocks.weights * left**2, ends)
         counts = np.split(self.table.blocks.weights, ends)
         fits = [
             100.0 * (1.0 - math.sqrt(float(p.sum() / w.sum())) / spread)
@@ -360,18 +366,17 @@ def linear_alternative(chosen: LinearCandidate, task: Task) -> Model:
 def closed(
     model: Model,
     task: Task,
-    part: Split,
-    error: float,
+    trial: Trial,
     *,
     linear: float | None,
     wants_network: bool,
     diagnosed: Callable[[], Diagnosis | None],
 ) -> Model:
-    """The model with its notes and verdict, by its error on the part that it was not trained on.
+    """The model with its notes and verdict, by a trial on data that it was not trained on.
     `linear` is the error of the best linear model there; `diagnosed` gives the properties of the
     record, None if a time budget leaves no time for them.
     """
-    notes = list(model.training.get("notes", []))
+    notes, error = list(model.training.get("notes", [])), trial.error
     if wants_network and linear is not None and error >= WORTH_IT * linear:
         notes.append(
             f"free-run error on data not trained on: {100 * error / linear:.1f} % of the best "
@@ -383,7 +388,7 @@ def closed(
             "closed around the model; for a controller identify with nk = 1"
         )
     extra: Provenance = {"notes": notes} if notes else {}
-    found = verdict(model, task.data, part, error)
+    found = verdict(model, task.data, trial)
     diagnosis = diagnosed()
     if found["grade"] == "good" and diagnosis is not None and diagnosis.find("repeats") is not None:
         found["grade"] = "fair"

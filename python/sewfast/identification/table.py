@@ -190,10 +190,10 @@ class Table:
         self._enter("grey_box", len(largest.core.theta), largest, [(c.core,) for c in found])
 
     def enter_linear(self) -> None:
-        """Rows of all linear models so far that every fold has."""
+        """Rows of the linear models so far that can be chosen and that every fold has."""
         if self.wants_network:
             return
-        for c in self.linear.candidates.values():
+        for c in self.linear.eligible:
             if all(m is not None for m in c.models):
                 self._enter("oe", c.parameters, c, [(m,) for m in c.models])
 

@@ -7,7 +7,7 @@ use crate::seam::{
 use numpy::PyReadonlyArray1;
 use pyo3::prelude::*;
 use sewfast_core::Monitor;
-use sewfast_core::residuals::{self, Run, Test};
+use sewfast_core::residuals::{self, Noise, Run, Test};
 use sewfast_core::{
     changes, column, dead_time, excitation, faults, feedback as loops, orders, sensor,
 };
@@ -342,6 +342,27 @@ pub fn parameter_test<'py>(
     let (runs, channels) = borrowed(&experiments)?;
     let test = py.detach(|| residuals::parameters(&runs, channels, trained));
     handed_over(py, test.raised(py)?)
+}
+
+#[pyfunction]
+pub fn innovation(py: Python<'_>, series: Vec<Values<'_>>) -> PyResult<f64> {
+    let known =
+        |e: &Values<'_>| slice(e, "series").map(|e| e.iter().map(|v| v.is_finite()).collect());
+    let known = series
+        .iter()
+        .map(known)
+        .collect::<PyResult<Vec<Vec<bool>>>>()?;
+    let whole = |e: &Values<'_>| {
+        let values = slice(e, "series")?.iter();
+        Ok(values
+            .map(|v| if v.is_finite() { *v } else { 0.0 })
+            .collect())
+    };
+    let series = series
+        .iter()
+        .map(whole)
+        .collect::<PyResult<Vec<Vec<f64>>>>()?;
+    Ok(py.detach(|| Noise::fit(&series, &known, 0.0, true).innovation.sqrt()))
 }
 
 #[pyfunction]

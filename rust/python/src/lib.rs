@@ -56,8 +56,8 @@ mod _core {
     #[pymodule_export]
     use crate::evidence::{
         changed, coloured_information, computed, copied, dead, delay, explained, feedback,
-        integration, limits, order_in_time, order_table, parameter_test, period, quantum,
-        residual_tests, rests, spikes, two_levels, unstable_pole, wraps,
+        innovation, integration, limits, order_in_time, order_table, parameter_test, period,
+        quantum, residual_tests, rests, spikes, two_levels, unstable_pole, wraps,
     };
     #[pymodule_export]
     use crate::frequency::{
