@@ -122,11 +122,16 @@ def test_a_loop_that_loses_its_encoder_is_ended_though_nobody_watches_it() -> No
         filter_samples=8, counts_per_rev=4096,
     )  # fmt: skip
     motor = Blind(gain=400.0)
-    with pytest.raises(LinkError, match="expected the encoder to move") as stop:
+    with pytest.raises(LinkError, match="expected the encoder to count on") as stop:
         run(pid, bench(motor), np.full(3000, 1000.0), name="level")
     assert stop.value.cause.name in ("encoder lost", "stage off")
-    # a quarter of a second after the command reached half of its limit
-    assert len(motor.commands) < 1000
+    assert motor.commands.index(0.0, 10) < 515
+    # without a stated speed a quarter of a second after the command reached half of its limit
+    motor = Blind(gain=400.0)
+    rig = SteppedBench(motor, Ts=TS, counts_per_rev=4096, volt=10.0, name="rig")
+    with pytest.raises(LinkError, match="expected the encoder to move"):
+        run(pid, rig, np.full(3000, 1000.0), name="level")
+    assert motor.commands.index(0.0, 10) < 1000
     assert motor.commands[-1] == 0.0
 
 

@@ -26,7 +26,7 @@ from ..storage import Fields
 from ..units import counts_of, duration, position_unit
 from .controller import Controller, SampledController, pid_of
 from .loop import check_fits, common_rest, plant_name, require_units, single_core
-from .machine import MachineBench, is_streaming, machine_of
+from .machine import MachineBench, guarded, is_streaming, machine_of
 
 if TYPE_CHECKING:
     from ..models.rest import Rest
@@ -742,7 +742,7 @@ def _played(
         controller.sent()
     _require_counts(controller, machine)
     require_units(controller, ("", "RPM"))
-    run = machine.follow(playing, r, name)
+    run = guarded(machine).follow(playing, r, name)
     counts = run.recording.counts
     place, goal = _replayed(playing, counts, r, start)
     return PositionRun(
