@@ -242,7 +242,7 @@ class _Look:
     ) -> _Look:
         found = _core.causes(
             *_columns(recording), [_columns(r) for r in before], Ts=recording.Ts,
-            counts_per_rev=recording.counts_per_rev,
+            counts_per_rev=recording.counts_per_rev, most=volt,
         )  # fmt: skip
         return cls(recording, found, volt, speed)
 

@@ -23,6 +23,9 @@ HOLD = 0.8
 """Duration of each [s]."""
 MOVED = 0.02
 """Turns that count as motion."""
+BLIND, GLANCE = 0.1, 0.1
+"""A machine whose encoder has not counted yet gets more than this share of its largest command for
+so long first [s]: it may turn unseen."""
 STALLS, STALLING = 3, 0.2
 """Stalls under a load that are allowed, and the largest share of the command for them."""
 
@@ -49,10 +52,16 @@ def first_motion(machine: Machine, demands: Demands) -> Motion:
     # share of the top speed at which the trials end
     enough = 0.2
     levels: list[tuple[float, float]] = []
-    stood, stalls = 0.0, 0
+    stood, stalls, is_blind = 0.0, 0, True
     for share in shares:
         u = share * demands.u_max
+        if is_blind and share > BLIND:
+            glance = machine.excite(_pulse(u, machine.Ts, GLANCE), f"glance_{100 * share:g}")
+            if np.ptp(glance.counts) == 0.0:
+                stood = u
+                continue
         recording = machine.excite(_pulse(u, machine.Ts), f"motion_{100 * share:g}")
+        is_blind = is_blind and np.ptp(recording.counts) == 0.0
         speed = _judged(recording, u, may_stall=stalls < STALLS and share < STALLING)
         if speed is None:
             has_moved = bool(np.ptp(recording.counts) >= MOVED * machine.counts_per_rev)
@@ -82,8 +91,8 @@ def first_motion(machine: Machine, demands: Demands) -> Motion:
     )  # fmt: skip
 
 
-def _pulse(u: float, Ts: float) -> FloatArray:
-    before, hold = round(0.1 / Ts), round(HOLD / Ts)
+def _pulse(u: float, Ts: float, seconds: float = HOLD) -> FloatArray:
+    before, hold = round(0.1 / Ts), max(2, round(seconds / Ts))
     command = np.zeros(before + hold)
     command[before:] = u
     return command
