@@ -247,6 +247,32 @@ def acceleration(fopdt: Fopdt, demands: Demands) -> float:
     return fopdt.K * demands.u_max / fopdt.T
 
 
+def too_strong(fopdt: Fopdt, demands: Demands, machine: Machine) -> Cause | None:
+    """The cause of a machine that a tenth of its largest command takes beyond its stated speed.
+    Raises `Refusal` if a single sample of the largest command does: nobody could stop it in time.
+    """
+    stated = machine.speed if math.isfinite(machine.speed) else 2.0 * demands.top
+    settled = fopdt.K * demands.u_max
+    # of sound drives the largest command is worth up to six times the stated speed
+    if settled <= 10.0 * stated:
+        return None
+    found = Cause(
+        "gain too large",
+        f"it turns at {fopdt.K:.4g} RPM per V, so that {stated / fopdt.K:.3g} V of "
+        f"{demands.u_max:g} take it to its {stated:g} RPM; check counts_per_rev, the unit of the "
+        "command, its scale in the drive; if the gain is meant, give a smaller u_max",
+        "step", None, settled / stated,
+    )  # fmt: skip
+    reached = -settled * math.expm1(-machine.Ts / fopdt.T)
+    require(
+        reached <= stated,
+        f"expected a machine that takes many samples to its {stated:g} RPM at "
+        f"{demands.u_max:g} V, one of {machine.Ts:g} s takes it to {reached:.4g} RPM",
+        found,
+    )
+    return found
+
+
 def acceleration_shown(recording: Recording, demands: Demands) -> float:
     """Measured acceleration under the largest commands [RPM/s]; inf without such commands.
     It is the ninth decile of the changes of speed. Braking does not count: friction helps there as

@@ -310,9 +310,10 @@ def _carry_out(
     journal.enter("step response")
     step = step_response(machine, asked, motion)
     journal.keep(fopdt=step)
-    if moves is None and (lost := lost_motion(step, asked, motion)) is not None:
-        journal.keep(cause=lost)
-        journal.say(lost.text)
+    odd = lost_motion(step, asked, motion) or excitations.too_strong(step, asked, machine)
+    if moves is None and odd is not None:
+        journal.keep(cause=odd)
+        journal.say(odd.text)
 
     journal.enter("small signals")
     small = small_signal(machine, asked, motion, step)
