@@ -380,10 +380,10 @@ def faults_of(case: Case, f: dict[str, Any]) -> list[str]:
     if not case.sound and not f["cause"] and f["verdict"] not in ("verified", "done"):
         found.append("no cause")
     # who cannot be watched is refused afterwards
-    if f["late"] is not None and f["verdict"] in ("done", "verified"):
+    if f["late"] is not None and f["over"] > 1.05 and f["verdict"] in ("done", "verified"):
         found.append("too fast unseen")
     if f["way"] == "stepped":
-        if f["late"] is not None and f["late"] > LATEST:
+        if f["late"] is not None and f["late"] > 1.01 * LATEST:
             found.append("late")
         most = FASTEST_OF_60 if "60" in case.name else FASTEST
         # a stage that does not obey can reach any speed, and within a sample nobody can act
