@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from .. import _core
-from ..causes import ABORTED
+from ..causes import ABORTED, loss
 from ..control.controller import SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import (
@@ -29,6 +29,7 @@ from ..control.machine import (
     SteppedBench,
     Watch,
     cancelled_by,
+    cause_in,
     is_streaming,
     machine_of,
     recording_of,
@@ -100,10 +101,14 @@ class Guard(RunGuard):
 
     def ended(self, reason: str, value: float, u: FloatArray, counts: FloatArray) -> Aborted:
         """The refusal."""
-        return Aborted.after(
+        stop = Aborted.after(
             seen(reason, value, self.speed), self.name, u, counts, self._controller,
             self.counts_per_rev, frequency=value if reason == "Swinging" else None,
         )  # fmt: skip
+        if reason == "Lost":
+            concluded = cause_in(stop.recording, volt=math.inf, speed=self.speed)
+            stop.cause = loss(stop.recording, len(u) - 1, concluded)
+        return stop
 
 
 def seen(reason: str, value: float, limit: float) -> str:

@@ -253,7 +253,7 @@ def too_strong(fopdt: Fopdt, demands: Demands, machine: Machine) -> Cause | None
     """
     stated = machine.speed if math.isfinite(machine.speed) else 2.0 * demands.top
     settled = fopdt.K * demands.u_max
-    # of sound drives the largest command is worth up to six times the stated speed
+    # of 27 sound drives and motors the largest command is worth 1 to 3.9 times the stated speed
     if settled <= 10.0 * stated:
         return None
     found = Cause(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import signals
-from ..causes import ABORTED, Cause, cause_among, turns_at_rest
+from ..causes import ABORTED, Cause, Seen, cause_among, turns_at_rest
 from ..control.controller import Controller, SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import WATCHED, Machine, RecordedRun
@@ -232,9 +232,11 @@ def commission(
         try:
             return _carry_out(recorded, asked, cost, journal)
         except (Refusal, LinkError) as stop:
-            # a refusal knows why, as does a device that saw it between the runs, without a
-            # recording; only one that is out of reach does not know what put it there
+            # a refusal knows why, as does a guard that saw it, and a device that did so between the
+            # runs, without a recording; only one that is out of reach does not know what put it
+            # there
             knows = isinstance(stop, Refusal) or stop.recording is None
+            knows = knows or isinstance(stop.cause, Seen)
             known = stop.cause if knows else None
             if known is not None and known.name == "out of reach":
                 known = None

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from .. import _core
 from ..arrays import FloatArray
-from ..causes import Cause, cause_of
+from ..causes import Cause, cause_of, loss
 from ..errors import DataError, LinkError, SettingError, SewfastError
 from ..gains import real
 from ..machine import VirtualMachine
@@ -302,6 +302,9 @@ class RunGuard:
             f"{then}", remedy=remedy,
         )  # fmt: skip
         error.recording = recording
+        if reason == "Lost":
+            concluded = cause_in(recording, volt=math.inf, speed=self.speed)
+            error.explain(loss(recording, samples - 1, concluded))
         return error
 
 
@@ -395,7 +398,9 @@ class GuardedMachine(MachineWrapper):
                 # what a run does long after a fault hides it
                 end = k + 1 + round(TAIL / self.Ts)
                 u, counts, y = recording.u[:end], recording.counts[:end], recording.y[:end]
-                self._explain(error, replace(recording, u=u, counts=counts, y=y, speed_true=None))
+                if error.cause is None:
+                    short = replace(recording, u=u, counts=counts, y=y, speed_true=None)
+                    self._explain(error, short)
                 raise error
 
 
@@ -763,4 +768,6 @@ class SteppedBench:
             received=f"{said}{under}; rest was commanded, and {after}", remedy=remedy,
         )  # fmt: skip
         self._explain(error, run)
+        if seen[0] == "Lost":
+            error.explain(loss(run, k, error.cause))
         return error
