@@ -22,7 +22,7 @@ TS = 1e-3
 
 @dataclass
 class Motor:
-    """`gain` RPM/V with a time constant of `lag` [s]; without friction it integrates the command."""
+    """`gain` RPM/V, a time constant of `lag` [s]; without friction it integrates the command."""
 
     gain: float = 250.0
     has_friction: bool = True
