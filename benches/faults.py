@@ -291,6 +291,7 @@ def tried(case: tuple[Fault, Machine, int]) -> dict[str, Any]:
         on = nullcontext(
             Bench(motor, machine.Ts, machine.of.counts, machine.volt, machine.name, machine.stated)
         )
+    found: Any = None
     with on as bench:
         try:
             found = sewfast.commission(
@@ -299,6 +300,8 @@ def tried(case: tuple[Fault, Machine, int]) -> dict[str, Any]:
             verdict, text, cause = found.verdict, found.reason, found.cause
         except SewfastError as error:
             verdict, text, cause = type(error).__name__, str(error), error.cause
+            found = getattr(error, "so_far", None)
+    fopdt = getattr(found, "fopdt", None)
     late = None
     if machine.of is None:
         fastest = on.fastest
@@ -314,6 +317,8 @@ def tried(case: tuple[Fault, Machine, int]) -> dict[str, Any]:
         "cause": named, "text": text, "late": late, "over": fastest / machine.stated,
         "is_right": is_named or (not named and verified and fault.may_verify),
         "is_false": verified and not may_verify, "advises": "raise" in text,
+        "strength": fopdt and fopdt.K * machine.volt / machine.stated,
+        "began": machine.of is None or motor.has_begun,
         "seconds": time.process_time() - began,
     }  # fmt: skip
 
@@ -378,8 +383,8 @@ def cases(args: argparse.Namespace) -> Iterator[tuple[Fault, Machine, int]]:
         yield from ((HEALTHY, Machine(d), seed) for d in FAMILY for seed in range(2))
         yield from ((HEALTHY, m, seed) for m, seed in machines(args))
         return
-    for machine, seed in machines(args):
-        for fault in FAULTS:
+    for i, (machine, seed) in enumerate(machines(args)):
+        for fault in FAULTS[i % args.every :: args.every]:
             can_be = machine is not BOARD or fault.wrong.keys() <= ON_BOARD
             if args.only in fault.name and can_be:
                 yield fault, machine, seed
@@ -391,6 +396,7 @@ def main() -> None:
     parser.add_argument("--motors", type=int, default=7, help="motors of MuJoCo")
     parser.add_argument("--boards", type=int, default=1, help="times on the emulated board")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--every", type=int, default=1, help="every so many faults of a machine")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", default="", help="part of a fault's name")
     parser.add_argument("--healthy", action="store_true", help="machines without a fault")

@@ -1289,9 +1289,9 @@ def host_loop(
 # --- guard.rs ---------------------------------------------------------------------------------------------
 
 def causes(
-    u: _F, counts: _F, before: Sequence[tuple[_F, _F]], *, Ts: float, counts_per_rev: float
+    u: _F, counts: _F, before: Sequence[tuple[_F, _F]], *, Ts: float, counts_per_rev: float, most: float = ...
 ) -> dict[str, Any]:
-    """What has changed in a machine, from a run (u, counts) and earlier ones, all from rest.
+    """What has changed in a machine, from a run (u, counts) and earlier ones, all from rest; ``most`` is its largest command [u].
 
     ``motor`` (gain [RPM/u], lag and delay [s], friction and bias [u]) is fitted to the earlier runs or, without any, to this
     one; ``unsure`` is its rms error on the earlier runs over their rms speed, ``together`` what this run adds to their
@@ -1313,6 +1313,9 @@ class Guard:
     ) -> Guard: ...
     def take(self, counts: float) -> tuple[str, float] | None:
         """Takes the counts of a sample, before its command acts."""
+
+    def sent(self, u: float) -> tuple[str, float] | None:
+        """Takes the command of that sample."""
 
     def watch(self, u: _F, counts: _F) -> tuple[int, tuple[str, float]] | None:
         """Takes the counts and commands of samples, both (N,); with the place of the sample at which something was seen."""

@@ -68,6 +68,29 @@ class Cause:
         }  # fmt: skip
 
 
+class Seen(Cause):
+    """A cause that a guard saw as it came, and not one that was concluded from a run."""
+
+
+def loss(recording: Recording, k: int, concluded: Cause | None) -> Seen:
+    """What became of an encoder whose counts fell from one sample to the next, as a guard saw by
+    sample `k`: what the run says, if that is about signs or counts, else the ratio of the paces. A
+    motor that was seen for some milliseconds may have been stopped by anything.
+    """
+    if concluded is not None and concluded.name in SUDDEN:
+        found = concluded
+    else:
+        r = recording
+        # samples that the guard waits, and those before the fall that it looks at
+        waits = max(8, math.ceil(0.01 / r.Ts))
+        paces = np.diff(r.counts[: k + 1])
+        value = float(paces[-waits:].mean() / paces[-waits - 4 : -waits].mean())
+        at, run = (k - waits) * r.Ts, r.name.removesuffix(ABORTED)
+        name, text = _counts(value, f"{at:.3g} s after {run!r} began")
+        found = Cause(name, text, run, at, value)
+    return Seen(found.name, found.text, found.run, found.at, found.value)
+
+
 def cause_of(
     recording: Recording,
     before: Sequence[Recording] = (),
@@ -242,7 +265,7 @@ class _Look:
     ) -> _Look:
         found = _core.causes(
             *_columns(recording), [_columns(r) for r in before], Ts=recording.Ts,
-            counts_per_rev=recording.counts_per_rev,
+            counts_per_rev=recording.counts_per_rev, most=volt,
         )  # fmt: skip
         return cls(recording, found, volt, speed)
 
@@ -353,6 +376,8 @@ class _Look:
         return bool(60.0 * turns / (k * r.Ts) > 0.8 * self.speed)
 
 
+SUDDEN = ("encoder lost", "encoder sign", "counts scaled", "counts jumped", "command sign", "sign")
+"""Causes that can change a speed from one sample to the next."""
 _LOST_ENCODER = "check the encoder's cable and supply, the coupling, whether the shaft is blocked"
 _SIGN = "swap two motor leads or the encoder's A and B, or change a sign in the drive"
 _LOAD = "check what drives the shaft: gravity, a spring, a load, an offset of the command"

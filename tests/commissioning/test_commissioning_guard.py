@@ -22,12 +22,13 @@ TS = 1e-3
 
 @dataclass
 class Motor:
-    """`gain` RPM/V with a time constant of .1 s; without friction it integrates the command."""
+    """`gain` RPM/V, a time constant of `lag` [s]; without friction it integrates the command."""
 
     gain: float = 250.0
     has_friction: bool = True
     flips_at: float = math.inf
     sticks_at: float = math.inf
+    lag: float = 0.1
     t: float = 0.0
     speed_rpm: float = 0.0
     angle: float = 0.0
@@ -47,7 +48,7 @@ class Motor:
         u = 10.0 if self.t >= self.sticks_at else u
         for _ in range(10):
             drag = self.speed_rpm if self.has_friction else 0.0
-            self.speed_rpm += 1e-4 / 0.1 * (self.gain * u - drag)
+            self.speed_rpm += 1e-4 / self.lag * (self.gain * u - drag)
             self.angle += 1e-4 * self.speed_rpm / 60.0
         self.t += TS
         self.speeds.append(abs(self.speed_rpm))
@@ -122,12 +123,37 @@ def test_a_loop_that_loses_its_encoder_is_ended_though_nobody_watches_it() -> No
         filter_samples=8, counts_per_rev=4096,
     )  # fmt: skip
     motor = Blind(gain=400.0)
-    with pytest.raises(LinkError, match="expected the encoder to move") as stop:
+    with pytest.raises(LinkError, match="expected the encoder to count on") as stop:
         run(pid, bench(motor), np.full(3000, 1000.0), name="level")
     assert stop.value.cause.name in ("encoder lost", "stage off")
-    # a quarter of a second after the command reached half of its limit
-    assert len(motor.commands) < 1000
+    assert motor.commands.index(0.0, 10) < 515
+    # without a stated speed a quarter of a second after the command reached half of its limit
+    motor = Blind(gain=400.0)
+    rig = SteppedBench(motor, Ts=TS, counts_per_rev=4096, volt=10.0, name="rig")
+    with pytest.raises(LinkError, match="expected the encoder to move"):
+        run(pid, rig, np.full(3000, 1000.0), name="level")
+    assert motor.commands.index(0.0, 10) < 1000
     assert motor.commands[-1] == 0.0
+
+
+def test_a_gain_that_one_sample_proves_too_large_is_refused_after_the_step() -> None:
+    motor = Motor(gain=15_000.0, lag=0.02)
+    with pytest.raises(Refusal, match="takes many samples to its 2000 RPM at 10 V") as stop:
+        commission(bench(motor), speed=1500, members=2, evaluations=60)
+    assert stop.value.cause.name == "gain too large"
+    assert "raise" not in str(stop.value)
+    assert max(motor.speeds) < STATED
+
+
+def test_a_dead_encoder_does_not_take_a_machine_to_full_speed() -> None:
+    class Dead(Motor):
+        counts = 0.0
+
+    motor = Dead(gain=400.0)
+    with pytest.raises(Refusal, match="its encoder counted less") as stop:
+        commission(bench(motor), speed=1500, members=2, evaluations=60)
+    assert stop.value.cause.name == "no motion"
+    assert max(motor.speeds) < 1.4 * STATED
 
 
 def test_commissioning_ends_on_a_machine_that_integrates() -> None:

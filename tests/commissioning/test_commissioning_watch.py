@@ -253,7 +253,7 @@ def test_a_motor_that_stands_under_a_small_command_ends_no_run() -> None:
     guard = Guard(QUIET, "hold", 1572.0)
     guard(0, np.full(5000, 9.9), np.zeros(5000))
     guard(0, np.full(245, 20.0), np.zeros(245))
-    with pytest.raises(Aborted, match=r"not by a count for \.25 s at 20 V") as stop:
+    with pytest.raises(Aborted, match=r"not a count for \.25 s at 20 V") as stop:
         guard(0, np.full(20, 20.0), np.zeros(20))
     assert len(stop.value.recording) == 5251
 

@@ -14,24 +14,26 @@ from typing import Any, cast
 import numpy as np
 
 from .. import _core
-from ..causes import ABORTED
+from ..causes import ABORTED, loss
 from ..control.controller import SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import (
-    NO_MOTION,
-    TOO_FAST,
+    SEEN,
     Followed,
     Machine,
     MachineBench,
+    MachineWrapper,
     RecordedRun,
+    RunGuard,
     Stepped,
     SteppedBench,
     Watch,
     cancelled_by,
+    cause_in,
     is_streaming,
-    is_watched,
     machine_of,
     recording_of,
+    watching,
 )  # fmt: skip
 from ..dataset import FloatArray
 from ..errors import DataError, LinkError, SettingError
@@ -78,19 +80,9 @@ class Aborted(Refusal):
         )
 
 
-_SEEN = {
-    "Speed": "expected at most {limit:g} RPM, it turned at {value:.4g}; " + TOO_FAST,
-    "NoMotion": "expected the encoder to move, it has not by a count for .25 s at {value:.3g} V; "
-    + NO_MOTION,
-    "Swinging": "expected a command that does not swing, it went 8 times in a row from limit to "
-    "limit, at {value:.3g} Hz; look for play, for a shaft that gives, for a delay",
-}
-
-
-class Guard:
-    """Ends a run that is faster than `speed` [RPM], whose motor or encoder has failed, or whose
-    command swings from limit to limit: a device's own guard (docs/PROTOCOL.md, 9 and 12). Under
-    feedback, a lost encoder means a motor at full speed until the end of the reference.
+class Guard(RunGuard):
+    """The guard of a loop, which ends it as a `Refusal`. Under feedback, a lost encoder means a
+    motor at full speed until the end of the reference.
     """
 
     def __init__(
@@ -100,70 +92,29 @@ class Guard:
         counts_per_rev: float,
         speed: float = math.inf,
     ) -> None:
-        self._controller, self._name, self._per_turn = controller, name, counts_per_rev
-        self._speed = speed
         low, high = controller.u_min, controller.u_max
-        self._guard = _core.Guard(
-            Ts=controller.Ts, counts_per_rev=counts_per_rev, volt=max(-low, high), speed=speed,
+        super().__init__(
+            name, controller.Ts, counts_per_rev, volt=max(-low, high), speed=speed,
             between=(low, high),
         )  # fmt: skip
-        self._u: list[FloatArray] = []
-        self._counts: list[FloatArray] = []
+        self._controller = controller
 
-    def __call__(self, first: int, u: FloatArray, counts: FloatArray) -> None:
-        """Check samples `first`, `first + 1`, ...; raises `Aborted`."""
-        self._u.append(u.copy())
-        self._counts.append(counts.copy())
-        found = self._guard.watch(u, counts)
-        if found is None:
-            return
-        after, (reason, value) = found
-        end = sum(map(len, self._u[:-1])) + after + 1
-        all_u, all_counts = (np.concatenate(x)[:end] for x in (self._u, self._counts))
-        raise Aborted.after(
-            _SEEN[reason].format(limit=self._speed, value=value), self._name, all_u, all_counts,
-            self._controller, self._per_turn,
-            frequency=value if reason == "Swinging" else None,
+    def ended(self, reason: str, value: float, u: FloatArray, counts: FloatArray) -> Aborted:
+        """The refusal."""
+        stop = Aborted.after(
+            seen(reason, value, self.speed), self.name, u, counts, self._controller,
+            self.counts_per_rev, frequency=value if reason == "Swinging" else None,
         )  # fmt: skip
+        if reason == "Lost":
+            concluded = cause_in(stop.recording, volt=math.inf, speed=self.speed)
+            stop.cause = loss(stop.recording, len(u) - 1, concluded)
+        return stop
 
 
-@dataclass
-class MachineWrapper:
-    """A wrapper that forwards all members of a machine."""
-
-    inner: Machine
-
-    @property
-    def name(self) -> str:
-        return self.inner.name
-
-    @property
-    def Ts(self) -> float:
-        return self.inner.Ts
-
-    @property
-    def counts_per_rev(self) -> float:
-        return self.inner.counts_per_rev
-
-    @property
-    def volt(self) -> float:
-        return self.inner.volt
-
-    @property
-    def speed(self) -> float:
-        return self.inner.speed
-
-    def excite(self, u: FloatArray, name: str) -> Recording:
-        return self.inner.excite(u, name)
-
-    def follow(
-        self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
-    ) -> RecordedRun:
-        if watch is None or not is_watched(self.inner):
-            return self.inner.follow(controller, r, name)
-        watched: Any = self.inner
-        found: RecordedRun = watched.follow(controller, r, name, watch=watch)
-        return found
+def seen(reason: str, value: float, limit: float) -> str:
+    """What a guard saw, as a sentence."""
+    expected, received, remedy = SEEN[reason]
+    return f"expected {expected.format(limit=limit)}, got {received.format(value=value)}; {remedy}"
 
 
 @dataclass
@@ -234,7 +185,8 @@ class RecordedBench(MachineWrapper):
         recording = self.kept(name, key)
         if recording is None:
             with self._keeping_what_failed():
-                recording = self.inner.excite(u, name)
+                guard = RunGuard(name, self.Ts, self.counts_per_rev, speed=self._stated)
+                recording = self.inner.excite(u, name, **watching(self.inner.excite, guard))
                 require_record(self.inner, name, len(u), recording)
                 self._require_speed(name, key, recording)
         self.runs.append(recording)
@@ -299,8 +251,7 @@ class RecordedBench(MachineWrapper):
         aborted = replace(recording, name=f"{name}{ABORTED}")
         self.note(aborted.name, key, aborted, None)
         raise Aborted(
-            f"{name!r}, {k * self.Ts:.3g} s after its start: "
-            + _SEEN[reason].format(limit=self._stated, value=value),
+            f"{name!r}, {k * self.Ts:.3g} s after its start: " + seen(reason, value, self._stated),
             aborted,
         )
 

@@ -23,6 +23,9 @@ HOLD = 0.8
 """Duration of each [s]."""
 MOVED = 0.02
 """Turns that count as motion."""
+BLIND, GLANCE = 0.1, 0.1
+"""A machine whose encoder has not counted yet gets more than this share of its largest command for
+so long first [s]: it may turn unseen."""
 STALLS, STALLING = 3, 0.2
 """Stalls under a load that are allowed, and the largest share of the command for them."""
 
@@ -49,10 +52,16 @@ def first_motion(machine: Machine, demands: Demands) -> Motion:
     # share of the top speed at which the trials end
     enough = 0.2
     levels: list[tuple[float, float]] = []
-    stood, stalls = 0.0, 0
+    stood, stalls, is_blind = 0.0, 0, True
     for share in shares:
         u = share * demands.u_max
+        if is_blind and share > BLIND:
+            glance = machine.excite(_pulse(u, machine.Ts, GLANCE), f"glance_{100 * share:g}")
+            if np.ptp(glance.counts) == 0.0:
+                stood = u
+                continue
         recording = machine.excite(_pulse(u, machine.Ts), f"motion_{100 * share:g}")
+        is_blind = is_blind and np.ptp(recording.counts) == 0.0
         speed = _judged(recording, u, may_stall=stalls < STALLS and share < STALLING)
         if speed is None:
             has_moved = bool(np.ptp(recording.counts) >= MOVED * machine.counts_per_rev)
@@ -82,8 +91,8 @@ def first_motion(machine: Machine, demands: Demands) -> Motion:
     )  # fmt: skip
 
 
-def _pulse(u: float, Ts: float) -> FloatArray:
-    before, hold = round(0.1 / Ts), round(HOLD / Ts)
+def _pulse(u: float, Ts: float, seconds: float = HOLD) -> FloatArray:
+    before, hold = round(0.1 / Ts), max(2, round(seconds / Ts))
     command = np.zeros(before + hold)
     command[before:] = u
     return command
@@ -236,6 +245,32 @@ TRAPEZOIDS = (
 def acceleration(fopdt: Fopdt, demands: Demands) -> float:
     """Acceleration at rest under the largest command without a current limit [RPM/s]."""
     return fopdt.K * demands.u_max / fopdt.T
+
+
+def too_strong(fopdt: Fopdt, demands: Demands, machine: Machine) -> Cause | None:
+    """The cause of a machine that a tenth of its largest command takes beyond its stated speed.
+    Raises `Refusal` if a single sample of the largest command does: nobody could stop it in time.
+    """
+    stated = machine.speed if math.isfinite(machine.speed) else 2.0 * demands.top
+    settled = fopdt.K * demands.u_max
+    # of 27 sound drives and motors the largest command is worth 1 to 3.9 times the stated speed
+    if settled <= 10.0 * stated:
+        return None
+    found = Cause(
+        "gain too large",
+        f"it turns at {fopdt.K:.4g} RPM per V, so that {stated / fopdt.K:.3g} V of "
+        f"{demands.u_max:g} take it to its {stated:g} RPM; check counts_per_rev, the unit of the "
+        "command, its scale in the drive; if the gain is meant, give a smaller u_max",
+        "step", None, settled / stated,
+    )  # fmt: skip
+    reached = -settled * math.expm1(-machine.Ts / fopdt.T)
+    require(
+        reached <= stated,
+        f"expected a machine that takes many samples to its {stated:g} RPM at "
+        f"{demands.u_max:g} V, one of {machine.Ts:g} s takes it to {reached:.4g} RPM",
+        found,
+    )
+    return found
 
 
 def acceleration_shown(recording: Recording, demands: Demands) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import signals
-from ..causes import ABORTED, Cause, cause_among, turns_at_rest
+from ..causes import ABORTED, Cause, Seen, cause_among, turns_at_rest
 from ..control.controller import Controller, SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import WATCHED, Machine, RecordedRun
@@ -244,9 +244,11 @@ def commission(
         try:
             return _carry_out(recorded, asked, cost, journal)
         except (Refusal, LinkError) as stop:
-            # a refusal knows why, as does a device that saw it between the runs, without a
-            # recording; only one that is out of reach does not know what put it there
+            # a refusal knows why, as does a guard that saw it, and a device that did so between the
+            # runs, without a recording; only one that is out of reach does not know what put it
+            # there
             knows = isinstance(stop, Refusal) or stop.recording is None
+            knows = knows or isinstance(stop.cause, Seen)
             known = stop.cause if knows else None
             if known is not None and known.name == "out of reach":
                 known = None
@@ -322,9 +324,10 @@ def _carry_out(
     journal.enter("step response")
     step = step_response(machine, asked, motion)
     journal.keep(fopdt=step)
-    if moves is None and (lost := lost_motion(step, asked, motion)) is not None:
-        journal.keep(cause=lost)
-        journal.say(lost.text)
+    odd = lost_motion(step, asked, motion) or excitations.too_strong(step, asked, machine)
+    if moves is None and odd is not None:
+        journal.keep(cause=odd)
+        journal.say(odd.text)
 
     journal.enter("small signals")
     small = small_signal(machine, asked, motion, step)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray
 from ..control.controller import Controller
-from ..control.machine import Machine, is_watched
+from ..control.machine import Machine, guarded, watching
 from ..control.margins import margins
 from ..dataset import Dataset
 from ..errors import DataError, LinkError, SettingError
@@ -161,10 +161,13 @@ def bode(
     if np.ndim(speed) == 0:
         with bench_of(on, None) as machine:
             plan = _Plan.of(machine, real("speed", speed), *design)
-            return _shaken(machine, plan, amplitude, controller)
+            return _shaken(guarded(machine), plan, amplitude, controller)
     with bench_of(on, None) as machine:
         return _over_speeds(
-            machine, [_Plan.of(machine, s, *design) for s in _rising(speed)], amplitude, controller
+            guarded(machine),
+            [_Plan.of(machine, s, *design) for s in _rising(speed)],
+            amplitude,
+            controller,
         )
 
 
@@ -446,8 +449,8 @@ def _under_feedback(
         if limited.any():
             raise _limited(limited, max(first, lead), plan.Ts)
 
-    watched: dict[str, Any] = {"watch": watch} if is_watched(machine) else {}
     try:
+        watched = watching(machine.follow, watch)
         recording = machine.follow(controller, r, "multisine", **watched).recording
     except LinkError as error:
         recording = _kept(error, lead, plan, is_whole=is_whole)

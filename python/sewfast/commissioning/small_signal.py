@@ -41,7 +41,7 @@ TWICE = 2.0
 BESIDE = (0.4, 0.8), (1.25, 1.8)
 """Surroundings of a line, as shares of its frequency."""
 SIZE = 0.1
-"""Amplitude as a share of the largest command: small enough for linear dynamics."""
+"""Largest amplitude as a share of the largest command: small enough for linear dynamics."""
 SAMPLES, LONGEST = 4_000, 12.0
 """Samples of the random command, and its longest duration [s]."""
 ITERATIONS = 60
@@ -163,7 +163,8 @@ def shaking(
     held = min(motion.command(level * demands.speed), most, (1.0 - SIZE) * demands.u_max)
     settle = max(1, round(min(4.0 * fopdt.T, LONGEST) / Ts))
     samples = int(min(SAMPLES, max(500, LONGEST / Ts)))
-    size = SIZE * demands.u_max
+    # even if it were held, it would not take the machine beyond its top
+    size = min(SIZE * demands.u_max, (demands.top - level * demands.speed) / fopdt.K)
     # samples that each random value is held: power up to a quarter of the sample rate
     random = _core.prbs(
         duration=samples * Ts, Ts=Ts, low=held - size, high=held + size, hold=2 * Ts,

@@ -433,7 +433,7 @@ def _on_machine(
     cancel: threading.Event | None,
     **options: Any,
 ) -> ClosedLoopRun:
-    from .machine import cancelled_by, is_streaming
+    from .machine import cancelled_by, guarded, is_streaming
 
     if not hasattr(on, "follow"):
         raise SettingError(
@@ -442,7 +442,7 @@ def _on_machine(
         )  # fmt: skip
     if is_streaming(on):
         return on.follow(controller, r, name, **options, **cancelled_by(cancel))
-    return on.follow(controller, r, name)
+    return guarded(on).follow(controller, r, name)
 
 
 def reference_samples(

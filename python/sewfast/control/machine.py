@@ -13,7 +13,7 @@ import inspect
 import math
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeGuard, cast
 
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from .. import _core
 from ..arrays import FloatArray
-from ..causes import Cause, cause_of
+from ..causes import Cause, cause_of, loss
 from ..errors import DataError, LinkError, SettingError, SewfastError
 from ..gains import real
 from ..machine import VirtualMachine
@@ -145,9 +145,10 @@ class Machine(Protocol):
 
     Any object with these members works with `record`, `run`, `commission` and `bode`: a drive
     behind a port, an FMU, a model of MuJoCo, your own test rig. A `VirtualMachine` has them all.
-    Every run, even an interrupted one, ends with no command on the motor. If its `follow` also
-    accepts a `watch` (`Watch`), a run that goes wrong is ended early. `Recording.of_counts` and
-    `RecordedRun.of_recording` make the results from the log of a test rig.
+    Every run, even an interrupted one, ends with no command on the motor. If its `excite` or its
+    `follow` also accepts a `watch` (`Watch`), a run that goes wrong is ended early, otherwise it is
+    refused afterwards. `Recording.of_counts` and `RecordedRun.of_recording` make the results from
+    the log of a test rig.
     """
 
     @property
@@ -195,9 +196,9 @@ def is_streaming(machine: object) -> TypeGuard[Streaming]:
     return hasattr(machine, "stream")
 
 
-def is_watched(machine: Machine) -> bool:
-    """Whether its runs can be watched."""
-    return "watch" in inspect.signature(machine.follow).parameters
+def watching(play: Callable[..., Any], watch: Watch) -> dict[str, Any]:
+    """The option `watch` for an `excite` or a `follow`, left out if it takes none."""
+    return {"watch": watch} if "watch" in inspect.signature(play).parameters else {}
 
 
 MEMBERS = ("name", "Ts", "counts_per_rev", "volt", "speed", "excite", "follow")
@@ -218,6 +219,196 @@ def machine_of(on: object) -> Machine:
             "sewfast.Machine",
         )  # fmt: skip
     return cast(Machine, on)
+
+
+# --- The guard of a machine without a device ------------------------------------------------------
+
+
+TOO_FAST = (
+    "look for a load that drives it, a turned sign of command or encoder, a gain larger than "
+    "recorded, wrong counts_per_rev, a counter that wraps"
+)
+"""What to do about a machine that is faster than stated: never a higher limit."""
+NO_MOTION = "look for a lost encoder, an amplifier that has tripped, a shaft that is blocked"
+"""What to do about a machine that stands under a large command."""
+SEEN = {
+    "Speed": ("at most {limit:g} RPM", "{value:.4g} RPM", TOO_FAST),
+    "NoMotion": ("the encoder to move", "not a count for .25 s at {value:.3g} V", NO_MOTION),
+    "Lost": (
+        "the encoder to count on while the command stays",
+        "counts that stopped, fell or turned from one sample to the next, at {value:.3g} V",
+        "look for a lost encoder or one of its channels, a slipping coupling, a shaft that hit "
+        "something",
+    ),
+    "Swinging": (
+        "a command that does not swing",
+        "one that went 8 times in a row from limit to limit, at {value:.3g} Hz",
+        "look for play, for a shaft that gives, for a delay",
+    ),
+}
+"""What was expected, what was seen instead, and what to do, by the guard's reasons."""
+
+
+class RunGuard:
+    """A device's own guard (docs/PROTOCOL.md, 9 and 12) for one run of a machine that has no
+    device: a `Watch` that ends it if it is faster than `speed` [RPM], if its motor or encoder has
+    failed under a command of up to `volt` [V], or if its command swings `between` two limits.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        Ts: float,
+        counts_per_rev: float,
+        *,
+        volt: float = math.inf,
+        speed: float = math.inf,
+        between: tuple[float, float] | None = None,
+    ) -> None:
+        self.name, self.Ts, self.counts_per_rev, self.speed = name, Ts, counts_per_rev, speed
+        self._guard = _core.Guard(
+            Ts=Ts, counts_per_rev=counts_per_rev, volt=volt, speed=speed, between=between
+        )
+        self._u: list[FloatArray] = []
+        self._counts: list[FloatArray] = []
+
+    def __call__(self, first: int, u: FloatArray, counts: FloatArray) -> None:
+        """Check samples `first`, `first + 1`, ...; raises what `ended` makes."""
+        self._u.append(u.copy())
+        self._counts.append(counts.copy())
+        found = self._guard.watch(u, counts)
+        if found is None:
+            return
+        after, (reason, value) = found
+        end = sum(map(len, self._u[:-1])) + after + 1
+        all_u, all_counts = (np.concatenate(x)[:end] for x in (self._u, self._counts))
+        raise self.ended(reason, value, all_u, all_counts)
+
+    def ended(self, reason: str, value: float, u: FloatArray, counts: FloatArray) -> SewfastError:
+        """The error of a run that was ended, from its commands [V] and counts until then."""
+        counts = counts - counts[0]
+        y = speed_or_nan(counts, self.Ts, self.counts_per_rev, "kalman")
+        recording = Recording(u, counts, y, None, self.Ts, self.counts_per_rev, self.name)
+        return self.error(reason, value, recording, len(u), "the run was ended")
+
+    def error(
+        self, reason: str, value: float, recording: Recording, samples: int, then: str
+    ) -> LinkError:
+        """The error that says what was seen after so many samples of a recording."""
+        expected, received, remedy = SEEN[reason]
+        error = LinkError(
+            name=self.name, expected=expected.format(limit=self.speed),
+            received=f"{received.format(value=value)} after {samples * self.Ts:.3g} s; "
+            f"{then}", remedy=remedy,
+        )  # fmt: skip
+        error.recording = recording
+        if reason == "Lost":
+            concluded = cause_in(recording, volt=math.inf, speed=self.speed)
+            error.explain(loss(recording, samples - 1, concluded))
+        return error
+
+
+@dataclass
+class MachineWrapper:
+    """A wrapper that forwards all members of a machine."""
+
+    inner: Machine
+
+    @property
+    def name(self) -> str:
+        return self.inner.name
+
+    @property
+    def Ts(self) -> float:
+        return self.inner.Ts
+
+    @property
+    def counts_per_rev(self) -> float:
+        return self.inner.counts_per_rev
+
+    @property
+    def volt(self) -> float:
+        return self.inner.volt
+
+    @property
+    def speed(self) -> float:
+        return self.inner.speed
+
+    def excite(self, u: FloatArray, name: str) -> Recording:
+        return self.inner.excite(u, name)
+
+    def follow(
+        self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
+    ) -> RecordedRun:
+        watched = {} if watch is None else watching(self.inner.follow, watch)
+        return self.inner.follow(controller, r, name, **watched)
+
+
+class GuardedMachine(MachineWrapper):
+    """A user's own machine: its runs are watched if they can be, and looked at afterwards."""
+
+    def excite(self, u: FloatArray, name: str) -> Recording:
+        # in an open loop a machine may stand under any command
+        with self._guarded(name, math.inf) as guard:
+            found = self.inner.excite(u, name, **watching(self.inner.excite, guard))
+            self._look_at(guard, found)
+            return found
+
+    def follow(
+        self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
+    ) -> RecordedRun:
+        with self._guarded(name, self.volt) as guard:
+
+            def both(first: int, u: FloatArray, counts: FloatArray) -> None:
+                guard(first, u, counts)
+                if watch is not None:
+                    watch(first, u, counts)
+
+            found = super().follow(controller, r, name, watch=both)
+            self._look_at(guard, getattr(found, "recording", None))
+            return found
+
+    @contextlib.contextmanager
+    def _guarded(self, name: str, volt: float) -> Iterator[RunGuard]:
+        """A guard for a run; what it raises is told its cause."""
+        title = f"{self.name}, {name}"
+        try:
+            yield RunGuard(title, self.Ts, self.counts_per_rev, volt=volt, speed=self.speed)
+        except LinkError as error:
+            recording = recording_of(error)
+            if isinstance(recording, Recording) and error.cause is None:
+                self._explain(error, recording)
+            raise
+
+    def _explain(self, error: LinkError, recording: Recording) -> None:
+        if cause := cause_in(recording, volt=self.volt, speed=self.speed):
+            error.explain(cause)
+
+    def _look_at(self, guard: RunGuard, recording: object) -> None:
+        """Refuse a run whose recording shows that it was too fast."""
+        if isinstance(recording, Recording) and math.isfinite(self.speed):
+            whole = _core.Guard(
+                Ts=self.Ts, counts_per_rev=self.counts_per_rev, volt=math.inf, speed=self.speed
+            )
+            seen = whole.watch(recording.u, recording.counts)
+            if seen is not None:
+                k, (reason, value) = seen
+                then = "it was seen after the run, which nobody could end: let it take a `watch`"
+                error = guard.error(reason, value, recording, k + 1, then)
+                # what a run does long after a fault hides it
+                end = k + 1 + round(TAIL / self.Ts)
+                u, counts, y = recording.u[:end], recording.counts[:end], recording.y[:end]
+                if error.cause is None:
+                    short = replace(recording, u=u, counts=counts, y=y, speed_true=None)
+                    self._explain(error, short)
+                raise error
+
+
+def guarded(machine: Machine) -> Machine:
+    """A machine whose runs are watched: those of a device or of a bench of this package are."""
+    if is_streaming(machine) or isinstance(machine, (SteppedBench, MachineBench, MachineWrapper)):
+        return machine
+    return GuardedMachine(machine)
 
 
 # --- Recording ------------------------------------------------------------------------------------
@@ -296,7 +487,7 @@ def record(
     if isinstance(machine, VirtualMachine):
         found = MachineBench(machine, method=method).excite(command, name)
     else:
-        found = machine.excite(command, name)
+        found = guarded(machine).excite(command, name)
     if file is not None:
         found.save(file, overwrite=overwrite)
     return found
@@ -379,23 +570,19 @@ class MachineBench:
         return RecordedRun.of(found, recording)
 
 
+OBEYS = 0.02
+"""A machine that is not slower so long after rest was commanded does not obey [s]."""
 COAST, TAIL = 5.0, 0.25
 """Longest wait for rest after a run was ended, and how much of it is recorded [s]: in seconds of a
 machine that nothing stops, what happened before would count little."""
-TOO_FAST = (
-    "look for a load that drives it, a turned sign of command or encoder, a gain larger than "
-    "recorded, wrong counts_per_rev, a counter that wraps"
-)
-"""What to do about a machine that is faster than stated: never a higher limit."""
-NO_MOTION = "look for a lost encoder, an amplifier that has tripped, a shaft that is blocked"
-"""What to do about a machine that stands under a large command."""
 
 
 class Stepped(Protocol):
     """A machine that is advanced one sample at a time: a simulator, or a test rig without a clock.
 
     If it has `speed_rpm`, its true speed [RPM], runs are scored by it, otherwise by the speed
-    estimated from counts.
+    estimated from counts. If it has `off()`, which takes the power from it whatever the command (a
+    contactor, a safe torque off), that is called when a run was ended and rest does not slow it.
     """
 
     @property
@@ -460,7 +647,8 @@ class SteppedBench:
 
     def excite(self, u: FloatArray, name: str) -> Recording:
         require_finite("command", u)
-        return self._played(lambda k, counts: float(u[k]), len(u), name)
+        # in an open loop a machine may stand under any command
+        return self._played(lambda k, counts: float(u[k]), len(u), name, math.inf)
 
     def follow(
         self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
@@ -470,21 +658,17 @@ class SteppedBench:
         per_count = 60.0 / (self.counts_per_rev * self.Ts)
         u, feedback, before = np.zeros(len(r)), np.zeros(len(r)), [0.0]
         seen = np.zeros(len(r))
-        # a loop that loses its encoder pushes ever harder; whoever watches looks for that, too
-        guard = None if watch is not None else _core.Guard(
-            Ts=self.Ts, counts_per_rev=self.counts_per_rev, volt=self.volt, speed=math.inf
-        )  # fmt: skip
 
         def decide(k: int, counts: float) -> float:
             if watch is not None and k and k % WATCHED == 0:
                 watch(k - WATCHED, u[k - WATCHED : k], seen[k - WATCHED : k])
             u[k] = core.step(float(early[k]), (counts - before[0]) * per_count)
             feedback[k], before[0], seen[k] = core.filtered, counts, counts
-            if guard is not None and guard.watch(u[k : k + 1], seen[k : k + 1]) is not None:
-                raise self._lost(name, u[k])
             return float(u[k])
 
-        recording = self._played(decide, len(r), name)
+        # a loop that loses its encoder pushes ever harder; whoever watches looks for that, too
+        volt = self.volt if watch is None else math.inf
+        recording = self._played(decide, len(r), name, volt)
         truth = recording.speed_true
         t = np.arange(len(r), dtype=np.float64) * self.Ts
         y = recording.y if truth is None else truth
@@ -492,13 +676,17 @@ class SteppedBench:
             t, np.array(r), u, y, feedback, controller, self.name, name, recording=recording
         )
 
-    def _played(self, decide: Callable[[int, float], float], samples: int, name: str) -> Recording:
-        """Counts, from 0, and true speeds, each read before the sample's command acts."""
+    def _played(
+        self, decide: Callable[[int, float], float], samples: int, name: str, volt: float
+    ) -> Recording:
+        """Counts, from 0, and true speeds, each read before the sample's command acts. A machine
+        that stands under half of `volt` [V] ends the run.
+        """
         machine = self.machine
         machine.reset()
         first = real(f"counts of {self.name}", machine.counts)
         guard = _core.Guard(
-            Ts=self.Ts, counts_per_rev=self.counts_per_rev, volt=self.volt, speed=self.speed
+            Ts=self.Ts, counts_per_rev=self.counts_per_rev, volt=volt, speed=self.speed
         )
         u, counts, speed = np.zeros(samples), np.zeros(samples), np.zeros(samples)
 
@@ -510,16 +698,15 @@ class SteppedBench:
                 counts[k], speed[k] = machine.counts - first, getattr(machine, "speed_rpm", np.nan)
                 seen = guard.take(counts[k]) if math.isfinite(counts[k]) else None
                 if seen is not None:
-                    recording = rested(k)
-                    error = self._too_fast(name, k, seen[1], u[max(0, k - 1)], guard)
-                    self._explain(error, recording)
-                    raise error
+                    raise self._ended(name, k, seen, u[max(0, k - 1)], guard, rested(k))
                 try:
                     command = decide(k, float(counts[k]))
                 except SewfastError as stop:  # of who watches
                     self._explain(stop, rested(k))
                     raise
                 u[k] = min(max(command, -self.volt), self.volt)
+                if (seen := guard.sent(u[k])) is not None:
+                    raise self._ended(name, k, seen, u[k], guard, rested(k))
                 machine.step(u[k])
         finally:
             # a test rig holds its last command: no run may leave it turning, however it ends
@@ -537,7 +724,13 @@ class SteppedBench:
         on until it stands. A stage that is stuck, or a load that drives it, obeys no such command.
         """
         coast: list[tuple[float, float]] = []
+        off, obeys = getattr(self.machine, "off", None), max(2, round(OBEYS / self.Ts))
+        half = obeys // 2
+        pace = abs(counts[-1] - counts[-1 - half]) if len(counts) > half else math.inf
         while len(coast) * self.Ts < COAST and not guard.at_rest:
+            turned = abs(coast[-1][0] - coast[-1 - half][0]) if len(coast) == obeys else 0.0
+            if off is not None and turned >= pace > 0.0:
+                off()
             self.machine.step(0.0)
             now = self.machine.counts - first
             if not math.isfinite(now):
@@ -561,19 +754,25 @@ class SteppedBench:
             if cause is not None:
                 error.explain(cause)
 
-    def _lost(self, name: str, u: float) -> LinkError:
-        """The error for a loop without an encoder."""
-        return LinkError(
-            name=f"{self.name}, {name}", expected="the encoder to move",
-            received=f"not a count for .25 s, at last at {u:.3g} V; rest was commanded",
-            remedy=NO_MOTION,
-        )  # fmt: skip
-
-    def _too_fast(self, name: str, k: int, speed: float, u: float, guard: _core.Guard) -> LinkError:
+    def _ended(
+        self,
+        name: str,
+        k: int,
+        seen: tuple[str, float],
+        u: float,
+        guard: _core.Guard,
+        run: Recording,
+    ) -> LinkError:
+        """The error for what the guard saw at sample `k`; `run` goes on towards rest."""
+        expected, received, remedy = SEEN[seen[0]]
+        said = f"{received.format(value=seen[1])} after {k * self.Ts:.3g} s"
+        under = f", under {u:.3g} V" if seen[0] == "Speed" else ""
         after = "it stands now" if guard.at_rest else f"it still turns {COAST:g} s after that"
-        return LinkError(
-            name=f"{self.name}, {name}", expected=f"at most {self.speed:g} RPM",
-            received=f"{speed:.4g} RPM after {k * self.Ts:.3g} s, under {u:.3g} V; rest was "
-            f"commanded, and {after}",
-            remedy=TOO_FAST,
+        error = LinkError(
+            name=f"{self.name}, {name}", expected=expected.format(limit=self.speed),
+            received=f"{said}{under}; rest was commanded, and {after}", remedy=remedy,
         )  # fmt: skip
+        self._explain(error, run)
+        if seen[0] == "Lost":
+            error.explain(loss(run, k, error.cause))
+        return error

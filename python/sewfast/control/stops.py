@@ -23,7 +23,7 @@ from ..models import Model
 from ..plotting import Drawing, Plotted, draw, legend
 from ..units import counts_of, duration, position_unit
 from .loop import check_fits, common_rest, plant_name, require_units, single_core
-from .machine import MachineBench, is_streaming, machine_of
+from .machine import MachineBench, guarded, is_streaming, machine_of
 from .position import PositionController, require_position
 
 if TYPE_CHECKING:
@@ -467,7 +467,7 @@ def _played(
         controller.sent()
     _require_counts(controller, machine)
     require_units(controller, ("", "RPM"))
-    run = machine.follow(playing, r, name)
+    run = guarded(machine).follow(playing, r, name)
     counts = run.recording.counts
     place, goal = _replayed(playing, counts, r, start)
     return PositionRun(

@@ -14,7 +14,7 @@ import numpy as np
 from .. import _core
 from ..arrays import FloatArray, bridged
 from ..control.loop import Plants, common_rest, cores_about
-from ..control.machine import Machine, RecordedRun, cancelled_by, is_streaming, machine_of
+from ..control.machine import Machine, RecordedRun, cancelled_by, guarded, is_streaming, machine_of
 from ..control.move import MoveTable, Repetition, repetition_lines, table_of
 from ..errors import DataError, Interrupted, SettingError
 from ..gains import whole
@@ -164,7 +164,7 @@ def learn(
             name="repetitions", expected="1 or more", received=f"{repetitions}",
             remedy="sewfast run --table plays a table once without learning",
         )  # fmt: skip
-    machine = machine_of(on)
+    machine = guarded(machine_of(on))
     if not math.isclose(machine.Ts, table.Ts, rel_tol=0.01):
         raise SettingError(
             name="on", expected=f"a machine at the table's sample time of {table.Ts} s",

@@ -134,7 +134,8 @@ const UNSURE: f64 = 0.1;
 /// Error of each block, as a share of the largest speed, that is charged for a load of the largest command.
 const UNLIKELY: f64 = 1e-3;
 
-/// Names the changes that explain `run`; `before` are earlier runs of the sound machine.
+/// Names the changes that explain `run`; `before` are earlier runs of the sound machine, `most` is its largest command
+/// \[u\], infinite if unknown: beyond it no stage can be stuck.
 ///
 /// # Errors
 /// `ErrorKind::Data` for columns of different lengths, with fewer than three samples or not finite;
@@ -144,6 +145,7 @@ pub fn causes(
     run: Run<'_>,
     ts: f64,
     counts_per_rev: f64,
+    most: f64,
     monitor: &Monitor,
 ) -> Result<Causes> {
     for (name, value) in [("Ts", ts), ("counts_per_rev", counts_per_rev)] {
@@ -187,7 +189,7 @@ pub fn causes(
         tried = considered(&blocks, &motor, &places(blocks.len(), PLACES));
     }
     for candidate in &mut tried {
-        candidate.refine(&blocks, monitor);
+        candidate.refine(&blocks, most, monitor);
     }
     tried.sort_by(|a, b| a.squares.total_cmp(&b.squares));
     let best = Change::ALL
@@ -580,7 +582,7 @@ fn values(change: Change, blocks: &Blocks, motor: &Motor, at: usize) -> Vec<(f64
 
 impl Candidate {
     /// Moves block and value while the error falls, then halves the steps (Hooke and Jeeves 1961).
-    fn refine(&mut self, blocks: &Blocks, monitor: &Monitor) {
+    fn refine(&mut self, blocks: &Blocks, most: f64, monitor: &Monitor) {
         if self.change == Change::Jump {
             self.place_the_jump(blocks);
             return;
@@ -599,7 +601,12 @@ impl Candidate {
                 (-1, 1.0),
                 (-1, -1.0),
             ] {
-                self.take_if_better(blocks, ways * wide as isize, by * apart);
+                self.take_if_better(blocks, most, ways * wide as isize, by * apart);
+            }
+            // a short change of twice the size is much like a longer one
+            for (ways, factor) in [(0, 2.0), (1, 2.0), (0, 0.5), (-1, 0.5)] {
+                let more = (factor - 1.0) * self.value;
+                self.take_if_better(blocks, most, ways * wide as isize, more);
             }
             if self.squares >= FALLS * before {
                 (wide, apart) = (wide.div_ceil(2), 0.5 * apart);
@@ -608,7 +615,7 @@ impl Candidate {
         }
     }
 
-    fn take_if_better(&mut self, blocks: &Blocks, later: isize, more: f64) {
+    fn take_if_better(&mut self, blocks: &Blocks, most: f64, later: isize, more: f64) {
         let at = self.at.saturating_add_signed(later).min(blocks.len() - 1);
         let value = self.value + more;
         let is_possible = match self.change {
@@ -617,6 +624,7 @@ impl Candidate {
             Change::Friction => (0.0..=blocks.largest).contains(&value),
             // a larger load would have turned the machine before
             Change::Load => value.abs() <= blocks.largest,
+            Change::Stuck => value.abs() <= most,
             Change::Inertia => value > 0.05,
             // a decoder makes 1, 2 or 4 counts of a line
             Change::Counts => value.abs() <= 4.0,

@@ -21,7 +21,7 @@ fn motor_dict<'py>(py: Python<'py>, motor: &Motor) -> PyResult<Bound<'py, PyDict
 
 /// The changes that explain a run, the best first, with the motor that each began with.
 #[pyfunction]
-#[pyo3(signature = (u, counts, before, *, Ts, counts_per_rev))]
+#[pyo3(signature = (u, counts, before, *, Ts, counts_per_rev, most=f64::INFINITY))]
 pub fn causes<'py>(
     py: Python<'py>,
     u: Values<'py>,
@@ -29,6 +29,7 @@ pub fn causes<'py>(
     before: Vec<(Values<'py>, Values<'py>)>,
     Ts: f64,
     counts_per_rev: f64,
+    most: f64,
 ) -> PyResult<Bound<'py, PyDict>> {
     let run = Run {
         u: slice(&u, "u")?,
@@ -44,7 +45,7 @@ pub fn causes<'py>(
         })
         .collect::<PyResult<Vec<_>>>()?;
     let found = watched(py, None, |monitor| {
-        core::causes(&before, run, Ts, counts_per_rev, monitor)
+        core::causes(&before, run, Ts, counts_per_rev, most, monitor)
     })?;
     let all = dict! { py;
         "motor" => motor_dict(py, &found.motor)?, "unsure" => found.unsure, "together" => found.together,

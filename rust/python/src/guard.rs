@@ -2,7 +2,7 @@
 
 use crate::seam::{Values, slice};
 use pyo3::prelude::*;
-use sewfast_control::link::{Limits, Trip, Watch};
+use sewfast_control::link::{Alarm, Limits, Trip, Watch};
 
 /// Watches the samples of one run.
 #[pyclass(module = "sewfast._core")]
@@ -19,6 +19,13 @@ type Seen = (String, f64);
 
 fn seen((reason, value): Trip) -> Seen {
     (format!("{reason:?}"), value.into())
+}
+
+fn alarmed(alarm: Alarm) -> Seen {
+    match alarm {
+        Alarm::Trip(trip) => seen(trip),
+        Alarm::Lost(u) => ("Lost".to_owned(), u.into()),
+    }
 }
 
 /// Least number of counts per turn in the counter: an input in turns or radians does not count whole steps.
@@ -65,6 +72,10 @@ impl Guard {
         self.watch.take_on_time(counts, step).err().map(seen)
     }
 
+    fn sent(&mut self, u: f64) -> Option<Seen> {
+        self.watch.sent(u as f32).err().map(alarmed)
+    }
+
     fn watch(&mut self, u: Values<'_>, counts: Values<'_>) -> PyResult<Option<(usize, Seen)>> {
         let (u, counts) = (slice(&u, "u")?, slice(&counts, "counts")?);
         for (k, (u, counts)) in u.iter().zip(counts).enumerate() {
@@ -74,12 +85,11 @@ impl Guard {
                 continue;
             }
             let (counts, step) = self.counter(*counts);
-            let passed = self
-                .watch
-                .take(counts, step)
-                .and_then(|()| self.watch.sent(*u as f32));
-            if let Err(trip) = passed {
+            if let Err(trip) = self.watch.take(counts, step) {
                 return Ok(Some((k, seen(trip))));
+            }
+            if let Err(alarm) = self.watch.sent(*u as f32) {
+                return Ok(Some((k, alarmed(alarm))));
             }
         }
         Ok(None)

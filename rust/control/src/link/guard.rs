@@ -43,8 +43,30 @@ const SHORT: [usize; 3] = [4, 2, 1];
 /// ... if it exceeds its limit by this factor.
 const FAR: f32 = 1.25;
 
+/// For a host: from one sample to the next no shaft falls below this share of its speed and stays slow while its
+/// command stays, ...
+const KEPT: f32 = 0.6;
+/// ... if it turned at this share of the largest speed, by this many steps in each of the [`STEADY`] samples before, ...
+const FAST: f32 = 0.1;
+const CLEAR: i64 = 4;
+const STEADY: usize = 4;
+/// ... with a command that is not smaller than this share of the largest one of the last [`HISTORY`] samples, ...
+const STAYS: f32 = 0.9;
+/// ... and stays slow for this time \[us\] and number of samples.
+const SLOW: u64 = 10_000;
+const SLOW_SAMPLES: u64 = 8;
+
 /// Why a run must end, with the value that exceeded its limit.
 pub type Trip = (Reason, f32);
+
+/// What a host's guard saw.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Alarm {
+    /// What a device would trip on.
+    Trip(Trip),
+    /// The counts stopped, fell or turned from one sample to the next, at this command.
+    Lost(f32),
+}
 
 /// The guard for a machine without its own device: a host passes it the counts and the command of each sample.
 #[derive(Clone, Debug)]
@@ -52,6 +74,30 @@ pub struct Watch {
     guard: Guard,
     limits: Limits,
     between: Option<(f32, f32)>,
+    /// One step of the encoder \[counts\].
+    step: i64,
+    /// The last commands.
+    commands: [f32; HISTORY],
+    /// The loss of speed that is being watched.
+    fall: Option<Fall>,
+}
+
+/// A speed that fell from one sample to the next.
+#[derive(Clone, Copy, Debug)]
+struct Fall {
+    /// Least counts of the [`STEADY`] samples before, each.
+    pace: i64,
+    /// Least command that keeps the machine turning, in the direction of the counts.
+    push: f32,
+    /// Samples since then.
+    samples: u64,
+}
+
+impl Fall {
+    /// Whether a command should keep the machine turning.
+    fn stays(&self, u: f32) -> bool {
+        u * self.pace.signum() as f32 >= self.push
+    }
 }
 
 impl Watch {
@@ -64,6 +110,9 @@ impl Watch {
             guard,
             limits,
             between,
+            step: 1,
+            commands: [0.0; HISTORY],
+            fall: None,
         }
     }
 
@@ -73,6 +122,7 @@ impl Watch {
     /// A mean speed over 8 samples that exceeds its limit for any position of the encoder's steps.
     pub fn take(&mut self, counts: i32, step: u32) -> Result<(), Trip> {
         self.guard.take(counts);
+        self.step = step.into();
         self.is_within(WINDOW, step, self.limits.speed)
     }
 
@@ -101,18 +151,73 @@ impl Watch {
     /// Treats the next counts as the first, as after lost samples.
     pub fn forget(&mut self) {
         self.guard.forget();
+        self.fall = None;
     }
 
     /// Takes the command of the sample.
     ///
     /// # Errors
-    /// A command that causes no motion, or that swings between its limits.
-    pub fn sent(&mut self, u: f32) -> Result<(), Trip> {
-        self.guard.expect_motion(&self.limits, u)?;
-        match self.between {
-            Some((low, high)) => self.guard.expect_calm(low, high, u),
-            None => Ok(()),
+    /// A command that causes no motion or that swings between its limits, and an encoder that is lost while it turns.
+    pub fn sent(&mut self, u: f32) -> Result<(), Alarm> {
+        self.guard
+            .expect_motion(&self.limits, u)
+            .map_err(Alarm::Trip)?;
+        if let Some((low, high)) = self.between {
+            self.guard.expect_calm(low, high, u).map_err(Alarm::Trip)?;
         }
+        self.expect_pace(u)
+    }
+
+    /// A shaft has mass: counts that stop, halve or turn within a sample, and stay so under a command that stays, are
+    /// those of an encoder that is lost (or of a shaft that hit something).
+    fn expect_pace(&mut self, u: f32) -> Result<(), Alarm> {
+        let fall = self.fall.or_else(|| self.falls(u));
+        self.fall = fall.filter(|fall| self.is_slow(fall.pace) && fall.stays(u));
+        self.commands.copy_within(1.., 0);
+        if let Some(last) = self.commands.last_mut() {
+            *last = u;
+        }
+        let Some(fall) = self.fall.as_mut() else {
+            return Ok(());
+        };
+        fall.samples = fall.samples.saturating_add(1);
+        let long = SLOW.max(SLOW_SAMPLES.saturating_mul(self.guard.period));
+        if fall.samples.saturating_mul(self.guard.period) < long {
+            return Ok(());
+        }
+        Err(Alarm::Lost(u))
+    }
+
+    /// Whether the last sample has far fewer counts than `pace`, in its direction.
+    fn is_slow(&self, pace: i64) -> bool {
+        let along = self.guard.moved(0, 1).saturating_mul(pace.signum());
+        (along as f32) < KEPT * pace.saturating_abs() as f32
+    }
+
+    /// The fall of the speed with this sample, after some of steady speed.
+    fn falls(&self, u: f32) -> Option<Fall> {
+        let moved = self.guard.moved(1, STEADY);
+        let towards = moved.signum();
+        let paces = || (1..=STEADY).map(|ago| self.guard.moved(ago, 1).saturating_mul(towards));
+        let (least, most) = paces().fold((i64::MAX, 0), |(a, b), x| (a.min(x), b.max(x)));
+        let is_clear = least >= CLEAR.saturating_mul(self.step);
+        let is_fast = least as f32 * self.guard.rpm * WINDOW as f32 >= FAST * self.limits.speed;
+        // half of the least, or two steps
+        let spread = (least / 2).max(self.step.saturating_mul(2));
+        let is_steady = most.saturating_sub(least) <= spread;
+        let pace = least.saturating_mul(towards);
+        if !(is_clear && is_fast && is_steady && self.is_slow(pace)) {
+            return None;
+        }
+        let along = |u: f32| u * towards as f32;
+        let largest = self.commands.iter().fold(0.0_f32, |a, &u| a.max(along(u)));
+        let push = STAYS * largest;
+        let fall = Fall {
+            pace,
+            push,
+            samples: 0,
+        };
+        (push > 0.0 && fall.stays(u)).then_some(fall)
     }
 
     /// Whether there was no count for a tenth of a second.
@@ -378,22 +483,77 @@ mod tests {
         let mut coarse = Watch::new(1e-3, 6.0, limits, None);
         assert!((0..2000).all(|k| coarse.take(k / 12, 1).is_ok()));
         let mut lost = watch();
-        let stuck = (0..1000).position(|_| lost.take(7, 1).and_then(|()| lost.sent(15.0)).is_err());
+        let mut stands = |u| lost.take(7, 1).is_err() || lost.sent(u).is_err();
+        let stuck = (0..1000).position(|_| stands(15.0));
         assert_eq!(stuck, Some(250));
         assert!(lost.at_rest());
         let mut swings = watch();
         let ended = (0..1000).find_map(|k| {
-            let seen = swings
-                .take(k, 1)
-                .and_then(|()| swings.sent(if k % 40 < 20 { 20.0 } else { -20.0 }));
-            seen.err()
+            assert_eq!(swings.take(k, 1), Ok(()));
+            swings.sent(if k % 40 < 20 { 20.0 } else { -20.0 }).err()
         });
-        assert_eq!(ended.map(|(reason, _)| reason), Some(Reason::Swinging));
-        assert!(ended.is_some_and(|(_, hertz)| (hertz - 25.0).abs() < 1.0));
+        assert!(matches!(
+            ended,
+            Some(Alarm::Trip((Reason::Swinging, hertz))) if (hertz - 25.0).abs() < 1.0
+        ));
         // at a period of a second ten samples pass before a motor counts as standing
         let mut slow = Watch::new(1.0, 1500.0, limits, None);
-        let stuck = (0..100).position(|_| slow.take(7, 1).and_then(|()| slow.sent(15.0)).is_err());
+        let mut stands = |u| slow.take(7, 1).is_err() || slow.sent(u).is_err();
+        let stuck = (0..100).position(|_| stands(15.0));
         assert_eq!(stuck, Some(10));
+    }
+
+    /// The sample of 200 at which a watch alarms, of an encoder that counts `counts(k)` under `u(k)`.
+    fn alarmed(counts: impl Fn(i32) -> i32, u: impl Fn(i32) -> f32) -> Option<(i32, Alarm)> {
+        let limits = Limits {
+            speed: 4000.0,
+            ..FREE
+        };
+        let mut watch = Watch::new(1e-3, 1500.0, limits, None);
+        (0..200).find_map(|k| {
+            assert_eq!(watch.take(counts(k), 1), Ok(()));
+            watch.sent(u(k)).err().map(|alarm| (k, alarm))
+        })
+    }
+
+    #[test]
+    fn counts_that_stop_halve_or_turn_within_a_sample_alarm_after_ten() {
+        // 20 counts a sample until sample 100, then `after` a sample; 800 RPM
+        let faulty = |after: i32| move |k: i32| 20 * k.min(100) + after * (k - 100).max(0);
+        for after in [0, 10, -20] {
+            // a loop pushes harder, or a steady command stays
+            for harder in [0.0, 0.1] {
+                let u = |k: i32| 4.0 + harder * (k - 100).max(0) as f32;
+                let found = alarmed(faulty(after), u);
+                assert_eq!(found, Some((110, Alarm::Lost(u(110)))), "{after}");
+            }
+            // a command that falls with the speed, or brakes, explains it
+            assert_eq!(
+                alarmed(faulty(after), |k| if k < 98 { 4.0 } else { 2.0 }),
+                None
+            );
+            assert_eq!(alarmed(faulty(after), |_| -4.0), None);
+        }
+        // what a shaft can do: lose a third, speed up, stop within 10 ms, or stand for less than that
+        let brakes =
+            |k: i32| 20 * k.min(100) + (0..(k - 100).clamp(0, 10)).map(|i| 18 - 2 * i).sum::<i32>();
+        let pauses = |k: i32| 20 * k.min(100) + 20 * (k - 108).max(0);
+        assert_eq!(alarmed(faulty(13), |_| 4.0), None);
+        assert_eq!(alarmed(faulty(60), |_| 4.0), None);
+        assert_eq!(alarmed(brakes, |_| 4.0), None);
+        // a turned command brakes with a quarter of the speed a sample
+        let turned = |k: i32| {
+            if k < 100 {
+                20 * k
+            } else {
+                2000 + [15, 26, 34, 39, 42, 42, 39, 33, 24, 12, -3, -20, -40]
+                    [(k as usize - 100).min(12)]
+            }
+        };
+        assert_eq!(alarmed(turned, |_| 4.0), None);
+        assert_eq!(alarmed(pauses, |_| 4.0), None);
+        // a creeping shaft may be held by friction: 3 counts a sample are 120 RPM of 4,000
+        assert_eq!(alarmed(|k| 3 * k.min(100), |_| 4.0), None);
     }
 
     #[test]

@@ -32,6 +32,6 @@ pub mod wire;
 
 pub use device::{Device, Measurement, Output, Reason, State};
 pub use frame::{Deframer, Frame, HEADER, Header, MAX_BODY, MAX_FRAME, MAX_WIRE, Rejected, encode};
-pub use guard::{Trip, Watch};
+pub use guard::{Alarm, Trip, Watch};
 pub use identity::{Channel, Encoding, Identity, Limits, Source, capability};
 pub use wire::{Body, Fields};

@@ -127,6 +127,7 @@ fn each_change_is_named_with_its_value_after_earlier_runs() {
                 as_run(&columns),
                 TS,
                 PER_TURN,
+                f64::INFINITY,
                 &monitor,
             )
             .unwrap();
@@ -156,7 +157,15 @@ fn a_run_alone_shows_what_changed_within_it() {
             at: 1130,
         };
         let columns = run(Some(fault), 2500, true);
-        let found = causes(&[], as_run(&columns), TS, PER_TURN, &Monitor::default()).unwrap();
+        let found = causes(
+            &[],
+            as_run(&columns),
+            TS,
+            PER_TURN,
+            f64::INFINITY,
+            &Monitor::default(),
+        )
+        .unwrap();
         let best = found.findings[0];
         assert_eq!(best.change, change, "{value}: {found:?}");
         assert!((best.at - 1.13).abs() < 0.1, "{value}: {best:?}");
@@ -171,6 +180,7 @@ fn a_healthy_run_needs_no_change() {
         as_run(&second),
         TS,
         PER_TURN,
+        f64::INFINITY,
         &Monitor::default(),
     )
     .unwrap();
@@ -184,7 +194,14 @@ fn a_healthy_run_needs_no_change() {
 #[test]
 fn hostile_runs_are_refused_or_survived() {
     let of = |u: &[f64], counts: &[f64]| {
-        causes(&[], Run { u, counts }, TS, PER_TURN, &Monitor::default())
+        causes(
+            &[],
+            Run { u, counts },
+            TS,
+            PER_TURN,
+            f64::INFINITY,
+            &Monitor::default(),
+        )
     };
     assert!(of(&[1.0, 2.0], &[0.0, 1.0]).is_err());
     assert!(of(&[1.0; 4], &[0.0; 5]).is_err());
@@ -198,6 +215,7 @@ fn hostile_runs_are_refused_or_survived() {
             },
             0.0,
             1.0,
+            f64::INFINITY,
             &Monitor::default()
         )
         .is_err()

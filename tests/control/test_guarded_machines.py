@@ -1,0 +1,149 @@
+"""`record` and `run` on machines that no device guards: too fast, blind, or not to be stopped."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sewfast import Controller, Gains, Recording, record, run
+from sewfast.commissioning import SteppedBench
+from sewfast.control.machine import RecordedRun
+from sewfast.errors import LinkError
+
+PID = Controller(
+    Gains.standard(0.01, 0.1, u_unit="V", y_unit="RPM"), u_min=-10.0, u_max=10.0,
+    filter_samples=8, counts_per_rev=4096,
+)  # fmt: skip
+LEVEL = np.repeat([500.0, 1200.0], [250, 1750])
+
+
+class Motor:
+    """400 RPM/V with a time constant of .1 s; after .5 s its encoder counts `counted` of a turn,
+    and its command is `command` times that which was given, or `stuck`.
+    """
+
+    def __init__(self, counted: float = 1.0, command: float = 1.0, stuck: float = 0.0) -> None:
+        self.counted, self.command, self.stuck, self.is_off = counted, command, stuck, False
+        self.top = 0.0
+        self.reset()
+
+    def reset(self) -> None:
+        self.t = self.speed_rpm = self.turns = 0.0
+
+    @property
+    def counts(self) -> float:
+        return math.floor(4096 * self.turns)
+
+    def step(self, u: float) -> None:
+        late = self.t >= 0.5
+        u = self.stuck or self.command * u if late else u
+        self.speed_rpm += 0.01 * (400.0 * u * (not self.is_off) - self.speed_rpm)
+        self.turns += (self.counted if late else 1.0) * 1e-3 * self.speed_rpm / 60.0
+        self.t, self.top = self.t + 1e-3, max(self.top, abs(self.speed_rpm))
+
+
+def stepped(motor: Motor) -> SteppedBench:
+    return SteppedBench(motor, Ts=1e-3, counts_per_rev=4096, volt=10.0, speed=2000.0, name="rig")
+
+
+class Own:
+    """A user's own, which plays a whole signal."""
+
+    name, Ts, counts_per_rev, volt, speed = "rig", 1e-3, 4096.0, 10.0, 2000.0
+
+    def __init__(self, motor: Motor) -> None:
+        self.motor = motor
+
+    def play(self, law: Any, n: int, name: str, watch: Any = None) -> Recording:
+        u, counts = np.zeros(n), np.zeros(n)
+        for k in range(n):
+            if watch is not None and k and k % 20 == 0:
+                watch(k - 20, u[k - 20 : k], counts[k - 20 : k])
+            counts[k] = self.motor.counts
+            u[k] = law(k, counts[k])
+            self.motor.step(u[k])
+        return Recording.of_counts(u, counts, Ts=1e-3, counts_per_rev=4096, name=name)
+
+    def excite(self, u: Any, name: str) -> Recording:
+        return self.play(lambda k, counts: u[k], len(u), name)
+
+    def follow(self, controller: Any, r: Any, name: str, **options: Any) -> RecordedRun:
+        core, before = controller.core(), [0.0]
+
+        def law(k: int, counts: float) -> float:
+            speed, before[0] = (counts - before[0]) * 60.0 / 4.096, counts
+            return float(core.step(r[k], speed))
+
+        log = self.play(law, len(r), name, **options)
+        return RecordedRun.of_recording(log, controller, r, plant=self.name)
+
+
+class Watched(Own):
+    """The same, which can be ended."""
+
+    def excite(self, u: Any, name: str, *, watch: Any = None) -> Recording:
+        return self.play(lambda k, counts: u[k], len(u), name, watch)
+
+    def follow(self, controller: Any, r: Any, name: str, *, watch: Any = None) -> RecordedRun:
+        return super().follow(controller, r, name, watch=watch)
+
+
+@pytest.mark.parametrize("kind", [stepped, Watched, Own])
+def test_a_sound_machine_runs_to_the_end(kind: Any) -> None:
+    brakes = np.repeat([1800.0, 200.0, -1800.0, 0.0], 500)
+    assert len(run(PID, kind(Motor()), brakes).r) == 2000
+    assert len(record(kind(Motor()), brakes / 400.0)) == 2000
+
+
+@pytest.mark.parametrize(("kind", "most"), [(stepped, 1.1), (Watched, 1.25), (Own, math.inf)])
+def test_a_machine_that_is_too_fast_is_ended_or_refused_afterwards(kind: Any, most: float) -> None:
+    motor = Motor(command=-1.0)
+    with pytest.raises(LinkError, match="rig, level: expected at most 2000 RPM") as stop:
+        run(PID, kind(motor), LEVEL, name="level")
+    assert stop.value.cause.name == "command sign"
+    assert motor.top <= most * 2000.0
+    assert ("let it take a `watch`" in str(stop.value)) == (kind is Own)
+    motor = Motor(command=3.0)
+    with pytest.raises(LinkError, match="rig, levels: expected at most 2000 RPM") as stop:
+        record(kind(motor), np.full(1500, 4.0), name="levels")
+    assert stop.value.cause.name == "gain"
+    assert motor.top <= most * 2000.0
+
+
+@pytest.mark.parametrize("kind", [stepped, Watched])
+@pytest.mark.parametrize(
+    ("counted", "named"), [(0.0, "encoder lost"), (0.5, "counts scaled"), (-1.0, "encoder sign")]
+)
+def test_an_encoder_that_is_lost_ends_a_run_before_it_is_too_fast(
+    kind: Any, counted: float, named: str
+) -> None:
+    motor = Motor(counted=counted)
+    with pytest.raises(LinkError, match="expected the encoder to count on") as stop:
+        run(PID, kind(motor), LEVEL, name="level")
+    assert stop.value.cause.name == named
+    assert motor.top < 2000.0
+    with pytest.raises(LinkError, match="expected the encoder to count on"):
+        record(kind(Motor(counted=counted)), np.full(1500, 4.0))
+
+
+def test_a_stage_that_does_not_obey_is_switched_off() -> None:
+    class Switched(Motor):
+        def off(self) -> None:
+            self.is_off = True
+
+    tops = []
+    for motor, can_be in ((Motor(stuck=10.0), False), (Switched(stuck=10.0), True)):
+        with pytest.raises(LinkError, match="expected at most 2000 RPM") as stop:
+            run(PID, stepped(motor), LEVEL)
+        tops.append(motor.top)
+        assert ("it stands now" in str(stop.value)) == can_be
+    assert tops[0] > 1.9 * 2000.0
+    assert tops[1] < 1.25 * 2000.0
+    # one that obeys is not: rest brakes it
+    obedient = Switched(command=-1.0)
+    with pytest.raises(LinkError):
+        run(PID, stepped(obedient), LEVEL)
+    assert not obedient.is_off
