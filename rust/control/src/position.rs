@@ -384,7 +384,8 @@ impl<T: Real> PositionLoop<T> {
 
     /// From the next sample on it goes to a place that differs from `angle` by whole `turn`s, both in counts, and stays there; returns the count.
     ///
-    /// Moving `onward` it is the first one that is reached without turning back, at no more than the present speed;
+    /// Moving `onward` it is the first one that is reached without turning back, at no more than the present speed unless that is
+    /// lost within a sample;
     /// otherwise the one that is nearest to where the shaft can be at rest first. From rest it goes forwards, or the shorter way.
     ///
     /// # Errors
@@ -436,7 +437,9 @@ impl<T: Real> PositionLoop<T> {
         // whole counts can be met exactly
         let goal = (angle + whole * turn + half).floor();
         (self.goal, self.carried) = (goal, T::ZERO);
-        self.fastest = if fast > T::ZERO && onward {
+        // what the drive loses within a sample is rest: at that speed a turn could take minutes
+        let (row, _) = self.design.rates.at(fast);
+        self.fastest = if fast > row.down * ts && onward {
             fast
         } else {
             self.design.speed
