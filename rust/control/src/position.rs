@@ -256,7 +256,7 @@ pub struct PositionLoop<T> {
     rate: T,
     /// Goal of the last sample \[counts\], and its own speed \[y\].
     goal: T,
-    carried: T,
+    own: T,
     /// Largest speed of this move \[y\].
     fastest: T,
     /// Samples since the last count.
@@ -301,7 +301,7 @@ impl<T: Real> PositionLoop<T> {
             places: Ring::filled(T::ZERO),
             rate: T::ZERO,
             goal: T::ZERO,
-            carried: T::ZERO,
+            own: T::ZERO,
             fastest: design.speed,
             still: 0,
             design,
@@ -314,7 +314,7 @@ impl<T: Real> PositionLoop<T> {
         self.speed.reset();
         self.mode = Mode::Speed;
         (self.counts, self.rate, self.goal) = (T::ZERO, T::ZERO, T::ZERO);
-        (self.carried, self.still) = (T::ZERO, 0);
+        (self.own, self.still) = (T::ZERO, 0);
         (self.path, self.places) = (Ring::filled(T::ZERO), Ring::filled(T::ZERO));
         self.fastest = self.design.speed;
     }
@@ -377,7 +377,7 @@ impl<T: Real> PositionLoop<T> {
     pub fn follow(&mut self) {
         self.take_over();
         self.goal = self.path.at(0);
-        self.carried = self.rate;
+        self.own = self.rate;
         self.fastest = self.design.speed;
         self.mode = Mode::Goals;
     }
@@ -434,9 +434,17 @@ impl<T: Real> PositionLoop<T> {
         } else {
             turns.floor()
         };
-        // whole counts can be met exactly
-        let goal = (angle + whole * turn + half).floor();
-        (self.goal, self.carried) = (goal, T::ZERO);
+        // whole counts can be met exactly, and the nearest one may be too near
+        let rounded = |whole: T| (angle + whole * turn + half).floor();
+        let goal = rounded(whole);
+        let goal = if onward && forwards && fast > T::ZERO && goal < earliest {
+            rounded(whole + T::ONE)
+        } else if onward && !forwards && goal > earliest {
+            rounded(whole - T::ONE)
+        } else {
+            goal
+        };
+        (self.goal, self.own) = (goal, T::ZERO);
         // what the drive loses within a sample is rest: at that speed a turn could take minutes
         let (row, _) = self.design.rates.at(fast);
         self.fastest = if fast > row.down * ts && onward {
@@ -477,15 +485,16 @@ impl<T: Real> PositionLoop<T> {
         let size = |x: T| if x < T::ZERO { -x } else { x };
         let (row, _) = self.design.rates.at(size(rate));
         let (up, down) = (row.up * ts, row.down * ts);
-        // a goal that moves as the drive can is followed at its own speed
-        let own = (goal - self.goal) / self.per_sample;
-        let follows = size(own) <= self.fastest && size(own - self.carried) <= up + down;
-        self.carried = if follows { own } else { T::ZERO };
-        self.goal = goal;
+        // a goal that moves as the drive can is followed at its own speed, from its second sample on: before, it may be a step
+        let (own, last) = ((goal - self.goal) / self.per_sample, self.own);
+        let moves = last != T::ZERO && size(own) <= self.fastest;
+        let follows = moves && size(own - last) <= up + down;
+        let carried = if follows { own } else { T::ZERO };
+        (self.goal, self.own) = (goal, own);
         let at = self.path.at(0);
-        let left = (goal - at) / self.design.counts_per_unit - self.carried * ts;
+        let left = (goal - at) / self.design.counts_per_unit - carried * ts;
         let towards = self.design.towards(size(left), ts);
-        let wanted = self.carried + if left < T::ZERO { -towards } else { towards };
+        let wanted = carried + if left < T::ZERO { -towards } else { towards };
         let wanted = wanted.limit(-self.fastest, self.fastest);
         // on its way to a goal the speed may fall by the rate of the row below, and by an eighth more just before it, where the
         // last samples do not divide the way evenly
@@ -510,7 +519,7 @@ impl<T: Real> PositionLoop<T> {
         };
         self.rate = wanted.limit(low, high);
         // exactly, for which no rounding must be left
-        let met = self.carried + left / ts == self.rate;
+        let met = carried + left / ts == self.rate;
         self.path.push(if met {
             goal
         } else {
