@@ -148,18 +148,22 @@ def with_position(task: TuningTask, speed: Controller) -> PositionTuning:
     held = [
         max(one.yields for one in _stops(task, [law], task.variations, AFTER)) for law, *_ in stiff
     ]
-    # a softer one if the stiffest leaves no stop clean
-    tried, kept = 0, None
-    for k in np.argsort(held).tolist():
+    # each plant is taken as it is and with further delay: with less gain it could not brake as its
+    # model says
+    later = [(1.0, 0), (1.0, max((delay for _, delay in task.variations), default=0))]
+    # the shortest way first, then the stiffest loop, then the shortest landing
+    tried, least = 0, None
+    for share, k, landing in itertools.product(SHARES, np.argsort(held).tolist(), LANDINGS):
         law, own, both = stiff[k]
-        law, judged, more = _landing(task, law)
-        tried += more
-        if kept is None or judged.passed < kept[1].passed:
-            kept = (law, judged, held[k], own, both)
+        law = replace(_landed(law, landing), share=share)
+        judged = _stops(task, [law], later, AFTER + DYING / law.gain)[0]
+        tried += 1
+        if least is None or judged.passed < least[1].passed:
+            least = (law, judged, held[k], own, both)
         if judged.is_clean:
             break
-    assert kept is not None
-    law, judged, yields, own, both = kept
+    assert least is not None
+    law, judged, yields, own, both = least
     return PositionTuning(
         law, yields, judged.error, judged.passed, judged.off, own, both, len(stiff) + tried
     )
@@ -233,26 +237,6 @@ def _sensitivities(task: TuningTask, speed: Controller, gain: float) -> tuple[fl
             received="none", remedy="give Constraints(plant=...), a linear model of the same drive",
         )  # fmt: skip
     return own, both
-
-
-def _landing(task: TuningTask, law: PositionController) -> tuple[PositionController, _Judged, int]:
-    """The controller with the largest share of the rates, and at that the shortest landing, with
-    which no stop passes its angle; if there is none, the one that passes it least. Each plant is
-    taken as it is and with further delay. With less gain it could not brake as its model says.
-    """
-    later = [(1.0, 0), (1.0, max((delay for _, delay in task.variations), default=0))]
-    tried, least = 0, None
-    for share in SHARES:
-        made = [replace(_landed(law, landing), share=share) for landing in LANDINGS]
-        for one in made:
-            found = _stops(task, [one], later, AFTER + DYING / one.gain)[0]
-            tried += 1
-            if least is None or found.passed < least[1].passed:
-                least = (one, found)
-            if found.is_clean:
-                return one, found, tried
-    assert least is not None
-    return *least, tried
 
 
 def _landed(law: PositionController, landing: float) -> PositionController:

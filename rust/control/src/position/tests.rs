@@ -281,7 +281,10 @@ fn at_rest_it_lets_go_if_asked() {
         steepest = steepest.max((u - before).abs());
         motor.advance(u);
     }
-    assert!((motor.before - 1100.0).abs() <= 1.0 && u == 0.0 && steepest < 2.0, "{steepest}");
+    assert!(
+        (motor.before - 1100.0).abs() <= 1.0 && u == 0.0 && steepest < 2.0,
+        "{steepest}"
+    );
     law.reset();
     assert_eq!((law.counts(), law.stands()), (0.0, false));
 }
