@@ -301,7 +301,12 @@ def test_the_command_line_tunes_stops_and_moves(
         (["--on", "/dev/ttyS77", "--stop-at", "90deg"], "no device has positions"),
         (["--on", "virtual", "--stop-at", "90deg", "--table", "a.json"], "two"),
         (["--on", "virtual", "--reference", "trapezoid"], "stop_at"),
-        (["--on", "virtual", "--speed", "900"], "beside them"),
+        (["--on", "virtual", "--speed", "900"], "--speed: expected --stop-at or --positions"),
+        (["--on", "virtual", "--way", "shortest", "--zero", "5"], "--way, --zero: expected"),
+        (["--on", "virtual", "--stop-at", "90,5deg"], "a number with a point"),
     ):
         assert main(["run", str(law), *refused]) == 2
         assert words in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["run", str(law), "--on", "virtual", "--stop-at", "-45deg"])
+    assert "is written --stop-at=-VALUE" in capsys.readouterr().err
