@@ -191,8 +191,9 @@ def test_what_cannot_be_is_refused_by_name() -> None:
         with pytest.raises(SettingError):
             replace(LAW, **bad)  # type: ignore[arg-type]
     for goals in ([], [math.nan], [0.0, math.inf]):
-        with pytest.raises(DataError):
-            follow_positions(LAW, machine, goals, unit="deg")
+        for on in (machine, bench(Counted())):
+            with refuses(DataError, name="goals"):
+                follow_positions(LAW, on, goals, unit="deg")
 
 
 def test_what_would_move_a_shaft_unasked_is_refused() -> None:
@@ -226,7 +227,7 @@ def test_a_file_with_another_loop_inside_is_refused(tmp_path: Path) -> None:
 def test_lost_counts_and_too_much_speed_end_a_run_with_no_command() -> None:
     machine = Counted()
     machine.lost = 800
-    with pytest.raises(DataError, match="position is lost"):
+    with pytest.raises(LinkError, match="expected a number as its counts"):
         stop_at(LAW, bench(machine), "90deg", speed=1000.0)
     assert machine.last == 0.0
     machine = Counted()
