@@ -84,7 +84,8 @@ def position_unit(text: str) -> str:
         return unit
     raise SettingError(
         name="unit", expected="deg, rad, turns or counts", received=repr(text),
-        remedy="a shaft has no lengths: convert them by its lead or radius",
+        remedy="write a number with a point and one of these, as in '90.5deg'; convert lengths by "
+        "the lead or radius",
     )  # fmt: skip
 
 

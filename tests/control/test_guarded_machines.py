@@ -10,14 +10,15 @@ import pytest
 
 from sewfast import Controller, Gains, Recording, record, run
 from sewfast.commissioning import SteppedBench
-from sewfast.control.machine import RecordedRun
-from sewfast.errors import LinkError
+from sewfast.control.machine import MEMBERS, RecordedRun
+from sewfast.errors import LinkError, SettingError
 
 PID = Controller(
     Gains.standard(0.01, 0.1, u_unit="V", y_unit="RPM"), u_min=-10.0, u_max=10.0,
     filter_samples=8, counts_per_rev=4096,
 )  # fmt: skip
 LEVEL = np.repeat([500.0, 1200.0], [250, 1750])
+STEADY = np.full(600, 2.0)
 
 
 class Motor:
@@ -147,3 +148,41 @@ def test_a_stage_that_does_not_obey_is_switched_off() -> None:
     with pytest.raises(LinkError):
         run(PID, stepped(obedient), LEVEL)
     assert not obedient.is_off
+
+
+@pytest.mark.parametrize("missing", [math.nan, None])
+@pytest.mark.parametrize("play", [lambda on: run(PID, on, LEVEL), lambda on: record(on, STEADY)])
+def test_counts_that_are_no_numbers_end_a_run(play: Any, missing: Any) -> None:
+    class Blind(Motor):
+        @property
+        def counts(self) -> Any:
+            return super().counts if self.t < 0.3 else missing
+
+    motor = Blind()
+    with pytest.raises(LinkError, match="expected a number as its counts") as stop:
+        play(stepped(motor))
+    assert motor.t < 0.31
+    assert np.isfinite(stop.value.recording.counts).all()
+
+
+def test_a_machine_that_is_unfinished_is_refused_by_what_it_lacks() -> None:
+    own = Own(Motor())
+    for name, changes, said in (
+        ("speed", {"speed": None}, "speed: expected a number, received None"),
+        ("excite", {"excite": lambda *given: None}, "expected a Recording, received NoneType"),
+    ):
+        changed = type("Changed", (Own,), changes)(Motor())
+        with pytest.raises(SettingError, match=said):
+            record(changed, LEVEL / 400.0)
+        members = {m: getattr(own, m) for m in MEMBERS if m != name}
+        for play in (lambda on: record(on, LEVEL), lambda on: run(PID, on, LEVEL)):
+            with pytest.raises(SettingError, match=f"without {name}; give it"):
+                play(type("Lacking", (), members)())
+    with pytest.raises(SettingError, match="SteppedBench"):
+        record(Motor(), LEVEL)  # type: ignore[arg-type]
+    with pytest.raises(SettingError, match=r"make one: Motor\(\)"):
+        stepped(Motor)  # type: ignore[arg-type]
+    motor = Motor()
+    motor.reset = lambda: setattr(motor, "speed_rpm", None)  # type: ignore[method-assign]
+    with pytest.raises(SettingError, match="speed_rpm of rig: expected a number"):
+        run(PID, stepped(motor), LEVEL)

@@ -191,8 +191,9 @@ def test_what_cannot_be_is_refused_by_name() -> None:
         with pytest.raises(SettingError):
             replace(LAW, **bad)  # type: ignore[arg-type]
     for goals in ([], [math.nan], [0.0, math.inf]):
-        with pytest.raises(DataError):
-            follow_positions(LAW, machine, goals, unit="deg")
+        for on in (machine, bench(Counted())):
+            with refuses(DataError, name="goals"):
+                follow_positions(LAW, on, goals, unit="deg")
 
 
 def test_what_would_move_a_shaft_unasked_is_refused() -> None:
@@ -226,7 +227,7 @@ def test_a_file_with_another_loop_inside_is_refused(tmp_path: Path) -> None:
 def test_lost_counts_and_too_much_speed_end_a_run_with_no_command() -> None:
     machine = Counted()
     machine.lost = 800
-    with pytest.raises(DataError, match="position is lost"):
+    with pytest.raises(LinkError, match="expected a number as its counts"):
         stop_at(LAW, bench(machine), "90deg", speed=1000.0)
     assert machine.last == 0.0
     machine = Counted()
@@ -301,7 +302,12 @@ def test_the_command_line_tunes_stops_and_moves(
         (["--on", "/dev/ttyS77", "--stop-at", "90deg"], "no device has positions"),
         (["--on", "virtual", "--stop-at", "90deg", "--table", "a.json"], "two"),
         (["--on", "virtual", "--reference", "trapezoid"], "stop_at"),
-        (["--on", "virtual", "--speed", "900"], "beside them"),
+        (["--on", "virtual", "--speed", "900"], "--speed: expected --stop-at or --positions"),
+        (["--on", "virtual", "--way", "shortest", "--zero", "5"], "--way, --zero: expected"),
+        (["--on", "virtual", "--stop-at", "90,5deg"], "a number with a point"),
     ):
         assert main(["run", str(law), *refused]) == 2
         assert words in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["run", str(law), "--on", "virtual", "--stop-at", "-45deg"])
+    assert "is written --stop-at=-VALUE" in capsys.readouterr().err

@@ -143,7 +143,8 @@ def _commissioned(args: argparse.Namespace) -> Commissioning:
 
 
 REPORT = """\
-Write DIR/report.html again from the files of `sewfast demo` in DIR; nothing is computed again.
+Write DIR/report.html again from the files of `sewfast demo` or `sewfast commission` in DIR; nothing
+is computed again.
 """
 
 
@@ -153,7 +154,9 @@ def add_report(commands: Commands) -> None:
         summary="the page of an experiment", text=REPORT,
         examples="example:\n  sewfast report demo",
     )  # fmt: skip
-    parser.add_argument("folder", type=Path, metavar="DIR", help="folder that demo filled")
+    parser.add_argument(
+        "folder", type=Path, metavar="DIR", help="folder that demo or commission filled"
+    )
 
 
 def report_command(args: argparse.Namespace) -> None:

@@ -188,11 +188,7 @@ def _run_positions(args: argparse.Namespace, controller: SampledController) -> N
             zero=args.zero, after=args.after, release=args.release,
         )  # fmt: skip
     else:
-        of_stops = {
-            "--zero": args.zero != 0.0, "--way": args.way != "onward", "--after": args.after != 1.0,
-            "--speed": args.speed is not None,
-        }  # fmt: skip
-        if beside := [name for name, given in of_stops.items() if given]:
+        if beside := _of_stops(args):
             raise SettingError(
                 name=beside[0], expected="--stop-at", received="--positions",
                 remedy="leave it out: goals are counted from where the run begins",
@@ -211,6 +207,15 @@ def _run_positions(args: argparse.Namespace, controller: SampledController) -> N
         summary["plot"] = str(args.plot)
         lines.append(f"written to {args.plot}")
     write_columns(args.out, found.columns(), found.units, summary, lines, as_json=args.json)
+
+
+def _of_stops(args: argparse.Namespace) -> list[str]:
+    """The options that were given and that only a stop has."""
+    given = {
+        "--speed": args.speed is not None, "--way": args.way != "onward",
+        "--zero": args.zero != 0.0, "--after": args.after != 1.0,
+    }  # fmt: skip
+    return [name for name, is_given in given.items() if is_given]
 
 
 def _goals(path: str, Ts: float) -> tuple[FloatArray, str]:
@@ -276,11 +281,12 @@ def _settle_plant(args: argparse.Namespace) -> None:
             expected="one of --stop-at, --positions, --table, --reference, --host-loop",
             received="two", remedy="leave one of them out",
         )  # fmt: skip
-    alone = args.speed is None and args.share is None and not args.release
-    if not moves and not alone:
+    alone = _of_stops(args)
+    alone += ["--share"] * (args.share is not None) + ["--release"] * args.release
+    if alone and not moves:
         raise SettingError(
-            name="--speed, --share, --release", expected="--stop-at or --positions beside them",
-            received="neither", remedy="leave them out for a run along a speed",
+            name=", ".join(alone), expected="--stop-at or --positions beside it",
+            received="neither", remedy="leave it out for a run along a speed",
         )  # fmt: skip
     needed = (is_port(args.on) and not moves) or args.host_loop is not None
     if args.reference is None and args.table is None and needed:

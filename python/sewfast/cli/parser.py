@@ -8,7 +8,7 @@ import difflib
 import re
 import sys
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from .. import plugins
 from ..errors import SewfastError, not_installed
@@ -81,6 +81,13 @@ class Parser(argparse.ArgumentParser):
             self.print_help()
             self.exit(0)
         return found
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong with the arguments: a value with a minus looks like an option."""
+        option = re.fullmatch(r"argument (?:-\w/)?(--[\w-]+): expected one argument", message)
+        if option is not None:
+            message += f"; one that begins with a minus is written {option[1]}=-VALUE"
+        super().error(message)
 
     def options_of(self, command: str | None) -> list[str]:
         """The long options of a command, or of the program."""

@@ -433,15 +433,14 @@ def _on_machine(
     cancel: threading.Event | None,
     **options: Any,
 ) -> ClosedLoopRun:
-    from .machine import cancelled_by, guarded, is_streaming
+    from .machine import cancelled_by, guarded, is_streaming, machine_of
 
-    if not hasattr(on, "follow"):
-        raise SettingError(
-            name="on", expected="a Model, a VirtualMachine or a Drive", received=type(on).__name__,
-            remedy="load a model with load_model, or connect to a drive",
-        )  # fmt: skip
     if is_streaming(on):
         return on.follow(controller, r, name, **options, **cancelled_by(cancel))
+    machine_of(
+        on, expected="a Model, a VirtualMachine, a Drive or a Machine",
+        remedy="load a model with load_model, or connect to a drive",
+    )  # fmt: skip
     return guarded(on).follow(controller, r, name)
 
 

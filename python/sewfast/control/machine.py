@@ -204,7 +204,18 @@ def watching(play: Callable[..., Any], watch: Watch) -> dict[str, Any]:
 MEMBERS = ("name", "Ts", "counts_per_rev", "volt", "speed", "excite", "follow")
 
 
-def machine_of(on: object) -> Machine:
+WRAP = "wrap it: sewfast.commissioning.SteppedBench(yours, Ts=..., counts_per_rev=..., volt=...)"
+"""What to do with a machine that can only be stepped."""
+
+
+def machine_of(
+    on: object,
+    *,
+    name: str = "on",
+    expected: str = "a VirtualMachine, a Drive or a Machine",
+    remedy: str = "sewfast.VirtualMachine(), connect to a drive, or give yours the members of "
+    "sewfast.Machine",
+) -> Machine:
     """The argument as a `Machine`; a virtual machine is wrapped."""
     if isinstance(on, VirtualMachine):
         return MachineBench(on)
@@ -212,12 +223,14 @@ def machine_of(on: object) -> Machine:
     missing = [m for m in MEMBERS if not hasattr(type(on), m) and not hasattr(on, m)]
     if missing:
         lacking = "" if len(missing) == len(MEMBERS) else f" without {', '.join(missing)}"
+        if all(hasattr(on, m) for m in ("reset", "step")):
+            remedy = WRAP
+        elif lacking:
+            remedy = "give it the members of sewfast.Machine; one without a limit of speed states "
+            remedy += "math.inf"
         raise SettingError(
-            name="on", expected="a VirtualMachine, a Drive or a Machine to commission",
-            received=f"{type(on).__name__}{lacking}",
-            remedy="sewfast.VirtualMachine(), connect to a drive, or give yours the members of "
-            "sewfast.Machine",
-        )  # fmt: skip
+            name=name, expected=expected, received=f"{type(on).__name__}{lacking}", remedy=remedy
+        )
     return cast(Machine, on)
 
 
@@ -239,6 +252,11 @@ SEEN = {
         "counts that stopped, fell or turned from one sample to the next, at {value:.3g} V",
         "look for a lost encoder or one of its channels, a slipping coupling, a shaft that hit "
         "something",
+    ),
+    "NoNumber": (
+        "a number as its counts",
+        "none, at {value:.3g} V",
+        "look for a lost encoder or line, a transfer that fails",
     ),
     "Swinging": (
         "a command that does not swing",
@@ -351,6 +369,7 @@ class GuardedMachine(MachineWrapper):
         # in an open loop a machine may stand under any command
         with self._guarded(name, math.inf) as guard:
             found = self.inner.excite(u, name, **watching(self.inner.excite, guard))
+            _require_made(self, name, found, Recording, "Recording.of_counts")
             self._look_at(guard, found)
             return found
 
@@ -365,7 +384,8 @@ class GuardedMachine(MachineWrapper):
                     watch(first, u, counts)
 
             found = super().follow(controller, r, name, watch=both)
-            self._look_at(guard, getattr(found, "recording", None))
+            _require_made(self, name, found, RecordedRun, "RecordedRun.of_recording")
+            self._look_at(guard, found.recording)
             return found
 
     @contextlib.contextmanager
@@ -384,9 +404,9 @@ class GuardedMachine(MachineWrapper):
         if cause := cause_in(recording, volt=self.volt, speed=self.speed):
             error.explain(cause)
 
-    def _look_at(self, guard: RunGuard, recording: object) -> None:
+    def _look_at(self, guard: RunGuard, recording: Recording) -> None:
         """Refuse a run whose recording shows that it was too fast."""
-        if isinstance(recording, Recording) and math.isfinite(self.speed):
+        if math.isfinite(self.speed):
             whole = _core.Guard(
                 Ts=self.Ts, counts_per_rev=self.counts_per_rev, volt=math.inf, speed=self.speed
             )
@@ -408,7 +428,28 @@ def guarded(machine: Machine) -> Machine:
     """A machine whose runs are watched: those of a device or of a bench of this package are."""
     if is_streaming(machine) or isinstance(machine, (SteppedBench, MachineBench, MachineWrapper)):
         return machine
+    _require_numbers(machine)
     return GuardedMachine(machine)
+
+
+def _require_numbers(machine: Machine | SteppedBench) -> None:
+    """Refuse a machine whose sample time, counts or limits are no numbers above 0."""
+    for name in ("Ts", "counts_per_rev", "volt", "speed"):
+        value = real(name, getattr(machine, name))
+        if not value > 0.0 or (math.isinf(value) and name != "speed"):
+            raise SettingError(
+                name=name, expected="a finite number above 0", received=f"{value!r}",
+                remedy="math.inf if it states none" if name == "speed" else "see the data sheet",
+            )  # fmt: skip
+
+
+def _require_made(machine: Machine, name: str, found: object, kind: type, maker: str) -> None:
+    """Refuse what a user's own machine returned if it is no recording, or no run."""
+    if not isinstance(found, kind):
+        raise SettingError(
+            name=f"{machine.name}, {name}", expected=f"a {kind.__name__}",
+            received=type(found).__name__, remedy=f"return what {maker} makes",
+        )  # fmt: skip
 
 
 # --- Recording ------------------------------------------------------------------------------------
@@ -471,11 +512,8 @@ def record(
     Interrupted
         On Ctrl-C or `cancel` with a drive; the motor is stopped, `best` is the recording so far.
     """
-    if not isinstance(machine, VirtualMachine) and not hasattr(machine, "excite"):
-        raise SettingError(
-            name="machine", expected="a VirtualMachine or a Drive", received=type(machine).__name__,
-            remedy="the machine comes first: record(machine, u)",
-        )  # fmt: skip
+    if not is_streaming(machine):
+        machine_of(machine, name="machine", remedy="the machine comes first: record(machine, u)")
     command = _command(u)
     if is_streaming(machine):
         return machine.excite(
@@ -596,6 +634,14 @@ class Stepped(Protocol):
         """Hold a command [V] for one sample."""
 
 
+def _number(value: object) -> float:
+    """The value as a float, NaN if it is none."""
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return math.nan
+
+
 @dataclass(frozen=True, eq=False)
 class SteppedBench:
     """A machine that is advanced sample by sample, with the controller computed here.
@@ -631,13 +677,19 @@ class SteppedBench:
     speed: float = float("inf")
 
     def __post_init__(self) -> None:
-        for name in ("Ts", "counts_per_rev", "volt", "speed"):
-            value = real(name, getattr(self, name))
-            if not value > 0.0 or (math.isinf(value) and name != "speed"):
-                raise SettingError(
-                    name=name, expected="a finite number above 0", received=f"{value!r}",
-                    remedy="see the data sheet",
-                )  # fmt: skip
+        _require_numbers(self)
+        if isinstance(self.machine, type):
+            raise SettingError(
+                name="machine", expected="an object with reset(), step(u) and counts",
+                received=f"the class {self.machine.__name__}",
+                remedy=f"make one: {self.machine.__name__}()",
+            )  # fmt: skip
+        lacking = [name for name in ("reset", "step") if not hasattr(self.machine, name)]
+        if lacking:
+            raise SettingError(
+                name="machine", expected="an object with reset(), step(u) and counts",
+                received=f"{type(self.machine).__name__} without {', '.join(lacking)}",
+            )  # fmt: skip
 
     def within(self, speed: float) -> SteppedBench:
         """The same machine with another limit of speed [RPM]."""
@@ -684,7 +736,9 @@ class SteppedBench:
         """
         machine = self.machine
         machine.reset()
-        first = real(f"counts of {self.name}", machine.counts)
+        first = real(f"counts of {self.name}", getattr(machine, "counts", None))
+        if hasattr(machine, "speed_rpm"):
+            real(f"speed_rpm of {self.name}", machine.speed_rpm)
         guard = _core.Guard(
             Ts=self.Ts, counts_per_rev=self.counts_per_rev, volt=volt, speed=self.speed
         )
@@ -695,9 +749,12 @@ class SteppedBench:
 
         try:
             for k in range(samples):
-                counts[k], speed[k] = machine.counts - first, getattr(machine, "speed_rpm", np.nan)
-                seen = guard.take(counts[k]) if math.isfinite(counts[k]) else None
-                if seen is not None:
+                counts[k] = _number(machine.counts) - first
+                speed[k] = _number(getattr(machine, "speed_rpm", np.nan))
+                if not math.isfinite(counts[k]):
+                    blind = "NoNumber", u[max(0, k - 1)]
+                    raise self._ended(name, k, blind, blind[1], guard, rested(max(0, k - 1)))
+                if (seen := guard.take(counts[k])) is not None:
                     raise self._ended(name, k, seen, u[max(0, k - 1)], guard, rested(k))
                 try:
                     command = decide(k, float(counts[k]))
@@ -732,11 +789,11 @@ class SteppedBench:
             if off is not None and turned >= pace > 0.0:
                 off()
             self.machine.step(0.0)
-            now = self.machine.counts - first
+            now = _number(self.machine.counts) - first
             if not math.isfinite(now):
                 break
             guard.take(now)
-            coast.append((now, getattr(self.machine, "speed_rpm", np.nan)))
+            coast.append((now, _number(getattr(self.machine, "speed_rpm", np.nan))))
         shown = np.reshape(coast[: round(TAIL / self.Ts)], (-1, 2))
         u = np.append(u[:-1], np.zeros(1 + len(shown)))
         counts, speed = np.append(counts, shown[:, 0]), np.append(speed, shown[:, 1])
@@ -768,6 +825,8 @@ class SteppedBench:
         said = f"{received.format(value=seen[1])} after {k * self.Ts:.3g} s"
         under = f", under {u:.3g} V" if seen[0] == "Speed" else ""
         after = "it stands now" if guard.at_rest else f"it still turns {COAST:g} s after that"
+        if seen[0] == "NoNumber":
+            after = "whether it stands is not known"
         error = LinkError(
             name=f"{self.name}, {name}", expected=expected.format(limit=self.speed),
             received=f"{said}{under}; rest was commanded, and {after}", remedy=remedy,

@@ -21,6 +21,7 @@ from ..gains import real, vector
 from ..machine import VirtualMachine
 from ..models import Model
 from ..plotting import Drawing, Plotted, draw, legend
+from ..recording import require_finite
 from ..units import counts_of, duration, position_unit
 from .loop import check_fits, common_rest, plant_name, require_units, single_core
 from .machine import MachineBench, guarded, is_streaming, machine_of
@@ -397,7 +398,13 @@ def follow_positions(
     assert position.counts_per_rev is not None
     known = position_unit(unit)
     r = vector("goals", goals) * counts_of(1.0, known, position.counts_per_rev)
-    _within("goals", r[np.isfinite(r)])
+    if not len(r):
+        raise DataError(
+            name="goals", expected="one for each sample", received="none",
+            remedy="a goal that stands for a second has a second of samples",
+        )  # fmt: skip
+    require_finite("goals", r)
+    _within("goals", r)
     found = _played(position, on, r, name, None, release, disturbance)
     return replace(found, unit=known)
 

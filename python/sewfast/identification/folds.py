@@ -336,7 +336,8 @@ def verdict(model: Model, data: Dataset, trial: Trial, where: str = UNSEEN_DATA)
     grade, remark = judged(fit, error, noise, share)
     if grade == "good" and (loose := 100.0 * trial.apart / spread) > 100.0 - GOOD:
         grade = "fair"
-        remark += f", but models without one of its parts differ from it by {loose:.0f} %"
+        by = f"differ from it by {loose:.0f} %" if math.isfinite(loose) else "run away"
+        remark += f", but models without one of its parts {by}"
     unit = f" {data.output_unit}" if data.output_unit else ""
     rmse = f"rmse {error:.3g}{unit}"
     text, todo = TEXTS[grade], []

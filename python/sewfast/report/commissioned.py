@@ -15,6 +15,7 @@ from ..greybox import load_motor
 from ..plotting import Picture, Trace, loop_drawing, style, svg
 from ..readers import read_table
 from ..tables import Table, milliseconds, percent, rpm, significant, volt
+from ..tuning.verdict import LIVELY
 from .artefacts import drawing
 from .pictures import hero
 
@@ -189,7 +190,7 @@ def _stops(found: Mapping[str, Any]) -> Table | None:
     caption = (
         f"Position gain {significant(position['gain'])} 1/s, "
         f"{percent(100.0 * position['share'], 0)} of what the models can do; Ms of both loops "
-        f"{shown(position['Ms'])}."
+        f"{shown(position['Ms'])} (at most {LIVELY:g})."
     )
     header = ("stop", "off, predicted [deg]", "off [deg]", "passed by [deg]", "turns")
     return Table(caption, header, rows)
