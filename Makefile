@@ -332,8 +332,8 @@ physics: $(VENV)/bench.stamp ## parameters of motors whose truth is known (docs/
 tracking: $(VENV)/bench.stamp ## what a feedforward is worth, beside simple-pid and a linear-quadratic regulator (SEEDS=5 MACHINES=8)
 	$(BIN)/python benches/tracking.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES))
 
-moves: $(VENV)/bench.stamp ## what a table of a known move brings, and what repetitions add (SEEDS=5 MACHINES=8, MOTORS=20 of MuJoCo, RUNS=200 on changed machines)
-	$(BIN)/python benches/moves.py $(if $(MOTORS),--motors $(MOTORS)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES)) $(if $(RUNS),--runs $(RUNS))
+moves: $(VENV)/bench.stamp ## what a table of a known move brings, and what repetitions add (SEEDS=5 MACHINES=8, MOTORS=20 of MuJoCo, MODEL=grey_box, RUNS=200 on changed machines)
+	$(BIN)/python benches/moves.py $(if $(MOTORS),--motors $(MOTORS)) $(if $(MODEL),--model $(MODEL)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES)) $(if $(RUNS),--runs $(RUNS))
 
 positions: $(VENV)/bench.stamp ## stops at an angle and standstill on virtual machines (SEEDS=1 MACHINES=8 STOPS=100 MODEL=grey_box)
 	$(BIN)/python benches/positions.py $(if $(MODEL),--model $(MODEL)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES)) $(if $(STOPS),--stops $(STOPS))
