@@ -158,12 +158,13 @@ def test_a_full_disk_keeps_the_controllers(tmp_path: Path, monkeypatch: pytest.M
     found = SimpleNamespace(
         recordings={"pulses": Table(fits=False), "motion": Table(fits=True)},
         models=Artefact(), first=Artefact(), controller=Artefact(), comparisons=[],
+        position=SimpleNamespace(controller=Artefact()), stops=(),
     )  # fmt: skip
     with refuses(
         DataError, expected="room for 2 tables", remedy="the controllers and models are there"
     ):
         result._artefacts(found, tmp_path)  # type: ignore[arg-type]
     assert written == [
-        "controllers/tuned.json", "controllers/first.json", "models/ensemble.json",
-        "recordings/motion.csv",
+        "controllers/tuned.json", "controllers/first.json", "controllers/position.json",
+        "models/ensemble.json", "recordings/motion.csv",
     ]  # fmt: skip
