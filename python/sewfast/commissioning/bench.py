@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from .. import _core
-from ..causes import ABORTED, loss
+from ..causes import ABORTED
 from ..control.controller import SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import (
@@ -29,14 +29,14 @@ from ..control.machine import (
     SteppedBench,
     Watch,
     cancelled_by,
-    cause_in,
     is_streaming,
     machine_of,
     recording_of,
+    require_made,
     watching,
 )  # fmt: skip
 from ..dataset import FloatArray
-from ..errors import DataError, LinkError, SettingError
+from ..errors import DataError, LinkError
 from ..link import Drive
 from ..link.record import conditions_of, device_of
 from ..recording import Recording, require_finite
@@ -106,8 +106,7 @@ class Guard(RunGuard):
             self.counts_per_rev, frequency=value if reason == "Swinging" else None,
         )  # fmt: skip
         if reason == "Lost":
-            concluded = cause_in(stop.recording, volt=math.inf, speed=self.speed)
-            stop.cause = loss(stop.recording, len(u) - 1, concluded)
+            stop.cause = self.lost(stop.recording, len(u))
         return stop
 
 
@@ -258,15 +257,11 @@ class RecordedBench(MachineWrapper):
 
 def require_record(machine: Machine, name: str, samples: int, found: object) -> None:
     """Refuse an unusable recording of a user's own machine."""
-    if not isinstance(found, Recording):
-        raise SettingError(
-            name=f"{machine.name}, {name}", expected="a Recording", received=type(found).__name__,
-            remedy="make it by Recording.of_counts",
-        )  # fmt: skip
-    columns = {"u": found.u, "counts": found.counts, "y": found.y}
+    made = require_made(machine, name, found, Recording)
+    columns = {"u": made.u, "counts": made.counts, "y": made.y}
     _require_columns(f"{machine.name}, {name}", columns, samples, "command")
     for member in ("Ts", "counts_per_rev"):
-        own, its = getattr(machine, member), getattr(found, member)
+        own, its = getattr(machine, member), getattr(made, member)
         if not math.isclose(own, its, rel_tol=1e-6):
             raise DataError(
                 name=f"{machine.name}, {name}", expected=f"the machine's {member} of {own:g}",
@@ -276,13 +271,9 @@ def require_record(machine: Machine, name: str, samples: int, found: object) -> 
 
 def _require_run(machine: Machine, name: str, samples: int, found: object) -> None:
     """The same for a closed loop."""
-    if not isinstance(found, RecordedRun):
-        raise SettingError(
-            name=f"{machine.name}, {name}", expected="a RecordedRun", received=type(found).__name__,
-            remedy="make it by RecordedRun.of_recording",
-        )  # fmt: skip
-    require_record(machine, name, samples, found.recording)
-    columns = {"r": found.r, "u": found.u, "y": found.y}
+    made = require_made(machine, name, found, RecordedRun)
+    require_record(machine, name, samples, made.recording)
+    columns = {"r": made.r, "u": made.u, "y": made.y}
     _require_columns(f"{machine.name}, {name}", columns, samples, "sample of the reference")
 
 

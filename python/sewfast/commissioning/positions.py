@@ -87,16 +87,18 @@ def verified_stops(
     keep: Callable[[tuple[Stop, ...]], object],
 ) -> tuple[Stop, ...]:  # fmt: skip
     """The stops on the models, then on the machine; `keep` gets them as they come."""
-    stops, after = [], AFTER + DYING / law.gain
-    for share, angle in STOPS:
-        begun = min(share * speed, law.fastest)
-        runs = tuple(stop_at(law, one, angle, speed=begun, after=after) for one in ensemble.members)
-        stops.append(Stop(f"{angle} from {begun:.4g} RPM", runs))
+    asked = [(angle, min(share * speed, law.fastest)) for share, angle in STOPS]
+
+    def run(on: Model | Machine, angle: str, begun: float) -> PositionRun:
+        return stop_at(law, on, angle, speed=begun, after=AFTER + DYING / law.gain)
+
+    stops = [
+        Stop(f"{angle} from {begun:.4g} RPM", tuple(run(m, angle, begun) for m in ensemble.members))
+        for angle, begun in asked
+    ]
     keep(tuple(stops))
-    for k, (share, angle) in enumerate(STOPS):
-        begun = min(share * speed, law.fastest)
-        measured = stop_at(law, machine, angle, speed=begun, after=after)
-        stops[k] = replace(stops[k], measured=measured)
+    for k, (angle, begun) in enumerate(asked):
+        stops[k] = replace(stops[k], measured=run(machine, angle, begun))
         keep(tuple(stops))
     return tuple(stops)
 

@@ -15,7 +15,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeGuard, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeGuard, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -321,9 +321,13 @@ class RunGuard:
         )  # fmt: skip
         error.recording = recording
         if reason == "Lost":
-            concluded = cause_in(recording, volt=math.inf, speed=self.speed)
-            error.explain(loss(recording, samples - 1, concluded))
+            error.explain(self.lost(recording, samples))
         return error
+
+    def lost(self, recording: Recording, samples: int) -> Cause:
+        """What became of an encoder that was seen to be lost after so many samples."""
+        concluded = cause_in(recording, volt=math.inf, speed=self.speed)
+        return loss(recording, samples - 1, concluded)
 
 
 @dataclass
@@ -362,6 +366,9 @@ class MachineWrapper:
         return self.inner.follow(controller, r, name, **watched)
 
 
+Made = TypeVar("Made", Recording, RecordedRun)
+
+
 class GuardedMachine(MachineWrapper):
     """A user's own machine: its runs are watched if they can be, and looked at afterwards."""
 
@@ -369,7 +376,7 @@ class GuardedMachine(MachineWrapper):
         # in an open loop a machine may stand under any command
         with self._guarded(name, math.inf) as guard:
             found = self.inner.excite(u, name, **watching(self.inner.excite, guard))
-            _require_made(self, name, found, Recording, "Recording.of_counts")
+            require_made(self, name, found, Recording)
             self._look_at(guard, found)
             return found
 
@@ -384,7 +391,7 @@ class GuardedMachine(MachineWrapper):
                     watch(first, u, counts)
 
             found = super().follow(controller, r, name, watch=both)
-            _require_made(self, name, found, RecordedRun, "RecordedRun.of_recording")
+            require_made(self, name, found, RecordedRun)
             self._look_at(guard, found.recording)
             return found
 
@@ -443,13 +450,15 @@ def _require_numbers(machine: Machine | SteppedBench) -> None:
             )  # fmt: skip
 
 
-def _require_made(machine: Machine, name: str, found: object, kind: type, maker: str) -> None:
-    """Refuse what a user's own machine returned if it is no recording, or no run."""
-    if not isinstance(found, kind):
-        raise SettingError(
-            name=f"{machine.name}, {name}", expected=f"a {kind.__name__}",
-            received=type(found).__name__, remedy=f"return what {maker} makes",
-        )  # fmt: skip
+def require_made(machine: Machine, name: str, found: object, kind: type[Made]) -> Made:
+    """What a user's own machine returned, if it is a recording, or a run."""
+    if isinstance(found, kind):
+        return found
+    maker = "of_counts" if kind is Recording else "of_recording"
+    raise SettingError(
+        name=f"{machine.name}, {name}", expected=f"a {kind.__name__}",
+        received=type(found).__name__, remedy=f"make it by {kind.__name__}.{maker}",
+    )  # fmt: skip
 
 
 # --- Recording ------------------------------------------------------------------------------------
@@ -634,10 +643,10 @@ class Stepped(Protocol):
         """Hold a command [V] for one sample."""
 
 
-def _number(value: object) -> float:
+def _number(value: Any) -> float:
     """The value as a float, NaN if it is none."""
     try:
-        return float(value)  # type: ignore[arg-type]
+        return float(value)
     except (TypeError, ValueError):
         return math.nan
 

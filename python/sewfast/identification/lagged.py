@@ -335,7 +335,6 @@ def _chosen(
     part = later_part(task.data, task.validation)
     if len(structures) == 1 or part is None:
         return structures[-1]
-    held = part
     progress = task.clock.limited(task.progress, SHARE_OF_CHOICE, _CHOICE)
     best = structures[0]
     kept: Fitted | None = None
@@ -343,14 +342,14 @@ def _chosen(
 
     def tested(structure: Mapping[str, int]) -> tuple[Fitted, Errors] | None:
         try:
-            found = fit(held.fitted, structure, progress)
+            found = fit(part.fitted, structure, progress)
         except FitError:
             return None
         if found.termination == "interrupted":
             if kept is None and found.iterations and not task.clock.over(SHARE_OF_CHOICE, _CHOICE):
                 raise _Stopped(structure, found)
             raise KeyboardInterrupt
-        errors = errors_of(free_runs(found.model, held), held)
+        errors = errors_of(free_runs(found.model, part), part)
         tried.append({**structure, "held_out_rmse": finite(errors.rmse)})
         return found, errors
 

@@ -113,31 +113,30 @@ class Ending:
             "choice": self._choice(mixture, reasons),
         }
         linear = self._linear_error()
+        left = mixture.unseen(self.table.blocks)
+        trial = self.table.blocks.trial(left, self._apart(model, mixture))
         model = closed(
-            self.task.documented(model, {**model.training, **provenance}), self.task,
-            self._trial(model, mixture), linear=linear, wants_network=self.wants_network,
-            diagnosed=self._diagnosed,
+            self.task.documented(model, {**model.training, **provenance}), self.task, trial,
+            linear=linear, wants_network=self.wants_network, diagnosed=self._diagnosed,
         )  # fmt: skip
-        model = self._with_blocks(model, mixture)
+        model = self._with_blocks(model, left)
         return replace(model, alternatives=tuple(self._alternatives(model)))
 
-    def _trial(self, model: Model, mixture: Mixture) -> Trial:
-        """What the mixture leaves on the blocks, and how far it is apart without each of them."""
+    def _apart(self, model: Model, mixture: Mixture) -> float:
+        """How far mixtures without one of the blocks are apart."""
         folds = [] if self.table.folds[0].is_given else range(len(self.table.folds))
-        without = [partial(mixture.runs, i) for i in folds]
-        return self.table.blocks.trial(
-            mixture.unseen(self.table.blocks), apart(model, self.task.data, without)
-        )
+        return apart(model, self.task.data, [partial(mixture.runs, i) for i in folds])
 
-    def _with_blocks(self, model: Model, mixture: Mixture) -> Model:
-        """The verdict with the fit of each block, which shows how far the figure can be trusted."""
+    def _with_blocks(self, model: Model, left: FloatArray) -> Model:
+        """The verdict with the fit of each block, from what is left on them, which shows how far
+        the figure can be trusted.
+        """
         spread, sizes = self.table.blocks.together.spread, self.table.blocks.sizes
         if len(sizes) < 2 or not spread > 0.0:
             return model
-        if not np.isfinite(mixture.residual).all():
+        if not np.isfinite(left).all():
             return model
         ends = np.cumsum(sizes)[:-1]
-        left = mixture.unseen(self.table.blocks)
         squares = np.split(self.table.blocks.weights * left**2, ends)
         counts = np.split(self.table.blocks.weights, ends)
         fits = [

@@ -590,17 +590,10 @@ def costs(
         raise SettingError(
             "expected controllers with one encoder, got several; compare them one by one"
         )
-    task = TuningTask.of(
-        models,
-        references,
-        start=given[0],
-        first={},
-        cost=cost,
-        aggregate=aggregate,
-        constraints=None,
-        variations=variations,
+    task = _task_of(
+        given[0], models, references, cost=cost, aggregate=aggregate, variations=variations,
         loads=loads,
-    )
+    )  # fmt: skip
     for controller in given:
         for plant in task.plants:
             check_fits(controller, plant)
@@ -638,10 +631,15 @@ def led(controller: Controller, models: Plants) -> tuple[Controller, Led]:
     return with_lead(_task_of(controller, models), controller, "preview")
 
 
-def _task_of(controller: SampledController, models: Plants) -> TuningTask:
+def _task_of(
+    controller: SampledController, models: Plants, references: References = None, *,
+    cost: Cost | None = None, aggregate: Aggregate = "mean",
+    variations: Sequence[tuple[float, int]] | None = None, loads: Sequence[LoadStep] = (),
+) -> TuningTask:  # fmt: skip
+    """The task to judge a controller on, as `tune` has it without further settings."""
     return TuningTask.of(
-        models, None, start=controller, first={}, cost=None, aggregate="mean", constraints=None,
-        variations=None, loads=(),
+        models, references, start=controller, first={}, cost=cost, aggregate=aggregate,
+        constraints=None, variations=variations, loads=loads,
     )  # fmt: skip
 
 
@@ -664,17 +662,7 @@ def recoveries(
     FitError
         If a loop diverges.
     """
-    task = TuningTask.of(
-        models,
-        [np.zeros(1)],
-        start=controller,
-        first={},
-        cost=None,
-        aggregate="mean",
-        constraints=None,
-        variations=variations,
-        loads=loads,
-    )
+    task = _task_of(controller, models, [np.zeros(1)], variations=variations, loads=loads)
     return np.array(_core.tuning_loads(task.core()))
 
 
