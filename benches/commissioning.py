@@ -32,8 +32,8 @@ from sewfast import (
 from sewfast.commissioning.demands import Demands, demands
 from sewfast.commissioning.excitations import standard
 from sewfast.commissioning.gains import ruled, search, start_of
+from sewfast.control.benches import MachineBench
 from sewfast.control.loop import ClosedLoopRun
-from sewfast.control.machine import MachineBench
 from sewfast.rules import eq_12
 from two_degrees import answer, eq_12_controller
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sewfast import signals
-from sewfast.control.machine import record
+from sewfast.control.record import record
 from sewfast.errors import DataError
 from sewfast.machine import VirtualMachine
 from sewfast.readers import read, read_table

@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from .control.feedforward import Feedforward
     from .control.files import load_controller
     from .control.loop import ClosedLoopRun, run
-    from .control.machine import Machine, record
+    from .control.machine import Machine
     from .control.margins import Margins, margins, operating_point
     from .control.position import PositionController
+    from .control.record import record
     from .control.state_feedback import StateFeedback
     from .control.stops import PositionRun, follow_positions, stop_at
     from .dataset import Dataset, Diagnosis, Experiment, diagnose
@@ -191,7 +192,8 @@ _HOMES = {
     "identification": "identify",
     "identification.least_squares": "LeastSquaresResult least_squares",
     "control.loop": "ClosedLoopRun run",
-    "control.machine": "Machine record",
+    "control.machine": "Machine",
+    "control.record": "record",
     "machine": "VirtualMachine",
     "models": "ARX IV Ensemble LinearOE Model NeuralOE NeuralSS load_model",
     "identification.order_table": "OrderTable orders",

@@ -18,7 +18,8 @@ from sewfast.commissioning.bench import DriveBench
 from sewfast.commissioning.result import run_numbers
 from sewfast.control.controller import Controller, SampledController, paper_controller
 from sewfast.control.loop import ClosedLoopRun, run
-from sewfast.control.machine import RecordedRun, Watch, record
+from sewfast.control.machine import RecordedRun, Watch
+from sewfast.control.record import record
 from sewfast.dataset import Dataset
 from sewfast.errors import FitError, LinkError
 from sewfast.evidence.figures import figures

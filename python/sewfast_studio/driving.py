@@ -90,7 +90,7 @@ def record(
 ) -> dict[str, Any]:
     """Record a named excitation into a file."""
     from sewfast import signals
-    from sewfast.control.machine import record
+    from sewfast.control.record import record
 
     u = scale * signals.excitation(signal, seed)
     made = record(drive, u, name=signal, file=folder / file, cancel=bench.cancel)

@@ -70,7 +70,7 @@ def make_demo(folder: str | os.PathLike[str]) -> None:
         If the folder is not writable.
     """
     from sewfast import signals
-    from sewfast.control.machine import record
+    from sewfast.control.record import record
     from sewfast.identification import identify
     from sewfast.machine import VirtualMachine
     from sewfast.models import Ensemble

@@ -30,8 +30,10 @@ from sewfast import (
 )
 from sewfast.commissioning.checkpoint import Checkpoint, prepare
 from sewfast.commissioning.result import require_own
+from sewfast.control.benches import MachineBench
 from sewfast.control.loop import run as closed_loop
-from sewfast.control.machine import MachineBench, RecordedRun, Watch, record
+from sewfast.control.machine import RecordedRun, Watch
+from sewfast.control.record import record
 from sewfast.dataset import FloatArray
 from sewfast.link import VirtualDevice
 from sewfast.recordfile import read_recording

@@ -25,7 +25,7 @@ from sewfast import (
 from sewfast.commissioning import Bench, Followed, Refusal, gains, procedure, training
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.gains import held, swing_of
-from sewfast.control.machine import MachineBench
+from sewfast.control.benches import MachineBench
 from sewfast.recording import Recording
 
 

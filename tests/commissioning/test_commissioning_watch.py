@@ -17,8 +17,9 @@ from sewfast import Controller, Gains, VirtualMachine, commission, run
 from sewfast.commissioning import Refusal
 from sewfast.commissioning.bench import Aborted, Guard, RecordedBench
 from sewfast.commissioning.verification import Watching, measure, predict, restless
+from sewfast.control.benches import MachineBench, SteppedBench
 from sewfast.control.controller import SampledController
-from sewfast.control.machine import WATCHED, MachineBench, RecordedRun, SteppedBench, Watch
+from sewfast.control.machine import WATCHED, RecordedRun, Watch
 from sewfast.dataset import FloatArray
 from sewfast.link import VirtualDevice, connect
 from sewfast.models import Ensemble

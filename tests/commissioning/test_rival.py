@@ -18,7 +18,7 @@ from sewfast.commissioning.gains import SENSITIVE, sensible
 from sewfast.commissioning.small_signal import SmallSignal
 from sewfast.commissioning.training import linear_rival
 from sewfast.control import Fopdt
-from sewfast.control.machine import MachineBench
+from sewfast.control.benches import MachineBench
 from sewfast.control.margins import margins
 from sewfast.errors import Interrupted, SettingError
 from sewfast.machine import VirtualMachine

@@ -15,8 +15,8 @@ from sewfast.commissioning.slow import HARMONICS, MOST, PER_CONSTANT, SHARPEST, 
 from sewfast.commissioning.small_signal import Resonance, SmallSignal
 from sewfast.control import Fopdt
 from sewfast.control.loop import run
-from sewfast.control.machine import record
 from sewfast.control.margins import margins
+from sewfast.control.record import record
 from sewfast.recording import Recording
 from sewfast.tuning.objective import Cost
 

@@ -21,7 +21,8 @@ from sewfast import Controller, Gains, Machine, Recording, VirtualMachine, recor
 from sewfast.arrays import FloatArray
 from sewfast.commissioning import SteppedBench
 from sewfast.commissioning.bench import bench_of
-from sewfast.control.machine import MEMBERS, MachineBench, RecordedRun, machine_of
+from sewfast.control.benches import MachineBench, machine_of
+from sewfast.control.machine import MEMBERS, RecordedRun
 from sewfast.errors import DataError, SettingError
 from sewfast.link import ODrive, SimpleFOC, VirtualDevice, connect
 from sewfast.recordfile import read_recording

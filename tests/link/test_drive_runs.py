@@ -18,7 +18,7 @@ from moments import is_on, once_on, until
 from sewfast import signals
 from sewfast.control import Controller, Gains
 from sewfast.control.loop import run
-from sewfast.control.machine import record
+from sewfast.control.record import record
 from sewfast.errors import Interrupted, LinkError, SettingError
 from sewfast.link import Drive, VirtualDevice, connect
 from sewfast.machine import VirtualMachine

@@ -19,7 +19,7 @@ from sewfast import VirtualMachine
 from sewfast.cli import main
 from sewfast.control import Controller, Gains
 from sewfast.control.loop import run
-from sewfast.control.machine import record
+from sewfast.control.record import record
 from sewfast.errors import DataError, LinkError, SettingError
 from sewfast.link import Drive, VirtualDevice, connect
 from sewfast.recordfile import Header, RecordWriter, export, read_recording

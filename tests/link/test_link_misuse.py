@@ -19,7 +19,7 @@ from refusals import refuses
 from sewfast import Controller, Gains, VirtualMachine
 from sewfast.cli import main
 from sewfast.control.loop import run
-from sewfast.control.machine import record
+from sewfast.control.record import record
 from sewfast.errors import DataError, LinkError, SettingError
 from sewfast.link import Drive, Outcome, Plan, VirtualDevice, connect, examine, run_on_host
 from sewfast.recordfile import Header, RecordWriter, export, read_recording

@@ -13,7 +13,7 @@ from cli import called as sewfast
 from recordings_made import header
 from refusals import refuses
 from sewfast.cli import main
-from sewfast.control.machine import record
+from sewfast.control.record import record
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, SettingError
 from sewfast.machine import VirtualMachine

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from cli import refused, sewfast
-from sewfast.control.machine import record
+from sewfast.control.record import record
 from sewfast.errors import LinkError
 from sewfast.link import Plan, connect, examine
 from sewfast.recordfile import read_recording

@@ -92,7 +92,7 @@ def record_command(args: argparse.Namespace) -> None:
         return
     place = recording_place(args.out, overwrite=args.overwrite)
     with opened(args) as drive:
-        from ..control.machine import record
+        from ..control.record import record
 
         _require_period(args, Ts, drive.identity.Ts)
         made = record(
@@ -137,7 +137,7 @@ def _require_period(args: argparse.Namespace, given: float, machine: float) -> N
 
 
 def _record_virtual(args: argparse.Namespace, u: FloatArray, Ts: float) -> None:
-    from ..control.machine import record
+    from ..control.record import record
     from ..recordfile.writer import require_replaceable
 
     if args.out is not None:

@@ -15,26 +15,20 @@ import numpy as np
 
 from .. import _core
 from ..causes import ABORTED
+from ..control.benches import MachineBench, Stepped, SteppedBench, machine_of
 from ..control.controller import SampledController
+from ..control.guarding import SEEN, MachineWrapper, RunGuard, require_made
 from ..control.loop import ClosedLoopRun
 from ..control.machine import (
-    SEEN,
     Followed,
     Machine,
-    MachineBench,
-    MachineWrapper,
     RecordedRun,
-    RunGuard,
-    Stepped,
-    SteppedBench,
     Watch,
     cancelled_by,
     is_streaming,
-    machine_of,
     recording_of,
-    require_made,
     watching,
-)  # fmt: skip
+)
 from ..dataset import FloatArray
 from ..errors import DataError, LinkError
 from ..link import Drive

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from ..control.machine import SteppedBench
+from ..control.benches import SteppedBench
 from ..errors import ModelFileError, SettingError, not_installed
 from .fmu_process import FmuProcess
 

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray
+from ..control.benches import guarded
 from ..control.controller import Controller
-from ..control.machine import Machine, guarded, watching
+from ..control.machine import Machine, watching
 from ..control.margins import margins
 from ..dataset import Dataset
 from ..errors import DataError, LinkError, SettingError

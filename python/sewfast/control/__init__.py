@@ -1,11 +1,11 @@
 """The controller and its loop.
 
 Read in this order: `biquad` (notches and other filters), `feedforward` (the command that a model
-needs), `controller` (the base class of all kinds;
-the PID), `state_feedback` (the second kind), `files` (`load_controller`), `loop` (`run`: on a model
-or a machine), `machine` (`Machine`, the protocol of machines; `record`), `position` (a position
-loop over a PID; `stop_at`), `defaults` (limits, filter
-and references of a drive by default), `margins` (of the linear loop), `systems` (the linear loop as
+needs), `controller` (the base class of all kinds; the PID), `state_feedback` (the second kind),
+`files` (`load_controller`), `loop` (`run`: on a model or a machine), `machine` (`Machine`, the
+protocol of machines), `guarding` (their guard), `benches` (machines of this process), `record`,
+`position` (a position loop over a PID), `stops` (`stop_at`), `defaults` (limits, filter and
+references of a drive by default), `margins` (of the linear loop), `systems` (the linear loop as
 state space), `forms` (a PID as MATLAB's and python-control's).
 """
 

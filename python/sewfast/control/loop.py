@@ -433,7 +433,8 @@ def _on_machine(
     cancel: threading.Event | None,
     **options: Any,
 ) -> ClosedLoopRun:
-    from .machine import cancelled_by, guarded, is_streaming, machine_of
+    from .benches import guarded, machine_of
+    from .machine import cancelled_by, is_streaming
 
     if is_streaming(on):
         return on.follow(controller, r, name, **options, **cancelled_by(cancel))

@@ -23,8 +23,9 @@ from ..models import Model
 from ..plotting import Drawing, Plotted, draw, legend
 from ..recording import require_finite
 from ..units import counts_of, duration, position_unit
+from .benches import MachineBench, guarded, machine_of
 from .loop import check_fits, common_rest, plant_name, require_units, single_core
-from .machine import MachineBench, guarded, is_streaming, machine_of
+from .machine import is_streaming
 from .position import PositionController, require_position
 
 if TYPE_CHECKING:

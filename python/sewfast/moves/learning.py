@@ -13,8 +13,9 @@ import numpy as np
 
 from .. import _core
 from ..arrays import FloatArray, bridged
+from ..control.benches import guarded, machine_of
 from ..control.loop import Plants, common_rest, cores_about
-from ..control.machine import Machine, RecordedRun, cancelled_by, guarded, is_streaming, machine_of
+from ..control.machine import Machine, RecordedRun, cancelled_by, is_streaming
 from ..control.move import MoveTable, Repetition, repetition_lines, table_of
 from ..errors import DataError, Interrupted, SettingError
 from ..gains import whole
