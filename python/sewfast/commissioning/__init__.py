@@ -1,9 +1,10 @@
 """Commissioning: from a machine at rest to a verified controller.
 
 Read in this order: `procedure` (`commission`, its stages one after the other), `demands` (settings
-and limits, `Refusal`), `bench` (wrappers around a machine); the stages: `excitations`,
-`small_signal`, `gains`, `training`, `slow`, `verification`; `result` (the value and its folder).
-Apart from these: `shaking` (`bode` of a machine), `fmu` (an FMU as a machine).
+and limits, `Refusal`), `references`, `journal` (results so far), `bench` (wrappers around a
+machine); the stages: `excitations`, `small_signal`, `gains`, `training`, `slow`, `verification`,
+`positions`; `result` (the value and its folder). Apart from these: `shaking` (`bode` of a machine),
+`fmu` (an FMU as a machine).
 """
 
 from ..frequency.local import unsmoothed

@@ -5,23 +5,17 @@ from __future__ import annotations
 import math
 import os
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from .. import signals
-from ..causes import ABORTED, Cause, Seen, cause_among, turns_at_rest
+from ..causes import Cause, Seen, cause_among, turns_at_rest
 from ..control.controller import Controller, SampledController
 from ..control.loop import ClosedLoopRun
-from ..control.machine import WATCHED, Machine, RecordedRun
+from ..control.machine import Machine, RecordedRun
 from ..dataset import FloatArray
-from ..errors import DataError, Interrupted, LinkError, SettingError
-from ..gains import vector
+from ..errors import Interrupted, LinkError, SettingError
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
 from ..progress import shown_in_notebooks
@@ -30,12 +24,11 @@ from ..rules import Fopdt
 from ..threads import available
 from ..tuning.objective import LARGEST_MS, Cost
 from ..tuning.search import Loop, TuningResult
-from ..tuning.task import GAINS
 from . import excitations
 from .bench import DriveBench, RecordedBench, bench_of, description_of
 from .checkpoint import STAGES, Checkpoint
 from .demands import Demands, Refusal, demands, require
-from .excitations import first_motion, lost_motion, standard, step_response
+from .excitations import first_motion, lost_motion, step_response
 from .gains import (
     Requirements,
     cause,
@@ -49,7 +42,9 @@ from .gains import (
     sensible,
     start_of,
 )
+from .journal import Journal, Progress
 from .positions import position_loop, unmet, verified_stops
+from .references import References, references_of, samples_of
 from .result import UNREACHED, VERIFIED, VERIFIED_POORLY, Commissioning, require_own
 from .shaking import margins_at_work
 from .slow import Thinning, TurnLoad, turn_load
@@ -68,7 +63,6 @@ from .verification import (
 __all__ = ["STAGES", "commission"]
 
 
-References = Mapping[str, ArrayLike] | Sequence[str]
 Between = Callable[[str, Commissioning], object]
 
 
@@ -199,8 +193,8 @@ def commission(
             machine,
             u_max=u_max,
             speed=speed,
-            references=_samples(references, machine, seed),
-            practice=_samples(practice, machine, seed),
+            references=samples_of(references, machine, seed),
+            practice=samples_of(practice, machine, seed),
             members=members,
             evaluations=evaluations,
             seed=seed,
@@ -374,7 +368,7 @@ def _carry_out(
     journal.keep(turn_load=load)
 
     journal.enter("tuning")
-    verify, practice = _references(fastest, asked, machine)
+    verify, practice = references_of(fastest, asked, machine)
     weights = cost_of(practice, machine.Ts, asked) if cost is None else cost
     journal.keep(cost=weights)
     pushes = thinning.pushes(load, practice, machine.Ts)
@@ -564,161 +558,3 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
         journal.say(tuning.warning)
     journal.keep(tuning=tuning, controller=controller, met=required.met(tuning.pid, ensemble))
     return ensemble, controller
-
-
-def _references(
-    fastest: float, asked: Demands, machine: Machine
-) -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
-    """References for the verification, and for tuning.
-    Gains are tuned on plants with down to .8 of the gain, which accelerate less. At the pace of the
-    verification these would reach the current limit, where no gains help, and the search would
-    minimise windup instead (drive `weak`, seed 5: 13.7 RPM on the machine; 4.96 with slower ones).
-    """
-    if asked.references is not None:
-        return asked.references, asked.practice or asked.references
-    return (
-        standard(fastest, asked, machine.Ts, short=False),
-        asked.practice or standard(min(GAINS) * fastest, asked, machine.Ts, short=True),
-    )
-
-
-def _samples(
-    references: References | None, machine: Machine, seed: int
-) -> Mapping[str, FloatArray] | None:
-    if references is None:
-        return None
-    given = isinstance(references, (Mapping, Sequence)) and not isinstance(references, str)
-    if not given or not references:
-        raise SettingError(
-            name="references", expected="a mapping from names to samples, or a sequence of names",
-            received=repr(references), remedy="leave it out for the standard ones",
-        )  # fmt: skip
-    if isinstance(references, Mapping):
-        return {str(name): _whole(str(name), r) for name, r in references.items()}
-    if abs(machine.Ts - signals.TS) > 1e-9:
-        raise SettingError(
-            name="references", expected=f"names on a machine at {signals.TS} s only",
-            received=f"one at {machine.Ts:g} s", remedy="give references as samples",
-        )  # fmt: skip
-    return {name: signals.reference(name, seed) for name in references}
-
-
-def _whole(name: str, reference: ArrayLike) -> FloatArray:
-    """The samples of a reference, checked."""
-    # least samples of a reference: fewer cannot be judged
-    shortest = 2 * WATCHED
-    samples = vector(name, reference).copy()
-    if not np.all(np.isfinite(samples)):
-        raise DataError(
-            name=name, expected="finite samples of a reference", received="NaN or infinity"
-        )
-    if len(samples) < shortest:
-        raise DataError(
-            name=name, expected=f"{shortest} samples of a reference or more",
-            received=f"{len(samples)}", remedy="hold its end for longer",
-        )  # fmt: skip
-    if not samples.any():
-        raise DataError(
-            name=name, expected="a reference that moves", received="zeros only",
-            remedy="give the speed to follow",
-        )  # fmt: skip
-    return samples
-
-
-# --- The journal: stages and results so far -------------------------------------------------------
-
-
-Progress: TypeAlias = Callable[[int, int, str], object]
-"""Called with the stages done, their total, and the present stage."""
-
-
-class Journal:
-    """Collects the results; `result` makes a `Commissioning` of them at any time."""
-
-    def __init__(
-        self,
-        machine: str,
-        progress: Progress | None,
-        cancel: threading.Event | None = None,
-        between: Callable[[str, Commissioning], object] | None = None,
-    ) -> None:
-        self._progress = progress
-        self._cancel, self._between = cancel, between
-        self._began: list[tuple[str, float]] = []
-        self._values: dict[str, Any] = {"machine": machine, "recordings": {}}
-
-    @property
-    def fopdt(self) -> Fopdt:
-        """The fit to the step response."""
-        found: Fopdt = self._values["fopdt"]
-        return found
-
-    @property
-    def first(self) -> Controller:
-        found: Controller = self._values["first"]
-        return found
-
-    def recording(self, name: str) -> Recording:
-        found: Recording = self._values["recordings"][name]
-        return found
-
-    @property
-    def stage(self) -> str:
-        return self._began[-1][0] if self._began else STAGES[0]
-
-    def enter(self, stage: str) -> None:
-        # register it first: the callbacks can raise to stop
-        self._began.append((stage, time.perf_counter()))
-        self._report(STAGES.index(stage), stage)
-        self.pause(stage)
-        # the time that a person took does not count for the stage
-        self._began[-1] = (stage, time.perf_counter())
-
-    def pause(self, following: str) -> None:
-        """Call `between` with the next step and the results so far; it can wait for a person."""
-        if self._between is not None:
-            self._between(following, self.result("under way"))
-        self.heed()
-
-    def heed(self) -> None:
-        """Raise `KeyboardInterrupt` if `cancel` is set."""
-        if self._cancel is not None and self._cancel.is_set():
-            raise KeyboardInterrupt
-
-    def within(self, done: int, total: int) -> None:
-        """Report progress within the stage."""
-        self.heed()
-        self._report(STAGES.index(self.stage), f"{self.stage} {done}/{total}")
-
-    def finish(self) -> None:
-        """Report that all stages are done."""
-        self._report(len(STAGES), "done")
-
-    def _report(self, done: int, text: str) -> None:
-        if self._progress is not None:
-            self._progress(done, len(STAGES), text)
-
-    def keep(self, **values: Any) -> None:
-        self._values |= values
-
-    def say(self, note: str) -> None:
-        """Add a note on something unusual."""
-        self._values["notes"] = (*self._values.get("notes", ()), note)
-
-    def note(self, name: str, recording: Recording) -> None:
-        """Store a recording, except those along the references, which are stored as runs."""
-        if self.stage != STAGES[-1] or name.startswith("hold_") or name.endswith(ABORTED):
-            self._values["recordings"] = {**self._values["recordings"], name: recording}
-
-    @property
-    def cause(self) -> Cause | None:
-        """What was seen to be wrong with the machine."""
-        found: Cause | None = self._values.get("cause")
-        return found
-
-    def result(self, verdict: str, reason: str = "") -> Commissioning:
-        ends = [t for _, t in self._began[1:]] + [time.perf_counter()]
-        seconds = {s: end - t for (s, t), end in zip(self._began, ends, strict=True)}
-        return Commissioning(
-            **self._values, verdict=verdict, stage=self.stage, reason=reason, seconds=seconds
-        )
