@@ -7,6 +7,7 @@ use std::rc::Rc;
 use nalgebra::{DMatrix, DVector};
 
 use crate::lagged::{Lagged, Lags};
+use crate::level::about_level;
 use crate::linear::{LinearFit, LinearModel, covariance_rows, soften, stabilised};
 use crate::lm::Termination;
 use crate::{Error, Monitor, Record, Result, arx};
@@ -65,14 +66,16 @@ pub fn fit(
     }
     let lags = arx::check(records, na, nb, nk)?;
     require_enough(records, &lags, offset)?;
-    let first = arx::fit(records, na, nb, nk, offset)?;
-    let refiner = Refiner::new(records, lags, offset, monitor);
-    monitor.set_total(max_iterations as u64);
-    let start = with_denominator(&first, stabilised(first.a()));
-    let start = start.and_then(|m| refiner.point(m)).ok_or_else(no_model)?;
-    let mut search = Search::new(start);
-    search.termination = search.iterate(&refiner, records, max_iterations, monitor);
-    Ok(search.fit(&refiner, records))
+    about_level(records, offset, |records, _| {
+        let first = arx::fit(records, na, nb, nk, offset)?;
+        let refiner = Refiner::new(records, lags, offset, monitor);
+        monitor.set_total(max_iterations as u64);
+        let start = with_denominator(&first, stabilised(first.a()));
+        let start = start.and_then(|m| refiner.point(m)).ok_or_else(no_model)?;
+        let mut search = Search::new(start);
+        search.termination = search.iterate(&refiner, records, max_iterations, monitor);
+        Ok(search.fit(&refiner, records))
+    })
 }
 
 /// The state of the iteration: the present point and the best free run so far.

@@ -34,6 +34,7 @@ pub mod lagged;
 #[cfg(test)]
 mod laws;
 pub mod least_squares;
+mod level;
 pub mod linear;
 pub mod linearised;
 pub mod lm;

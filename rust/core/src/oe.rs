@@ -7,6 +7,7 @@ use problem::OutputError;
 use starts::{excerpt, restart_error};
 
 use crate::lagged::{Lagged, Lags};
+use crate::level::about_level;
 use crate::linear::{LinearFit, LinearModel, stabilised};
 use crate::lm::{self, Outcome, Problem, Settings, Termination};
 use crate::{Error, Monitor, Record, Result, arx};
@@ -87,7 +88,7 @@ fn by_search(
     monitor: &Monitor,
 ) -> Result<LinearFit> {
     let iterations = max_iterations + (REFINED - 1) * HEAT;
-    from_rest_or_motion(records, iterations, monitor, |records| {
+    let found = |records: &[Record]| {
         let mut problem = OutputError::new(records, lags, offset, fed, monitor)?;
         let from_pieces = excerpt(records)
             .and_then(|pieces| searched_in(&pieces, &mut problem, max_iterations, monitor));
@@ -98,6 +99,9 @@ fn by_search(
             }
         };
         finished(problem, best, spent, max_iterations, monitor)
+    };
+    about_level(records, offset, |records, _| {
+        from_rest_or_motion(records, iterations, monitor, found)
     })
 }
 
@@ -128,14 +132,17 @@ pub fn fit_from(
             lags.channels
         )));
     }
-    from_rest_or_motion(records, max_iterations, monitor, |records| {
-        let mut problem = OutputError::new(records, lags, offset, false, monitor)?;
-        let (cost, theta) = problem
-            .with_states(initial)
-            .or_else(|| problem.with_poles(&stabilised(initial.a())))
-            .ok_or_else(no_model)?;
-        let start = unfinished(cost, theta, Termination::MaxIterations);
-        finished(problem, start, 0, max_iterations, monitor)
+    about_level(records, offset, |records, level| {
+        let initial = level.lowered(initial)?;
+        from_rest_or_motion(records, max_iterations, monitor, |records| {
+            let mut problem = OutputError::new(records, lags, offset, false, monitor)?;
+            let (cost, theta) = problem
+                .with_states(&initial)
+                .or_else(|| problem.with_poles(&stabilised(initial.a())))
+                .ok_or_else(no_model)?;
+            let start = unfinished(cost, theta, Termination::MaxIterations);
+            finished(problem, start, 0, max_iterations, monitor)
+        })
     })
 }
 
