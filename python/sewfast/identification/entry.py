@@ -365,8 +365,9 @@ def _judged_by(model: Model, faults: Sequence[Fault]) -> Model:
 
 def _verdict(model: Model, task: Task) -> Provenance:
     """The verdict on a kind requested by name, on validation data; of a linear model else on
-    blocks of the record, each by a fit to the rest. Else it is that on the training data, and a
-    linear model, which a short record hardly proves wrong, is "fair" at best.
+    blocks of the record, each by a fit to the rest. (The others have judged themselves by what they
+    held out.) Else it is that on the training data, which hardly prove a model wrong: "fair" at
+    best, unless it is a given model that was trained further.
     """
     data, validation = task.data, task.validation
     is_linear, trial = model.kind in ("arx", "iv", "oe"), None
@@ -380,13 +381,14 @@ def _verdict(model: Model, task: Task) -> Provenance:
         trial = unseen(model, alike, _KINDS[model.kind])
         where = where if trial is None else UNSEEN_DATA
     found = verdict(model, data, trial or tried(model, part), where=where)
-    if is_linear and where != UNSEEN_DATA and found["grade"] == "good":
+    is_seen = where != UNSEEN_DATA and not model.training.get("trained_further")
+    if is_seen and found["grade"] == "good":
         found["grade"] = "fair"
         measured = found["text"].partition(": ")[2]
         found["text"] = (
-            f"{TEXTS['fair']}: nothing of the record can be held out to judge by; {measured}"
+            f"{TEXTS['fair']}: nothing of the record was held out to judge by; {measured}"
         )
-        found["next"] = what_to_record(data)
+        found["next"] = ["give validation data", *what_to_record(data)]
     if is_linear and found["grade"] != "useless":
         slowest, longest = linear.time_constant(model.core), max(len(e) for e in data.experiments)
         # a real integrator is not a superfluous pole

@@ -27,7 +27,7 @@ from ..validation import (
     scored_runs,
     without_input,
 )
-from .task import Provenance, sources
+from .task import Provenance, sources, with_provenance
 
 SHARE = 0.2
 """Part of every experiment that is held out, at its end.
@@ -366,6 +366,15 @@ def verdict(model: Model, data: Dataset, trial: Trial, where: str = UNSEEN_DATA)
         "text": text,
         "next": todo,
     }
+
+
+def judged_without(model: Model, without: Model, data: Dataset, part: Split) -> Model:
+    """The model of some data with the verdict that one `without` a part of them gets on that part.
+    Validation data judge the model itself, later.
+    """
+    if part.is_given or doubling(model) is not None:
+        return model
+    return with_provenance(model, {"verdict": verdict(model, data, tried(without, part))})
 
 
 def unstable_verdict(model: Model, part: Split, where: str) -> Provenance:

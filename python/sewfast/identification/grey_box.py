@@ -22,7 +22,16 @@ from ..motorfit.estimation import Normal, minimised
 from ..motorfit.joint import changed, weights
 from ..progress import TimeUp
 from ..units import is_position, revolutions_per_second
-from .folds import WORTH_IT, Errors, Split, compared, errors_of, free_runs, later_part
+from .folds import (
+    WORTH_IT,
+    Errors,
+    Split,
+    compared,
+    errors_of,
+    free_runs,
+    judged_without,
+    later_part,
+)
 from .task import Look, Pool, Provenance, R, Task, finite
 
 TERMS = ("lag", "delay", "coulomb", "offset", "drop", "stribeck", "limit")
@@ -61,7 +70,7 @@ def grey_box(task: Task) -> Model:
         )  # fmt: skip
     motors = Motors(task.seed, task.iterations_or_usual)
     hidden, tried = task.hidden or 0, list[Provenance]()
-    is_open = task.hidden is None and task.select
+    part = later_part(task.data, task.validation) if task.select else None
 
     def look(*_: object) -> None:
         if task.progress is not None:
@@ -69,12 +78,12 @@ def grey_box(task: Task) -> Model:
 
     found: MotorCandidate | None = None
     try:
-        if is_open and (part := later_part(task.data, task.validation)) is not None:
+        if part is not None:
             found = motors.alone(part, look)
             tried = [found.held_out()]
-            more = motors.beside(found, part, look)
+            more = motors.beside(found, part, look, task.hidden or HIDDEN)
             tried.append(more.held_out())
-            found = more if _is_better(more, found) else found
+            found = more if task.hidden or _is_better(more, found) else found
             hidden = found.hidden
         core = motors.fitted(task.data, hidden, look)
     except TimeUp:
@@ -90,7 +99,10 @@ def grey_box(task: Task) -> Model:
         "structure": {"hidden": hidden},
         "tried": tried,
     }
-    return task.model(GreyBox, core, known)
+    model = task.model(GreyBox, core, known)
+    if part is None or found is None:
+        return model
+    return judged_without(model, task.model(GreyBox, found.core, {}), task.data, part)
 
 
 def require_equations(data: Dataset) -> None:
@@ -180,10 +192,10 @@ class Motors:
         return joint.fitted(data, _at_any_time(look), integrates=not inside).core
 
     def beside(
-        self, motor: MotorCandidate, part: Split, look: Look | None = None
+        self, motor: MotorCandidate, part: Split, look: Look | None = None, hidden: int = HIDDEN
     ) -> MotorCandidate:
         """The same motor with a network."""
-        return _judged(self._with_network(motor.core, part.fitted, HIDDEN, look), part)
+        return _judged(self._with_network(motor.core, part.fitted, hidden, look), part)
 
     def candidate(self, part: Split, pool: Pool, until: float | None) -> MotorCandidate | None:
         """A motor fitted to a part; None if the data are not those of a motor.
