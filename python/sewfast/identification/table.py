@@ -22,8 +22,10 @@ from typing import Any, TypeAlias
 
 from .. import _core
 from ..dataset import Diagnosis, diagnose
+from ..dataset.feedback import integration
 from ..dataset.pieces import thinned
 from ..models.base import EnsembleCore
+from ..units import is_position
 from . import grey_box
 from .blocks import Blocks, Mixture, Row, near
 from .grey_box import or_none
@@ -284,16 +286,23 @@ class Table:
             lagged = Structure(2, nk, hidden, LAGGED_DECAY, kind="neural_oe")
             found[2:2] = [lagged] if nk >= 1 else []
         if is_free:
-            # linear models miss the integrator of a drive that friction holds most of the time
-            sizes = [(2, HIDDEN)]
-            if self._integrates:
-                sizes = [(2, 2), (2, HIDDEN), (3, 2), (3, HIDDEN)]
-            sizes = [(nx, task.hidden or h) for nx, h in sizes]
+            sizes = [(nx, task.hidden or h) for nx, h in self._integrators()]
             found += [
                 Structure(nx, linear.nk, h, decays[0], integrator=True)
                 for nx, h in dict.fromkeys(sizes)
             ]
         return [s for s in found if self._is_affordable(s)]
+
+    def _integrators(self) -> list[tuple[int, int]]:
+        """States and hidden units of networks with an integrator; none if the output is no position
+        and the record shows that its plant has none. Linear models miss the integrator of a drive
+        that friction holds most of the time, so that they alone do not decide.
+        """
+        if self._integrates:
+            return [(2, 2), (2, HIDDEN), (3, 2), (3, HIDDEN)]
+        found = integration(self.task.data)
+        is_restored = found is not None and found.is_restored
+        return [] if is_restored and not is_position(self.task.data.output_unit) else [(2, HIDDEN)]
 
     def _orders_of(self, output: Output, orders: Sequence[int]) -> Sequence[int]:
         """Numbers of states to try with an output function; a hidden sign takes two to be told."""
