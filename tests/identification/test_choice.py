@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -435,7 +436,7 @@ def test_a_network_that_nothing_was_held_out_of_is_fair_at_best() -> None:
 def test_a_network_by_name_is_trained_where_the_linear_fits_took_the_search_s_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(table, "SHARE_OF_SEARCH", 1e-9)
+    monkeypatch.setattr(table, "SHARES", replace(table.SHARES, search=1e-9))
     data = bent_data(600)
     model = identify(data, model="neural_ss", time_budget=600.0)
     assert {m.kind for m in model.members or (model,)} == {"neural_ss"}

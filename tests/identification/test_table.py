@@ -110,10 +110,7 @@ def test_a_network_has_to_halve_the_error_to_need_the_input_of_the_same_sample(
 
 
 def _task(data: Dataset) -> Task:
-    usual: dict[str, Any] = dict.fromkeys(("nk", "nx", "hidden", "output", "starts", "iterations"))
-    return Task(
-        data=data, validation=None, na=2, nb=2, seed=0, threads=1, progress=None, **usual
-    )  # fmt: skip
+    return Task(data)
 
 
 # --- weights --------------------------------------------------------------------------------------

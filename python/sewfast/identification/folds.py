@@ -37,6 +37,11 @@ memorises the record; a later part is the honest test if there are many data.
 """
 LEAST_HELD_OUT = 2 * INIT
 """Samples of a held-out part, and of what is left to fit."""
+AS_GOOD = 0.05
+"""An error that is larger by more than this share is worse, however uncertain the comparison."""
+TRIAL = 20_000
+"""Samples by which something is decided that few samples tell badly: to which networks are trained
+before the last stage, and by which a process noise is chosen."""
 WORTH_IT = 0.98
 """A larger structure has to bring the error below this part of the smaller one's to count as a
 gain, however significant it is."""
@@ -72,9 +77,12 @@ class Split:
         weights = np.concatenate([weights_of(e)[first:] for e, first in scored])
         return math.sqrt(mean_square(squares, weights))
 
-    def shortened(self, fitted: int, held: int) -> Split:
-        """About so many samples, a proportional part of every experiment."""
-        return replace(self, fitted=thinned(self.fitted, fitted), held=_shortened(self.held, held))
+    def shortened(self, samples: int) -> Split:
+        """About so many samples to fit, a proportional part of every experiment, and ten times as
+        many to judge by: a free run takes a tenth of the time of a fit, or less.
+        """
+        fitted, held = thinned(self.fitted, samples), _shortened(self.held, 10 * samples)
+        return replace(self, fitted=fitted, held=held)
 
 
 def _split(data: Dataset) -> Split | None:

@@ -27,6 +27,7 @@ from .folds import (
 )
 from .linear import is_misled, oe, raised
 from .task import (
+    SHARES,
     Progress,
     Provenance,
     Task,
@@ -41,9 +42,6 @@ from .task import (
 
 DECAYS = (1e-2, 1e-4)
 """Weight decays of the default network, the strongest first."""
-SHARE_OF_CHOICE = 0.4
-"""Share of a time budget for linear fits, or for a choice among structures; the rest is for the fit
-of the model to all data."""
 _LINEAR_FITS = "linear fits at which the network begins"
 
 
@@ -105,7 +103,7 @@ class Networks:
     def of(cls, task: Task) -> Networks:
         """The networks of a task, whose linear models are fitted here."""
         brief = replace(
-            task, progress=task.clock.limited(task.progress, SHARE_OF_CHOICE, _LINEAR_FITS)
+            task, progress=task.clock.limited(task.progress, SHARES.choice, _LINEAR_FITS)
         )
         try:
             linear = _linear(brief)
@@ -238,7 +236,7 @@ def _linear(task: Task) -> _core.LinearModel:
     try:
         best: _core.LinearModel = oe(task).core
     except KeyboardInterrupt as e:
-        if not task.clock.over(SHARE_OF_CHOICE, _LINEAR_FITS):
+        if not task.clock.over(SHARES.choice, _LINEAR_FITS):
             raise
         if not isinstance(e, Interrupted):
             return _core.fit_arx(arrays(task.data), **task.orders, offset=True)
@@ -253,7 +251,7 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
     orders = task.orders
     na, nb = orders["na"] - 1, orders["nb"] - 1
     part = later_part(task.data, task.validation)
-    if na < 1 or nb < 1 or part is None or task.clock.over(SHARE_OF_CHOICE, _LINEAR_FITS):
+    if na < 1 or nb < 1 or part is None or task.clock.over(SHARES.choice, _LINEAR_FITS):
         return linear
     learned = arrays(part.fitted)
     models = []
@@ -266,7 +264,7 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
             return linear
         except KeyboardInterrupt:
             # Ctrl-C, or the end of the linear fits' share of a time budget
-            if not task.clock.over(SHARE_OF_CHOICE, _LINEAR_FITS):
+            if not task.clock.over(SHARES.choice, _LINEAR_FITS):
                 raise
             return linear
         models.append(fit.model)
@@ -353,7 +351,7 @@ def _chosen(
     """
     if part is None:
         return structures[-1], None
-    progress = task.clock.limited(task.progress, SHARE_OF_CHOICE, _CHOICE)
+    progress = task.clock.limited(task.progress, SHARES.choice, _CHOICE)
     best = structures[0]
     kept: Fitted | None = None
     least: Errors | None = None
@@ -364,7 +362,7 @@ def _chosen(
         except FitError:
             return None
         if found.termination == "interrupted":
-            if kept is None and found.iterations and not task.clock.over(SHARE_OF_CHOICE, _CHOICE):
+            if kept is None and found.iterations and not task.clock.over(SHARES.choice, _CHOICE):
                 raise _Stopped(structure, found)
             raise KeyboardInterrupt
         errors = errors_of(free_runs(found.model, part), part)
@@ -384,7 +382,7 @@ def _chosen(
                 if ratio <= max(deviation, -math.log(WORTH_IT)):
                     best, kept = smaller, found[0]
     except KeyboardInterrupt:
-        if task.clock.over(SHARE_OF_CHOICE, _CHOICE):
+        if task.clock.over(SHARES.choice, _CHOICE):
             return best, kept
         if kept is None:
             raise
