@@ -36,11 +36,7 @@ SMALL: dict[str, Any] = {"nx": 1, "nk": 1, "hidden": 4, "starts": 2, "iterations
 
 
 def task(data: Dataset, **settings: Any) -> Task:
-    usual: dict[str, Any] = dict.fromkeys(("nk", "nx", "hidden", "output", "starts", "iterations"))
-    return Task(
-        data=data, validation=None, na=2, nb=2, seed=0, threads=2, progress=None,
-        **{**usual, **settings},
-    )  # fmt: skip
+    return Task(data, threads=2, **settings)
 
 
 def pool() -> Pool:
