@@ -31,14 +31,6 @@ class Integration:
     restoring: float
     driving: float
 
-    @property
-    def is_restored(self) -> bool:
-        """Whether the record refutes a pole at 1, at a level of 1 %: the critical value of the
-        regression with a line (Fuller, *Introduction to Statistical Time Series*, 1976, table
-        8.5.2).
-        """
-        return self.restoring > 3.96
-
 
 def integration(data: Dataset) -> Integration | None:
     """Test for a pole at 1 that an input drives; None where the record is too short or still."""
