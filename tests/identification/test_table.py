@@ -110,10 +110,7 @@ def test_a_network_has_to_halve_the_error_to_need_the_input_of_the_same_sample(
 
 
 def _task(data: Dataset) -> Task:
-    usual: dict[str, Any] = dict.fromkeys(("nk", "nx", "hidden", "output", "starts", "iterations"))
-    return Task(
-        data=data, validation=None, na=2, nb=2, seed=0, threads=1, progress=None, **usual
-    )  # fmt: skip
+    return Task(data)
 
 
 # --- weights --------------------------------------------------------------------------------------
@@ -181,6 +178,26 @@ def test_a_bent_plant_gets_networks_and_their_weights_are_told() -> None:
     assert len(verdict["blocks"]) == COUNT
     assert min(verdict["blocks"]) <= verdict["fit_percent"] <= max(verdict["blocks"])
     assert "block by block" in verdict["text"]
+
+
+@pytest.mark.parametrize(
+    ("pole", "sizes"),
+    [(0.9, [(2, 4)]), (1.0, [(2, 2), (2, 4), (3, 2), (3, 4)])],
+)
+def test_several_integrators_are_tried_where_the_record_shows_one_and_one_else(
+    pole: float, sizes: list[tuple[int, int]]
+) -> None:
+    u = np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, 150), 8)
+    y = np.zeros(len(u))
+    for k in range(1, len(u)):
+        y[k] = pole * y[k - 1] + 0.1 * u[k - 1]
+    y += 0.01 * np.random.default_rng(1).normal(size=len(u))
+    task = _task(Dataset.from_arrays(u, y, 0.01))
+    folds = blocked(task.data)
+    tried = Table(task, Blocks(task.data, folds), Pool(1, Clock(None), None))
+    tried.linear.search(None)
+    found = tried._likely(tried._outputs())
+    assert [(s.nx, s.hidden) for s in found if s.integrator] == sizes
 
 
 def test_one_start_is_one_network() -> None:

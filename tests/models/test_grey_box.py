@@ -77,6 +77,9 @@ def test_units_that_are_asked_for_are_taken() -> None:
     assert model.orders["hidden"] == 2
     assert model.parameter_names[-8:] == tuple(f"{w}[{i}]" for i in (0, 1) for w in "bpqc")
     assert len(model.parameter_names) == len(model.theta)
+    # judged by the same equations and as many units without the last part of the record
+    assert "of data not trained on" in model.training["verdict"]["text"]
+    assert [t["hidden"] for t in model.training["tried"]] == [0, 2]
 
 
 def test_the_plant_of_a_loop_moves_as_the_free_run_does() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -190,7 +191,7 @@ def test_an_interrupt_of_the_choice_hands_over_the_best_so_far(tmp_path: Path) -
 def test_a_budget_that_ends_the_choice_leaves_time_for_a_model(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(lagged, "SHARE_OF_CHOICE", 1e-9)
+    monkeypatch.setattr(lagged, "SHARES", replace(lagged.SHARES, choice=1e-9))
     data = _plant(800, 14, before=_band)
     model = sewfast.identify(data, model="hammerstein-wiener", time_budget=600.0)
     assert model.training["tried"] == []

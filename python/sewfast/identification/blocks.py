@@ -19,6 +19,7 @@ from ..errors import DataError, FitError
 from ..models import Model
 from ..models.base import EnsembleCore
 from .folds import (
+    AS_GOOD,
     ERROR_BLOCKS,
     LEAST_HELD_OUT,
     Errors,
@@ -44,12 +45,14 @@ ENOUGH = 5_000
 spread over the record. Short stretches resemble what is beside them: of records with few events
 long blocks tell more (`bldc_cigan`: error on its last part 12.3 with two stretches of 625 samples a
 block, 9.9 with blocks of 1,250, 9.2 of the best linear model)."""
-AS_GOOD, BY_LUCK = 0.05, 10.0
+BY_LUCK = 10.0
 """Fewer structures suffice if their error is larger by at most a standard error, or by this number
-over that of samples, up to the first bound: the best of dozens of structures leads by luck."""
+over that of samples, up to `AS_GOOD`: the best of dozens of structures leads by luck."""
 FAR = 2.0
 """A structure with an error of more than this many times the least has no part in any weights: the
-errors of bad models can cancel on some blocks, but a median of members does not cancel them."""
+errors of bad models can cancel on some blocks, but a median of members does not cancel them. A
+network with nk = 0 stays only if those of its size are as far behind: it is no plant for a loop,
+and a smoothed speed anticipates the input a little."""
 
 
 def blocked(

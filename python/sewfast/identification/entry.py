@@ -36,7 +36,7 @@ from .folds import (
 )
 from .outputs import OUTPUTS
 from .rest import for_loops
-from .task import Clock, Progress, Provenance, Task, with_provenance
+from .task import SHARES, Clock, Progress, Provenance, Task, with_provenance
 from .training import Structure
 
 _KINDS: dict[str, Callable[[Task], Model]] = {
@@ -50,13 +50,10 @@ _KINDS: dict[str, Callable[[Task], Model]] = {
     "paper": lagged.paper,
     **{cls.kind: lagged.identified_as(cls) for cls in STRUCTURED},
 }
-SHARE_OF_FIT = 0.9
-"""Share of a time budget for the fits; the rest is for the evidence stored with the model."""
 _FIT = "iterations of the fit"
 NETWORKS = ("neural_oe", "neural_ss")
 _SEARCHED = ("auto", "neural_ss")
 """Kinds without given lags: their structure is searched."""
-_LAGS = 2
 _PAPER = {"na": 2, "nb": 2, "nk": 1, "hidden": 8}
 
 
@@ -201,8 +198,7 @@ def identify(
     task = Task(
         data=_in_effect(data, "data"),
         validation=None if validation is None else _in_effect(validation, "validation"),
-        na=_LAGS if na is None else na,
-        nb=_LAGS if nb is None else nb,
+        **{name: n for name, n in (("na", na), ("nb", nb)) if n is not None},
         nk=nk,
         nx=nx,
         hidden=hidden,
@@ -211,7 +207,7 @@ def identify(
         seed=seed,
         iterations=iterations,
         threads=available() if threads is None else threads,
-        progress=progress if kind in _SEARCHED else clock.limited(progress, SHARE_OF_FIT, _FIT),
+        progress=progress if kind in _SEARCHED else clock.limited(progress, SHARES.fit, _FIT),
         workers=workers,
         clock=clock,
         select=select,
@@ -262,10 +258,8 @@ def seeded(
     linear fits and each network. Raises the errors of `identify`.
     """
     task = Task(
-        data=_in_effect(data, "data"), validation=None, na=_LAGS, nb=_LAGS, nk=None, nx=None,
-        hidden=None, output=None, starts=1, seed=0, iterations=iterations, threads=1,
-        progress=progress, select=False,
-    )  # fmt: skip
+        _in_effect(data, "data"), starts=1, iterations=iterations, progress=progress, select=False
+    )
     _require_data(task, "neural_oe")
     networks = lagged.Networks.of(task)
 
@@ -299,7 +293,7 @@ def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
     try:
         return identified(task)
     except Interrupted as e:
-        if not task.clock.over(SHARE_OF_FIT, _FIT):
+        if not task.clock.over(SHARES.fit, _FIT):
             raise
         # without a step these are still their linear start
         begins_linear = e.best.kind in (*NETWORKS, *(cls.kind for cls in STRUCTURED))
@@ -308,7 +302,7 @@ def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
         best: Model = e.best
         return best
     except KeyboardInterrupt:
-        if not task.clock.over(SHARE_OF_FIT, _FIT):
+        if not task.clock.over(SHARES.fit, _FIT):
             raise
         raise too_short from None
 
@@ -365,8 +359,9 @@ def _judged_by(model: Model, faults: Sequence[Fault]) -> Model:
 
 def _verdict(model: Model, task: Task) -> Provenance:
     """The verdict on a kind requested by name, on validation data; of a linear model else on
-    blocks of the record, each by a fit to the rest. Else it is that on the training data, and a
-    linear model, which a short record hardly proves wrong, is "fair" at best.
+    blocks of the record, each by a fit to the rest. (The others have judged themselves by what they
+    held out.) Else it is that on the training data, which hardly prove a model wrong: "fair" at
+    best, unless it is a given model that was trained further.
     """
     data, validation = task.data, task.validation
     is_linear, trial = model.kind in ("arx", "iv", "oe"), None
@@ -380,13 +375,14 @@ def _verdict(model: Model, task: Task) -> Provenance:
         trial = unseen(model, alike, _KINDS[model.kind])
         where = where if trial is None else UNSEEN_DATA
     found = verdict(model, data, trial or tried(model, part), where=where)
-    if is_linear and where != UNSEEN_DATA and found["grade"] == "good":
+    is_seen = where != UNSEEN_DATA and not model.training.get("trained_further")
+    if is_seen and found["grade"] == "good":
         found["grade"] = "fair"
         measured = found["text"].partition(": ")[2]
         found["text"] = (
-            f"{TEXTS['fair']}: nothing of the record can be held out to judge by; {measured}"
+            f"{TEXTS['fair']}: nothing of the record was held out to judge by; {measured}"
         )
-        found["next"] = what_to_record(data)
+        found["next"] = ["give validation data", *what_to_record(data)]
     if is_linear and found["grade"] != "useless":
         slowest, longest = linear.time_constant(model.core), max(len(e) for e in data.experiments)
         # a real integrator is not a superfluous pole

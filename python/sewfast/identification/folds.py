@@ -27,7 +27,7 @@ from ..validation import (
     scored_runs,
     without_input,
 )
-from .task import Provenance, sources
+from .task import Provenance, sources, with_provenance
 
 SHARE = 0.2
 """Part of every experiment that is held out, at its end.
@@ -37,6 +37,11 @@ memorises the record; a later part is the honest test if there are many data.
 """
 LEAST_HELD_OUT = 2 * INIT
 """Samples of a held-out part, and of what is left to fit."""
+AS_GOOD = 0.05
+"""An error that is larger by more than this share is worse, however uncertain the comparison."""
+TRIAL = 20_000
+"""Samples by which something is decided that few samples tell badly: to which networks are trained
+before the last stage, and by which a process noise is chosen."""
 WORTH_IT = 0.98
 """A larger structure has to bring the error below this part of the smaller one's to count as a
 gain, however significant it is."""
@@ -72,9 +77,12 @@ class Split:
         weights = np.concatenate([weights_of(e)[first:] for e, first in scored])
         return math.sqrt(mean_square(squares, weights))
 
-    def shortened(self, fitted: int, held: int) -> Split:
-        """About so many samples, a proportional part of every experiment."""
-        return replace(self, fitted=thinned(self.fitted, fitted), held=_shortened(self.held, held))
+    def shortened(self, samples: int) -> Split:
+        """About so many samples to fit, a proportional part of every experiment, and ten times as
+        many to judge by: a free run takes a tenth of the time of a fit, or less.
+        """
+        fitted, held = thinned(self.fitted, samples), _shortened(self.held, 10 * samples)
+        return replace(self, fitted=fitted, held=held)
 
 
 def _split(data: Dataset) -> Split | None:
@@ -366,6 +374,15 @@ def verdict(model: Model, data: Dataset, trial: Trial, where: str = UNSEEN_DATA)
         "text": text,
         "next": todo,
     }
+
+
+def judged_without(model: Model, without: Model, data: Dataset, part: Split) -> Model:
+    """The model of some data with the verdict that one `without` a part of them gets on that part.
+    Validation data judge the model itself, later.
+    """
+    if part.is_given or doubling(model) is not None:
+        return model
+    return with_provenance(model, {"verdict": verdict(model, data, tried(without, part))})
 
 
 def unstable_verdict(model: Model, part: Split, where: str) -> Provenance:

@@ -22,22 +22,28 @@ from ..motorfit.estimation import Normal, minimised
 from ..motorfit.joint import changed, weights
 from ..progress import TimeUp
 from ..units import is_position, revolutions_per_second
-from .folds import WORTH_IT, Errors, Split, compared, errors_of, free_runs, later_part
-from .task import Look, Pool, Provenance, R, Task, finite
+from .folds import (
+    TRIAL,
+    WORTH_IT,
+    Errors,
+    Split,
+    compared,
+    errors_of,
+    free_runs,
+    judged_without,
+    later_part,
+)
+from .task import HIDDEN, SHARES, Look, Pool, Provenance, R, Task, finite
 
 TERMS = ("lag", "delay", "coulomb", "offset", "drop", "stribeck", "limit")
 IF_CLEAR = ("sag",)
 """Terms of a motor without effects over the turn."""
-HIDDEN = 4
-"""Hidden units of the network that is tried."""
 STARTS = 2
 """Random starts of the network; the best one is kept."""
 EXCERPT, POLISHING = 8_000, 10
 """Samples on which the starts are trained, and iterations of the best one on all samples."""
 SEARCHED, MOST_FITTED = 10_000, 100_000
 """Samples to which a motor is fitted during a search of structures, and at its end."""
-ENOUGH = 1.0
-"""Squared distance to the minimum in standard errors at which the descent ends."""
 ARGUMENTS, OUTPUTS = 3.0, 0.1
 """Prior standard deviations of the weights, in units of the scales. They keep a network small where
 the record gives no information, and count as much as a single residual."""
@@ -47,8 +53,6 @@ NOISES = tuple(10.0**e for e in range(-10, -1))
 """Process noises to try, in squares of the scales."""
 UNEXPLAINED = 0.01
 """Most of the variance that the equations of a joint may leave, to rule out an unstable plant."""
-PROBED = 20_000
-"""Samples used to choose the process noise."""
 
 
 def grey_box(task: Task) -> Model:
@@ -61,7 +65,7 @@ def grey_box(task: Task) -> Model:
         )  # fmt: skip
     motors = Motors(task.seed, task.iterations_or_usual)
     hidden, tried = task.hidden or 0, list[Provenance]()
-    is_open = task.hidden is None and task.select
+    part = later_part(task.data, task.validation) if task.select else None
 
     def look(*_: object) -> None:
         if task.progress is not None:
@@ -69,12 +73,12 @@ def grey_box(task: Task) -> Model:
 
     found: MotorCandidate | None = None
     try:
-        if is_open and (part := later_part(task.data, task.validation)) is not None:
+        if part is not None:
             found = motors.alone(part, look)
             tried = [found.held_out()]
-            more = motors.beside(found, part, look)
+            more = motors.beside(found, part, look, task.hidden or HIDDEN)
             tried.append(more.held_out())
-            found = more if _is_better(more, found) else found
+            found = more if task.hidden or _is_better(more, found) else found
             hidden = found.hidden
         core = motors.fitted(task.data, hidden, look)
     except TimeUp:
@@ -90,7 +94,10 @@ def grey_box(task: Task) -> Model:
         "structure": {"hidden": hidden},
         "tried": tried,
     }
-    return task.model(GreyBox, core, known)
+    model = task.model(GreyBox, core, known)
+    if part is None or found is None:
+        return model
+    return judged_without(model, task.model(GreyBox, found.core, {}), task.data, part)
 
 
 def require_equations(data: Dataset) -> None:
@@ -115,7 +122,7 @@ def is_joint(task: Task) -> bool:
     data = thinned(task.data, SEARCHED)
     if data.n_inputs != 1 or not (is_position(data.output_unit) or not data.output_unit):
         return False
-    look = task.clock.limited(task.progress, 0.3, "the equations of a joint")
+    look = task.clock.limited(task.progress, SHARES.joint, "the equations of a joint")
     try:
         fit = joint.fitted(data, _at_any_time(look), integrates=True)
     except (DataError, FitError, SettingError, TimeUp):
@@ -180,10 +187,10 @@ class Motors:
         return joint.fitted(data, _at_any_time(look), integrates=not inside).core
 
     def beside(
-        self, motor: MotorCandidate, part: Split, look: Look | None = None
+        self, motor: MotorCandidate, part: Split, look: Look | None = None, hidden: int = HIDDEN
     ) -> MotorCandidate:
         """The same motor with a network."""
-        return _judged(self._with_network(motor.core, part.fitted, HIDDEN, look), part)
+        return _judged(self._with_network(motor.core, part.fitted, hidden, look), part)
 
     def candidate(self, part: Split, pool: Pool, until: float | None) -> MotorCandidate | None:
         """A motor fitted to a part; None if the data are not those of a motor.
@@ -340,7 +347,7 @@ def trained_from(
 
     count = sum(int(np.isfinite(e.y).sum()) for e in data.experiments)
     bounds = (low, np.full(len(start), np.inf))
-    found = minimised(normal, cost, start, bounds, count, enough=ENOUGH, iterations=iterations)
+    found = minimised(normal, cost, start, bounds, count, iterations=iterations)
     best = changed(core, theta=found.x)
     residual = 2.0 * cost_of(best, data)
     return changed(best, residual_variance=max(residual, 1e-300))
@@ -374,7 +381,7 @@ def _with_noise(core: _core.GreyBox, data: Dataset) -> _core.GreyBox:
     ]
 
     def one_step(noise: float) -> float:
-        own, total, left = changed(core, process_noise=noise), 0.0, PROBED
+        own, total, left = changed(core, process_noise=noise), 0.0, TRIAL
         for e, state in part:
             n = min(left, len(e))
             left -= n

@@ -14,9 +14,20 @@ from ..dataset import Dataset, Experiment
 from ..errors import FitError, Interrupted
 from ..models import LinearOE, Model, NeuralOE
 from ..models.base import Fitted, StructuredModel
-from .folds import LEAST_HELD_OUT, WORTH_IT, Errors, compared, errors_of, free_runs, later_part
+from .folds import (
+    LEAST_HELD_OUT,
+    WORTH_IT,
+    Errors,
+    Split,
+    compared,
+    errors_of,
+    free_runs,
+    judged_without,
+    later_part,
+)
 from .linear import is_misled, oe, raised
 from .task import (
+    SHARES,
     Progress,
     Provenance,
     Task,
@@ -31,9 +42,6 @@ from .task import (
 
 DECAYS = (1e-2, 1e-4)
 """Weight decays of the default network, the strongest first."""
-SHARE_OF_CHOICE = 0.4
-"""Share of a time budget for linear fits, or for a choice among structures; the rest is for the fit
-of the model to all data."""
 _LINEAR_FITS = "linear fits at which the network begins"
 
 
@@ -95,7 +103,7 @@ class Networks:
     def of(cls, task: Task) -> Networks:
         """The networks of a task, whose linear models are fitted here."""
         brief = replace(
-            task, progress=task.clock.limited(task.progress, SHARE_OF_CHOICE, _LINEAR_FITS)
+            task, progress=task.clock.limited(task.progress, SHARES.choice, _LINEAR_FITS)
         )
         try:
             linear = _linear(brief)
@@ -111,16 +119,16 @@ class Networks:
 
     def selected(self) -> Model:
         """The network that held-out data choose, compared there with the linear model."""
-        data, held = self.task.data, self.task.validation
+        fitted, held = self.task.data, self.task.validation
         if held is None:
             lag = max(self.task.na, self.task.orders["nk"] + self.task.nb)
-            data, held = _with_blocks_held_out(data, lag)
-        network, decays = self._best(data, held)
+            fitted, held = _with_blocks_held_out(fitted, lag)
+        network, decays = self._best(fitted, held)
         choice = self._compared(network, held)
-        known: Provenance = {"samples_fitted": len(data), **decays}
+        known: Provenance = {"samples_fitted": len(fitted), **decays}
         if len(network.trace) < 2 or _is_still_linear(choice):
             # a strong decay would pull the network back to its linear part
-            network = self._trained(self.task.data, None, DECAYS[-1])
+            network, fitted = self._trained(self.task.data, None, DECAYS[-1]), self.task.data
             # J is in scaled units: a linear model without error needs no step
             # J in scaled units below which a linear model explains everything
             if len(network.trace) < 2 and network.cost > 1e-6:
@@ -135,7 +143,10 @@ class Networks:
             share = f"below {100 * WORTH_IT:.0f} % of its error"
             bound = f"not credibly better than the linear model ({share})"
             known["notes"] = [f"{bound}: consider model oe"]
-        return self._model(network, known)
+        model = self._model(network, known)
+        if held is None or fitted is self.task.data:
+            return model
+        return judged_without(model, model, self.task.data, Split(fitted, held))
 
     def _trained(self, data: Dataset, held: Dataset | None, decay: float) -> _core.NeuralFit:
         """A network of some of the data, stopped by others if there are any."""
@@ -225,7 +236,7 @@ def _linear(task: Task) -> _core.LinearModel:
     try:
         best: _core.LinearModel = oe(task).core
     except KeyboardInterrupt as e:
-        if not task.clock.over(SHARE_OF_CHOICE, _LINEAR_FITS):
+        if not task.clock.over(SHARES.choice, _LINEAR_FITS):
             raise
         if not isinstance(e, Interrupted):
             return _core.fit_arx(arrays(task.data), **task.orders, offset=True)
@@ -240,7 +251,7 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
     orders = task.orders
     na, nb = orders["na"] - 1, orders["nb"] - 1
     part = later_part(task.data, task.validation)
-    if na < 1 or nb < 1 or part is None or task.clock.over(SHARE_OF_CHOICE, _LINEAR_FITS):
+    if na < 1 or nb < 1 or part is None or task.clock.over(SHARES.choice, _LINEAR_FITS):
         return linear
     learned = arrays(part.fitted)
     models = []
@@ -253,7 +264,7 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
             return linear
         except KeyboardInterrupt:
             # Ctrl-C, or the end of the linear fits' share of a time budget
-            if not task.clock.over(SHARE_OF_CHOICE, _LINEAR_FITS):
+            if not task.clock.over(SHARES.choice, _LINEAR_FITS):
                 raise
             return linear
         models.append(fit.model)
@@ -313,29 +324,34 @@ def identified_as(cls: type[StructuredModel]) -> Callable[[Task], Model]:
             known = fit_provenance(fit) | note | {"structure": dict(structure), "tried": tried}
             return task.model(cls, fit.model, known)
 
+        part = later_part(task.data, task.validation)
         try:
-            chosen = _chosen(task, structures, fit, tried)
+            chosen, without = _chosen(task, part, structures, fit, tried)
         except _Stopped as stopped:
             raise Interrupted(model(stopped.structure, stopped.fit)) from None
-        return completed(model(chosen, fit(task.data, chosen, task.progress)))
+        found = completed(model(chosen, fit(task.data, chosen, task.progress)))
+        if part is None or without is None:
+            return found
+        return judged_without(found, model(chosen, without), task.data, part)
 
     return identified
 
 
 def _chosen(
     task: Task,
+    part: Split | None,
     structures: tuple[Mapping[str, int], ...],
     fit: Callable[[Dataset, Mapping[str, int], Progress | None], Fitted],
     tried: list[Provenance],
-) -> Mapping[str, int]:
-    """The structure with the least held-out error, or a simpler one that does about as well.
+) -> tuple[Mapping[str, int], Fitted | None]:
+    """The structure with the least held-out error, or a simpler one that does about as well, and
+    its fit to the rest of the data.
     Unless the order was given, one pole less is tried too: a superfluous pole follows trends and
     spoils the steady gain. If the share of a time budget is used up, it is the best so far.
     """
-    part = later_part(task.data, task.validation)
-    if len(structures) == 1 or part is None:
-        return structures[-1]
-    progress = task.clock.limited(task.progress, SHARE_OF_CHOICE, _CHOICE)
+    if part is None:
+        return structures[-1], None
+    progress = task.clock.limited(task.progress, SHARES.choice, _CHOICE)
     best = structures[0]
     kept: Fitted | None = None
     least: Errors | None = None
@@ -346,7 +362,7 @@ def _chosen(
         except FitError:
             return None
         if found.termination == "interrupted":
-            if kept is None and found.iterations and not task.clock.over(SHARE_OF_CHOICE, _CHOICE):
+            if kept is None and found.iterations and not task.clock.over(SHARES.choice, _CHOICE):
                 raise _Stopped(structure, found)
             raise KeyboardInterrupt
         errors = errors_of(free_runs(found.model, part), part)
@@ -363,11 +379,12 @@ def _chosen(
             found = tested(smaller)
             if found:
                 ratio, deviation = compared(found[1], least)
-                best = smaller if ratio <= max(deviation, -math.log(WORTH_IT)) else best
+                if ratio <= max(deviation, -math.log(WORTH_IT)):
+                    best, kept = smaller, found[0]
     except KeyboardInterrupt:
-        if task.clock.over(SHARE_OF_CHOICE, _CHOICE):
-            return best
+        if task.clock.over(SHARES.choice, _CHOICE):
+            return best, kept
         if kept is None:
             raise
         raise _Stopped(best, kept) from None
-    return best
+    return best, kept

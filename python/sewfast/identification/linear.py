@@ -13,12 +13,14 @@ import numpy as np
 from .. import _core
 from ..dataset import Dataset, Diagnosis
 from ..dataset.experiment import mean_square, weights_of
+from ..dataset.pieces import thinned
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted
 from ..models import ARX, IV, LinearOE, Model
 from ..validation import doubling
 from .delays import delay, reach
 from .folds import (
+    AS_GOOD,
     RUNAWAY,
     UNSEEN_DATA,
     WORTH_IT,
@@ -33,6 +35,7 @@ from .folds import (
     with_run_up,
 )
 from .task import (
+    SHARES,
     Look,
     Pool,
     Provenance,
@@ -97,7 +100,7 @@ def held_by_a_loop(task: Task) -> Model | None:
     The verdict is that of a fit to the earlier part of the record, on the rest.
     """
 
-    look = task.clock.limited(task.progress, 0.9, "larger orders of an unstable plant")
+    look = task.clock.limited(task.progress, SHARES.fit, "larger orders of an unstable plant")
 
     def plant(data: Dataset) -> Model | None:
         fit = _core.fit_innovations(
@@ -146,8 +149,6 @@ UNSEEN = 3.0
 """Time constants of more than this many times the longest experiment are trends, not dynamics."""
 EARLIER = 0.7
 """Part of every experiment to fit to when two orders are compared on the rest."""
-AS_GOOD = 1.05
-"""Ratio of the smaller order's error to the larger one's up to which the smaller one is enough."""
 
 
 def short(task: Task, reason: str) -> Model:
@@ -167,8 +168,8 @@ def short(task: Task, reason: str) -> Model:
                 other is not None
                 and time_constant(other.model) <= longest
                 and (
-                    other.cost <= AS_GOOD**2 * model.training["cost"]
-                    or _later(data, smaller).rmse <= AS_GOOD * _later(data, own).rmse
+                    other.cost <= (1.0 + AS_GOOD) ** 2 * model.training["cost"]
+                    or _later(data, smaller).rmse <= (1.0 + AS_GOOD) * _later(data, own).rmse
                 )
             ):
                 model = task.model(LinearOE, other.model, linear_provenance(other))
@@ -213,15 +214,13 @@ def time_constant(model: _core.LinearModel) -> float:
 # no motor has, and its steady gain is wrong.
 
 
-ORDERS = (1, 2, 3, 4, 5, 6, 7, 8)
+ORDERS, SMALL = (1, 2, 3, 4, 5, 6, 7, 8), 3
+"""Orders that are tried, and the largest of them with a delay: large ones mimic it with poles."""
 DELAYS = (2, 3, 4, 5, 6)
 """Delays tried besides one sample, unless a delay is given."""
-LATE_ORDERS = (1, 2, 3)
-"""Orders tried with an estimated dead time beyond these delays."""
 SAMPLES_OF_DELAY = 2_000
 """Samples for that estimate."""
 SAMPLES = 6_000
-HELD_OUT = 10 * SAMPLES
 """Samples of a fit that is only used for a decision: blocks spread over the record."""
 ITERATIONS = 60
 PATIENCE = 2
@@ -277,7 +276,7 @@ class LinearTable:
     candidates: dict[tuple[int, int], LinearCandidate] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._excerpts = [f.shortened(SAMPLES, HELD_OUT) for f in self.folds]
+        self._excerpts = [f.shortened(SAMPLES) for f in self.folds]
 
     @property
     def nk(self) -> int:
@@ -313,7 +312,7 @@ class LinearTable:
                 break
         if self.given_nk is None and self.candidates:
             # an apparent order can be a delay, so one order less is tried as well
-            small = min(self.choice.order, 3)
+            small = min(self.choice.order, SMALL)
             self.add(((o, nk) for nk in DELAYS for o in (small - 1, small) if o > 0), until)
 
     @staticmethod
@@ -325,13 +324,13 @@ class LinearTable:
         Large orders mimic a dead time with poles that the drive does not have. The estimate can be
         late by a sample.
         """
-        data = self.folds[0].shortened(SAMPLES_OF_DELAY, SAMPLES_OF_DELAY).fitted
+        data = thinned(self.folds[0].fitted, SAMPLES_OF_DELAY)
         try:
             found = delay(data, longest=reach(data)).nk
         except (DataError, FitError):
             return []
         nks = (found - 1, found) if found > max(DELAYS) else ()
-        return [(o, nk) for o in LATE_ORDERS for nk in nks]
+        return [(o, nk) for o in ORDERS[:SMALL] for nk in nks]
 
     def add(self, wanted: Iterable[tuple[int, int]], until: float | None) -> None:
         """Fit these orders and delays on every fold."""

@@ -28,14 +28,12 @@ from .blocks import Blocks, Mixture, Row, blocked, combined
 from .folds import LEAST_HELD_OUT, TEXTS, WORTH_IT, Trial, apart, verdict, what_to_record
 from .grey_box import or_none
 from .linear import LinearCandidate, linear_provenance, short
-from .table import SHARE_OF_REFIT, TRAINING, Table
-from .task import Pool, Provenance, Stopped, Task, finite, with_provenance, wrap
+from .table import BRIEF, TRAINING, Table
+from .task import SHARES, Pool, Provenance, Stopped, Task, finite, with_provenance, wrap
 from .training import Request, Structure, counting, guarded, train
 
 REFIT_LOST, DIAGNOSIS = "the fit to all samples", "the diagnosis of the record"
 """What is lost if a budget ends before these."""
-REFIT = 15
-"""Iterations on all data of a network that was trained without a block."""
 MOST_MEMBERS = 15
 """Members of an ensemble: a controller is tuned on each, and a median of more is hardly better."""
 _CLASSES: dict[type, type[Model]] = {
@@ -209,9 +207,9 @@ class Ending:
         given = of_folds[:most]
         if not most or is_interrupted or self.table.folds[0].is_given:
             return given
-        if self.clock.over(SHARE_OF_REFIT, REFIT_LOST):
+        if self.clock.over(SHARES.refit, REFIT_LOST):
             return given
-        until = self.clock.until(SHARE_OF_REFIT)
+        until = self.clock.until(SHARES.refit)
         if row.kind == "oe":
             options = self.task.fit_options(
                 na=row.found.order, nb=row.found.order + 1, nk=row.found.nk
@@ -235,7 +233,7 @@ class Ending:
             return able[:most]
         linear = self.table.start_of(row.found, 0) if row.kind == "neural_oe" else None
         request = Request(
-            row.found, self.task.data, None, min(REFIT, self.task.iterations or REFIT), linear,
+            row.found, self.task.data, None, min(BRIEF, self.task.iterations or BRIEF), linear,
             initial=[m for m, _ in given],
         )  # fmt: skip
         found = train(
@@ -338,7 +336,7 @@ class Ending:
 
     def _diagnosed(self) -> Diagnosis | None:
         is_known = "diagnosis" in self.table.__dict__ or not self.clock.over(
-            SHARE_OF_REFIT, DIAGNOSIS
+            SHARES.refit, DIAGNOSIS
         )
         return self.table.diagnosis if is_known else None
 

@@ -23,8 +23,6 @@ from .delays import DelayEstimate, delay, reach
 
 Progress: TypeAlias = Callable[[int, int, float], object]
 
-SHOWN = 12
-
 
 @dataclass(frozen=True)
 class Structure:
@@ -135,10 +133,14 @@ class OrderTable:
         if ax.lines:
             legend(ax)
 
+    def _shown(self, most: int = 12) -> list[Structure]:
+        """The best structures, with the choice."""
+        ranked = sorted(self.rows, key=lambda r: r.free_run)[:most]
+        return ranked if self.choice in ranked else [*ranked[:-1], self.choice]
+
     def _repr_html_(self) -> str:
         """A table for a notebook: the best structures, the choice in bold."""
-        ranked = sorted(self.rows, key=lambda r: r.free_run)[:SHOWN]
-        shown = ranked if self.choice in ranked else [*ranked[:-1], self.choice]
+        shown = self._shown()
         rows = tuple(
             (f"{r.na} {r.nb} {r.nk}", *(significant(v, 5) for v in _numbers(r))) for r in shown
         )
@@ -149,8 +151,7 @@ class OrderTable:
 
     def __str__(self) -> str:
         head = " na  nb  nk   free run   one step        AIC        BIC        FPE  Lipschitz"
-        ranked = sorted(self.rows, key=lambda r: r.free_run)[:SHOWN]
-        shown = ranked if self.choice in ranked else [*ranked[:-1], self.choice]
+        shown = self._shown()
         lines = [_line(r, "<- choice" if r is self.choice else "") for r in shown]
         left = len(self.rows) - len(shown)
         more = [f"    and {left} more, see `rows`"] if left else []

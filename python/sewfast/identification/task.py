@@ -33,6 +33,32 @@ CLOSING = 0.3
 """Processor time that is kept for verdict and evidence [s]; the evidence takes .25 s or more."""
 
 
+HIDDEN = 4
+"""Hidden units of the first networks that are tried, alone or beside a motor."""
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Parts of a time budget by which work must be finished. A fit that cannot be finished is worth
+    nothing, so that each of them leaves time for what follows: `linear` is for linear models but
+    the smallest, `joint` for the equations of a joint and `choice` for one among structures.
+    `search`, `networks` trained to the end and `refit` to everything follow each other, each before
+    the `guard` of its own; a kind by name has its `fit`. The rest is for verdict and evidence.
+    """
+
+    linear: float = 0.12
+    joint: float = 0.3
+    choice: float = 0.4
+    search: float = 0.7
+    networks: float = 0.87
+    fit: float = 0.9
+    refit: float = 0.94
+    guard: float = 0.95
+
+
+SHARES = Shares()
+
+
 class Clock:
     """Time since it was created or began anew, and a budget [s]; without one it never runs out.
     `lost` lists the work that the budget cut short, in words: the result then depends on the
@@ -222,21 +248,21 @@ Pairs: TypeAlias = list[tuple[FloatArray, ...]]
 
 @dataclass(frozen=True)
 class Task:
-    """One identification: training data, validation data, and settings (None: the default)."""
+    """One identification: training data, validation data, and settings (None: by the kind)."""
 
     data: Dataset
-    validation: Dataset | None
-    na: int
-    nb: int
-    nk: int | None
-    nx: int | None
-    hidden: int | None
-    output: str | None
-    starts: int | None
-    seed: int
-    iterations: int | None
-    threads: int
-    progress: Progress | None
+    validation: Dataset | None = None
+    na: int = 2
+    nb: int = 2
+    nk: int | None = None
+    nx: int | None = None
+    hidden: int | None = None
+    output: str | None = None
+    starts: int | None = None
+    seed: int = 0
+    iterations: int | None = None
+    threads: int = 1
+    progress: Progress | None = None
     workers: Workers | None = None
     select: bool = True
     is_order_given: bool = False

@@ -21,7 +21,7 @@ from ..errors import FitError
 from ..progress import TimeUp
 from ..threads import Workers, spread
 from .outputs import LINEAR, Output, scale_of
-from .task import Look, Pairs, Pool, Provenance, Stopped, arrays
+from .task import SHARES, Look, Pairs, Pool, Provenance, Stopped, arrays
 
 Network: TypeAlias = _core.NeuralSS | _core.NeuralOE
 
@@ -236,8 +236,7 @@ def guarded(
         return _core.guard(start.model, data, linear=bounds)
 
     late = "not asked within the time budget"
-    # part of a time budget by which the guard must be finished
-    until = pool.clock.until(0.95)
+    until = pool.clock.until(SHARES.guard)
     faults = (
         late if f is None else f
         for f in pool.map(fault, flat, until=until, what="the guard of networks")

@@ -91,8 +91,8 @@ def minimised(
     bounds: tuple[FloatArray, FloatArray],
     count: int,
     *,
-    enough: float,
     iterations: int,
+    enough: float = 1.0,
 ) -> Minimum:
     """Find the least-squares solution near a start (n,), within the bounds, both (n,).
     A `cost` that is not finite rejects a trial. The mean square of the `count` residuals is the
