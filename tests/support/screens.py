@@ -178,7 +178,7 @@ def states(browser: Any, folder: Path) -> Iterator[str]:
         yield "tune"
         at("noise").click()
         at("knob-feedforward-value").click()
-        until(lambda: "(" in at("cost").text and not_old(), "the feedforward")
+        until(lambda: "below" in at("cost").text and not_old(), "the feedforward")
         yield "tune-feedforward"
         at("knob-Kp").send_keys("\ue012" * 6)
         browser.execute_script("document.getElementById('evaluations').value = 200")
@@ -203,9 +203,9 @@ def states(browser: Any, folder: Path) -> Iterator[str]:
         browser.refresh()
         until(lambda: at("cost").text.startswith("cost"), "the cost again")
         press("search")
-        until(lambda: at("tune-progress").text.startswith("found"), "a search")
+        until(lambda: "Found" in at("tune-progress").text, "a search")
         press("save")
-        until(lambda: "(-" in at("cost").text, "the cost of what was found")
+        until(lambda: "below" in at("cost").text and not_old(), "the cost of what was found")
         yield "tune-searched"
         step("data")
         yield "data"

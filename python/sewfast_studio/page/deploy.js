@@ -15,6 +15,9 @@ on("state", s => {
   mark("deploy", s.controllers.length ? `${s.controllers.length} saved` : "nothing yet", s.controllers.length ? "good" : "");
 });
 
+/** Once there is a report, the way on is to read it. */
+function next(on) { $("report").classList.toggle("primary", !on); $("report-link").hidden = !on; $("report-link").classList.toggle("primary", on); }
+
 function show() {
   const name = $("deploy-controller").value, quoted = /^[\w./-]+$/.test(name) ? name : `'${name.replaceAll("'", "'\\''")}'`;
   $("deploy-copy").replaceChildren();
@@ -24,11 +27,11 @@ function show() {
 }
 $("deploy-controller").onchange = show;
 $("report").onclick = async () => {
-  failed(null);
+  failed(null); next(false);
   try { await ask("report"); $("report-state").textContent = "under way"; } catch (error) { failed(error); }
 };
 on("reported", m => {
   if (m.error) return failed(new Error(m.error));
-  $("report-state").textContent = `Written: ${m.found.file}`; $("report-link").href = m.found.address; $("report-link").hidden = false;
+  $("report-state").textContent = `Written: ${m.found.file}`; $("report-link").href = m.found.address; next(true);
   copies($("report-copy"), m.found);
 });

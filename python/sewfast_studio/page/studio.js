@@ -55,5 +55,6 @@ $("take").onclick = async () => {
   $("take").textContent = "Take over";
 };
 for (const v of VIEWS) $(`view-${v}`).onclick = () => view(v);
+for (const id of ["to-deploy", "verified"]) $(id).onclick = () => view("deploy");
 // a file that is dropped anywhere goes to the step Look
 addEventListener("drop", () => { if ($("data").hidden) view("data"); }, { capture: true });
