@@ -25,7 +25,7 @@ PHRASES = {
     "search more variables, ": "",
     "give more evaluations": "raise “Controllers tried”",
     "give more time": "raise “Seconds at most”",
-    "relax the constraints": "relax the limits",
+    "the constraints": "the limits",
     ", or name the column (time=...)": "",
 }
 """What else a page calls by another name."""

@@ -44,6 +44,12 @@ PAPER = ("report", "tune-searched", "data-looked", "model-done", "verify-done")
 """States that are printed as well."""
 STEPS = ("drive", "data", "model", "tune", "commission", "deploy")
 PATIENCE = 180.0
+NO_GAINS = """
+for (const [id, value] of [["limit-Ms", 1.01], ["limit-u", 0.1], ["evaluations", 20]])
+  document.getElementById(id).value = value;
+document.getElementById("tune-within").checked = true;
+"""
+"""Limits that no controller keeps."""
 UNFOLD = "document.querySelectorAll('main details:not(.menu)').forEach(d => { d.open = true })"
 
 AXE = """
@@ -195,9 +201,8 @@ def states(browser: Any, folder: Path) -> Iterator[str]:
         yield "tune-refused-field"
         browser.refresh()
         until(lambda: at("cost").text.startswith("cost"), "the cost then")
-        browser.execute_script(UNFOLD)
-        at("notch-hz").send_keys("60000")
-        press("add-notch")
+        browser.execute_script(NO_GAINS)
+        press("search")
         until(lambda: at("tune-error").text, "a refusal")
         yield "tune-refused"
         browser.refresh()

@@ -5,7 +5,7 @@ import { copies } from "/copies.js";
 import { showLook } from "/look.js";
 
 const $ = id => document.getElementById(id), PIECE = 48 * 1024;
-let writes = false, files = null, stale = false, uploading = false;
+let writes = false, files = null, stale = false, uploading = false, looking = false;
 
 const number = id => $(id).valueAsNumber > 0 ? $(id).valueAsNumber : null;
 
@@ -22,7 +22,7 @@ export function chosen() {
 export const columns = () => [...$("inputs").options].map(o => o.value);
 
 const tell = teller(document, "error");
-function enable() { $("upload").disabled = !writes || uploading; }
+function enable() { $("upload").disabled = !writes || uploading; $("look").disabled = looking || !$("file").value; }
 
 export function fill(select, pairs, kept) {
   select.replaceChildren(...pairs.map(([value, label]) => {
@@ -39,7 +39,7 @@ on("state", s => {
     fill($("file"), s.recordings.map(n => [n, n]), [s.recordings.includes(before) ? before : s.first]);
     // a recording may be large, so it is opened only where its columns are asked for
     if ($("file").value !== before) { stale = true; if (!$("data").hidden) open(); }
-    if (!s.recordings.length && !s.gone) tell(new Error("There is no recording in this folder. Drop a CSV, log, JSON, .mat, .npz, Parquet or MCAP file here."));
+    $("what-to-look-at").textContent = s.recordings.length ? "Drop a file here, or choose one at the side. Then press Look." : "There is no recording in this folder. Drop a CSV, log, JSON, .mat, .npz, Parquet or MCAP file here.";
     mark("data", s.recordings.length === 1 ? "1 file" : `${s.recordings.length || "no"} files`);
     document.dispatchEvent(new CustomEvent("recordings", { detail: s.recordings }));
   }
@@ -86,7 +86,7 @@ function follow({ field, value }) {
 function next(on) { $("look").classList.toggle("primary", !on); $("to-model").hidden = !on; }
 
 async function look() {
-  tell(null); $("look").disabled = true;
+  tell(null); looking = true; enable();
   try {
     const f = await send("look", chosen());
     $("rows-fold").open = false;  // the signals say more
@@ -95,7 +95,7 @@ async function look() {
     $("looked").textContent = n ? `${n} thing${n > 1 ? "s" : ""} to improve` : "Good to identify a model from";
     mark("data", n ? `${n} to improve` : "good", n ? "warn" : "good");
   } catch (error) { tell(error); mark("data", "not read", "bad"); }
-  $("look").disabled = false;
+  looking = false; enable();
 }
 
 $("file").onchange = () => { stale = true; open(); };

@@ -14,7 +14,7 @@ export function teller(root, id) {
     const toast = root.querySelector(`[id="${id}"]`);
     if (beside) { beside.text.remove(); beside.field.removeAttribute("aria-invalid"); beside.field.removeAttribute("aria-describedby"); beside = null; }
     const place = toast.parentNode, said = error ? error.message : "";
-    const named = /^([\w[\]]+)(?:, [\w[\]]+)*: /.exec(said), name = named && named[1], quoted = /“([^”]+)”/.exec(said);
+    const named = /^([\w[\]]+)(?:, [\w[\]]+)*: /.exec(said), name = named && named[1], quoted = /\(“([^”]+)”\)/.exec(said);
     // the one that a message begins with, or what to do names: then it is unfolded
     let field = named && place.querySelector(`[id="${name}"], [id="knob-${name}-value"], [data-name="${name}"]`), rest = said;
     if (field) rest = said.slice(named[0].length);

@@ -115,7 +115,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
     const before = notches, kept = values;
     notches = [...notches, numbers];
     await open(kept);
-    if (!opened) { const said = $("tune-error").textContent; notches = before; await open(kept); tell(new Error(said)); }
+    if (!opened) { const said = $("tune-error").textContent; notches = before; await open(kept); tell(new Error(`notch: ${said}`)); }
   }
 
   function keep(v) { tell(null); before = now; history.push({ ...v }); if (history.length > 200) history.shift(); enable(); }
@@ -314,7 +314,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
   }));
   $("add-notch").onclick = () => {
     const f = $("notch-hz").valueAsNumber;
-    f > 0 ? addNotch([f, .1, .5]) : tell(new Error("Expected a frequency in Hz. Type it, or take the one that the frequency response in Look proposes."));
+    f > 0 ? addNotch([f, .1, .5]) : tell(new Error("notch: Expected a frequency in Hz. Type it, or take the one that the frequency response in Look proposes."));
   };
   $("undo").onclick = undo;
   $("reset").onclick = () => set(Object.fromEntries(opened.knobs.map(k => [k.name, k.value])));

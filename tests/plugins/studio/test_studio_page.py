@@ -505,7 +505,7 @@ def test_a_notch_is_put_in_and_taken_out(tuned: Studio, browser: Any) -> None:
     at("notch-hz").clear()
     at("notch-hz").send_keys("6000")
     at("add-notch").click()
-    until(lambda: at("tune-error").text)
+    until(lambda: browser.find_elements("css selector", "label + .refused"))
     assert len(browser.find_elements("css selector", "#notches li")) == 1
     browser.find_element("css selector", "#notches button").click()
     until(lambda: browser.execute_script(NUMBER, "noise gain") == before)
