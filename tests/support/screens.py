@@ -43,7 +43,8 @@ SHEET = (718, 1047)
 PAPER = ("report", "tune-searched", "data-looked", "model-done", "verify-done")
 """States that are printed as well."""
 STEPS = ("drive", "data", "model", "tune", "commission", "deploy")
-PATIENCE = 180.0
+PATIENCE = 600.0
+"""Seconds for a state, on a computer that does other work as well."""
 NO_GAINS = """
 for (const [id, value] of [["limit-Ms", 1.01], ["limit-u", 0.1], ["evaluations", 20]])
   document.getElementById(id).value = value;

@@ -37,7 +37,7 @@ on("stage", m => {
 function loops(references) {
   $("loops").replaceChildren();
   for (const r of references) {
-    const name = NAMES[r.name] ?? r.name.replaceAll("_", " "), title = `${name}: tracking error`;
+    const name = NAMES[r.name] ?? r.name.replaceAll("_", " "), title = `${name}: error`;
     draw($("loops"), r.curves, `tracking error along ${name}, ${r.curves.map(c => c.name).join(" and ")}, over time`, title);
   }
 }

@@ -25,6 +25,8 @@ function show() {
   copies($("deploy-copy"), { commands: `# C99, then IEC 61131-3 structured text, then an FMU\nsewfast deploy ${quoted} firmware\nsewfast deploy ${quoted} plc --to st\nsewfast deploy ${quoted} simulation --to fmi\n` });
   const fold = $("deploy-copy").querySelector("details"); fold.open = true; fold.querySelector("summary").textContent = "Commands that write it as code";
 }
+/** Takes a controller of the folder, as one that was just saved. */
+export function choose(name) { if ([...$("deploy-controller").options].some(o => o.value === name)) { $("deploy-controller").value = name; show(); } }
 $("deploy-controller").onchange = show;
 $("report").onclick = async () => {
   failed(null); next(false);
