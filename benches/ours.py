@@ -153,7 +153,7 @@ def _candidates(number: int, encoded: bool, threads: int) -> Work:
 
     def work() -> dict[str, Any]:
         found = _core.tuning_costs(task, cores, threads=threads)
-        return _reached(np.array([cost for cost, _ in found]))
+        return _reached(np.array([cost for cost, *_ in found]))
 
     return work
 

@@ -71,8 +71,8 @@ def _tune(page: Any, file: Path) -> Path:
     _until(lambda: _text(page, "cost").startswith("cost"))
     _write(page, "evaluations", SEARCHED)
     _press(page, "search")
-    _until(lambda: _text(page, "tune-progress").startswith("found"))
-    _until(lambda: "(-" in _text(page, "cost"))
+    _until(lambda: "Found" in _text(page, "tune-progress"))
+    _until(lambda: "below" in _text(page, "cost"))
     _until(lambda: "being judged" not in _text(page, "lights"))
     return _taken(page, file)
 

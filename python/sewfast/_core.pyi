@@ -750,8 +750,8 @@ def tune(
 
 def tuning_costs(
     task: _Task, controllers: Sequence[_Controller], *, threads: int, progress: _Progress = None
-) -> list[tuple[float, float]]:
-    """Cost and violation of each controller."""
+) -> list[tuple[float, float, float, float]]:
+    """Cost, violation, largest overshoot [%] and command [u] of each controller."""
 
 def tuning_loads(task: _Task) -> list[tuple[float, float]]:
     """Recovery [ms] and rms deviation [y] of the start on each plant in each variation, the worst over the load steps."""

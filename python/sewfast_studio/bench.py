@@ -28,6 +28,8 @@ from sewfast.errors import Interrupted, LinkError, SettingError, SewfastError
 from sewfast.link.drive import Drive
 from sewfast.live import Feed
 
+from .words import spoken
+
 if TYPE_CHECKING:
     from sewfast.dataset import FloatArray
     from sewfast.link.plan import Outcome, Plan, Sink
@@ -44,7 +46,7 @@ LOOK = 0.2
 LAST_WORDS = 10.0
 """Time for a stopped run to close its file after the server has ended [s]."""
 
-STOPPED = "stopped; what was recorded until then is kept"
+STOPPED = "Stopped; what was recorded until then is kept"
 
 Send = Callable[..., None]
 
@@ -334,7 +336,7 @@ class Bench:
 def error_text(error: Exception) -> str:
     """The text of an error for the page: a refusal as it is, a fault with its type."""
     if isinstance(error, (ValueError, RecursionError, SewfastError, OSError)):
-        return str(error)
+        return spoken(str(error))
     return f"a fault in sewfast: {type(error).__name__}: {error}"
 
 

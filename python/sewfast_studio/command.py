@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from sewfast.cli.arguments import Commands, add_command
 from sewfast.cli.drive import is_port
@@ -63,7 +64,9 @@ def command(args: argparse.Namespace) -> None:
         port = args.place if args.place is not None and is_port(args.place) else None
         place = "." if port is not None else args.place or "."
         if args.demo:
-            place = left.enter_context(tempfile.TemporaryDirectory(prefix="sewfast-"))
+            # the page names the folder
+            place = Path(left.enter_context(tempfile.TemporaryDirectory()), "demo")
+            place.mkdir()
             make_demo(place)
         studio = left.enter_context(Studio(Project(place, demo=args.demo, port=port), args.port))
         if args.json:

@@ -343,8 +343,8 @@ class Steps:
         return {**getattr(self.project, name)(step), **self._copies(step, name)}
 
     def _bode(self, step: Step, reference: str | None, segment: int | None) -> None:
-        # the filter of resampling looks ahead, which hides the delay
-        step = replace(step, resample=None)
+        # the filter of resampling looks ahead, which hides the delay; a response needs every sample
+        step = replace(step, resample=None, mask=(), hold=False)
         copies = {
             "python": self.project.python(step, "bode", reference, segment),
             "commands": self.project.commands(step, "bode", reference, segment),
@@ -374,8 +374,8 @@ class Steps:
             return tuning.move(values, noise=fields.get("noise", False))
         if name == "tune_verdict":
             return tuning.verdict(values)
-        if name == "tune_costs":
-            return {"costs": tuning.costs([{}, values], fields.get("weights"))}
+        if name == "tune_judge":
+            return tuning.judged(values, fields.get("weights"))
         if name in ("tune_search", "tune_front"):
             return self._search(tuning, name, values, fields)
         file = checked_name(fields.get("file"))

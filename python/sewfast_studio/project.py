@@ -9,12 +9,13 @@ import secrets
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from sewfast.errors import SettingError, unwritable
+from sewfast.errors import SettingError, SewfastError, unwritable
 
 from .requests import (
     COMMISSIONED,
@@ -26,10 +27,12 @@ from .requests import (
     require_writable,
     script,
 )
+from .words import advice, spoken
 
 if TYPE_CHECKING:
     from sewfast.dataset import Dataset
     from sewfast.frequency import FrequencyResponse
+    from sewfast.readers import Table
 
     from .tuning import Tuning
 
@@ -113,6 +116,7 @@ class Project:
         self.demo, self.port = demo, port
         self._formats: dict[Path, tuple[int, str]] = {}
         self._tunings: dict[object, Tuning] = {}
+        self._last: tuple[object, Table] | None = None
         self._lock = threading.Lock()
         if self.first is not None and self.first not in self.documents(MODEL_FORMAT):
             self.path_of(self.first)
@@ -260,9 +264,9 @@ class Project:
 
     def columns(self, step: Step) -> dict[str, Any]:
         """Columns of a recording, and its input and output where names and units show them."""
-        from sewfast.readers import read_table, roles
+        from sewfast.readers import roles
 
-        table = read_table(self.path_of(step.file))
+        table = self._table(step.file)
         found, shown = roles(table), table.names[:SHOWN_COLUMNS]
         return {
             "names": list(table.names),
@@ -278,7 +282,9 @@ class Project:
 
     def look(self, step: Step) -> dict[str, Any]:
         """The signals, with the summary of `sewfast look`."""
-        return looked_at(self._read(step))
+        found = looked_at(self._read(step))
+        said = [advice(text) for text in found["advice"]]
+        return {**found, "text": spoken(found["text"]), "advice": said}
 
     def identify(
         self,
@@ -321,9 +327,9 @@ class Project:
             "rmse": found.simulation.rmse,
             "unit": found.unit,
             # the verdict of the whole card: a model with a good fit can fail another check
-            "verdict": card.summary,
+            "verdict": spoken(card.summary),
             "grade": GRADES[card.verdict],
-            "lines": [line.to_json() for line in card.lines],
+            "lines": [{**line.to_json(), "meaning": spoken(line.meaning)} for line in card.lines],
             "free_run": curves,
             "error": {"name": "error", "unit": found.unit, **unexplained},
         }
@@ -345,11 +351,10 @@ class Project:
         from sewfast.readers import read
 
         columns = self._columns(step, reference)
-        data = read(self.path_of(step.file), **columns)
+        data = read(self._table(step.file), **columns)
         if "counts" in columns:
             data = unsmoothed(self.folder / step.file, data)
-        data = data if step.resample is None else data.resample(step.resample)
-        return bode(data, reference=reference, segment=segment)
+        return bode(step.changed(data), reference=reference, segment=segment)
 
     def python(
         self, step: Step, name: str, reference: str | None = None, segment: int | None = None
@@ -366,13 +371,27 @@ class Project:
     def _read(self, step: Step) -> Dataset:
         from sewfast.readers import read
 
-        data = read(self.path_of(step.file), **self._columns(step))
-        return data if step.resample is None else data.resample(step.resample)
+        return step.changed(read(self._table(step.file), **self._columns(step)))
 
     def _columns(self, step: Step, reference: str | None = None) -> dict[str, Any]:
+        return step.columns(self._table(step.file), reference)
+
+    def _table(self, file: str) -> Table:
+        """All columns of a recording. The last one is kept: to look at it takes it four times."""
         from sewfast.readers import read_table
 
-        return step.columns(read_table(self.path_of(step.file)), reference)
+        path = self.path_of(file)
+        version = (path, path.stat().st_mtime_ns, path.stat().st_size)
+        with self._lock:
+            if self._last is None or self._last[0] != version:
+                self._last = None
+                try:
+                    table = read_table(path)
+                except SewfastError as e:
+                    # a page knows the file by its name in the folder
+                    raise type(e)(str(e).replace(str(path), file)) from e
+                self._last = (version, replace(table, path=Path(file)))
+            return self._last[1]
 
 
 def looked_at(data: Dataset) -> dict[str, Any]:

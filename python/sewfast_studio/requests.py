@@ -20,7 +20,7 @@ from sewfast.kinds import KINDS, Kind
 if TYPE_CHECKING:
     from sewfast.commissioning import Commissioning
     from sewfast.commissioning.verification import Comparison
-    from sewfast.dataset import FloatArray
+    from sewfast.dataset import Dataset, FloatArray
     from sewfast.readers import Table
 
 MODEL = "model.json"
@@ -49,6 +49,12 @@ class Step:
     model : str
         Kind of model to identify.
     seed : int
+    mask : tuple of str
+        Outputs to leave out: ranges of samples ``A:B``, or ``outliers``.
+    shift : int
+        Samples by which the inputs were logged late.
+    hold : bool
+        Whether a missing input is the last known one.
     """
 
     file: str
@@ -60,6 +66,9 @@ class Step:
     counts: str | None = None
     counts_per_rev: float | None = None
     Ts: float | None = None
+    mask: tuple[str, ...] = ()
+    shift: int = 0
+    hold: bool = False
 
     @classmethod
     def parse(cls, asked: dict[str, Any]) -> Step:
@@ -83,13 +92,24 @@ class Step:
         counts = asked.get("counts")
         require(counts is None or isinstance(counts, str), "counts", "a column or null", counts)
         require(model in KINDS, "model", f"one of {', '.join(KINDS)}", model)
+        mask = asked.get("mask") or ""
+        require(isinstance(mask, str), "mask", "ranges such as 100:120, or outliers", mask)
         seed = 0 if seed is None else seed
         whole = isinstance(seed, int) and not isinstance(seed, bool) and 0 <= seed < 2**32
         require(whole, "seed", "a whole number from 0", seed)
         return cls(
             asked["file"], tuple(inputs), output or None, resample, model, seed, counts or None,
-            asked.get("counts_per_rev"), asked.get("Ts"),
+            asked.get("counts_per_rev"), asked.get("Ts"), tuple(re.split(r"[\s,;]+", mask.strip()))
+            if mask.strip() else (), asked.get("shift") or 0, bool(asked.get("hold")),
         )  # fmt: skip
+
+    def changed(self, data: Dataset) -> Dataset:
+        """The data as this step uses them; `_changes` are the same calls."""
+        data = data.shift_inputs(self.shift) if self.shift else data
+        for span in self.mask:
+            data = data.mask(data.mark_outliers() if span == "outliers" else span)
+        data = data.fill_inputs("hold") if self.hold else data
+        return data if self.resample is None else data.resample(self.resample)
 
     def columns(self, table: Table, reference: str | None = None) -> dict[str, Any]:
         """Arguments of `sewfast.read`, with the references, as on the command line.
@@ -139,8 +159,7 @@ def script(
     if name == "bode" and step.output is None:
         lines.insert(1, "from sewfast.commissioning import unsmoothed")
         lines.append(f"data = unsmoothed({step.file!r}, data)")
-    if step.resample is not None:
-        lines.append(f"data = data.resample({step.resample!r})")
+    lines += _changes(step)
     if name == "look":
         lines.append("print(data.summary())")
     elif name == "bode":
@@ -153,6 +172,16 @@ def script(
         lines.append(f"model = sewfast.load_model({MODEL!r})")
         lines += ["print(sewfast.validate(model, data))", "print(sewfast.check(model, data))"]
     return "\n".join(lines) + "\n"
+
+
+def _changes(step: Step) -> list[str]:
+    """`Step.changed` as Python."""
+    calls = [f"shift_inputs({step.shift})"] if step.shift else []
+    for span in step.mask:
+        calls.append(f"mask({'data.mark_outliers()' if span == 'outliers' else repr(span)})")
+    calls += ["fill_inputs('hold')"] if step.hold else []
+    calls += [] if step.resample is None else [f"resample({step.resample!r})"]
+    return [f"data = data.{call}" for call in calls]
 
 
 def commands(
@@ -168,6 +197,8 @@ def commands(
         options.append(f"--output={columns['output']}")
     if step.Ts is not None:
         options.append(f"--ts={step.Ts!r}")
+    options += [f"--shift-input={step.shift}"] if step.shift else []
+    options += [f"--mask={span}" for span in step.mask] + ["--hold-inputs"] * step.hold
     if step.resample is not None:
         options.append(f"--resample={step.resample!r}")
     kind = [f"--model={step.model.replace('_', '-')}", f"--seed={step.seed}", "-o", MODEL]

@@ -160,6 +160,9 @@ _STEP = {
     "Ts": {"type": ["number", "null"], "exclusiveMinimum": 0},
     "counts": {**NAME, "type": ["string", "null"]},
     "counts_per_rev": {"type": ["number", "null"], "exclusiveMinimum": 0},
+    "mask": {**NAME, "type": ["string", "null"]},
+    "shift": {"type": ["integer", "null"], "minimum": -10_000, "maximum": 10_000},
+    "hold": {"type": "boolean"},
     "model": NAME,
     "seed": {**SEED, "type": ["integer", "null"]},
 }
@@ -213,7 +216,7 @@ _MESSAGES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "commission": ({"machine": NAME, **_EFFORT}, ()),
     "tune_open": (_TUNE, ("model",)),
     "tune_move": ({**_TUNE, "noise": {"type": "boolean"}}, ("model", "values")),
-    **dict.fromkeys(("tune_costs", "tune_verdict"), (_TUNE, ("model", "values"))),
+    **dict.fromkeys(("tune_judge", "tune_verdict"), (_TUNE, ("model", "values"))),
     **dict.fromkeys(("tune_search", "tune_front"), _SEARCH),
     "loop": ({**_TUNE, "response": {"type": ["integer", "null"]}}, ("model", "values")),
     "bode": (

@@ -19,6 +19,8 @@ import numpy as np
 
 from sewfast.errors import FitError, Interrupted, SettingError
 
+from .words import spoken
+
 if TYPE_CHECKING:
     from sewfast.analysis.points import LoopBode
     from sewfast.analysis.responses import Responses
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from sewfast.control.feedforward import Feedforward
     from sewfast.dataset import FloatArray
     from sewfast.models import Model
-    from sewfast.tuning import Constraints, Cost
+    from sewfast.tuning import Constraints, Cost, Judge
     from sewfast.tuning.lead import Lead
 
 MOST_MEMBERS = 16
@@ -273,31 +275,34 @@ class Tuning:
         numbers["du_rms"] = float(np.sqrt(np.mean(np.diff(inside) ** 2, axis=1)).max())
         return {**numbers, "diverges": False}, curves
 
-    def costs(
-        self, several: Sequence[Mapping[str, Any]], weights: Mapping[str, float] | None = None
-    ) -> list[float]:
-        """Costs of controllers on the model, as in `sewfast.tune`; inf if one diverges.
+    @cached_property
+    def judge(self) -> Judge:
+        """Judges controllers on the model as a search does."""
+        from sewfast.tuning import Judge
+
+        return Judge(self.start, self.model)
+
+    def judged(
+        self, values: Mapping[str, Any], weights: Mapping[str, float] | None = None
+    ) -> dict[str, Any]:
+        """What a search would find of these values, and of the start.
 
         Parameters
         ----------
-        several : list of dict
-            The values of each.
+        values : dict
         weights : mapping, optional
             Fields of `sewfast.Cost` by name.
         """
-        from sewfast.tuning import Cost, costs
+        from sewfast.tuning import Cost
 
-        # all get the same weights: the defaults depend on the first
-        controllers = [self.controller(values) for values in several]
-        found = costs(controllers, self.model, cost=Cost(**(weights or {})))
-        return [float(cost) for cost in found]
+        several = [self.controller({}), self.controller(values)]
+        start, here = self.judge.of(several, Cost(**(weights or {})))
+        return {**vars(here), "start_cost": start.cost}
 
     def verdict(self, values: Mapping[str, Any]) -> dict[str, str]:
         """Grade and reasons of these gains, as `sewfast.tune` says them."""
-        from sewfast.tuning import verdict_on
-
-        found = verdict_on(self.controller(values), self.model)
-        return {"grade": found.grade, "text": str(found)}
+        found = self.judge.verdict(self.controller(values))
+        return {"grade": found.grade, "text": spoken(str(found))}
 
     def check(self, search: Search) -> None:
         """Check the settings of a search.
@@ -373,17 +378,12 @@ class Tuning:
             if not isinstance(stopped.best, ParetoFront):
                 raise
             found = stopped.best
-        each = [self._values_of(c) for c in found.controllers]
-        # the costs that the page shows: those of the front are of the mean terms of all runs
-        costs = self.costs(each, search.weights)
-        quickest_first = sorted(
-            zip(each, costs, found.values[:, 1].tolist(), strict=True), key=lambda row: row[1]
-        )
-        front: list[dict[str, Any]] = []
-        for named, cost, Ms in quickest_first:
-            if not front or Ms < front[-1]["Ms"]:
-                front.append({"values": named, "cost": cost, "Ms": Ms})
-        return {"front": front[::-1], "unit": found.units[FRONT[0]]}
+        # the controllers are sorted by their cost
+        front = [
+            {"values": self._values_of(controller), "cost": cost, "Ms": Ms}
+            for controller, (cost, Ms) in zip(found.controllers, found.values.tolist(), strict=True)
+        ]
+        return {"front": front[::-1]}
 
     def keep(self, found: Found) -> dict[str, Any]:
         """Store a search, so that its copy repeats it; return its result for the page."""
@@ -395,7 +395,7 @@ class Tuning:
             "ended": found.ended,
             "cost": found.cost,
             "start_cost": found.start_cost,
-            "verdict": found.verdict,
+            "verdict": found.verdict and spoken(found.verdict),
         }
 
     def _values_of(self, controller: Controller) -> dict[str, float]:

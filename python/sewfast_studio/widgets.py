@@ -31,7 +31,7 @@ START = "start.json"
 ALLOWED = (
     "tune_open",
     "tune_move",
-    "tune_costs",
+    "tune_judge",
     "tune_verdict",
     "tune_search",
     "tune_front",
@@ -157,7 +157,7 @@ def look_view(data: Dataset) -> Any:
     html = '<div class="results"><div id="signals" class="linked"></div><ul id="advice"></ul>'
     html += '<details id="summary-fold" open hidden><summary>All figures</summary>'
     html += '<pre id="summary"></pre></details></div>'
-    view = _widget(_source(("curves", "look", "widget"), _LOOK, html))
+    view = _widget(_source(("curves", "tell", "look", "widget"), _LOOK, html))
     found = looked_at(data)
 
     def answer(_: dict[str, Any]) -> None:

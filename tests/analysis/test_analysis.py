@@ -77,6 +77,20 @@ def test_metrics_of_steps_are_read_off_their_curves() -> None:
     assert abs(upset.disturbance) * gain == pytest.approx(upset.size, rel=0.11)
 
 
+@pytest.mark.parametrize("pole", [1.0, 0.99999])
+def test_a_disturbance_is_seen_on_a_plant_that_does_not_settle(pole: float) -> None:
+    """A position, and one whose model has a pole beside 1: its gain is that of hours."""
+    core = _core.LinearModel(np.poly([pole, 0.95])[1:], np.array([[2e-4, 2e-4]]), 1, 0.0)
+    known = {"input_range": [[-10.0, 10.0]], "output_range": [-20.0, 20.0]}
+    angle = LinearOE(core, 0.01, ("u",), "y", ("V",), "rad", None, known)
+    held = Controller(Gains.standard(2.0, 8.0, 0.5, u_unit="V", y_unit="rad"), Ts=0.01,
+                      u_min=-10, u_max=10)  # fmt: skip
+    tracked, upset = analyse(held, angle, references=[np.zeros(100)], threads=1).responses
+    n = int((upset.t >= 0).sum())
+    free = angle.simulate(np.full(n, upset.disturbance))
+    assert abs(free[-1]) == pytest.approx(abs(tracked.size), rel=0.1)
+
+
 def test_what_never_settles_has_no_time() -> None:
     short = analyse(IDEAL, drive(), speeds=[1000.0], seconds=0.2, references=[TRAPEZOID])
     slow = replace(IDEAL, gains=Gains.standard(0.0005, 5.0))

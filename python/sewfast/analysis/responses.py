@@ -354,7 +354,8 @@ def default_steps(
     seconds: float | None,
     span: float | None = None,
 ) -> Steps:
-    """Default steps: a twentieth of the recorded span, and a disturbance of the same effect.
+    """Default steps: a twentieth of the recorded span, and a disturbance of the same effect, on a
+    plant that does not settle by their end (an integrator) of the same effect until then.
     `points` are the plants at the operating point, and `slowest` is the time constant of the
     slowest closed-loop pole [s]. `span` reaches from rest to the farther end of the recorded output
     [y]; without it the step is a tenth of the level.
@@ -366,17 +367,26 @@ def default_steps(
     if checked.get("seconds", 1.0) <= 0.0:
         raise SettingError(f"expected seconds above 0, got {seconds:g}")
     level = points[0].y if level is None else level
-    gains = [abs(p.gain) for p in points if math.isfinite(p.gain) and p.gain]
-    gain = float(np.median(gains)) if gains else math.inf
+    samples = round((5.0 * slowest if seconds is None else seconds) / controller.Ts)
+    samples = min(max(samples, 200), 20_000)
+    gain = float(np.median([_effect(p, samples) for p in points]))
     half = 0.5 * (controller.u_max - controller.u_min)
     if step is None:
         small = 0.01 * half * gain if math.isfinite(half * gain) else 1.0
         step = 0.05 * span if span else 0.1 * abs(level) if level else small
     if disturbance is None:
-        disturbance = -step / gain if math.isfinite(gain) else -0.05 * (
-            half if math.isfinite(half) else 1.0
-        )  # fmt: skip
-    if seconds is None:
-        seconds = 5.0 * slowest
-    samples = round(seconds / controller.Ts)
-    return Steps(float(level), float(step), float(disturbance), min(max(samples, 200), 20_000))
+        disturbance = -step / gain if gain else -0.05 * (half if math.isfinite(half) else 1.0)
+    return Steps(float(level), float(step), float(disturbance), samples)
+
+
+def _effect(point: PlantPoint, samples: int) -> float:
+    """What a unit of input does to the output of a plant without control: its gain, or how far it
+    gets until the end if it does not settle before [y/u].
+    """
+    slowest = max(np.abs(np.linalg.eigvals(point.A)), default=0.0)
+    if slowest**samples < math.exp(-1.0) and math.isfinite(point.gain):
+        return abs(point.gain)
+    n = len(point.A)
+    held = np.block([[point.A, point.B], [np.zeros((1, n)), np.ones((1, 1))]])
+    x = np.linalg.matrix_power(held, samples)[:n, -1]
+    return abs(float((point.C @ x + point.D[:, 0])[0]))

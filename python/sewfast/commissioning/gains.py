@@ -23,9 +23,10 @@ from ..gains import Gains
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
 from ..rules import Fopdt, Rule, eq_12, simc
+from ..tuning.judge import costs, recoveries
 from ..tuning.lead import Effort, with_lead
 from ..tuning.objective import LARGEST_MS, Constraints, Cost, LoadStep
-from ..tuning.search import TuningResult, costs, recoveries, tune
+from ..tuning.search import TuningResult, tune
 from ..tuning.task import TuningTask
 from .bench import Aborted
 from .demands import Demands, Refusal

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 INPUT_REMEDY = (
     "a simulation needs every input: choose a range without it, take the pieces between, "
-    "Dataset.split_at_gaps (--split-at-gaps), or say what the input was: "
-    'Dataset.fill_inputs("hold") assumes that it stayed as it was last known (--hold-inputs)'
+    "Dataset.split_at_gaps (--split-at-gaps), or take the one last known, "
+    'Dataset.fill_inputs("hold") (--hold-inputs)'
 )
 OUTPUT_REMEDY = (
-    "repair it, choose a range without it, or take the pieces between: "
+    "repair it, choose a range without it, or take the pieces between, "
     "Dataset.split_at_gaps (--split-at-gaps)"
 )
 

@@ -369,8 +369,8 @@ def _values(c: ColumnSummary) -> Iterator[str]:
     elif c.missing and c.role == "input":
         yield (
             f"{c.name} is not known at {c.missing} samples, and a simulation needs every input: "
-            'data.fill_inputs("hold") where it stayed as it was (--hold-inputs), else the pieces '
-            'between: data.split_at_gaps(of="inputs") (--split-at-gaps)'
+            'hold it where it stayed as it was, data.fill_inputs("hold") (--hold-inputs), or take '
+            'the pieces between, data.split_at_gaps(of="inputs") (--split-at-gaps)'
         )
     elif c.missing:
         yield (

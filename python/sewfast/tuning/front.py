@@ -22,6 +22,7 @@ from ..plotting import Drawing, Panel, Plotted, lettered
 from ..progress import TimeUp, shown_in_notebooks
 from ..storage import write_table
 from ..tables import Table, significant
+from .lead import WEIGHTS
 from .objective import Constraints, Cost, LoadStep
 from .search import TuningResult, tune
 from .task import (
@@ -201,7 +202,9 @@ def pareto(
     ----------
     models, references, start, variables, aggregate, constraints, variations, loads, seed, threads
         As in `tune`; without a start, that of `tune` with its default limits. If Ms is an
-        objective, it has no limit by default.
+        objective, it has no limit by default. A feedforward of the start is that of every
+        controller of the front, and the start's weights of the reference, whose work it does,
+        are searched only if they are named.
     objectives : sequence of str
         Two or more of tracking, chatter, effort, overshoot, rise, lag, saturation, recovery, load,
         cost, Ms.
@@ -262,7 +265,13 @@ def pareto(
         **settings,
     )
     settings["constraints"] = tuned.constraints
-    task = TuningTask.of(models, references, start=tuned.start, first={}, **settings)
+    begun = tuned.start
+    if isinstance(start, Controller) and start.feedforward is not None:
+        assert isinstance(begun, Controller)
+        begun = replace(begun, alpha=start.alpha, beta=start.beta, feedforward=start.feedforward)
+        if variables is None:
+            variables = [(v.name, v.low, v.high) for v in tuned.variables if v.name not in WEIGHTS]
+    task = TuningTask.of(models, references, start=begun, first={}, **settings)
     task = task.with_loops(time)
     rest = max(1, total - first)
     deadline = Deadline(time, time.share(1.0 - LOOK), _shifted(progress, first, total))

@@ -293,4 +293,4 @@ def _judged(
         task.core(), cores, threads=effort.threads, progress=effort.deadline
     )
     effort.check()
-    return judged
+    return [(cost, violation) for cost, violation, *_ in judged]

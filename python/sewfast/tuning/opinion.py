@@ -143,7 +143,8 @@ def _opinion(
 
 def _judged(task: TuningTask, controller: SampledController) -> tuple[float, float]:
     """Cost, and the sum of violations of the constraints."""
-    return _core.tuning_costs(task.core(), [controller.core()], threads=1)[0]
+    cost, violation, *_ = _core.tuning_costs(task.core(), [controller.core()], threads=1)[0]
+    return cost, violation
 
 
 def _relative(costs: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,17 +1,20 @@
 // The step Verify: the stages of a commissioning as they are entered, predictions before the machine runs along them, then what it did.
 import { ask, on, mark } from "/server.js";
-import { teller } from "/tell.js";
+import { sentences, teller, upper } from "/tell.js";
 import { draw } from "/curves.js";
 import { copies } from "/copies.js";
 
 const $ = id => document.getElementById(id);
+const NAMES = { chirp_hi_lo: "chirp, fast to slow", chirp_lo_hi: "chirp, slow to fast" };
 let writes = false, busy = false, stages = [];
 
 const tell = teller(document, "commission-error");
-function enable() { $("commission-start").disabled = busy || !writes; $("commission-cancel").disabled = $("commission-cancel").hidden = !busy || !writes; }
+function enable() { $("commission-start").disabled = busy || !writes; $("commission-cancel").disabled = $("commission-cancel").hidden = !busy || !writes; $("commission-bar").hidden = !busy; }
+/** Once something is verified, the way on is the step's action. */
+function next(on) { $("commission-start").classList.toggle("primary", !on); $("verified").hidden = !on; }
 
 $("commission-start").onclick = async () => {
-  tell(null); stages = []; $("stages").replaceChildren(); $("commission-verdict").textContent = ""; $("loops").replaceChildren(); $("no-commission").hidden = true; $("commission-fold").hidden = true;
+  tell(null); stages = []; $("stages").replaceChildren(); $("commission-verdict").textContent = ""; $("loops").replaceChildren(); $("no-commission").hidden = true; $("commission-fold").hidden = true; $("commission-bar").removeAttribute("value"); next(false);
   const seed = $("machine-seed").value;
   try {
     const effort = { seed: 0, members: $("networks").valueAsNumber, evaluations: $("commission-tries").valueAsNumber };
@@ -34,15 +37,15 @@ on("stage", m => {
 function loops(references) {
   $("loops").replaceChildren();
   for (const r of references) {
-    const title = `${r.name.replaceAll("_", " ")}: tracking error`;
-    draw($("loops"), r.curves, `tracking error along ${r.name}, ${r.curves.map(c => c.name).join(" and ")}, over time`, title);
+    const name = NAMES[r.name] ?? r.name.replaceAll("_", " "), title = `${name}: error`;
+    draw($("loops"), r.curves, `tracking error along ${name}, ${r.curves.map(c => c.name).join(" and ")}, over time`, title);
   }
 }
 
 on("state", s => { writes = s.writes; enable(); if (!busy && !$("commission-verdict").textContent) mark("commission", "not yet"); });
 on("progress", p => {
   if (!["commissioned", "driven"].includes(p.of)) return;
-  busy = true; enable();
+  busy = true; enable(); $("commission-bar").value = p.done / Math.max(p.total, 1);
   const [, name, share] = p.best.match(/^(.*?)(?: (\d+\/\d+))?$/);
   if (stages.at(-1) !== name) { stages.push(name); $("stages").append(document.createElement("li")); }
   $("stages").lastChild.textContent = share ? `${name}, ${share}` : name;
@@ -51,8 +54,9 @@ function ended(m) {
   busy = false; $("go").hidden = true; $("commission-start").hidden = false; enable();
   if (m.error) { mark("commission", "not verified", "bad"); return tell(new Error(m.error)); }
   const f = m.found, cost = v => v === null ? "none" : v.toPrecision(4);
-  $("commission-verdict").textContent = `${f.verdict}: cost predicted ${cost(f.predicted_cost)}, measured ${cost(f.measured_cost)}`;
-  mark("commission", ...f.verdict.startsWith("verified") ? ["verified", "good"] : ["not verified", "bad"]);
+  const is = f.verdict.startsWith("verified"), unit = f.references[0]?.curves[0]?.unit ?? "";
+  $("commission-verdict").textContent = `${sentences(upper(f.verdict))} Cost predicted ${cost(f.predicted_cost)} ${unit}, measured ${cost(f.measured_cost)} ${unit}`;
+  mark("commission", ...is ? ["verified", "good"] : ["not verified", "bad"]); next(is);
   loops(f.references);
   $("commission-text").textContent = f.text; $("commission-fold").hidden = false;
   copies($("commission-copy"), { ...f, ...(m.python ? m : {}) });

@@ -1,9 +1,10 @@
 // Curves on a canvas: ticks with units, bands and gaps, linked cursors, zoom and pan, files as SVG and PNG.
 // Measured, predicted and reference look the same in every chart: solid, dashed and dotted, in colours of the sheet.
-const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3], [12, 4], [2, 3]], REFERENCE = 5;
-const TOKENS = ["--series-1", "--series-2", "--series-3", "--series-4", "--series-5", "--soft", "--ink", "--paper"], INK = 6, PAPER = 7;
+const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3], [12, 4], [2, 3], [5, 2]];
+export const REFERENCE = 5, BESIDE = 6;
+const TOKENS = ["--series-1", "--series-2", "--series-3", "--series-4", "--series-5", "--soft", "--soft", "--ink", "--paper"], INK = 7, PAPER = 8, GREY = [1, BESIDE];
 const ROLES = { measured: 0, "free run": 1, predicted: 1, fit: 1, model: 1, reference: REFERENCE };
-const CHARTS = new Set(), FONT = "12px system-ui, 'DejaVu Sans', sans-serif", LEFT = 62, RIGHT = 12, BELOW = 34;
+const CHARTS = new Set(), FONT = "12px system-ui, 'DejaVu Sans', sans-serif", LEFT = 62, RIGHT = 12, BELOW = 34, TITLE = 26;
 let printing = false;
 
 function every(act) { for (const c of CHARTS) c.canvas.isConnected ? act(c) : CHARTS.delete(c); }
@@ -19,7 +20,7 @@ export class Chart {
    * path, whose x does not grow: the title of what grows along it). */
   constructor(place, axes) {
     this.axes = { x: "time [s]", y: "", log: false, marks: [], floor: -Infinity, roof: Infinity, along: "", ...axes };
-    this.series = []; this.marks = []; this.view = null; this.colours = null;
+    this.series = []; this.marks = []; this.view = null; this.colours = null; this.spots = new Map();
     CHARTS.add(this);
     const plot = document.createElement("div"); plot.className = "plot";
     this.canvas = document.createElement("canvas");
@@ -54,7 +55,7 @@ export class Chart {
     // a processor paints a few lines sooner than they take to a graphics card and back, above all where there is none
     const g = canvas.getContext("2d", { willReadFrequently: true });
     g.setTransform(scale, 0, 0, scale, 0, 0); g.clearRect(0, 0, w, h);
-    this.picture(g, w, h, printing ? TOKENS.map((_, k) => k === PAPER ? "#fff" : k === 1 ? "#888" : "#000") : this.colours ??= this.resolved());
+    this.picture(g, w, h, printing ? TOKENS.map((_, k) => k === PAPER ? "#fff" : GREY.includes(k) ? "#888" : "#000") : this.colours ??= this.resolved());
   }
 
   /** The sheet's colours of a scheme, or of the page's own. */
@@ -77,11 +78,17 @@ export class Chart {
     if (!(high >= low)) return;
     if (high - low < 1e-9 * Math.max(1, Math.abs(high))) { high += 1; low -= 1; }
     const room = .04 * (high - low); low -= room; high += room;
-    const top = this.legend(g, w, colours), right = w - RIGHT, bottom = h - BELOW, lg = axes.log ? Math.log10 : v => v;
-    const kx = (right - LEFT) / (lg(to) - lg(from)), ky = (bottom - top) / (high - low), x0 = lg(from);
-    const X = v => LEFT + kx * (lg(v) - x0), Y = v => bottom - ky * (v - low);
-    const back = px => { const v = x0 + (px - LEFT) / kx; return axes.log ? 10 ** v : v; };
-    this.at = { X, Y, back, whole, from, to, left: LEFT, right, top, bottom, low, high, colours };
+    const lg = axes.log ? Math.log10 : v => v, right = w - RIGHT, bottom = h - BELOW, x0 = lg(from), kx = (right - LEFT) / (lg(to) - x0);
+    const X = v => LEFT + kx * (lg(v) - x0), back = px => { const v = x0 + (px - LEFT) / kx; return axes.log ? 10 ** v : v; };
+    const below = top => { const ky = (bottom - top) / (high - low); this.at = { X, Y: v => bottom - ky * (v - low), back, whole, from, to, left: LEFT, right, top, bottom, low, high, colours }; };
+    below(TITLE);
+    // names stand at their curves where there is room, the others beside the title; if these need another row, all
+    const names = series.flatMap((s, i) => s.name && s.name !== axes.y ? [i] : []);
+    let labels = names.length > 1 ? this.beside(g, names, part) : [];
+    const others = () => names.filter(i => !labels.some(f => f.i === i));
+    if (this.legend(g, w, colours, others(), false) > TITLE) labels = [];
+    below(this.legend(g, w, colours, others()));
+    const { Y, top } = this.at;
     this.grid(g, w, h);
     g.save(); g.beginPath(); g.rect(LEFT, top - 2, right - LEFT, bottom - top + 4); g.clip();
     series.forEach((s, i) => {
@@ -92,7 +99,33 @@ export class Chart {
       g.lineWidth = style ? 1.6 : 1.8; g.setLineDash(DASHES[style]); s.dots ? dots(g, s, X, Y) : trace(g, s, X, Y, begin, end, right - LEFT);
     });
     g.restore();
-    this.point(g);
+    g.textAlign = "left"; g.textBaseline = "middle";
+    for (const { i, x, y } of labels) { g.fillStyle = colours[styleOf(series[i], i)]; g.fillText(series[i].name, x, y); }
+    this.point(g, labels);
+  }
+
+  /** Places at their own curves for names, where their boxes meet no curve and are nearest to their own. */
+  beside(g, names, part) {
+    const { left, right, top, bottom } = this.at, found = [];
+    if (this.series.some(s => part(s)[1] - part(s)[0] > 4 * (right - left))) return [];
+    const ways = this.series.map(s => reach(s, this.at, ...part(s)));
+    for (const i of names) {
+      const name = this.series[i].name, wide = Math.ceil(g.measureText(name).width), steps = 24, room = right - left - wide - 8, kept = this.spots.get(name);
+      let best = null, least = Infinity;
+      for (let k = -1; k <= steps; k++) for (const up of [true, false]) {
+        // where it stood before, so that it does not jump while a slider moves
+        const at = k < 0 ? kept?.share : k / steps;
+        if (at === undefined || (k < 0 && up !== kept.up)) continue;
+        const x = Math.round(4 + at * room), [high, low] = extent(ways[i], x, x + wide), y = up ? high - 11 : low + 11;
+        if (!(high <= low) || y - 8 < top || y + 8 > bottom) continue;
+        const clear = ways.every((way, j) => { const [a, b] = extent(way, x - 4, x + wide + 4), gap = j === i ? 9 : 15; return !(a < y + gap && b > y - gap); });
+        const score = k < 0 ? -1 : low - high + 20 * (1 - at);
+        if (clear && score < least && !found.some(f => Math.abs(f.y - y) < 16 && left + x < f.x + f.wide + 8 && left + x + wide + 8 > f.x)) { least = score; best = { i, x: left + x, y, wide, share: at, up }; }
+      }
+      if (best) found.push(best);
+      this.spots.set(name, best);
+    }
+    return found;
   }
 
   grid(g, w, h) {
@@ -114,8 +147,8 @@ export class Chart {
     g.fillText(this.axes.x, (left + right) / 2, h - 8);
   }
 
-  /** Circles with labels, each at the corner where the fewest points of curves are. */
-  point(g) {
+  /** Circles with labels, each at the corner where the fewest points of curves are, and no name. */
+  point(g, names) {
     const { X, Y, low, high, from, to, left, right, top, bottom, colours } = this.at;
     g.lineWidth = 1.6; g.setLineDash([]); g.textBaseline = "middle"; g.textAlign = "left";
     for (const m of this.marks) if (m.x >= from && m.x <= to && m.y >= low && m.y <= high) {
@@ -125,6 +158,7 @@ export class Chart {
       for (const [dx, dy] of [[9, -12], [9, 12], [-9 - wide, -12], [-9 - wide, 12], [9, -28], [9, 28], [-9 - wide, -28], [-9 - wide, 28]]) {
         const a = x + dx, b = y + dy;
         let met = a < left || a + wide > right || b - 8 < top || b + 8 > bottom ? 1e6 : 0;
+        if (names.some(n => Math.abs(n.y - b) < 16 && n.x < a + wide + 4 && n.x + n.wide > a - 4)) met += 1e5;
         for (const s of this.series) for (let k = 0; k < s.x.length; k++) {
           const px = X(s.x[k]); if (px > a - 2 && px < a + wide + 2 && Math.abs(Y(s.y[k]) - b) < 9) met++;
         }
@@ -135,19 +169,19 @@ export class Chart {
   }
 
   /** Title and names above the axes, so that they cover nothing, in as many rows as they need; returns where the axes begin. */
-  legend(g, w, colours) {
+  legend(g, w, colours, names, draws = true) {
     let at = LEFT, y = 12;
     const place = wide => { if (at > LEFT && at + wide > w - 30) { at = LEFT; y += 18; } const x = at; at += wide + 16; return x; };
-    g.textAlign = "left"; g.textBaseline = "middle"; g.lineWidth = 1.8; g.setLineDash([]);
-    if (this.axes.y) { g.fillStyle = colours[INK]; g.font = `600 ${FONT}`; g.fillText(this.axes.y, place(g.measureText(this.axes.y).width), y); g.font = FONT; }
-    this.series.forEach((s, i) => {
-      if (!s.name || s.name === this.axes.y) return;
-      const style = styleOf(s, i), x = place(32 + g.measureText(s.name).width);
+    g.textAlign = "left"; g.textBaseline = "middle"; g.lineWidth = 1.8; g.setLineDash([]); g.fillStyle = colours[INK];
+    if (this.axes.y) { g.font = `600 ${FONT}`; const x = place(g.measureText(this.axes.y).width); if (draws) g.fillText(this.axes.y, x, y); g.font = FONT; }
+    for (const i of names) {
+      const s = this.series[i], style = styleOf(s, i), x = place(32 + g.measureText(s.name).width);
+      if (!draws) continue;
       g.strokeStyle = g.fillStyle = colours[style]; g.setLineDash(DASHES[style]);
       if (s.dots) for (const k of [3, 13, 23]) g.fillRect(x + k - 1, y - 1, 3, 3); else line(g, x, y, x + 26, y);
       g.setLineDash([]); g.fillStyle = colours[INK]; g.fillText(s.name, x + 32, y);
-    });
-    return y + 14;
+    }
+    return y + TITLE - 12;
   }
 
   // --- cursor, zoom and pan -----------------------------------------------------------------------
@@ -318,6 +352,30 @@ function place(x, value) {
 /** The samples from one x to another, with a neighbour at either side. */
 function inside(x, from, to) { return [Math.max(0, place(x, from) - 1), Math.min(x.length, place(x, to) + 2)]; }
 function nearest(x, value) { const k = place(x, value); return k > 0 && (k >= x.length || value - x[k - 1] < x[k] - value) ? k - 1 : k; }
+
+/** Least and largest pixel of a curve in each column of its picture. */
+function reach({ x, y }, { X, Y, left, right }, begin, end) {
+  const wide = Math.ceil(right - left) + 1, high = new Float32Array(wide).fill(Infinity), low = new Float32Array(wide).fill(-Infinity);
+  let px = NaN, py = NaN;
+  for (let k = begin; k < end; k++) {
+    const qx = X(x[k]) - left, qy = Y(y[k]);
+    const first = Number.isNaN(py) ? qx : px, from = Number.isNaN(py) ? qy : py, a = Math.max(0, Math.floor(Math.min(first, qx))), b = Math.min(wide - 1, Math.ceil(Math.max(first, qx)));
+    for (let c = a; c <= b; c++) {
+      const share = qx === first ? 0 : Math.min(1, Math.max(0, (c - first) / (qx - first))), at = from + share * (qy - from);
+      if (at < high[c]) high[c] = at; if (at > low[c]) low[c] = at;
+      // within a column a curve may climb all the way
+      if (b - a < 2) { if (qy < high[c]) high[c] = qy; if (qy > low[c]) low[c] = qy; }
+    }
+    px = qx; py = qy;
+  }
+  return { high, low };
+}
+/** The same over some columns. */
+function extent({ high, low }, from, to) {
+  let a = Infinity, b = -Infinity;
+  for (let c = Math.max(0, from); c <= Math.min(high.length - 1, to); c++) { if (high[c] < a) a = high[c]; if (low[c] > b) b = low[c]; }
+  return [a, b];
+}
 
 /** A line; of many samples only the lowest and the highest of each column of pixels, which is all that one sees. */
 function trace(g, { x, y }, X, Y, begin, end, pixels) {

@@ -5,7 +5,7 @@ import { copies } from "/copies.js";
 import { showLook } from "/look.js";
 
 const $ = id => document.getElementById(id), PIECE = 48 * 1024;
-let writes = false, files = null, stale = false, uploading = false;
+let writes = false, files = null, stale = false, uploading = false, looking = false;
 
 const number = id => $(id).valueAsNumber > 0 ? $(id).valueAsNumber : null;
 
@@ -14,6 +14,7 @@ export function chosen() {
   return {
     file: $("file").value, inputs: [...$("inputs").selectedOptions].map(o => o.value), output: $("output").value || null,
     counts: $("counts").value || null, counts_per_rev: number("counts-per-rev"), Ts: number("Ts"), resample: number("resample"),
+    mask: $("mask").value.trim() || null, shift: $("shift").valueAsNumber || null, hold: $("hold").checked,
   };
 }
 
@@ -21,7 +22,7 @@ export function chosen() {
 export const columns = () => [...$("inputs").options].map(o => o.value);
 
 const tell = teller(document, "error");
-function enable() { $("upload").disabled = !writes || uploading; }
+function enable() { $("upload").disabled = !writes || uploading; $("look").disabled = looking || !$("file").value; }
 
 export function fill(select, pairs, kept) {
   select.replaceChildren(...pairs.map(([value, label]) => {
@@ -38,7 +39,7 @@ on("state", s => {
     fill($("file"), s.recordings.map(n => [n, n]), [s.recordings.includes(before) ? before : s.first]);
     // a recording may be large, so it is opened only where its columns are asked for
     if ($("file").value !== before) { stale = true; if (!$("data").hidden) open(); }
-    if (!s.recordings.length && !s.gone) tell(new Error("There is no recording in this folder. Drop a CSV, log, JSON, .mat, .npz, Parquet or MCAP file here."));
+    $("what-to-look-at").textContent = s.recordings.length ? "Drop a file here, or choose one at the side. Then press Look." : "There is no recording in this folder. Drop a CSV, log, JSON, .mat, .npz, Parquet or MCAP file here.";
     mark("data", s.recordings.length === 1 ? "1 file" : `${s.recordings.length || "no"} files`);
     document.dispatchEvent(new CustomEvent("recordings", { detail: s.recordings }));
   }
@@ -50,16 +51,17 @@ export async function open() {
   if (!stale || !$("file").value) return;
   stale = false; tell(null);
   // what was found on another recording would pass for this one's
-  for (const id of ["signals", "advice", "summary", "look-copy", "looked"]) $(id).replaceChildren();
-  $("summary-fold").hidden = true; $("no-look").hidden = false; next(false);
+  for (const id of ["signals", "advice", "summary", "look-copy", "looked", "rows", "inputs", "output", "counts"]) $(id).replaceChildren();
+  $("summary-fold").hidden = $("rows-fold").hidden = true; $("no-look").hidden = false; next(false); mark("data", "not looked at");
+  $("mask").value = $("shift").value = ""; $("hold").checked = false;
   try {
     const c = await send("columns", chosen()), names = c.names.map(n => [n, n]);
-    fill($("inputs"), names, c.inputs);
+    fill($("inputs"), names, c.inputs); $("inputs").size = Math.min(6, Math.max(2, names.length));
     fill($("output"), [["", c.encoder ? "speed from counts" : "speed from the counts below"], ...names], [c.output ?? ""]);
     fill($("counts"), [["", c.encoder ? "counts" : "none"], ...names], [""]);
     rows(c);
     document.dispatchEvent(new CustomEvent("columns"));
-  } catch (error) { tell(error); }
+  } catch (error) { tell(error); mark("data", "not read", "bad"); }
 }
 
 /** The first rows of a file, under names and units, so that a person sees which column is which. */
@@ -73,19 +75,27 @@ function rows(c) {
   $("rows-fold").hidden = false; $("rows-fold").open = true;
 }
 
+/** Does what an advice says, and looks again. */
+function follow({ field, value }) {
+  const at = $(field);
+  if (at.type === "checkbox") at.checked = true; else at.value = field === "mask" && at.value ? `${at.value} ${value}` : value;
+  at.closest("details").open = true; look();
+}
+
 /** After a look, the way on is the step's action. */
 function next(on) { $("look").classList.toggle("primary", !on); $("to-model").hidden = !on; }
 
 async function look() {
-  tell(null); $("look").disabled = true;
+  tell(null); looking = true; enable();
   try {
     const f = await send("look", chosen());
     $("rows-fold").open = false;  // the signals say more
-    showLook($("data"), f); copies($("look-copy"), f); $("no-look").hidden = true; next(true);
-    $("looked").textContent = f.advice.length ? `${f.advice.length} thing${f.advice.length > 1 ? "s" : ""} to improve` : "Good to identify a model from";
-    mark("data", f.advice.length ? `${f.advice.length} to improve` : "good", f.advice.length ? "warn" : "good");
+    showLook($("data"), f, follow); copies($("look-copy"), f); $("no-look").hidden = true; next(true);
+    const n = f.advice.filter(a => !a.idle).length;
+    $("looked").textContent = n ? `${n} thing${n > 1 ? "s" : ""} to improve` : "Good to identify a model from";
+    mark("data", n ? `${n} to improve` : "good", n ? "warn" : "good");
   } catch (error) { tell(error); mark("data", "not read", "bad"); }
-  $("look").disabled = false;
+  looking = false; enable();
 }
 
 $("file").onchange = () => { stale = true; open(); };

@@ -15,6 +15,9 @@ on("state", s => {
   mark("deploy", s.controllers.length ? `${s.controllers.length} saved` : "nothing yet", s.controllers.length ? "good" : "");
 });
 
+/** Once there is a report, the way on is to read it. */
+function next(on) { $("report").classList.toggle("primary", !on); $("report-link").hidden = !on; $("report-link").classList.toggle("primary", on); }
+
 function show() {
   const name = $("deploy-controller").value, quoted = /^[\w./-]+$/.test(name) ? name : `'${name.replaceAll("'", "'\\''")}'`;
   $("deploy-copy").replaceChildren();
@@ -22,13 +25,15 @@ function show() {
   copies($("deploy-copy"), { commands: `# C99, then IEC 61131-3 structured text, then an FMU\nsewfast deploy ${quoted} firmware\nsewfast deploy ${quoted} plc --to st\nsewfast deploy ${quoted} simulation --to fmi\n` });
   const fold = $("deploy-copy").querySelector("details"); fold.open = true; fold.querySelector("summary").textContent = "Commands that write it as code";
 }
+/** Takes a controller of the folder, as one that was just saved. */
+export function choose(name) { if ([...$("deploy-controller").options].some(o => o.value === name)) { $("deploy-controller").value = name; show(); } }
 $("deploy-controller").onchange = show;
 $("report").onclick = async () => {
-  failed(null);
+  failed(null); next(false);
   try { await ask("report"); $("report-state").textContent = "under way"; } catch (error) { failed(error); }
 };
 on("reported", m => {
   if (m.error) return failed(new Error(m.error));
-  $("report-state").textContent = `Written: ${m.found.file}`; $("report-link").href = m.found.address; $("report-link").hidden = false;
+  $("report-state").textContent = `Written: ${m.found.file}`; $("report-link").href = m.found.address; next(true);
   copies($("report-copy"), m.found);
 });

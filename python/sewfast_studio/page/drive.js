@@ -6,7 +6,7 @@ import { copies } from "/copies.js";
 import { titleOf } from "/tune.js";
 
 const $ = id => document.getElementById(id);
-const LIMITS = ["volt", "speed_rpm", "acceleration", "current"], SAID = ["command", "V", "speed", "RPM", "acceleration", "RPM/s", "current", "A"], MOST_COLUMNS = 1200;
+const LIMITS = ["volt", "speed_rpm", "acceleration", "current"], SAID = ["command", "V", "speed", "RPM", "acceleration", "RPM/s", "current", "A"], MOST_COLUMNS = 1200, PROMPT = 10;
 let writes = false, drive = { connected: false, armed: false }, prompt = 0, paused = false, looping = false, charts = new Map(), run = -1, asking = false;
 
 const tell = teller(document, "drive-error");
@@ -20,7 +20,7 @@ function stop() {
 }
 $("stop").onclick = stop;
 addEventListener("keydown", event => { if (event.key === "Escape") { event.preventDefault(); stop(); } }, { capture: true });
-on("beat", m => { prompt = m.prompt; ask("alive", { n: m.n }, false); state(); });
+on("beat", m => { prompt = m.prompt; ask("alive", { n: m.n }, false); state(); $("arm").disabled = !mayArm(); });
 on("closed", () => { $("drive-state").textContent = "no connection: use the emergency stop"; });
 on("stopped", m => {
   drive = { ...drive, armed: false }; state(); enable();
@@ -54,7 +54,7 @@ function state() {
   if ($("drive-state").textContent !== said) $("drive-state").textContent = said;
   mark("drive", ...!d.connected ? ["no drive"] : d.state === "tripped" ? ["tripped", "bad"] : d.armed ? [d.job ? "moving" : "armed", "warn"] : ["connected", "good"]);
   $("no-drive").hidden = d.connected; $("live-panel").hidden = !d.connected;
-  $("prompt").textContent = d.connected && writes && !d.armed ? (prompt < 10 ? `This page has answered ${prompt} of 10 times in a row.` : "This page answers in time.") : "";
+  $("prompt").textContent = d.connected && writes && !d.armed ? (prompt < PROMPT ? `This page has answered ${prompt} of ${PROMPT} times in a row. Arming waits for that.` : "This page answers in time.") : "";
   // the last sample of a run is no speed of the drive any more
   if (!d.job) $("speed").textContent = d.connected ? `${d.state}${speed}` : "no drive";
 }
@@ -74,10 +74,13 @@ function table() {
 /** Limits are numbers of a drive from the first that is set on; before, it moves nothing. */
 function isLimited() { return !!drive.limits && drive.limits.some(v => v !== 0); }
 
+/** Only a page that answers in time may watch over a motor. */
+function mayArm() { return drive.connected && writes && !drive.job && !drive.armed && prompt >= PROMPT; }
+
 function enable() {
   const d = drive, idle = d.connected && writes && !d.job;
   $("connect").disabled = d.connected || !writes; $("disconnect").disabled = !idle; $("limits").disabled = !idle;
-  $("arm").disabled = !idle || d.armed; $("disarm").disabled = !idle || !d.armed; $("clear").disabled = !idle || d.state !== "tripped";
+  $("arm").disabled = !mayArm(); $("disarm").disabled = !idle || !d.armed; $("clear").disabled = !idle || d.state !== "tripped";
   $("record").disabled = !idle || !d.armed;
   // what comes next is the only action that stands out
   $("connect").hidden = d.connected; $("limits").hidden = !d.connected || d.armed; $("limits").classList.toggle("primary", !isLimited());
@@ -134,11 +137,11 @@ function paint(f) {
   const panels = new Map(), t = f.curves.t, n = t.length, step = n > 1 ? t[1] - t[0] : 0;
   for (const [name, unit] of Object.entries(f.columns)) panels.set(unit, [...(panels.get(unit) || []), name]);
   for (const [unit, names] of panels) {
-    if (!charts.has(unit)) charts.set(unit, new Chart($("live"), { y: `${names.length > 1 ? "" : names[0] + " "}[${unit || "1"}]` }));
+    if (!charts.has(unit)) charts.set(unit, new Chart($("live"), { y: `${names.find(n => names.every(m => m.startsWith(n))) ?? ""} [${unit || "1"}]`.trim() }));
     const series = names.map(name => {
       const low = f.curves[`${name}_low`], high = f.curves[`${name}_high`], x = new Float32Array(2 * n), y = new Float32Array(2 * n);
       for (let k = 0; k < n; k++) { x[2 * k] = t[k]; x[2 * k + 1] = t[k] + .5 * step; y[2 * k] = low[k]; y[2 * k + 1] = high[k]; }
-      return { name: names.length > 1 ? name : "", x, y };
+      return { name: names.length > 1 ? name.replaceAll("_", " ") : "", x, y };
     });
     charts.get(unit).draw(series, `${names.join(" and ")} over the last ${seconds($("live-seconds").valueAsNumber)} seconds`);
   }

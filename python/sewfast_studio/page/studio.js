@@ -5,7 +5,7 @@ import { mount } from "/tune.js";
 import * as bode from "/bode.js";
 import * as model from "/model.js";
 import "/commission.js";
-import "/deploy.js";
+import { choose } from "/deploy.js";
 import { look } from "/drive.js";
 
 const { ask, on } = server, $ = id => document.getElementById(id), VIEWS = ["drive", "data", "model", "tune", "commission", "deploy"];
@@ -55,5 +55,7 @@ $("take").onclick = async () => {
   $("take").textContent = "Take over";
 };
 for (const v of VIEWS) $(`view-${v}`).onclick = () => view(v);
+$("to-deploy").onclick = () => { choose($("save-name").value); view("deploy"); };
+$("verified").onclick = () => { choose("commissioned/controllers/tuned.json"); view("deploy"); };
 // a file that is dropped anywhere goes to the step Look
 addEventListener("drop", () => { if ($("data").hidden) view("data"); }, { capture: true });

@@ -1,15 +1,15 @@
 // The step Tune: sliders whose every move is a question to the server, and at most one under way; the latest wins.
-import { Chart } from "/curves.js";
+import { BESIDE, Chart, REFERENCE } from "/curves.js";
 import { sentences, teller } from "/tell.js";
 
 const PINS = ["A", "B"], MOST_NOTCHES = 4, DEEPEST = -30, CALM = 700;
-const WEIGHTS = [["tracking", "per y"], ["chatter", "per u"], ["effort", "per u"], ["overshoot", "per %"], ["rise", "per ms"], ["lag", "per ms"], ["saturation", "per share"]];
-const KNOBS = { alpha: "weight alpha", beta: "weight beta", N: "derivative filter N", filter_samples: "speed filter", filter_time: "feedback filter" };
+const WEIGHTS = [["tracking", "y"], ["chatter", "u"], ["effort", "u"], ["overshoot", "%"], ["rise", "ms"], ["lag", "ms"], ["saturation", "share"]];
+const KNOBS = { alpha: "weight alpha", beta: "weight beta", N: "derivative filter N", filter_samples: "mean of feedback", filter_time: "lag of feedback" };
 const NUMBERS = [ // name, title, unit
   ["Ms", "Ms", ""], ["Mt", "Mt", ""], ["phase_margin_deg", "phase margin", "deg"], ["gain_margin", "gain margin", ""],
   ["delay_margin_ms", "delay margin", "ms"], ["crossover_hz", "crossover", "Hz"], ["noise_gain", "noise gain", "u/y"],
-  ["rise_ms", "rise 10 to 90 %", "ms"], ["overshoot_percent", "overshoot", "%"], ["settling_ms", "settling, 2 %", "ms"],
-  ["peak", "disturbance peak", "y"], ["recovery_ms", "recovery", "ms"], ["u_rms", "effort, rms u", "u"], ["du_rms", "chatter, rms du", "u"],
+  ["rise_ms", "rise 10 to 90 %", "ms"], ["overshoot_percent", "overshoot of this step", "%"], ["settling_ms", "settling, 2 %", "ms"],
+  ["peak", "disturbance peak", "y"], ["recovery_ms", "recovery", "ms"], ["u_rms", "command, rms", "u"], ["du_rms", "its change, rms", "u"],
 ];
 
 /** A file of a commissioning by a name that fits into a field. */
@@ -29,7 +29,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
     upset: new Chart($("upset-plot"), {}),
     sensitivity: new Chart($("sens-plot"), { x: "frequency [Hz]", y: "|S|, |T| [dB]", log: true, marks: [0], floor: -60 }),
   };
-  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, saving = false, notches = [], failed = "", front = [], before = null, verdict = null, weighing = 0;
+  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, saving = false, notches = [], failed = "", front = [], before = null, judged = null, verdict = null, weighing = 0, sought = null, stored = null;
 
   const question = more => ({ model: $("tune-model").value, controller: $("tune-start").value || null, values, notches, ...more });
   const given = pairs => Object.fromEntries(pairs.map(([name, id]) => [name, $(id).valueAsNumber]).filter(([, v]) => Number.isFinite(v)));
@@ -43,9 +43,10 @@ export function mount(root, { ask, on, mark = () => {} }) {
       opened = await ask("tune_open", question({ values: {} }));
       const start = Object.fromEntries(opened.knobs.map(k => [k.name, k.value]));
       values = { ...start, ...Object.fromEntries(Object.entries(kept).filter(([name]) => name in start)) };
-      history = []; pins = {}; first = before = now = verdict = null; front = []; $("front").hidden = true;
+      history = []; pins = {}; first = before = now = judged = verdict = null; front = []; $("front").hidden = true;
       if (Object.keys(kept).length) first = await loopOf(start);
-      $("tune-members").textContent = opened.members > 1 ? `${opened.members} models. A curve is their median. Its band holds all of them.` : "one model"; $("limit-unit").textContent = `[${opened.u_unit}]`;
+      $("tune-members").textContent = opened.members > 1 ? `${opened.members} models. A curve is their median. Its band holds all of them.` : ""; $("limit-unit").textContent = `[${opened.u_unit}]`;
+      for (const [name, per] of WEIGHTS) $(`weight-${name}`).previousSibling.textContent = `${name}, per ${{ u: opened.u_unit, y: opened.y_unit }[per] || per} `;
       const measures = opened.counts || !opened.noise;
       $("noise").disabled = measures; $("noise").checked = opened.counts || (!measures && $("noise").checked);
       $("noise-what").textContent = opened.counts ? "Noise of the encoder's counts" : opened.noise ? `Noise of ${text(opened.noise)} ${opened.y_unit}, as recorded` : "Noise: none was recorded";
@@ -86,7 +87,6 @@ export function mount(root, { ask, on, mark = () => {} }) {
   function trade(k) {
     const most = front.length - 1, of = front[k];
     $("front-response").value = k; $("front-robust").value = most - k;
-    $("front-cost").value = `cost ${text(of.cost)} ${opened.y_unit}`; $("front-Ms").value = `Ms ${text(of.Ms)}`;
     return of.values;
   }
   let traded = null;  // values when a drag began
@@ -115,7 +115,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
     const before = notches, kept = values;
     notches = [...notches, numbers];
     await open(kept);
-    if (!opened) { const said = $("tune-error").textContent; notches = before; await open(kept); tell(new Error(said)); }
+    if (!opened) { const said = $("tune-error").textContent; notches = before; await open(kept); tell(new Error(`notch: ${said}`)); }
   }
 
   function keep(v) { tell(null); before = now; history.push({ ...v }); if (history.length > 200) history.shift(); enable(); }
@@ -131,14 +131,14 @@ export function mount(root, { ask, on, mark = () => {} }) {
     try {
       const found = await loopOf(asked);
       if (found.stamp !== opened.stamp) return await anew();
-      now = found; first ??= now; verdict = null; paint();
+      now = found; first ??= now; judged = verdict = null; paint();
       // what something else has said stays until a person goes on
       if (failed && $("tune-error").textContent === failed) tell(null);
       failed = "";
       requestAnimationFrame(() => setTimeout(() => document.dispatchEvent(new CustomEvent("drawn", { detail: performance.now() - began }))));
     } catch (error) { tell(error); failed = $("tune-error").textContent; }
     asking = false;
-    if (again !== null) { const since = again; again = null; move(since); } else resting = setTimeout(cost, 250);
+    if (again !== null) { const since = again; again = null; move(since); } else resting = setTimeout(judge, 250);
   }
 
   async function loopOf(values) { return { ...await ask("tune_move", question({ values, noise: $("noise").checked && !opened.counts })), values }; }
@@ -155,21 +155,25 @@ export function mount(root, { ask, on, mark = () => {} }) {
 
   /** A file of this name is another one now: what is shown of it begins again, with the numbers as they stand. */
   async function anew() {
+    const was = opened, kept = values, moved = was.knobs.some(k => values[k.name] !== k.value);
     asking = false; again = null;
-    await open(values);
+    await open();
+    // gains that were set by hand stay, unless they are in other units now
+    if (opened && moved && was.u_unit === opened.u_unit && was.y_unit === opened.y_unit) await open(kept);
     if (opened) tell(new Error("The model or the controller in the folder has changed. The start was computed again."));
   }
 
-  /** What `tune` would count; it takes longer, so it waits for a rest. */
-  async function cost() {
+  /** What a search would find of these gains: their cost, and what its limits count. It takes longer, so it waits for a rest. */
+  async function judge() {
     if (asking || !opened) return;
     const asked = values;
     try {
-      const [start, here] = (await ask("tune_costs", question({ weights: weights() }))).costs;
+      const found = await ask("tune_judge", question({ weights: weights() }));
       if (asked !== values) return;
-      const said = c => c === null ? "diverges" : `${c.toPrecision(4)} ${opened.y_unit}`;
-      $("cost").textContent = `cost ${said(here)}, start ${said(start)}` + (here !== null && start ? ` (${(100 * (here / start - 1)).toFixed(1)} %)` : "");
-      $("cost").classList.remove("old"); weighing = setTimeout(weigh, CALM);
+      judged = found;
+      const { cost, start_cost: start } = judged, share = 100 * (cost / start - 1), off = Math.abs(share).toFixed(1);
+      $("cost").textContent = cost === null ? "cost: the loop diverges" : `cost ${cost.toPrecision(4)} ${opened.y_unit}` + (start === null ? ", while the start diverges" : off === "0.0" ? ", that of the start" : `, ${off} % ${share < 0 ? "below" : "above"} the start`);
+      $("cost").classList.remove("old"); weighing = setTimeout(weigh, CALM); lights();
     } catch (error) { tell(error); }
   }
 
@@ -185,7 +189,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
     } catch (error) { tell(error); }
   }
 
-  const STYLES = { now: 0, A: 1, B: 3, before: 5, start: 5 };
+  const STYLES = { now: 0, A: 1, B: 3, before: BESIDE, start: BESIDE };
   const each = () => {
     const beside = $("compare").value, other = beside === "before" && before !== first ? before : beside ? first : null;
     return [["now", now], ...PINS.filter(p => pins[p]).map(p => [p, pins[p]]), [other === first ? "start" : "before", other]].filter(([, f], i) => i === 0 || (f && f !== now));
@@ -214,28 +218,34 @@ export function mount(root, { ask, on, mark = () => {} }) {
 
   function paint() {
     const shown = each(), style = name => STYLES[name], y = opened.y_unit, u = opened.u_unit;
-    const all = (x, name) => shown.flatMap(([label, f]) => series(x, name, f, label, style(label)));
+    const word = label => shown.length > 1 ? label : "";  // a curve alone needs no name
+    const all = (x, name) => shown.flatMap(([label, f]) => series(x, name, f, word(label), style(label)));
     const says = now.diverges ? "the loop diverges" : `overshoot ${text(now.overshoot_percent)} %, rise ${text(now.rise_ms)} ms, Ms ${text(now.Ms)}`;
-    charts.step.axes.y = `step response [${y}]`; charts.command.axes.y = `command [${u}]`; charts.load.axes.y = `disturbance of ${text(opened.disturbance)} ${u} [${y}]`;
-    charts.step.draw(now.diverges ? [] : all("reference_t", "reference_y"), `step response, ${says}`);
+    charts.step.axes.y = `step: output [${y}]`; charts.command.axes.y = `step: command [${u}]`; charts.load.axes.y = `disturbance ${text(opened.disturbance)} ${u}: output [${y}]`;
+    charts.step.draw(now.diverges ? [] : [...shown.flatMap(([label, f]) => series("reference_t", "reference_y", f, label, style(label))), ...series("reference_t", "reference_r", now, "reference", REFERENCE)], `step response, ${says}`);
     charts.command.draw(now.diverges ? [] : all("reference_t", "reference_u"), "command of the step");
     charts.load.draw(now.diverges ? [] : all("disturbance_t", "disturbance_y"), `disturbance response, recovery ${text(now.recovery_ms)} ms`);
-    charts.upset.axes.y = `command, disturbed [${u}]`; charts.upset.draw(now.diverges ? [] : all("disturbance_t", "disturbance_u"), "command against the disturbance");
+    charts.upset.axes.y = `disturbance: command [${u}]`; charts.upset.draw(now.diverges ? [] : all("disturbance_t", "disturbance_u"), "command against the disturbance");
     const limit = limitMs();
     charts.nichols.draw([...shown.map(([label, f]) => nichols(label, f, style(label))), ...limit > 1 ? [circle(limit)] : []], `Nichols chart of L, and where Ms is ${limit}`, [{ x: -180, y: 0, label: "\u22121" }]);
     charts.loop.draw(all("hertz", "L_db"), "size of L over frequency");
     charts.phase.draw(all("hertz", "L_deg"), "phase of L over frequency");
     charts.sensitivity.draw([...series("hertz", "S_db", now, "S", 0), ...series("hertz", "T_db", now, "T", 4),
       ...shown.slice(1).flatMap(([label, f]) => series("hertz", "S_db", f, `S ${label}`, style(label)))], `sensitivity, peak ${text(now.Ms)}`);
+    if (front.length) { $("front-rise").value = `rise ${shortTime(now.rise_ms)}`; $("front-Ms").value = `Ms ${text(now.Ms)}`; }
     numbers(shown); lights();
   }
 
-  const text = v => v === null || v === undefined ? "none" : Number(v.toPrecision(3)).toString();
+  const text = v => v === null || v === undefined ? "none" : Number(v.toPrecision(3)).toString().replace("-", "\u2212");
+  const SLOW = 1e4, shortTime = ms => ms === null ? "without end" : ms > SLOW ? `${text(ms / 1000)} s` : `${text(ms)} ms`;
 
   /** The table is made when its columns change; a move only writes into it, which the browser lays out sooner. */
   function numbers(shown) {
     const table = $("numbers"), titles = shown.map(([label]) => label), unit = { u: opened.u_unit, y: opened.y_unit, "u/y": `${opened.u_unit}/${opened.y_unit}` };
-    const head = ["number", ...titles, "unit"], rows = NUMBERS.map(([name, title, of]) => [title, ...shown.map(([, f]) => text(f[name])), unit[of] ?? of]);
+    const head = ["quantity", ...titles, "unit"], rows = NUMBERS.map(([name, title, of]) => {
+      const values = shown.map(([, f]) => f[name]), slow = of === "ms" && values.some(v => v > SLOW);
+      return [title, ...values.map(v => text(slow && v ? v / 1000 : v)), slow ? "s" : unit[of] ?? of];
+    });
     if (table.rows.length !== rows.length + 1 || table.rows[0].cells.length !== head.length) {
       table.replaceChildren(...[head, ...rows].map((cells, k) => {
         const row = document.createElement("tr");
@@ -251,31 +261,39 @@ export function mount(root, { ask, on, mark = () => {} }) {
     [head, ...rows].forEach((cells, k) => cells.forEach((said, i) => { const cell = table.rows[k].cells[i]; if (cell.textContent !== said) cell.textContent = said; }));
   }
 
-  const limitMs = () => parseFloat($("limit-Ms").value) || 1.8, KINDS = { good: "good", fair: "warn", poor: "bad", unfit: "bad" };
+  const limitMs = () => parseFloat($("limit-Ms").value) || 1.8, HAIR = 1.001, KINDS = { good: "good", fair: "warn", poor: "bad", unfit: "bad" };
 
-  /** The verdict and the limits as words and signs, never by colour alone. */
+  /** The verdict and the limits as words and signs, never by colour alone. A search judges by its own references, and so do the limits:
+   * what is drawn is one step. */
   function lights() {
     const limit = limitMs(), over = parseFloat($("limit-overshoot").value), most = parseFloat($("limit-u").value);
-    const rows = [["stable", now.stable && !now.diverges, now.stable ? "yes" : "no"], [`Ms at most ${limit}`, now.stable && now.Ms <= limit, text(now.Ms)]];
-    if (Number.isFinite(over)) rows.push([`overshoot at most ${over} %`, !now.diverges && now.overshoot_percent <= over, text(now.overshoot_percent)]);
-    if (Number.isFinite(most)) rows.push([`command at most ${most} ${opened.u_unit}`, !now.diverges && now.u_peak <= most, text(now.u_peak)]);
-    if (limit > 1) $("Ms-means").textContent = `Ms ${limit} leaves a gain margin of at least ${text(limit / (limit - 1))} and a phase margin of at least ${text(2 * Math.asin(.5 / limit) * 180 / Math.PI)} degrees.`;
-    const chips = [[`gains: ${verdict ? verdict.grade : "being judged"}`, verdict ? KINDS[verdict.grade] : ""],
-      ...rows.map(([what, ok, found]) => [`${ok ? "kept" : "broken"}: ${what} (${found})`, ok ? "good" : "bad"])];
+    const row = (what, found, limit, unit = "") => [what, judged && found !== null && found <= limit * HAIR, `${judged ? ` ${found === null ? "without end" : text(found) + unit},` : ""} at most ${limit}${unit}`];
+    const rows = [row("Ms", judged?.Ms, limit)];
+    if (Number.isFinite(over)) rows.push(row("overshoot", judged?.overshoot, over, " %"));
+    if (Number.isFinite(most)) rows.push(row("command", judged?.u, most, ` ${opened.u_unit}`));
+    if (limit > 1) $("Ms-means").textContent = `Ms ${limit} leaves a gain margin of at least ${text(limit / (limit - 1))} and a phase margin of at least ${text(2 * Math.asin(.5 / limit) * 180 / Math.PI)} degrees.` +
+      (judged?.Ms > 1.01 * now.Ms ? ` The table holds about ${text(opened.level)} ${opened.y_unit}. The limit counts other levels too: Ms is ${text(judged.Ms)} there.` : "");
+    const stable = now.stable && !now.diverges;
+    const chips = [[verdict ? `gains ${verdict.grade}` : "gains: being judged", verdict ? KINDS[verdict.grade] : ""], [stable ? "stable" : "unstable", stable ? "good" : "bad"],
+      ...rows.map(([what, ok, said]) => [`${what}${judged ? "" : ":"}${said}`, !judged ? "" : ok ? "good" : "bad"])];
     while ($("lights").children.length > chips.length) $("lights").lastChild.remove();
     chips.forEach(([said, kind], k) => {
       const li = $("lights").children[k] ?? $("lights").appendChild(document.createElement("li"));
       if (li.textContent !== said) li.textContent = said;
-      li.className = `chip ${kind}`;
+      li.className = `chip ${kind}`; li.title = k < 2 ? "" : "The largest of all references, models and variations that a search runs";
     });
-    const broken = rows.find(([, ok]) => !ok), judged = verdict && verdict.grade !== "good";
-    mark("tune", broken ? "limit broken" : judged ? verdict.grade : `Ms ${text(now.Ms)}`, broken ? "bad" : judged ? KINDS[verdict.grade] : "good");
+    const broken = !stable || (judged && rows.some(([, ok]) => !ok)), rated = verdict && verdict.grade !== "good";
+    mark("tune", !stable ? "unstable" : broken ? "limit broken" : rated ? verdict.grade : `Ms ${text(now.Ms)}`, broken ? "bad" : rated ? KINDS[verdict.grade] : judged ? "good" : "");
   }
 
   function enable() {
     $("undo").disabled = !history.length; $("reset").disabled = !opened;
     $("search").disabled = $("trade").disabled = !opened || busy || !writes; $("tune-cancel").disabled = $("tune-cancel").hidden = !busy || !writes; $("tune-bar").hidden = !busy;
     $("save").disabled = !opened || !writes; $("add-notch").disabled = !opened || notches.length >= MOST_NOTCHES;
+    // what comes next is the only action that stands out
+    const next = values === stored ? "to-deploy" : values === sought && !busy ? "save" : "search";
+    for (const id of ["search", "save", "to-deploy"]) $(id).classList.toggle("primary", id === next);
+    $("to-deploy").hidden = next !== "to-deploy";
     for (const p of PINS) { $(`pin-${p}`).disabled = !opened; $(`take-${p}`).disabled = !pins[p]; }
   }
 
@@ -291,12 +309,12 @@ export function mount(root, { ask, on, mark = () => {} }) {
   $("weights").replaceChildren(...WEIGHTS.map(([name, per]) => {
     const label = document.createElement("label"), field = document.createElement("input");
     label.textContent = `${name}, ${per} `; Object.assign(field, { type: "number", min: 0, step: "any", id: `weight-${name}`, placeholder: "usual" });
-    field.onchange = () => { if (opened) { $("cost").classList.add("old"); cost(); } };
+    field.onchange = () => { if (opened) { $("cost").classList.add("old"); judge(); } };
     label.append(field); return label;
   }));
   $("add-notch").onclick = () => {
     const f = $("notch-hz").valueAsNumber;
-    f > 0 ? addNotch([f, .1, .5]) : tell(new Error("Expected a frequency in Hz. Type it, or take the one that the frequency response in Look proposes."));
+    f > 0 ? addNotch([f, .1, .5]) : tell(new Error("notch: Expected a frequency in Hz. Type it, or take the one that the frequency response in Look proposes."));
   };
   $("undo").onclick = undo;
   $("reset").onclick = () => set(Object.fromEntries(opened.knobs.map(k => [k.name, k.value])));
@@ -304,7 +322,9 @@ export function mount(root, { ask, on, mark = () => {} }) {
     $(`pin-${p}`).onclick = () => { pins[p] = now; enable(); paint(); };
     $(`take-${p}`).onclick = () => set(pins[p].values);
   }
-  for (const id of ["limit-Ms", "limit-overshoot", "limit-u", "compare"]) $(id).oninput = () => { if (now) paint(); };
+  $("compare").oninput = () => { if (now) paint(); };
+  // who sets a limit wants it kept
+  for (const id of ["limit-Ms", "limit-overshoot", "limit-u"]) $(id).oninput = () => { $("tune-within").checked = true; if (now) paint(); };
   $("noise").onchange = withNoise;
   let alone = null;  // the weights of the reference, whose work a feedforward does
   $("knob-feedforward-value").onchange = event => {
@@ -329,6 +349,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
       await ask("tune_save", question({ file })); $("saved").textContent = `Written: ${file}`;
       // the start is this controller now, and has the notches that were put into it
       if (file === $("tune-start").value) { notches = []; await open(values); }
+      stored = values; enable();
     } catch (error) { tell(error); }
     saving = false;
   };
@@ -346,8 +367,8 @@ export function mount(root, { ask, on, mark = () => {} }) {
     busy = false; $("tune-progress").textContent = ""; enable();
     if (m.error) return tell(new Error(m.error));
     if (!opened) return;
-    $("tune-progress").textContent = m.found.interrupted ? "cancelled: the best so far" : `${m.found.ended === "time" ? "time is up; found" : "found"}: cost ${m.found.cost.toPrecision(4)}, began at ${m.found.start_cost.toPrecision(4)}; ${m.found.verdict}`;
-    set(m.found.values);
+    $("tune-progress").textContent = m.found.interrupted ? "Cancelled. These are the best gains so far." : `${m.found.ended === "time" ? "Time is up. " : ""}Found gains with cost ${m.found.cost.toPrecision(4)} ${opened.y_unit}, from ${m.found.start_cost.toPrecision(4)}.`;
+    set(m.found.values); sought = values; enable();
   });
   on("traded", m => {
     busy = false; $("tune-progress").textContent = ""; enable();
@@ -359,11 +380,11 @@ export function mount(root, { ask, on, mark = () => {} }) {
     $("tune-progress").textContent = `Found ${front.length} controllers. Each is better than every other in response or in robustness.`;
     // where it begins: the fastest that keeps the limit
     const limit = parseFloat($("limit-Ms").value) || 1.8, kept = front.map((f, k) => f.Ms <= limit ? k : 0);
-    set({ ...values, ...trade(Math.max(...kept)) });
+    set({ ...values, ...trade(Math.max(...kept)) }); sought = values; enable();
   });
   on("state", s => {
     writes = s.writes; enable();
-    fill($("tune-model"), s.models.map(n => [n, titleOf(n)]), s.first); fill($("tune-start"), [["", "first controller"], ...s.controllers.map(n => [n, titleOf(n)])], s.start ?? "");
+    fill($("tune-model"), s.models.map(n => [n, titleOf(n)]), s.first); fill($("tune-start"), [["", "computed from the model"], ...s.controllers.map(n => [n, titleOf(n)])], s.start ?? "");
     $("no-model").hidden = s.models.length > 0; $("figures").hidden = !s.models.length; $("step-plot").parentNode.hidden = !s.models.length;
     if (!opened) mark("tune", s.models.length ? "ready" : "needs a model");
     if (!$("tune").hidden && !saving) opened ? move() : open();

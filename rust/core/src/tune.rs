@@ -223,7 +223,20 @@ fn staged<P: Plant + Clone + Send + Sync>(
     cma_es::refine(&whole, found, options, monitor)
 }
 
-/// What each design costs, and by how much it violates the constraints; infinite if a run diverges.
+/// A design as a search judges it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Judged {
+    /// What it costs; infinite if a run diverges.
+    pub cost: f64,
+    /// Sum of the relative violations of the constraints; infinite if a run diverges.
+    pub violation: f64,
+    /// Largest overshoot of all runs \[%\]; infinite if one diverges.
+    pub overshoot: f64,
+    /// Largest `|u|` of all runs \[u\]; infinite if one diverges.
+    pub u_max: f64,
+}
+
+/// What a search finds of each design.
 ///
 /// # Errors
 /// As [`tune`], except that useless designs are no error.
@@ -232,16 +245,31 @@ pub fn costs<P: Plant + Clone + Send + Sync>(
     designs: &[AnyDesign<f64>],
     threads: usize,
     monitor: &Monitor,
-) -> Result<Vec<Judgement>> {
+) -> Result<Vec<Judged>> {
     task.check()?;
     monitor.set_total(designs.len() as u64);
-    let bench = Bench::new(task)?;
+    let bench = Bench::new(task)?.with_overshoot();
     let mut benches = vec![bench; threads.clamp(1, designs.len().max(1))];
     Ok(several(&mut benches, designs, TOGETHER, |bench, some| {
-        let trials: Vec<_> = some.iter().map(|d| (*d, Judgement::HOPELESS)).collect();
-        let judged = bench.judge(task, Extent::Whole, &trials, monitor);
+        let judged = bench.records(task, some, monitor);
         monitor.advance(some.len() as u64);
-        judged
+        let judged = judged.into_iter().map(|record| {
+            record.map_or(
+                Judged {
+                    cost: f64::INFINITY,
+                    violation: f64::INFINITY,
+                    overshoot: f64::INFINITY,
+                    u_max: f64::INFINITY,
+                },
+                |record| Judged {
+                    cost: record.cost,
+                    violation: record.violation,
+                    overshoot: record.largest.overshoot,
+                    u_max: record.largest.u_max,
+                },
+            )
+        });
+        judged.collect()
     }))
 }
 

@@ -185,13 +185,20 @@ def test_a_move_gives_what_the_library_gives(tuned: Studio) -> None:
     np.testing.assert_array_equal(curves["reference_y"], np.median(runs, 0)[-n:].astype("f4"))
 
 
-def test_costs_are_those_of_tune(tuned: Studio) -> None:
+def test_limits_and_costs_are_judged_as_tune_does(tuned: Studio) -> None:
     model = sewfast.load_model(tuned.project.folder / "drive.json")
     start = first_controller(model)
     with Page(tuned) as page:
-        first, second = page.ask("tune_costs", **MOVE)["found"]["costs"]
-    assert first == costs(start, model)[0]
-    assert second != first
+        found = page.ask("tune_judge", **MOVE)["found"]
+        assert found["start_cost"] == costs(start, model)[0] != found["cost"]
+        # gains that a search kept within limits are within them on the page
+        limits = {"Ms": 1.5, "overshoot": 3.0}
+        page.ask("tune_search", evaluations=60, seed=0, constraints=limits, **MOVE)
+        values = page.event("searched")["found"]["values"]
+        found = page.ask("tune_judge", **{**MOVE, "values": values})["found"]
+    assert found["Ms"] <= 1.001 * limits["Ms"]
+    assert 0.0 < found["overshoot"] <= limits["overshoot"]
+    assert 0.0 < found["u"] <= start.u_max
 
 
 def test_noise_and_feedforward_are_those_of_the_library(tuned: Studio) -> None:

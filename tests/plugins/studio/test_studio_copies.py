@@ -7,8 +7,10 @@ import shlex
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
+import sewfast
 from sewfast.cli.parser import build_parser
 from sewfast_studio import driving, requests
 
@@ -24,7 +26,10 @@ ASKED: dict[str, dict[str, Any]] = {
     },
     "commission": {"seed": 1, "members": 2, "evaluations": 50},
 }  # fmt: skip
-STEP = requests.Step("-odd.csv", ("u",), "y", resample=0.01, model="oe", seed=4)
+STEP = requests.Step(
+    "-odd.csv", ("u",), "y", resample=0.01, model="oe", seed=4,
+    mask=("3:5", "outliers"), shift=2, hold=True,
+)  # fmt: skip
 
 
 def called(script: str, name: str) -> ast.Call:
@@ -66,10 +71,30 @@ def test_a_commissioning_of_a_virtual_machine() -> None:
 def test_steps(name: str) -> None:
     columns = {"inputs": ["u"], "output": "y"}
     # as the studio does: the filter of resampling looks ahead
-    step = replace(STEP, resample=None) if name == "bode" else STEP
+    step = replace(STEP, resample=None, mask=(), hold=False) if name == "bode" else STEP
     copy = requests.script(step, name, columns, None, None)
     assert ast.unparse(called(copy, "read")).startswith("sewfast.read('-odd.csv', inputs=['u']")
     if name != "look":
         called(copy, name)
     said = requests.commands(step, name, columns, None, None)
-    assert "./-odd.csv" in known(said, name).data
+    options = known(said, name)
+    assert "./-odd.csv" in options.data
+    assert options.shift_input == 2
+    if name != "bode":
+        assert (options.mask, options.hold_inputs) == (["3:5", "outliers"], True)
+
+
+def test_the_copy_of_a_changed_recording_gives_the_same_data() -> None:
+    u = np.repeat([0.0, 1.0, np.nan, 2.0, 1.0], 40)
+    y = np.convolve(np.nan_to_num(u), 0.1 * np.ones(10))[:200]
+    y[50] = 90.0
+    step = replace(STEP, resample=None)
+    data = sewfast.Dataset.from_arrays(u, y, Ts=0.01)
+    found = step.changed(data)
+    copied: dict[str, Any] = {"data": data}
+    lines = requests.script(step, "look", {"inputs": ["u"], "output": "y"}, None, None)
+    exec("\n".join(x for x in lines.splitlines() if x.startswith("data = data.")), copied)
+    for ours, theirs in zip(found.experiments, copied["data"].experiments, strict=True):
+        np.testing.assert_array_equal(ours.u, theirs.u)
+        np.testing.assert_array_equal(ours.y, theirs.y)
+    assert np.isfinite(found.experiments[0].u).all()

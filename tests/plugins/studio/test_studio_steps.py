@@ -97,30 +97,30 @@ def test_the_trade_off_is_a_front_from_calm_to_quick(tuned: Studio) -> None:
         found = page.event("traded")["found"]
         front = found["front"]
         assert len(front) > 2
-        assert found["unit"] == "RPM"
         errors, peaks = ([f[name] for f in front] for name in ("cost", "Ms"))
         assert errors == sorted(errors, reverse=True)
         assert peaks == sorted(peaks)
         for point in front[:: len(front) - 1]:
-            costs = page.ask("tune_costs", **{**MOVE, "values": point["values"]})["found"]["costs"]
-            assert costs[1] == point["cost"]
+            judged = page.ask("tune_judge", **{**MOVE, "values": point["values"]})["found"]
+            assert judged["cost"] == point["cost"]
+            assert judged["Ms"] == pytest.approx(point["Ms"], rel=1e-3)
         shown = page.ask("tune_move", **{**MOVE, "values": front[0]["values"]})["found"]
         assert shown["stable"]
 
 
 def test_weights_change_the_cost(tuned: Studio) -> None:
     with Page(tuned) as page:
-        usual = page.ask("tune_costs", **MOVE)["found"]["costs"]
-        heavy = page.ask("tune_costs", weights={"chatter": 1e4}, **MOVE)["found"]["costs"]
-    assert heavy[1] > usual[1]
+        usual = page.ask("tune_judge", **MOVE)["found"]
+        heavy = page.ask("tune_judge", weights={"chatter": 1e4}, **MOVE)["found"]
+    assert heavy["cost"] > usual["cost"]
 
 
 @pytest.mark.parametrize(
     ("do", "wrong"),
     [
-        ("tune_costs", {"weights": {"chatter": -1.0}}),
-        ("tune_costs", {"weights": {"chatter": math.nan}}),
-        ("tune_costs", {"weights": {"unknown": 1.0}}),
+        ("tune_judge", {"weights": {"chatter": -1.0}}),
+        ("tune_judge", {"weights": {"chatter": math.nan}}),
+        ("tune_judge", {"weights": {"unknown": 1.0}}),
         ("tune_move", {"notches": [[60.0, 0.1]]}),
         ("tune_move", {"notches": [NOTCH] * 5}),
         ("tune_move", {"notches": [[600.0, 0.1, 0.5]]}),

@@ -63,6 +63,16 @@ impl<P: Plant + Clone> Bench<P> {
         self
     }
 
+    /// The same, but with the overshoot computed in any case.
+    pub(super) fn with_overshoot(mut self) -> Self {
+        self.measures = self
+            .measures
+            .into_iter()
+            .map(Measure::with_overshoot)
+            .collect();
+        self
+    }
+
     pub(super) fn weights(&self) -> &Weights {
         &self.weights
     }
@@ -101,12 +111,9 @@ impl<P: Plant + Clone> Bench<P> {
                 return false;
             };
             let total = &mut totals[i];
-            total.go_to(plant);
-            total.largest = total.largest.max(&terms);
-            total.late = total.late.worse(task.constraints.of_load(plant, &terms));
+            total.take(task, plant, &terms);
             total.own += share * weights.of(&terms) / task.alike(run);
-            let runs = task.constraints.of_runs(&total.largest);
-            let excess = loops[i].and(total.late).and(runs);
+            let excess = total.excess(task, loops[i]);
             judgements[i] = Judgement {
                 violation: excess.sum,
                 cost: total.lower_bound(task),
@@ -118,14 +125,14 @@ impl<P: Plant + Clone> Bench<P> {
         judgements
     }
 
-    /// Terms over all plants and references, as the task aggregates them, and the violation of its constraints; `None`
-    /// if a run diverges or on a stop.
-    pub(super) fn terms(
+    /// What each controller does over all plants and references; `None` if a run diverges or on a stop.
+    pub(super) fn records(
         &mut self,
         task: &Task<'_, P>,
         designs: &[AnyDesign<f64>],
         monitor: &Monitor,
-    ) -> Vec<Option<(Terms, f64)>> {
+    ) -> Vec<Option<Record>> {
+        let weights = self.weights;
         let mut means = vec![Some(Mean::default()); designs.len()];
         let (whole, all) = (Extent::Whole, designs.to_vec());
         self.each_run(task, whole, all, monitor, |i, plant, run, terms| {
@@ -134,22 +141,28 @@ impl<P: Plant + Clone> Bench<P> {
                 return false;
             };
             mean.go_to(plant, task);
-            mean.largest = mean.largest.max(&terms);
-            mean.late = mean.late.worse(task.constraints.of_load(plant, &terms));
+            mean.total.take(task, plant, &terms);
+            mean.total.own += weights.of(&terms) / task.alike(run);
             mean.own = mean.own.plus(&terms, 1.0 / task.alike(run));
             true
         });
-        let aggregated = |(mean, design): (Option<Mean>, &AnyDesign<f64>)| {
+        let recorded = |(mean, design): (Option<Mean>, &AnyDesign<f64>)| {
             let mut mean = mean?;
             mean.go_to(task.plants.len(), task);
-            let runs = mean.late.and(task.constraints.of_runs(&mean.largest));
-            let terms = match task.aggregate {
-                Aggregate::Mean => mean.sum,
-                Aggregate::Worst => mean.worst,
-            };
-            Some((terms, task.constraints.of_loops(design).and(runs).sum))
+            Some(Record {
+                cost: mean.total.lower_bound(task),
+                violation: mean
+                    .total
+                    .excess(task, task.constraints.of_loops(design))
+                    .sum,
+                largest: mean.total.largest,
+                terms: match task.aggregate {
+                    Aggregate::Mean => mean.sum,
+                    Aggregate::Worst => mean.worst,
+                },
+            })
         };
-        means.into_iter().zip(designs).map(aggregated).collect()
+        means.into_iter().zip(designs).map(recorded).collect()
     }
 
     /// Runs every controller over the extent's runs on every plant. `take` gets the controller's index, the plant, the run and its terms
@@ -316,6 +329,19 @@ impl Total {
         }
     }
 
+    /// Takes the terms of a run on a plant, but not what it costs.
+    fn take<P>(&mut self, task: &Task<'_, P>, plant: usize, terms: &Terms) {
+        self.go_to(plant);
+        self.largest = self.largest.max(terms);
+        self.late = self.late.worse(task.constraints.of_load(plant, terms));
+    }
+
+    /// The excess of the runs so far, with that of the linear loops.
+    fn excess<P>(&self, task: &Task<'_, P>, loops: Excess) -> Excess {
+        let runs = task.constraints.of_runs(&self.largest);
+        loops.and(self.late).and(runs)
+    }
+
     fn lower_bound<P>(&self, task: &Task<'_, P>) -> f64 {
         match task.aggregate {
             Aggregate::Mean => (self.finished + self.own) / task.plants.len() as f64,
@@ -324,23 +350,36 @@ impl Total {
     }
 }
 
-/// The terms of a controller so far.
+/// What a controller does over all plants and references.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Record {
+    /// The cost that is tuned for.
+    pub cost: f64,
+    /// Sum of the relative violations of the constraints.
+    pub violation: f64,
+    /// The largest of each term over all runs, as the constraints limit it.
+    pub largest: Terms,
+    /// The mean of each term, over the plants as the task aggregates them.
+    pub terms: Terms,
+}
+
+/// The terms of a controller so far, with what they cost: a mean of costs, as a cost of mean terms would let an overshoot
+/// in one run be made up for in another.
 #[derive(Clone, Copy, Debug, Default)]
 struct Mean {
-    plant: usize,
+    total: Total,
     sum: Terms,
     worst: Terms,
     own: Terms,
-    largest: Terms,
-    late: Excess,
 }
 
 impl Mean {
     fn go_to<P>(&mut self, plant: usize, task: &Task<'_, P>) {
-        if plant != self.plant {
+        if plant != self.total.plant {
             self.sum = self.sum.plus(&self.own, 1.0 / task.plants.len() as f64);
             self.worst = self.worst.max(&self.own);
-            (self.plant, self.own) = (plant, Terms::default());
+            self.own = Terms::default();
+            self.total.go_to(plant);
         }
     }
 }

@@ -2,9 +2,9 @@
 
 use sewfast_control::AnyDesign;
 
-use super::bench::{Bench, TOGETHER};
+use super::Task;
+use super::bench::{Bench, Record, TOGETHER};
 use super::variable::{designed, place};
-use super::{Task, Terms};
 use crate::closed_loop::Plant;
 use crate::search::nsga2::{self, Objectives, Values};
 use crate::search::{Options, Termination};
@@ -152,9 +152,10 @@ struct Several<'a, P> {
 }
 
 impl<P: Plant + Clone + Send + Sync> Several<'_, P> {
-    fn value(&self, objective: Objective, terms: &Terms, design: &AnyDesign<f64>) -> f64 {
+    fn value(&self, objective: Objective, record: &Record, design: &AnyDesign<f64>) -> f64 {
+        let terms = &record.terms;
         match objective {
-            Objective::Cost => self.bench.weights().of(terms),
+            Objective::Cost => record.cost,
             Objective::Tracking => terms.tracking,
             Objective::Chatter => terms.chatter,
             Objective::Effort => terms.effort,
@@ -192,7 +193,7 @@ impl<P: Plant + Clone + Send + Sync> Objectives for Several<'_, P> {
         let design = |point: &Vec<f64>| designed(self.task.variables, point, &self.task.start);
         let designs: Vec<_> = points.iter().map(|point| design(point).ok()).collect();
         let known: Vec<_> = designs.iter().copied().flatten().collect();
-        let mut judged = bench.terms(self.task, &known, monitor).into_iter();
+        let mut judged = bench.records(self.task, &known, monitor).into_iter();
         let values = |design: &Option<_>| {
             let judged = design.and_then(|design| Some((design, judged.next()??)));
             judged.map_or_else(|| self.hopeless(), |judged| self.values(judged))
@@ -202,12 +203,12 @@ impl<P: Plant + Clone + Send + Sync> Objectives for Several<'_, P> {
 }
 
 impl<P: Plant + Clone + Send + Sync> Several<'_, P> {
-    fn values(&self, (design, (terms, violation)): (AnyDesign<f64>, (Terms, f64))) -> Values {
+    fn values(&self, (design, record): (AnyDesign<f64>, Record)) -> Values {
         let objectives = self.objectives.iter();
         Values {
-            violation,
+            violation: record.violation,
             objectives: objectives
-                .map(|o| self.value(*o, &terms, &design))
+                .map(|o| self.value(*o, &record, &design))
                 .collect(),
         }
     }

@@ -466,6 +466,52 @@ fn a_front_trades_tracking_for_calm() {
 }
 
 #[test]
+fn a_front_of_the_cost_states_what_a_search_counts() {
+    with_task(start(), |task| {
+        // a step of each kind, of which only one overshoots
+        let (up, slow) = (task.references[0], [0.0; 400]);
+        let references = [up, &slow];
+        let task = Task {
+            references: &references,
+            disturbances: &[],
+            noise: &[],
+            ..task.clone()
+        };
+        let objectives = [Objective::Cost, Objective::Effort];
+        let (starts, options) = ([task.start], options(480, 2));
+        let front = pareto(
+            &task,
+            &objectives,
+            &starts,
+            24,
+            options,
+            &Monitor::default(),
+        )
+        .unwrap();
+        assert!(front.designs.len() > 5, "{front:?}");
+        let judged = costs(&task, &front.designs, 1, &Monitor::default()).unwrap();
+        for (values, judged) in front.values.iter().zip(&judged) {
+            assert_eq!(values[0].to_bits(), judged.cost.to_bits());
+        }
+        // the overshoot is that which a limit is compared with
+        let most = judged[0].overshoot;
+        let limited = |overshoot| {
+            let constraints = Constraints {
+                overshoot: Some(overshoot),
+                ..Constraints::default()
+            };
+            let task = Task {
+                constraints,
+                ..task.clone()
+            };
+            costs(&task, &front.designs[..1], 1, &Monitor::default()).unwrap()[0].violation
+        };
+        assert!(most > 0.0 && limited(most) == 0.0, "{most}");
+        assert!((limited(0.5 * most) - 1.0).abs() < 1e-12);
+    });
+}
+
+#[test]
 fn notches_are_searched_and_other_biquads_keep_their_bits() {
     let notch = |f: f64, d, w| Biquad::notch(f, d, w, TS).unwrap();
     let low_pass = Biquad::low_pass(200.0, 0.7, TS).unwrap();

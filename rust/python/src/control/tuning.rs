@@ -118,7 +118,7 @@ fn values(variables: &[Variable], design: &AnyDesign<f64>) -> Vec<f64> {
     variables.iter().map(|v| v.parameter.of(design)).collect()
 }
 
-/// What controllers cost, and by how much they violate the constraints.
+/// What controllers cost, by how much they violate the constraints, their largest overshoot [%] and command [u].
 #[pyfunction]
 #[pyo3(signature = (task, controllers, *, threads, progress=None))]
 pub fn tuning_costs<'py>(
@@ -127,7 +127,7 @@ pub fn tuning_costs<'py>(
     controllers: Vec<AnyGiven<'py>>,
     threads: usize,
     progress: Option<&Bound<'py, PyAny>>,
-) -> PyResult<Vec<(f64, f64)>> {
+) -> PyResult<Vec<(f64, f64, f64, f64)>> {
     let given = Given::new(py, &task)?;
     let designs = designs(&controllers);
     let judged = watched(py, progress, |monitor| {
@@ -139,7 +139,10 @@ pub fn tuning_costs<'py>(
         }
         Ok(judged)
     })?;
-    Ok(judged.iter().map(|j| (j.cost, j.violation)).collect())
+    let each = judged.iter();
+    Ok(each
+        .map(|j| (j.cost, j.violation, j.overshoot, j.u_max))
+        .collect())
 }
 
 fn designs(controllers: &[AnyGiven<'_>]) -> Vec<AnyDesign<f64>> {

@@ -60,19 +60,23 @@ fn controllers_side_by_side_are_worth_what_they_are_worth_alone() {
 fn compare<P: Plant + Clone + Send + Sync>(task: &Task<'_, P>, designs: &[AnyDesign<f64>]) {
     let judged = |designs: &[_], threads| {
         let judged = costs(task, designs, threads, &Monitor::default()).unwrap();
-        let bits = |j: &Judgement| [j.cost.to_bits(), j.violation.to_bits()];
+        let bits = |j: &Judged| [j.cost, j.violation, j.overshoot, j.u_max].map(f64::to_bits);
         judged.iter().map(bits).collect::<Vec<_>>()
     };
     let together = judged(designs, 1);
     let alone: Vec<_> = designs.iter().flat_map(|d| judged(&[*d], 1)).collect();
     assert_eq!(together, alone);
     assert_eq!(together, judged(designs, 3));
-    let terms = |designs: &[_]| {
+    let records = |designs: &[_]| {
         let mut bench = Bench::new(task).unwrap().with_all_terms(task);
-        bench.terms(task, designs, &Monitor::default())
+        bench.records(task, designs, &Monitor::default())
     };
-    let alone: Vec<_> = designs.iter().flat_map(|d| terms(&[*d])).collect();
-    assert_eq!(terms(designs), alone);
+    let alone: Vec<_> = designs.iter().flat_map(|d| records(&[*d])).collect();
+    assert_eq!(records(designs), alone);
+    for (record, judged) in alone.iter().zip(together) {
+        let record = record.map_or(f64::INFINITY, |r| r.cost);
+        assert_eq!(record.to_bits(), judged[0]);
+    }
 }
 
 #[test]
