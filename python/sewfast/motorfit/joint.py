@@ -39,8 +39,12 @@ TERMS: dict[str, tuple[str, ...]] = {
     "directional": ("k_m", "k_g", "k_b"),
     "quadratic": ("k_mm",),
     "creep": ("creep",),
+    "settling": ("settling",),
     "reach": ("reach", "damping"),
     "dead_band": ("dead_band",),
+    "rate": ("rate",),
+    "backlash": ("play", "load_share", "rub_share"),
+    "cogging": ("cogging_c", "cogging_s", "cogging_order"),
 }
 """Terms that a joint may have beyond inertia, viscous and dry friction, offset and delay."""
 WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
@@ -48,10 +52,12 @@ WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Delays of a start [samples]."""
 NOT_NEGATIVE = {
-    "k_e", "k_b", "tau", "delay", "k_s", "k_l", "k_m", "k_g", "k_mm", "creep", "dead_band",
-    "damping",
+    "k_e", "k_b", "tau", "delay", "k_s", "k_l", "k_m", "k_g", "k_mm", "creep", "settling",
+    "dead_band", "damping", "rub_share",
 }  # fmt: skip
-POSITIVE = {"k_a", "w_s", "reach", "limit", "k_q"}
+POSITIVE = {
+    "k_a", "w_s", "reach", "limit", "k_q", "rate", "play", "load_share", "cogging_order",
+}  # fmt: skip
 EXPONENTS = (0.5, 3.0)
 """Exponents of Stribeck's fall that were measured (Armstrong-Helouvry 1994, Automatica 30)."""
 ITERATIONS, ENOUGH = 30, 1.0
@@ -64,6 +70,8 @@ SETTLED = 1e-2
 NEARBY, NEAR = 6, 0.02
 """Starts around the fit, and their relative distance: of 6 MuJoCo joints two had a lower minimum
 nearby, with errors of reach and delay a tenth as large (.01 and .08 found the same)."""
+WAVES_TRIED, MOST_ORDERS = 2, 400
+"""Orders from which a fit of cogging starts, of so many in which smoothed signals are searched."""
 GLANCE = 3
 """Iterations of each start of a term; the best start is fitted further."""
 PIECES = 4
@@ -156,12 +164,18 @@ class _Fit:
         self.unit, self.command_unit = factor(data.output_unit), factor(data.input_units[0])
         self.is_angle = radians(data.output_unit) is not None
         self.pieces: Sequence[Experiment] = data.experiments
+        self.width = WIDTHS[0]
+        """Width of the bell with which the start was best."""
+        self.orders: list[float] | None = None
+        self.tried = 0
+        """Orders of cogging from which those are the best."""
         self.least: dict[str, float] = {}
         """Least inertia: of the start, since bounds relative to each fit would compound."""
         u = np.concatenate([e.u[:, 0] for e in data.experiments])
         # friction that grows faster than the drive would lock a joint that is driven more
         self.most = {"k_l": 1.0, "k_m": 1.0, "k_mm": 0.5 / max(float(np.ptp(u)), 1e-300)}
-        """Largest friction per drive, within the range of the commands."""
+        """Largest friction per drive, within the range of the commands; and parts of a whole."""
+        self.most |= {"load_share": 0.99, "rub_share": 0.99}
 
     def cut(self, share: int) -> None:
         """Each experiment in as many pieces as belong to it."""
@@ -200,7 +214,7 @@ class _Fit:
                 core = self.core(known, k_q, list(known))
                 cost = squares(core, self.pieces, core.first_states(_arrays(self.pieces)))
                 if cost < least:
-                    best, least = core, cost
+                    best, least, self.width = core, cost, width
                     # what turns faster than the integration can follow is not told apart
                     h = RESOLVED * self.data.Ts / core.settings["steps"]
                     self.least = {"k_a": max(FLOOR * k_a, h * (known["k_e"] + h * k_q))}
@@ -282,7 +296,7 @@ class _Fit:
         n = self.independent(own)
 
         def schwarz(of: tuple[str, Descent]) -> float:
-            return n * math.log(max(of[1].cost, 1e-300)) + len(TERMS[of[0]]) * math.log(n)
+            return n * math.log(max(of[1].cost, 1e-300)) + self._price(of[0], n)
 
         found: dict[str, Descent] = {}
         for term in TERMS:
@@ -336,18 +350,24 @@ class _Fit:
                 best = min(best, other, key=lambda f: f.cost)
         return best
 
-    @staticmethod
-    def _explains(fewer: Descent, more: Descent, term: str, n: float) -> bool:
+    def _explains(self, fewer: Descent, more: Descent, term: str, n: float) -> bool:
         """Whether a term lowers the cost by more than the number of its parameters explains."""
         gain = n * math.log(max(fewer.cost, 1e-300) / max(more.cost, 1e-300))
-        return gain >= len(TERMS[term]) * math.log(n)
+        return gain >= self._price(term, n)
+
+    def _price(self, term: str, n: float) -> float:
+        """What the parameters of a term explain of `n log cost`, and the best of many orders
+        (Chen and Chen 2008, Biometrika 95).
+        """
+        tried = max(self.tried, 1) if term == "cogging" else 1
+        return len(TERMS[term]) * math.log(n) + 2.0 * math.log(tried)
 
     def _may_have(self, term: str, core: _core.GreyBox) -> bool:
         if term == "gravity":
             return self.is_angle
         # behind a controller inside, a lag of the current is a part of the delay
         integrates: bool = core.settings["integrator"]
-        only = {"lag": True, "reach": False, "dead_band": False}
+        only = {"lag": True, "reach": False, "dead_band": False, "rate": False}
         return only.get(term, integrates) == integrates
 
     def _begun(self, core: _core.GreyBox, term: str) -> Iterator[_core.GreyBox]:
@@ -355,7 +375,9 @@ class _Fit:
         s = core.settings
         k_s, scale = float(s["values"][PLACE["k_s"]]), s["command_scale"]
         size = max(k_s, 0.02 * scale)
-        fast = s["speed_scale"]
+        fast, rmse = s["speed_scale"], s["unit"] * math.sqrt(s["residual_variance"])
+        k_q = s["joint"][JOINT["k_q"] - len(PARAMETERS)]
+        orders = self._orders(core) if term == "cogging" else []
         starts: dict[str, list[dict[str, float]]] = {
             "lag": [{"tau": s["Ts"]}],
             "stribeck": [
@@ -368,13 +390,48 @@ class _Fit:
             "directional": [{"k_m": 0.03, "k_g": 0.03, "k_b": 0.0}],
             "quadratic": [{"k_mm": 0.03 / scale}],
             "creep": [{"creep": 0.1 * s["Ts"]}],
+            "settling": [{"settling": 0.5 * s["Ts"]}],
             "reach": [{"reach": part * scale, "damping": 0.0} for part in (1.0, 2.0, 3.0)],
             "dead_band": [{"dead_band": part * size} for part in (0.3, 0.8)],
+            # without a limit of the rate, the delay has stood for it
+            "rate": [{"rate": part * k_q * fast, "delay": 0.0} for part in (1.0, 2.0, 3.0)],
+            "backlash": [
+                {"play": part * rmse, "load_share": share, "rub_share": rub}
+                for part in (1.0, 3.0)
+                for share, rub in ((0.1, 0.3), (0.4, 0.6))
+            ],
+            "cogging": [
+                {"cogging_c": 0.0, "cogging_s": 0.0, "cogging_order": order} for order in orders
+            ],
         }
         for values in starts[term]:
             more = {PLACES[n]: v for n, v in values.items() if PLACES[n] not in s["free"]}
             theta = np.array([*core.theta, *more.values()])
+            if "delay" in values:
+                theta[s["free"].index(PLACE["delay"])] = values["delay"]
             yield changed(core, free=[*s["free"], *more], theta=theta)
+
+    def _orders(self, core: _core.GreyBox) -> list[float]:
+        """Orders of waves over the position that explain most of what drives, in smoothed signals:
+        of those that repeat within the record's range, and not within four of its steps."""
+        if self.orders is None:
+            s, y = core.settings, [self.unit * e.y for e in self.data.experiments]
+            span = float(np.nanmax(np.concatenate(y)) - np.nanmin(np.concatenate(y)))
+            steps = np.abs(np.concatenate([np.diff(q) for q in y]))
+            step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else span
+            first, last = 4.0 * math.pi / span, 2.0 * math.pi / (4.0 * step)
+            tried = np.arange(first, last, math.pi / span)[:MOST_ORDERS]
+            left = np.array(
+                _core.greybox_waves(
+                    _arrays(self.data.experiments), width=self.width,
+                    delay=float(s["values"][PLACE["delay"]]) / s["Ts"], Ts=s["Ts"], unit=self.unit,
+                    k_q=s["joint"][JOINT["k_q"] - len(PARAMETERS)], orders=tried.tolist(),
+                )
+            )  # fmt: skip
+            self.tried, padded = len(tried), np.pad(left, 1, constant_values=math.inf)
+            least = np.flatnonzero((left < padded[:-2]) & (left <= padded[2:]))
+            self.orders = tried[least[np.argsort(left[least])][:WAVES_TRIED]].tolist()
+        return self.orders
 
     def independent(self, found: Descent) -> float:
         """Number of samples that are as good as independent, by the residuals' correlation."""
