@@ -340,6 +340,22 @@ def test_a_length_does_not_command_an_angle() -> None:
         assert motorfit.joint.is_commanded(data) is inside
 
 
+def test_a_position_that_does_not_follow_its_command_is_refused_by_its_cause() -> None:
+    e = _servo(600, 3).experiments[0]
+
+    def refused(u: Any, y: Any) -> str:
+        data = Dataset.from_arrays(u, y, TS, input_units=("rad",), output_unit="rad")
+        with pytest.raises(DataError) as caught:
+            physics(data, structure="joint")
+        return str(caught.value)
+
+    assert "degrees" in refused(e.u[:, 0], np.degrees(e.y))
+    assert "degrees" in refused(np.degrees(e.u[:, 0]), e.y)
+    assert "gear" in refused(e.u[:, 0], 50.0 * e.y)
+    assert "at a stop at 0.2 rad" in refused(e.u[:, 0], np.minimum(e.y, 0.2))
+    assert "at a stop at -0.1 rad" in refused(e.u[:, 0], np.maximum(e.y, -0.1))
+
+
 def test_what_is_no_joint_is_refused() -> None:
     e = _axis(300, 3).experiments[0]
     with pytest.raises(SettingError, match="output_unit"):

@@ -81,6 +81,11 @@ SHORTEST, FIRST = 50, 30
 measured ones is left out."""
 LEAD = 10
 """Samples before a piece whose commands may still act in it. They count as not measured."""
+OTHER_UNIT = math.sqrt(180.0 / math.pi)
+"""Gain of a position over its command that is nearer to degrees per radian than to 1."""
+STOPPED = 0.1
+"""Least range of the commands, and how far they go beyond it, relative to all of them, that leave a
+joint at one place if that is a stop: friction holds a joint too, but not twice at one count."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
 """Factor from each unit of a length to m."""
 STEPS_PER_RADIAN = 100.0
@@ -133,6 +138,8 @@ def fitted(
             name="inputs", expected="one input, the joint's command",
             received=", ".join(data.input_names), remedy="choose its column",
         )  # fmt: skip
+    if not integrates:
+        _require_following(data)
     fit = _Fit(data, look)
     core = fit.started(integrates)
     for share in (32, 16, 8, PIECES):
@@ -145,6 +152,63 @@ def fitted(
     if covariance:
         known = fit.covariance(found, terms)
     return JointFit(found.core, terms, missing, *known)
+
+
+def _require_following(data: Dataset) -> None:
+    """`DataError` for a position that does not follow its command as under a controller: one in
+    another unit, before a gear, or at a stop.
+    """
+    given, unit = factor(data.input_units[0]), factor(data.output_unit)
+    pairs = [(given * e.u[:, 0], unit * e.y) for e in data.experiments]
+    gain = max((_gain(pairs, round(delay)) for delay in DELAYS), key=abs)
+    if not 1.0 / OTHER_UNIT < abs(gain) < OTHER_UNIT:
+        raise DataError(
+            name=data.source,
+            expected="a position that moves as far as its command, as one does under a controller",
+            received=f"one that moves {abs(gain):.3g} times as far; 57.3 would be degrees in place "
+            "of radians, another number a gear between the two",
+            remedy="state the unit of each, and give both on the same side of the gear",
+        )  # fmt: skip
+    for side in (1.0, -1.0):
+        for e, (u, y) in zip(data.experiments, pairs, strict=True):
+            if stop := _stop(side * u, side * y):
+                first, last, off = stop
+                raise DataError(
+                    name=data.source, expected="a joint that moves freely",
+                    received=f"one at a stop at {e.y[first]:.4g} {data.output_unit}, such as in "
+                    f"samples {first} to {last}, where its command goes up to "
+                    f"{off / unit:.3g} {data.output_unit} further",
+                    remedy="leave out what goes to the stop, or record commands within it",
+                )  # fmt: skip
+
+
+def _gain(pairs: Sequence[tuple[FloatArray, FloatArray]], delay: int) -> float:
+    """Movement of positions per movement of commands that are late by so many samples."""
+    late = [(u[: len(u) - delay], y[delay:]) for u, y in pairs if len(u) > delay + 1]
+    used = [(u[np.isfinite(y)], y[np.isfinite(y)]) for u, y in late]
+    rows = [(u - u.mean(), y - y.mean()) for u, y in used if len(u)]
+    size = sum(float(u @ u) for u, _ in rows)
+    return sum(float(u @ y) for u, y in rows) / size if size > 0.0 else 1.0
+
+
+def _stop(u: FloatArray, y: FloatArray) -> tuple[int, int, float] | None:
+    """First and last sample of a rest at the largest position, and how far beyond it the command
+    goes in such rests; None unless different commands leave the joint at that same place.
+    """
+    steps = np.abs(np.diff(y))
+    band = float(np.min(steps[steps > 0.0], initial=math.inf))
+    top = np.nanmax(y)
+    edges = np.flatnonzero(np.diff(np.r_[0, (y >= top - band).astype(int), 0]))
+    rests = [(a, b) for a, b in edges.reshape(-1, 2) if b - a >= FIRST]
+    if not rests:
+        return None
+    # a command that has just changed still finds the joint there
+    low, high = np.quantile(np.concatenate([u[a:b] for a, b in rests]), [0.1, 0.9])
+    if min(high - low, high - top) < STOPPED * float(np.ptp(u)):
+        return None
+    off = [float(np.median(u[a:b])) - top for a, b in rests]
+    a, b = rests[int(np.argmax(off))]
+    return int(a), int(b) - 1, max(off)
 
 
 @dataclass(frozen=True, eq=False)
