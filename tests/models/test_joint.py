@@ -229,7 +229,7 @@ def test_the_unit_of_an_angle_changes_the_unit_of_the_result_alone(unit: str) ->
     assert joint.rmse == pytest.approx(scale * plain.rmse, rel=1e-6)
     assert joint.parameters.keys() == plain.parameters.keys()
     for name, one in plain.parameters.items():
-        per = scale if name in ("inertia", "viscous") else 1.0
+        per = {"inertia": scale, "viscous": scale, "cogging_period": 1.0 / scale}.get(name, 1.0)
         found = joint.parameters[name]
         for a, b in ((found.value, one.value), (found.low, one.low), (found.high, one.high)):
             assert per * a == pytest.approx(b, rel=1e-4, abs=1e-6), name
