@@ -130,6 +130,11 @@ def greybox_regressed(
     """What drives a joint per speed, acceleration, sign of the speed and at all, of signals smoothed over ``width``
     samples, for each delay [samples]; None with too few samples.
     """
+def greybox_waves(
+    experiments: _Experiments, *, width: float, delay: float, Ts: float, unit: float, k_q: float,
+    orders: Sequence[float],
+) -> list[float]:
+    """Squares that friction, inertia, gravity and a wave of each order over the position leave of what drives a joint."""
 def minimised(
     normal: Callable[[_F], tuple[float, _F, _F]], cost: Callable[[_F], float], start: _F, low: _F, high: _F, *,
     count: float, enough: float, iterations: int,
@@ -138,8 +143,7 @@ def minimised(
     exception that ended the descent after its start.
     """
 def sandwich_covariance(
-    jacobian: _F, residuals: _F, lengths: Sequence[int], windows: Sequence[int], *, channels: int = 1,
-    known: _F | None = None,
+    jacobian: _F, residuals: _F, lengths: Sequence[int], *, channels: int = 1, known: _F | None = None,
 ) -> _F:
     """Covariance (n, n) of an estimate from sums of scores over windows; rows by piece, then channel."""
 def inverse_root(matrix: _F) -> tuple[_F, _F]:

@@ -229,7 +229,7 @@ def test_the_unit_of_an_angle_changes_the_unit_of_the_result_alone(unit: str) ->
     assert joint.rmse == pytest.approx(scale * plain.rmse, rel=1e-6)
     assert joint.parameters.keys() == plain.parameters.keys()
     for name, one in plain.parameters.items():
-        per = scale if name in ("inertia", "viscous") else 1.0
+        per = {"inertia": scale, "viscous": scale, "cogging_period": 1.0 / scale}.get(name, 1.0)
         found = joint.parameters[name]
         for a, b in ((found.value, one.value), (found.low, one.low), (found.high, one.high)):
             assert per * a == pytest.approx(b, rel=1e-4, abs=1e-6), name
@@ -338,6 +338,22 @@ def test_a_length_does_not_command_an_angle() -> None:
     for given, of, inside in (("mm", "deg", False), ("mm", "m", True), ("V", "V", False)):
         data = Dataset.from_arrays(e.u, e.y, TS, input_units=(given,), output_unit=of)
         assert motorfit.joint.is_commanded(data) is inside
+
+
+def test_a_position_that_does_not_follow_its_command_is_refused_by_its_cause() -> None:
+    e = _servo(600, 3).experiments[0]
+
+    def refused(u: Any, y: Any) -> str:
+        data = Dataset.from_arrays(u, y, TS, input_units=("rad",), output_unit="rad")
+        with pytest.raises(DataError) as caught:
+            physics(data, structure="joint")
+        return str(caught.value)
+
+    assert "degrees" in refused(e.u[:, 0], np.degrees(e.y))
+    assert "degrees" in refused(np.degrees(e.u[:, 0]), e.y)
+    assert "gear" in refused(e.u[:, 0], 50.0 * e.y)
+    assert "at a stop at 0.2 rad" in refused(e.u[:, 0], np.minimum(e.y, 0.2))
+    assert "at a stop at -0.1 rad" in refused(e.u[:, 0], np.maximum(e.y, -0.1))
 
 
 def test_what_is_no_joint_is_refused() -> None:

@@ -69,6 +69,56 @@ def test_friction_per_drive_is_told_from_friction_per_load() -> None:
     assert of["k_l"] + of["k_m"] == pytest.approx(0.15, abs=0.05)
 
 
+def _geared(
+    n: int, seed: int, *, rate: float = 1e9, gap: float = 0.0, wave: float = 0.0
+) -> Dataset:
+    """Angle of the load of a motor with k_p / J = 400 1/s^2 in all, of which the load has .3,
+    behind a stiff contact with this gap; .01 rad of friction on either side, the setpoint's rate
+    limited, cogging of this size nine times per turn."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-0.9, 0.9, n // 100 + 1), 100)[:n]
+    u[: n // 2] = np.convolve(u, np.ones(60) / 60, "same")[: n // 2]
+    share, h = 0.3, TS / SUBSTEPS
+    own, load = h * 400.0 / (1.0 - share), h * 400.0 / share
+    stiff = share / 400.0 * (2.0 * math.pi * 150.0) ** 2
+    damping = 1.4 * math.sqrt(stiff * share / 400.0)
+    y, r, q, w, p, v = np.zeros(n), u[0], u[0], 0.0, u[0], 0.0
+    for k in range(n * SUBSTEPS):
+        if k % SUBSTEPS == 0:
+            y[k // SUBSTEPS] = np.floor(p / STEP + 0.5) * STEP
+        r += min(max(u[max(k - 30, 0) // SUBSTEPS] - r, -rate * h), rate * h)
+        off = q - p
+        over = off - math.copysign(0.5 * gap, off) if abs(off) > 0.5 * gap else 0.0
+        force = stiff * over + damping * (w - v) if over else 0.0
+        force = force if force * over > 0.0 else 0.0
+        free = w + own * (r - p - 0.06 * w - wave * math.cos(9.0 * q + 0.7) - force)
+        w = math.copysign(max(abs(free) - own * 0.01, 0.0), free)
+        free = v + load * force
+        v = math.copysign(max(abs(free) - load * 0.01, 0.0), free)
+        q, p = q + h * w, p + h * v
+    return Dataset.from_arrays(u, y, TS, input_units=("rad",), output_unit="rad")
+
+
+@pytest.mark.slow("fits with all terms")
+@pytest.mark.parametrize(
+    ("term", "drawn", "truth"),
+    [
+        ("rate", {"rate": 2.0}, {"rate": 2.0}),
+        ("backlash", {"gap": 0.03}, {"backlash": 0.03}),
+        ("cogging", {"wave": 0.01}, {"cogging": 0.01, "cogging_period": 2.0 * math.pi / 9.0}),
+    ],
+)
+def test_rate_backlash_and_cogging_are_found_where_they_are(
+    term: str, drawn: dict[str, float], truth: dict[str, float]
+) -> None:
+    joint = physics(_geared(3000, 1, **drawn), structure="joint")
+    assert {"rate", "backlash", "cogging"} & set(joint.terms) == {term}
+    for name, value in truth.items():
+        assert joint.value(name) == pytest.approx(value, rel=0.05), name
+    assert joint.value("stiffness") == pytest.approx(400.0, rel=0.05)
+    assert term in " ".join(joint.to_model().describe()) or term == "backlash"
+
+
 def test_a_step_after_a_standstill_has_no_inertia_of_nothing() -> None:
     u, q, w, h = np.r_[np.zeros(100), np.full(200, 3.0)], 0.0, 0.0, 1e-4
     y = np.zeros(300)
@@ -107,18 +157,18 @@ def test_its_model_has_the_ranges_of_its_record() -> None:
     assert model.training["output_range"] == list(data.output_range)
 
 
+_FIRST = ("k_l", "k_q", "damping", "dead_band", "reach")
+
+
 def test_a_file_from_before_the_terms_loads(tmp_path: Path) -> None:
     joint = physics(_rubbing(600, 3), structure="joint")
     joint.to_model().save(tmp_path / "m.json")
     document = json.loads((tmp_path / "m.json").read_text())
-    for name in ("k_m", "k_g", "creep", "exponent", "k_mm"):
+    later = [n for n in sewfast._core.GREYBOX_JOINT if n not in _FIRST]
+    for name in later:
         value = document["parameters"]["joint"].pop(name)
         assert value == 0.0 or name in document["parameters"]["free"]
-    document["parameters"]["free"] = [
-        n
-        for n in document["parameters"]["free"]
-        if n not in ("k_m", "k_g", "creep", "exponent", "k_mm")
-    ]
+    document["parameters"]["free"] = [n for n in document["parameters"]["free"] if n not in later]
     document["parameters"]["theta"] = document["parameters"]["theta"][
         : len(document["parameters"]["free"])
     ]

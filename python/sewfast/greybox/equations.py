@@ -428,9 +428,8 @@ def _result(
                 remedy="widen the bound, or write that value into the function and leave the "
                 "parameter out",
             )  # fmt: skip
-    windows = [int(np.clip(math.sqrt(len(p.u)), 1, max(len(p.u) // 15, 1))) for p in records.pieces]
     lengths = [len(p.u) for p in records.pieces]
-    covariance = covariance_of(found.jac, found.fun, lengths, windows)
+    covariance = covariance_of(found.jac, found.fun, lengths)
     y = np.concatenate([p.y[p.used] for p in records.pieces])
     model = np.concatenate([r[p.used, 0] for p, r in zip(records.pieces, runs, strict=True)])
     spread = float(np.linalg.norm(y - y.mean()))

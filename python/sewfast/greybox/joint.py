@@ -48,12 +48,19 @@ class Joint(Findings):
     parameters : mapping of Parameter by name
         Value, 95 % interval and unit, in units of the command, or if `inside`, of the position
         command: `inertia` (per acceleration), `viscous` (per speed), `friction` (against dry
-        friction), `offset`, `delay`; of the terms that the record shows `lag`, `stribeck`,
-        `stribeck_speed` and `stribeck_exponent`, `gravity`, `load_friction` (per load that the
-        gears carry), `drive_friction` and `outer_friction` (per drive, and per load from outside),
-        `quadratic_friction` (per square of the drive), `creep` (time constant with which friction
-        holds), `dead_band`, `reach` (largest output of the controller) and `damping` (k_d / k_p);
-        if `inside`, `stiffness` (k_p / J).
+        friction), `offset`, `delay`; if `inside`, `stiffness` (k_p / J). Of the terms that the
+        record shows
+
+        - `lag`; `gravity`; `cogging` (amplitude) and `cogging_period`,
+        - `stribeck`, `stribeck_speed` and `stribeck_exponent`, `load_friction` (per load that the
+          gears carry), `drive_friction` and `outer_friction` (per drive, and per load from
+          outside), `quadratic_friction` (per square of the drive),
+        - `creep` (speed under a friction that holds, per acceleration of the other forces) and
+          `settling` (time in which it stops the joint, beyond `creep`),
+        - `dead_band`, `reach` (largest output of the controller) and `damping` (k_d / k_p), `rate`
+          (of the controller's setpoint),
+        - `backlash` (its whole width), `load_share` and `rub_share` (parts of inertia and dry
+          friction behind it).
     undetermined : mapping of str by name
         Parameters that the record does not determine, and why.
     terms : tuple of str
@@ -256,8 +263,19 @@ def _quantities(
         ],
         "quadratic": [("quadratic_friction", f"1/{u}", lambda p: p["k_mm"])],
         "creep": [("creep", "s", lambda p: p["creep"])],
+        "settling": [("settling", "s", lambda p: p["settling"])],
         "reach": [("reach", u, lambda p: p["reach"]), ("damping", "s", lambda p: p["damping"])],
         "dead_band": [("dead_band", u, lambda p: p["dead_band"])],
+        "rate": [("rate", f"{u}/s", lambda p: p["rate"])],
+        "backlash": [
+            ("backlash", y, lambda p: 2.0 * p["play"] / unit),
+            ("load_share", "1", lambda p: p["load_share"]),
+            ("rub_share", "1", lambda p: p["rub_share"]),
+        ],
+        "cogging": [
+            ("cogging", u, lambda p: math.hypot(p["cogging_c"], p["cogging_s"])),
+            ("cogging_period", y, lambda p: 2.0 * math.pi / p["cogging_order"] / unit),
+        ],
     }
     return found + [q for t in terms for q in of_terms[t]]
 

@@ -38,6 +38,9 @@ LATER = {
     "directional": "friction per drive and load",
     "quadratic": "friction per square of the drive",
     "dead_band": "dead band of the controller",
+    "rate": "limit of the setpoint's rate",
+    "backlash": "backlash",
+    "cogging": "cogging",
 }
 """Terms that MuJoCo's joint and actuator do not have."""
 
@@ -141,7 +144,14 @@ class _Parts:
             "offset": self.offset,
             "delay": of["delay"],
             "lag": of["tau"],
-            "friction_settling": of["creep"],
+            "backlash": 2.0 * of["play"],
+            "load_share": of["load_share"],
+            "rub_share": of["rub_share"],
+            "cogging_cos": scale * of["cogging_c"],
+            "cogging_sin": scale * of["cogging_s"],
+            "cogging_order": of["cogging_order"],
+            "friction_creep": of["creep"],
+            "friction_settling": of["creep"] + of["settling"],
         }
         if self.joint.inside:
             found |= {
@@ -149,6 +159,7 @@ class _Parts:
                 "kd": scale * of["damping"],
                 "force_limit": scale * of["reach"] or None,
                 "dead_band": of["dead_band"] / of["k_q"],
+                "rate": of["rate"] / of["k_q"] or None,
             }
         return found
 
@@ -171,7 +182,8 @@ def _mujoco(parts: _Parts) -> str:
         mass = pull**2 / (GRAVITY**2 * POINT * parts.inertia)
         arm = (-parts.gravity[0] / (mass * GRAVITY), -parts.gravity[1] / (mass * GRAVITY))
     own = mass if parts.is_slide else mass * (arm[0] ** 2 + arm[1] ** 2)
-    settling = max(SETTLING * step, 4.0 * of["creep"])
+    # its speed falls off within half of MuJoCo's time constant, as firm as it does not creep
+    settling = max(SETTLING * step, 2.0 * (of["creep"] + of["settling"]))
     firm = min(max(1.0 - 2.0 * of["creep"] / settling, 1e-4), 0.9999)
     delay = f' delay="{of["delay"]:.6g}" nsample="{math.ceil(of["delay"] / step) + 2}"'
     late = delay if of["delay"] > 0.0 else ""
@@ -248,7 +260,7 @@ def _replayed(
 ) -> FloatArray:
     """Positions of MuJoCo's free run at the samples, (N,)."""
     data, s = mujoco.MjData(model), joint.model.settings
-    data.qvel[0], data.qpos[0] = state[0] * s["speed_scale"], state[-1] * s["unit"]
+    data.qvel[0], data.qpos[0] = state[0] * s["speed_scale"], state[3] * s["unit"]
     u = to_command * e.u[:, 0]
     if model.nhistory:
         count = int(model.actuator_history[0][0])

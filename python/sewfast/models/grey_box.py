@@ -63,8 +63,11 @@ class GreyBox(SingleModel):
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Speed, drive and the previous command in units of their scales, and the position."""
-        return ("speed", "drive", "command before", "position")[: self.settings["nx"]]
+        """Speed, drive and the previous command in units of their scales, and the position; with a
+        limit of the setpoint's rate or play the setpoint, and position and speed of the load."""
+        of_motor = ("speed", "drive", "command before", "position")
+        of_load = ("setpoint", "load position", "load speed")
+        return (*of_motor, *of_load)[: self.settings["nx"]]
 
     @property
     def motor(self) -> dict[str, float]:
@@ -139,12 +142,15 @@ class GreyBox(SingleModel):
         if self.settings["position"]:
             parts = self._of_joint(u)
             gravity = math.hypot(of["load_1c"], of["load_1s"])
-            of |= {"gravity": gravity, "stribeck": of["k_t"]}
+            cogging = math.hypot(of["cogging_c"], of["cogging_s"])
+            of |= {"gravity": gravity, "stribeck": of["k_t"], "cogging": cogging}
             named |= {
                 "gravity": ("gravity", u), "stribeck": ("Stribeck friction", u),
                 "k_l": ("friction per load", ""), "k_m": ("friction per drive", ""),
                 "k_g": ("friction per load from outside", ""), "creep": ("creep", "s"),
-                "dead_band": ("dead band", u),
+                "settling": ("settling of the friction", "s"),
+                "dead_band": ("dead band", u), "rate": ("rate of the setpoint", f"{u}/s"),
+                "play": ("half of the play", "rad or m"), "cogging": ("cogging", u),
                 "reach": ("largest output of the controller", u), "damping": ("k_d / k_p", "s"),
             }  # fmt: skip
         parts += [
@@ -184,7 +190,7 @@ def _completed(values: FloatArray, limit: float) -> FloatArray:
     return np.insert(values, min(at, len(values)), limit)
 
 
-_LATER = ("k_m", "k_g", "creep", "exponent", "k_mm")
+_LATER = ("k_m", "k_g", "creep", "exponent", "k_mm", *JOINT[JOINT.index("settling") :])
 _NUMBERS = (
     "Ts", "unit", "speed_scale", "command_scale", "residual_variance", "process_noise",
 )  # fmt: skip

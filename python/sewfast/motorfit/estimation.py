@@ -49,18 +49,16 @@ def covariance_of(
     jacobian: FloatArray,
     residuals: FloatArray,
     lengths: Sequence[int],
-    windows: Sequence[int],
     *,
     channels: int = 1,
     known: FloatArray | None = None,
 ) -> FloatArray:
     """Covariance of an estimate, (n, n), from sums of scores over a window.
     `jacobian` (m, n) and `residuals` (m,) are sorted by piece, then channel. `lengths` are the
-    pieces' samples, `windows` those over which scores correlate, and `known` (k, k) is the inverse
-    prior covariance of the first k parameters.
+    pieces' samples, and `known` (k, k) is the inverse prior covariance of the first k parameters.
     """
     return _core.sandwich_covariance(
-        np.ascontiguousarray(jacobian), np.ascontiguousarray(residuals), lengths, windows,
+        np.ascontiguousarray(jacobian), np.ascontiguousarray(residuals), lengths,
         channels=channels, known=known,
     )  # fmt: skip
 

@@ -39,8 +39,12 @@ TERMS: dict[str, tuple[str, ...]] = {
     "directional": ("k_m", "k_g", "k_b"),
     "quadratic": ("k_mm",),
     "creep": ("creep",),
+    "settling": ("settling",),
     "reach": ("reach", "damping"),
     "dead_band": ("dead_band",),
+    "rate": ("rate",),
+    "backlash": ("play", "load_share", "rub_share"),
+    "cogging": ("cogging_c", "cogging_s", "cogging_order"),
 }
 """Terms that a joint may have beyond inertia, viscous and dry friction, offset and delay."""
 WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
@@ -48,10 +52,12 @@ WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Delays of a start [samples]."""
 NOT_NEGATIVE = {
-    "k_e", "k_b", "tau", "delay", "k_s", "k_l", "k_m", "k_g", "k_mm", "creep", "dead_band",
-    "damping",
+    "k_e", "k_b", "tau", "delay", "k_s", "k_l", "k_m", "k_g", "k_mm", "creep", "settling",
+    "dead_band", "damping", "rub_share",
 }  # fmt: skip
-POSITIVE = {"k_a", "w_s", "reach", "limit", "k_q"}
+POSITIVE = {
+    "k_a", "w_s", "reach", "limit", "k_q", "rate", "play", "load_share", "cogging_order",
+}  # fmt: skip
 EXPONENTS = (0.5, 3.0)
 """Exponents of Stribeck's fall that were measured (Armstrong-Helouvry 1994, Automatica 30)."""
 ITERATIONS, ENOUGH = 30, 1.0
@@ -64,6 +70,8 @@ SETTLED = 1e-2
 NEARBY, NEAR = 6, 0.02
 """Starts around the fit, and their relative distance: of 6 MuJoCo joints two had a lower minimum
 nearby, with errors of reach and delay a tenth as large (.01 and .08 found the same)."""
+WAVES_TRIED, MOST_ORDERS = 2, 400
+"""Orders from which a fit of cogging starts, of so many in which smoothed signals are searched."""
 GLANCE = 3
 """Iterations of each start of a term; the best start is fitted further."""
 PIECES = 4
@@ -73,6 +81,11 @@ SHORTEST, FIRST = 50, 30
 measured ones is left out."""
 LEAD = 10
 """Samples before a piece whose commands may still act in it. They count as not measured."""
+OTHER_UNIT = math.sqrt(180.0 / math.pi)
+"""Gain of a position over its command that is nearer to degrees per radian than to 1."""
+STOPPED = 0.1
+"""Least range of the commands, and how far they go beyond it, relative to all of them, that leave a
+joint at one place if that is a stop: friction holds a joint too, but not twice at one count."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
 """Factor from each unit of a length to m."""
 STEPS_PER_RADIAN = 100.0
@@ -125,6 +138,8 @@ def fitted(
             name="inputs", expected="one input, the joint's command",
             received=", ".join(data.input_names), remedy="choose its column",
         )  # fmt: skip
+    if not integrates:
+        _require_following(data)
     fit = _Fit(data, look)
     core = fit.started(integrates)
     for share in (32, 16, 8, PIECES):
@@ -137,6 +152,63 @@ def fitted(
     if covariance:
         known = fit.covariance(found, terms)
     return JointFit(found.core, terms, missing, *known)
+
+
+def _require_following(data: Dataset) -> None:
+    """`DataError` for a position that does not follow its command as under a controller: one in
+    another unit, before a gear, or at a stop.
+    """
+    given, unit = factor(data.input_units[0]), factor(data.output_unit)
+    pairs = [(given * e.u[:, 0], unit * e.y) for e in data.experiments]
+    gain = max((_gain(pairs, round(delay)) for delay in DELAYS), key=abs)
+    if not 1.0 / OTHER_UNIT < abs(gain) < OTHER_UNIT:
+        raise DataError(
+            name=data.source,
+            expected="a position that moves as far as its command, as one does under a controller",
+            received=f"one that moves {abs(gain):.3g} times as far; 57.3 would be degrees in place "
+            "of radians, another number a gear between the two",
+            remedy="state the unit of each, and give both on the same side of the gear",
+        )  # fmt: skip
+    for side in (1.0, -1.0):
+        for e, (u, y) in zip(data.experiments, pairs, strict=True):
+            if stop := _stop(side * u, side * y):
+                first, last, off = stop
+                raise DataError(
+                    name=data.source, expected="a joint that moves freely",
+                    received=f"one at a stop at {e.y[first]:.4g} {data.output_unit}, such as in "
+                    f"samples {first} to {last}, where its command goes up to "
+                    f"{off / unit:.3g} {data.output_unit} further",
+                    remedy="leave out what goes to the stop, or record commands within it",
+                )  # fmt: skip
+
+
+def _gain(pairs: Sequence[tuple[FloatArray, FloatArray]], delay: int) -> float:
+    """Movement of positions per movement of commands that are late by so many samples."""
+    late = [(u[: len(u) - delay], y[delay:]) for u, y in pairs if len(u) > delay + 1]
+    used = [(u[np.isfinite(y)], y[np.isfinite(y)]) for u, y in late]
+    rows = [(u - u.mean(), y - y.mean()) for u, y in used if len(u)]
+    size = sum(float(u @ u) for u, _ in rows)
+    return sum(float(u @ y) for u, y in rows) / size if size > 0.0 else 1.0
+
+
+def _stop(u: FloatArray, y: FloatArray) -> tuple[int, int, float] | None:
+    """First and last sample of a rest at the largest position, and how far beyond it the command
+    goes in such rests; None unless different commands leave the joint at that same place.
+    """
+    steps = np.abs(np.diff(y))
+    band = float(np.min(steps[steps > 0.0], initial=math.inf))
+    top = np.nanmax(y)
+    edges = np.flatnonzero(np.diff(np.r_[0, (y >= top - band).astype(int), 0]))
+    rests = [(a, b) for a, b in edges.reshape(-1, 2) if b - a >= FIRST]
+    if not rests:
+        return None
+    # a command that has just changed still finds the joint there
+    low, high = np.quantile(np.concatenate([u[a:b] for a, b in rests]), [0.1, 0.9])
+    if min(high - low, high - top) < STOPPED * float(np.ptp(u)):
+        return None
+    off = [float(np.median(u[a:b])) - top for a, b in rests]
+    a, b = rests[int(np.argmax(off))]
+    return int(a), int(b) - 1, max(off)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,12 +228,18 @@ class _Fit:
         self.unit, self.command_unit = factor(data.output_unit), factor(data.input_units[0])
         self.is_angle = radians(data.output_unit) is not None
         self.pieces: Sequence[Experiment] = data.experiments
+        self.width = WIDTHS[0]
+        """Width of the bell with which the start was best."""
+        self.orders: list[float] | None = None
+        self.tried = 0
+        """Orders of cogging from which those are the best."""
         self.least: dict[str, float] = {}
         """Least inertia: of the start, since bounds relative to each fit would compound."""
         u = np.concatenate([e.u[:, 0] for e in data.experiments])
         # friction that grows faster than the drive would lock a joint that is driven more
         self.most = {"k_l": 1.0, "k_m": 1.0, "k_mm": 0.5 / max(float(np.ptp(u)), 1e-300)}
-        """Largest friction per drive, within the range of the commands."""
+        """Largest friction per drive, within the range of the commands; and parts of a whole."""
+        self.most |= {"load_share": 0.99, "rub_share": 0.99}
 
     def cut(self, share: int) -> None:
         """Each experiment in as many pieces as belong to it."""
@@ -200,7 +278,7 @@ class _Fit:
                 core = self.core(known, k_q, list(known))
                 cost = squares(core, self.pieces, core.first_states(_arrays(self.pieces)))
                 if cost < least:
-                    best, least = core, cost
+                    best, least, self.width = core, cost, width
                     # what turns faster than the integration can follow is not told apart
                     h = RESOLVED * self.data.Ts / core.settings["steps"]
                     self.least = {"k_a": max(FLOOR * k_a, h * (known["k_e"] + h * k_q))}
@@ -282,7 +360,7 @@ class _Fit:
         n = self.independent(own)
 
         def schwarz(of: tuple[str, Descent]) -> float:
-            return n * math.log(max(of[1].cost, 1e-300)) + len(TERMS[of[0]]) * math.log(n)
+            return n * math.log(max(of[1].cost, 1e-300)) + self._price(of[0], n)
 
         found: dict[str, Descent] = {}
         for term in TERMS:
@@ -336,18 +414,24 @@ class _Fit:
                 best = min(best, other, key=lambda f: f.cost)
         return best
 
-    @staticmethod
-    def _explains(fewer: Descent, more: Descent, term: str, n: float) -> bool:
+    def _explains(self, fewer: Descent, more: Descent, term: str, n: float) -> bool:
         """Whether a term lowers the cost by more than the number of its parameters explains."""
         gain = n * math.log(max(fewer.cost, 1e-300) / max(more.cost, 1e-300))
-        return gain >= len(TERMS[term]) * math.log(n)
+        return gain >= self._price(term, n)
+
+    def _price(self, term: str, n: float) -> float:
+        """What the parameters of a term explain of `n log cost`, and the best of many orders
+        (Chen and Chen 2008, Biometrika 95).
+        """
+        tried = max(self.tried, 1) if term == "cogging" else 1
+        return len(TERMS[term]) * math.log(n) + 2.0 * math.log(tried)
 
     def _may_have(self, term: str, core: _core.GreyBox) -> bool:
         if term == "gravity":
             return self.is_angle
         # behind a controller inside, a lag of the current is a part of the delay
         integrates: bool = core.settings["integrator"]
-        only = {"lag": True, "reach": False, "dead_band": False}
+        only = {"lag": True, "reach": False, "dead_band": False, "rate": False}
         return only.get(term, integrates) == integrates
 
     def _begun(self, core: _core.GreyBox, term: str) -> Iterator[_core.GreyBox]:
@@ -355,7 +439,9 @@ class _Fit:
         s = core.settings
         k_s, scale = float(s["values"][PLACE["k_s"]]), s["command_scale"]
         size = max(k_s, 0.02 * scale)
-        fast = s["speed_scale"]
+        fast, rmse = s["speed_scale"], s["unit"] * math.sqrt(s["residual_variance"])
+        k_q = s["joint"][JOINT["k_q"] - len(PARAMETERS)]
+        orders = self._orders(core) if term == "cogging" else []
         starts: dict[str, list[dict[str, float]]] = {
             "lag": [{"tau": s["Ts"]}],
             "stribeck": [
@@ -368,13 +454,48 @@ class _Fit:
             "directional": [{"k_m": 0.03, "k_g": 0.03, "k_b": 0.0}],
             "quadratic": [{"k_mm": 0.03 / scale}],
             "creep": [{"creep": 0.1 * s["Ts"]}],
+            "settling": [{"settling": 0.5 * s["Ts"]}],
             "reach": [{"reach": part * scale, "damping": 0.0} for part in (1.0, 2.0, 3.0)],
             "dead_band": [{"dead_band": part * size} for part in (0.3, 0.8)],
+            # without a limit of the rate, the delay has stood for it
+            "rate": [{"rate": part * k_q * fast, "delay": 0.0} for part in (1.0, 2.0, 3.0)],
+            "backlash": [
+                {"play": part * rmse, "load_share": share, "rub_share": rub}
+                for part in (1.0, 3.0)
+                for share, rub in ((0.1, 0.3), (0.4, 0.6))
+            ],
+            "cogging": [
+                {"cogging_c": 0.0, "cogging_s": 0.0, "cogging_order": order} for order in orders
+            ],
         }
         for values in starts[term]:
             more = {PLACES[n]: v for n, v in values.items() if PLACES[n] not in s["free"]}
             theta = np.array([*core.theta, *more.values()])
+            if "delay" in values:
+                theta[s["free"].index(PLACE["delay"])] = values["delay"]
             yield changed(core, free=[*s["free"], *more], theta=theta)
+
+    def _orders(self, core: _core.GreyBox) -> list[float]:
+        """Orders of waves over the position that explain most of what drives, in smoothed signals:
+        of those that repeat within the record's range, and not within four of its steps."""
+        if self.orders is None:
+            s, y = core.settings, [self.unit * e.y for e in self.data.experiments]
+            span = float(np.nanmax(np.concatenate(y)) - np.nanmin(np.concatenate(y)))
+            steps = np.abs(np.concatenate([np.diff(q) for q in y]))
+            step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else span
+            first, last = 4.0 * math.pi / span, 2.0 * math.pi / (4.0 * step)
+            tried = np.arange(first, last, math.pi / span)[:MOST_ORDERS]
+            left = np.array(
+                _core.greybox_waves(
+                    _arrays(self.data.experiments), width=self.width,
+                    delay=float(s["values"][PLACE["delay"]]) / s["Ts"], Ts=s["Ts"], unit=self.unit,
+                    k_q=s["joint"][JOINT["k_q"] - len(PARAMETERS)], orders=tried.tolist(),
+                )
+            )  # fmt: skip
+            self.tried, padded = len(tried), np.pad(left, 1, constant_values=math.inf)
+            least = np.flatnonzero((left < padded[:-2]) & (left <= padded[2:]))
+            self.orders = tried[least[np.argsort(left[least])][:WAVES_TRIED]].tolist()
+        return self.orders
 
     def independent(self, found: Descent) -> float:
         """Number of samples that are as good as independent, by the residuals' correlation."""

@@ -365,11 +365,9 @@ class Problem:
         """
         n, J = len(state.names()), [self.jacobian(state), self._starts(state)[0]]
         k_v = max(state.theta[0] + state.theta[1], 1e-12)
-        settling = 2.0 * state.theta[PLACE["k_a"]] / k_v / self.records.Ts
         lengths = [len(p.u) for p in self.records.pieces]
-        windows = [int(np.clip(max(settling, math.sqrt(m)), 1, max(m // 15, 1))) for m in lengths]
         whole = covariance_of(
-            np.concatenate(J, axis=1), self.residuals(state), lengths, windows,
+            np.concatenate(J, axis=1), self.residuals(state), lengths,
             channels=2 if self.has_current else 1, known=self._expected(state)[2],
         )  # fmt: skip
         timing = (TIMING * self.records.Ts) ** 2

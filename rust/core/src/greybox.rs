@@ -25,9 +25,8 @@
 //! v = (e - dead_band sign e) - damping w, |v| <= reach,    e = u - k_q q, 0 if |e| <= dead_band
 //! ```
 //!
-//! Friction of a joint need not hold it quite: at standstill the speed that the other forces would give falls off with the
-//! time constant `creep`, so that a constant force below the friction makes it creep at `creep` times the acceleration that
-//! the force alone would give.
+//! Friction of a joint need not hold it quite: as far as it is large enough, speed falls off with the time constant
+//! `creep + settling` to `creep` times the acceleration that the other forces alone would give.
 //!
 //! With a resistance R \[command/A\], a motor constant K and G volts per unit of command, `k_e = K/G`, `k_a = J R/K`,
 //! `k_b = B R/K`, `k_s = T R/K`. Derivatives are carried along as dual numbers (Griewank and Walther 2008, chapter 3):
@@ -43,7 +42,7 @@ pub use model::{Frame, GreyBox, JOINT, MOST_UNITS};
 pub(crate) use motor::{Motor, Moving, tanh_of_one};
 pub use normal::{Current, Measured, Normal, normal};
 pub use pieces::{Descent, Fit, Pieces};
-pub use start::{Smoothing, regressed};
+pub use start::{Smoothing, regressed, waves};
 
 use crate::simd::{self, F64x8, Kernel};
 use crate::{Error, Monitor, Result};
@@ -326,7 +325,8 @@ struct Equations<const N: usize> {
     k_l: Option<Dual<N>>,
     /// The same per drive, per load from outside, and per square of the drive.
     directional: Option<[Dual<N>; 3]>,
-    creep: Option<Dual<N>>,
+    /// Of a friction that does not hold quite, over half a step and a whole one.
+    soft: Option<[Soft<N>; 2]>,
     /// Exponent of the fall of the friction with speed.
     exponent: Option<Dual<N>>,
     inner: Option<Inner<N>>,
@@ -370,6 +370,25 @@ impl<const N: usize> Inner<N> {
                 (reach.scaled(output.value.signum()), Dual::ZERO)
             }
             _ => (output, change),
+        }
+    }
+}
+
+/// Where friction is large enough, the speed after a time is `keep` of that before, and `gain` of the other forces' change.
+#[derive(Clone, Copy, Debug)]
+struct Soft<const N: usize> {
+    keep: Dual<N>,
+    gain: Dual<N>,
+}
+
+impl<const N: usize> Soft<N> {
+    /// An implicit step, which stays stable for any time constant.
+    fn over(time: f64, creep: &Dual<N>, settling: &Dual<N>) -> Self {
+        let constant = creep.plus(1.0, settling);
+        let share = constant.plus(1.0, &Dual::constant(time)).inverse();
+        Self {
+            keep: constant.times(&share),
+            gain: creep.times(&share),
         }
     }
 }
@@ -458,7 +477,7 @@ impl<const N: usize> Equations<N> {
             }),
             k_l: None,
             directional: None,
-            creep: None,
+            soft: None,
             exponent: None,
             inner: None,
             share,
@@ -565,12 +584,16 @@ impl<const N: usize> Equations<N> {
                 .plus(1.0, &k_mm.times(&torque.times(&torque)));
         }
         let most = dry.times(&turn.per_inertia).scaled(time);
-        if let Some(creep) = &self.creep {
-            let whole = creep.value + time;
-            if free.value.abs() * time <= most.value * whole {
-                let share = creep.through(creep.value / whole, time / (whole * whole));
-                return free.times(&share);
+        if let Some([half, whole]) = &self.soft {
+            let soft = if time < self.step { half } else { whole };
+            let held = from
+                .times(&soft.keep)
+                .plus(1.0, &free.plus(-1.0, from).times(&soft.gain));
+            let taken = free.value - held.value;
+            if taken.abs() <= most.value {
+                return held;
             }
+            return free.plus(-taken.signum(), &most);
         } else if free.value.abs() <= most.value {
             return Dual::ZERO;
         }

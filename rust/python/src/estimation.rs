@@ -66,13 +66,12 @@ pub fn minimised<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (jacobian, residuals, lengths, windows, *, channels=1, known=None))]
+#[pyo3(signature = (jacobian, residuals, lengths, *, channels=1, known=None))]
 pub fn sandwich_covariance<'py>(
     py: Python<'py>,
     jacobian: Rows<'py>,
     residuals: Values<'py>,
     lengths: Vec<usize>,
-    windows: Vec<usize>,
     channels: usize,
     known: Option<Rows<'py>>,
 ) -> PyResult<Matrix<'py>> {
@@ -81,7 +80,6 @@ pub fn sandwich_covariance<'py>(
         jacobian,
         residuals: slice(&residuals, "residuals")?,
         lengths: &lengths,
-        windows: &windows,
         channels,
     };
     let known = match &known {

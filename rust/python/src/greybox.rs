@@ -444,3 +444,27 @@ pub fn greybox_regressed(
     };
     released(py, || greybox::regressed(&samples, &how))
 }
+
+/// What a wave of each order over the position leaves of the drive, for the start of a cogging.
+#[pyfunction]
+#[pyo3(signature = (experiments, *, width, delay, Ts, unit, k_q, orders))]
+pub fn greybox_waves(
+    py: Python<'_>,
+    experiments: Experiments<'_>,
+    width: f64,
+    delay: f64,
+    Ts: f64,
+    unit: f64,
+    k_q: f64,
+    orders: Vec<f64>,
+) -> PyResult<Vec<f64>> {
+    let samples = samples(py, &experiments)?;
+    let how = Smoothing {
+        width,
+        delays: &[delay],
+        sample_time: Ts,
+        unit,
+        k_q,
+    };
+    released(py, || greybox::waves(&samples, &how, &orders))
+}

@@ -64,7 +64,9 @@ mod _core {
         ProposalTask, fit_shaft, record_response, shaft_fraction, shaft_response,
     };
     #[pymodule_export]
-    use crate::greybox::{GreyBox, Tracker, greybox_normal, greybox_regressed, greybox_run};
+    use crate::greybox::{
+        GreyBox, Tracker, greybox_normal, greybox_regressed, greybox_run, greybox_waves,
+    };
     #[pymodule_export]
     use crate::guard::Guard;
     #[pymodule_export]

@@ -312,8 +312,8 @@ impl<V: F64x8> Plant for ScalarMotor<'_, V> {
     }
 }
 
-/// Numbers in [`BatchPlant::phi`] for a motor: output, speed, drive, command of the last sample, position.
-const OF_MOTOR: usize = 5;
+/// Numbers in [`BatchPlant::phi`] for a motor: output, speed, drive, command of the last sample, position, setpoint, the load's position and speed.
+const OF_MOTOR: usize = 8;
 
 /// Eight runs of one plant, side by side.
 pub(super) struct BatchPlant<'a> {
@@ -392,7 +392,7 @@ impl<'a> BatchPlant<'a> {
 
     #[inline(always)]
     fn turn<V: F64x8>(&mut self, motor: &Motor, due: V, meanwhile: &mut impl Meanwhile) {
-        let [output, w, x, before, q] = &mut self.phi[..] else {
+        let [output, w, x, before, q, setpoint, shown, v] = &mut self.phi[..] else {
             return;
         };
         let mut at = Moving {
@@ -400,12 +400,18 @@ impl<'a> BatchPlant<'a> {
             x: V::load(&x.0),
             before: V::load(&before.0),
             q: V::load(&q.0),
+            setpoint: V::load(&setpoint.0),
+            shown: V::load(&shown.0),
+            v: V::load(&v.0),
         };
         let (y, moved) = motor.step(&mut at, due, V::tanh, meanwhile);
         at.w.store(&mut w.0);
         at.x.store(&mut x.0);
         at.before.store(&mut before.0);
         at.q.store(&mut q.0);
+        at.setpoint.store(&mut setpoint.0);
+        at.shown.store(&mut shown.0);
+        at.v.store(&mut v.0);
         y.store(&mut output.0);
         let position = V::load(&self.position.0).add(moved);
         position.store(&mut self.position.0);

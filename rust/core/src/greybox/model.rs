@@ -9,12 +9,12 @@
 //! held over a sample. The states are speed, drive and previous command, in units of the scales. An output belongs to the end of its
 //! sample, so it depends on the command `v(k) = u(k - nk)`, where `nk` is one sample plus the whole samples of the delay.
 //!
-//! If the output is a position, it is the last state, in units of the output. It then also says at which angle a record begins, which a
+//! If the output is a position, it is the fourth state, in units of the output. It then also says at which angle a record begins, which a
 //! speed does not: gravity (`load_1`) is allowed, and the friction and the controller of a joint ([`JOINT`]).
 
 use super::motor::{self, Motor};
 use super::{
-    DELAY, Dual, Equations, FIRST_OVER_THE_TURN, Inner, ORDERS, PARAMETERS, Run, Turn, check,
+    DELAY, Dual, Equations, FIRST_OVER_THE_TURN, Inner, ORDERS, PARAMETERS, Run, Soft, Turn, check,
     varies,
 };
 use crate::closed_loop::{KernelPlant, Known, Plant};
@@ -28,7 +28,7 @@ use crate::{Error, Result};
 use nalgebra::{DMatrix, DVector};
 
 /// Names of the parameters of a joint beyond those of a motor, in their order after [`PARAMETERS`]; 0 for none.
-pub const JOINT: [&str; 10] = [
+pub const JOINT: [&str; 18] = [
     "k_l",
     "k_q",
     "damping",
@@ -39,6 +39,14 @@ pub const JOINT: [&str; 10] = [
     "creep",
     "exponent",
     "k_mm",
+    "settling",
+    "rate",
+    "play",
+    "load_share",
+    "rub_share",
+    "cogging_c",
+    "cogging_s",
+    "cogging_order",
 ];
 const K_L: usize = 0;
 const K_Q: usize = 1;
@@ -50,11 +58,23 @@ const K_G: usize = 6;
 const CREEP: usize = 7;
 const EXPONENT: usize = 8;
 const K_MM: usize = 9;
+const SETTLING: usize = 10;
+const RATE: usize = 11;
+const PLAY: usize = 12;
+const LOAD_SHARE: usize = 13;
+const RUB_SHARE: usize = 14;
+const COGGING: [usize; 3] = [15, 16, 17];
 
-/// Most states: speed, drive, previous command, and the position if it is the output.
-const STATES: usize = 4;
+/// Parameters of a joint that may be negative.
+const SIGNED: [&str; 4] = ["k_q", "damping", "cogging_c", "cogging_s"];
+
+/// Most states: speed, drive, previous command; the position if it is the output; with a rate limit or play the controller's
+/// setpoint, and position and speed of the load.
+const STATES: usize = 7;
+const POSITION: usize = 3;
+const SHOWN: usize = 5;
 /// Places of the states that a measurement corrects: all but the previous command.
-const FILTERED: [usize; 3] = [0, 1, 3];
+const FILTERED: [usize; 6] = [0, 1, 3, 4, 5, 6];
 /// Weights of a unit: `b`, `p`, `q`, `c`.
 const WEIGHTS: usize = 4;
 /// The first parameter of a joint.
@@ -66,6 +86,8 @@ pub const MOST_UNITS: usize = 6;
 /// Weight of an initial state's distance from what the first outputs say, relative to a squared error.
 const PRIOR: f64 = 1e-2;
 const STATE_STEPS: usize = 20;
+/// Samples over which the first outputs say a speed.
+const SLOPE: usize = 4;
 
 /// The settings of a grey box apart from theta.
 #[derive(Clone, Debug, PartialEq)]
@@ -194,18 +216,41 @@ impl GreyBox {
             ));
         }
         for (&value, name) in frame.joint.iter().zip(JOINT) {
-            if !value.is_finite() || value < 0.0 && name != "k_q" && name != "damping" {
+            if !value.is_finite() || value < 0.0 && !SIGNED.contains(&name) {
                 return Err(Error::setting(format!(
                     "expected a finite number from 0 on as {name}, got {value}"
                 )));
             }
+        }
+        if [LOAD_SHARE, RUB_SHARE]
+            .iter()
+            .any(|&j| frame.joint[j] >= 1.0)
+            || self.has(PLAY) && frame.joint[LOAD_SHARE] == 0.0
+        {
+            return Err(Error::setting(
+                "expected a part of inertia and friction behind the play, above 0 and below 1, got others; leave the play out",
+            ));
         }
         Ok(())
     }
 
     /// States of this model.
     pub fn order(&self) -> usize {
-        STATES - usize::from(!self.frame.position)
+        match self.frame.position {
+            true if self.has(RATE) || self.has(PLAY) => STATES,
+            position => POSITION + usize::from(position),
+        }
+    }
+
+    /// Whether a term of a joint is there, or sought.
+    fn has(&self, term: usize) -> bool {
+        self.frame.joint[term] != 0.0 || self.frame.free.contains(&(OF_JOINT + term))
+    }
+
+    /// Places of the states that a fit of pieces estimates: what is in motion when a piece begins.
+    pub(super) fn begun(&self) -> &'static [usize] {
+        const BEGUN: [usize; 5] = [0, POSITION, 4, SHOWN, 6];
+        &BEGUN[..self.order() - 2]
     }
 
     /// Whether a constant command moves the output on and on.
@@ -226,6 +271,9 @@ impl GreyBox {
             frame.command_scale,
             frame.command_scale,
             frame.unit,
+            frame.command_scale,
+            frame.unit,
+            frame.speed_scale,
         ]
     }
 
@@ -314,6 +362,11 @@ struct Moving<const N: usize> {
     x: Dual<N>,
     before: Dual<N>,
     q: Dual<N>,
+    /// What the controller goes for, with a limit of its rate.
+    setpoint: Dual<N>,
+    /// Position and speed of a load behind play.
+    shown: Dual<N>,
+    v: Dual<N>,
 }
 
 impl<const N: usize> Moving<N> {
@@ -324,13 +377,24 @@ impl<const N: usize> Moving<N> {
             w: one(0),
             x: one(1),
             before: one(2),
-            q: one(3),
+            q: one(POSITION),
+            setpoint: one(4),
+            shown: one(SHOWN),
+            v: one(6),
         }
     }
 
     /// With derivatives by the states, from index `place` on.
     fn seeded(mut self, model: &GreyBox, place: usize) -> Self {
-        let states = [&mut self.w, &mut self.x, &mut self.before, &mut self.q];
+        let states = [
+            &mut self.w,
+            &mut self.x,
+            &mut self.before,
+            &mut self.q,
+            &mut self.setpoint,
+            &mut self.shown,
+            &mut self.v,
+        ];
         for (j, (state, scale)) in states.into_iter().zip(model.scales()).enumerate() {
             if j < model.order() {
                 state.by[place + j] = scale;
@@ -339,16 +403,26 @@ impl<const N: usize> Moving<N> {
         self
     }
 
+    fn states(&self) -> [Dual<N>; STATES] {
+        [
+            self.w,
+            self.x,
+            self.before,
+            self.q,
+            self.setpoint,
+            self.shown,
+            self.v,
+        ]
+    }
+
     /// The states in units of their scales.
     fn scaled(&self, model: &GreyBox) -> [Dual<N>; STATES] {
-        let scales = model.scales();
-        let states = [self.w, self.x, self.before, self.q];
+        let (scales, states) = (model.scales(), self.states());
         std::array::from_fn(|j| states[j].scaled(1.0 / scales[j]))
     }
 
     fn state(&self, model: &GreyBox) -> [f64; STATES] {
-        let scales = model.scales();
-        let states = [self.w, self.x, self.before, self.q];
+        let (scales, states) = (model.scales(), self.states());
         std::array::from_fn(|j| states[j].value / scales[j])
     }
 }
@@ -359,13 +433,145 @@ pub(super) struct Stepper<const N: usize> {
     pub equations: Equations<N>,
     pub turn: Turn<N>,
     pub network: Vec<[Dual<N>; WEIGHTS]>,
-    /// Load over the angle, `c cos q + s sin q`.
-    pub gravity: Option<[Dual<N>; 2]>,
+    /// Loads over the angle: gravity and cogging.
+    pub by_angle: Vec<ByAngle<N>>,
+    /// Most change of the controller's setpoint per second.
+    pub rate: Option<Dual<N>>,
+    pub play: Option<Play<N>>,
     pub frame: Frame,
     /// Fraction of a sample in the command's delay.
     pub part: f64,
     /// Place of the delay among the free parameters.
     pub late: Option<usize>,
+}
+
+/// `c cos(order q) + s sin(order q)`.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ByAngle<const N: usize> {
+    pub order: Dual<N>,
+    pub c: Dual<N>,
+    pub s: Dual<N>,
+}
+
+/// A load with parts of inertia and friction, all forces from outside, and a position of its own within the play.
+#[derive(Clone, Debug)]
+pub(super) struct Play<const N: usize> {
+    /// Half of the play.
+    pub half: Dual<N>,
+    /// The motor without the load.
+    pub alone: Equations<N>,
+    pub turn: Turn<N>,
+    /// The load's acceleration per force, and by its friction.
+    pub per_load: Dual<N>,
+    pub rub: Dual<N>,
+    /// Parts of the inertia: the load's, and the motor's.
+    pub share: Dual<N>,
+    pub rest: Dual<N>,
+}
+
+impl<const N: usize> Play<N> {
+    fn new(equations: &Equations<N>, [half, share, rub]: [Dual<N>; 3]) -> Self {
+        let (turn, one) = (equations.at(0.0, 0.0), Dual::constant(1.0));
+        let (rest, held) = (one.plus(-1.0, &share), one.plus(-1.0, &rub));
+        let per_load = turn.per_inertia.times(&share.inverse());
+        Self {
+            half,
+            alone: Equations {
+                k_s: equations.k_s.times(&held),
+                k_t: equations.k_t.times(&held),
+                ..equations.clone()
+            },
+            turn: Turn {
+                per_inertia: turn.per_inertia.times(&rest.inverse()),
+                load: Dual::ZERO,
+                ..turn
+            },
+            rub: equations.k_s.times(&rub).times(&per_load),
+            per_load,
+            share,
+            rest,
+        }
+    }
+
+    /// The load's speed after a time of its own.
+    #[inline(always)]
+    fn loose(&self, v: &Dual<N>, load: &Dual<N>, time: f64) -> Dual<N> {
+        let free = v.plus(-time, &load.times(&self.per_load));
+        let most = self.rub.scaled(time);
+        if free.value.abs() <= most.value {
+            return Dual::ZERO;
+        }
+        free.plus(-side_of(&free), &most)
+    }
+
+    /// Advances by a step. A load that touches a flank goes with the motor unless it goes ahead of it; one that meets a flank
+    /// goes on at the common speed (perfectly inelastic impact).
+    #[inline(always)]
+    fn step(&self, together: &Equations<N>, turn: &Turn<N>, at: &mut Moving<N>, command: &Dual<N>) {
+        let step = together.step;
+        let goes = |q: &Dual<N>, from: &Dual<N>, to: &Dual<N>| {
+            q.plus(0.5 * step, from).plus(0.5 * step, to)
+        };
+        let loose = self.loose(&at.v, &turn.load, step);
+        let ahead = at.q.plus(-1.0, &at.shown);
+        if ahead.value.abs() >= TOUCHES * self.half.value {
+            let side = side_of(&ahead);
+            let (drive, speed) = together.advanced(turn, &at.x, &at.w, &at.shown, command);
+            if side * (loose.value - speed.value) <= 0.0 {
+                at.q = goes(&at.q, &at.w, &speed);
+                at.shown = at.q.plus(-side, &self.half);
+                (at.x, at.w, at.v) = (drive, speed, speed);
+                return;
+            }
+        }
+        let (drive, speed) = self
+            .alone
+            .advanced(&self.turn, &at.x, &at.w, &at.shown, command);
+        at.q = goes(&at.q, &at.w, &speed);
+        at.shown = goes(&at.shown, &at.v, &loose);
+        (at.x, at.w, at.v) = (drive, speed, loose);
+        let ahead = at.q.plus(-1.0, &at.shown);
+        if ahead.value.abs() > self.half.value {
+            let common = speed.times(&self.rest).plus(1.0, &loose.times(&self.share));
+            at.shown = at.q.plus(-side_of(&ahead), &self.half);
+            (at.w, at.v) = (common, common);
+        }
+    }
+}
+
+/// A setpoint's mean and end over a time in which it goes for a command at a limited rate.
+#[inline(always)]
+fn ramped<const N: usize>(
+    rate: &Dual<N>,
+    from: &Dual<N>,
+    command: &Dual<N>,
+    time: &Dual<N>,
+) -> (Dual<N>, Dual<N>) {
+    let (left, most) = (command.plus(-1.0, from), rate.times(time));
+    if left.value.abs() <= most.value {
+        return (*command, *command);
+    }
+    let change = most.scaled(side_of(&left));
+    (from.plus(0.5, &change), from.plus(1.0, &change))
+}
+
+/// Part of the play from which a load touches.
+pub(super) const TOUCHES: f64 = 1.0 - 1e-9;
+
+/// -1 or 1, with 1 for either zero.
+#[inline(always)]
+fn side_of<const N: usize>(dual: &Dual<N>) -> f64 {
+    if dual.value < 0.0 { -1.0 } else { 1.0 }
+}
+
+impl<const N: usize> ByAngle<N> {
+    #[inline(always)]
+    fn added_to(&self, load: &Dual<N>, q: &Dual<N>) -> Dual<N> {
+        let angle = self.order.times(q);
+        let (sin, cos) = angle.value.sin_cos();
+        load.plus(1.0, &self.c.times(&angle.through(cos, -sin)))
+            .plus(1.0, &self.s.times(&angle.through(sin, cos)))
+    }
 }
 
 impl<const N: usize> Stepper<N> {
@@ -392,7 +598,9 @@ impl<const N: usize> Stepper<N> {
             .iter()
             .any(|&j| some(j))
             .then(|| directional.map(joint));
-        equations.creep = some(CREEP).then(|| joint(CREEP));
+        let (creep, settling) = (joint(CREEP), joint(SETTLING));
+        equations.soft = (some(CREEP) || some(SETTLING))
+            .then(|| [0.5 * step, step].map(|time| Soft::over(time, &creep, &settling)));
         equations.exponent = some(EXPONENT).then(|| joint(EXPONENT));
         equations.inner = some(K_Q).then(|| Inner {
             k_q: joint(K_Q),
@@ -401,11 +609,18 @@ impl<const N: usize> Stepper<N> {
             reach: (frame.joint[REACH] > 0.0).then(|| joint(REACH)),
         });
         let [c, s, ..] = equations.turn;
-        let by_angle = GRAVITY
+        let mut by_angle = Vec::new();
+        let pulls = GRAVITY
             .iter()
             .any(|&j| frame.values[j] != 0.0 || run.free.contains(&j));
-        if by_angle {
+        if pulls {
             (equations.turn[0], equations.turn[1]) = (Dual::ZERO, Dual::ZERO);
+            let order = Dual::constant(1.0);
+            by_angle.push(ByAngle { order, c, s });
+        }
+        if COGGING.iter().any(|&j| some(j)) {
+            let [c, s, order] = COGGING.map(joint);
+            by_angle.push(ByAngle { order, c, s });
         }
         let mut next = frame.free.len();
         let mut weight = |value: f64| {
@@ -418,8 +633,11 @@ impl<const N: usize> Stepper<N> {
         };
         Self {
             turn: equations.at(0.0, 0.0),
+            by_angle,
+            rate: (frame.joint[RATE] > 0.0).then(|| joint(RATE)),
+            play: some(PLAY)
+                .then(|| Play::new(&equations, [PLAY, LOAD_SHARE, RUB_SHARE].map(joint))),
             equations,
-            gravity: by_angle.then_some([c, s]),
             network: model
                 .network
                 .iter()
@@ -460,20 +678,34 @@ impl<const N: usize> Stepper<N> {
         for j in 0..steps {
             let left = self.part * steps as f64 - j as f64;
             let old = left.clamp(0.0, 1.0);
-            let mut command = now.scaled(1.0 - old).plus(old, &at.before);
-            if let (Some(place), true) = (self.late, (0.0..1.0).contains(&left)) {
-                command.by[place] += (at.before.value - now.value) / step;
+            let (mut held, mut given) = (at.before, *now);
+            let shifts = self.late.filter(|_| (0.0..1.0).contains(&left));
+            if let Some(rate) = &self.rate {
+                let mut before = Dual::constant(old * step);
+                if let Some(place) = shifts {
+                    before.by[place] = 1.0;
+                }
+                let after = Dual::constant(step).plus(-1.0, &before);
+                let (mean, end) = ramped(rate, &at.setpoint, &held, &before);
+                held = mean;
+                (given, at.setpoint) = ramped(rate, &end, &given, &after);
+            }
+            let mut command = given.scaled(1.0 - old).plus(old, &held);
+            if let Some(place) = shifts {
+                command.by[place] += (held.value - given.value) / step;
             }
             let mut turn = turn;
-            if let Some([c, s]) = &self.gravity {
-                let angle = at.q.plus(0.5 * step, &at.w);
-                let (sin, cos) = angle.value.sin_cos();
-                turn.load = turn
-                    .load
-                    .plus(1.0, &c.times(&angle.through(cos, -sin)))
-                    .plus(1.0, &s.times(&angle.through(sin, cos)));
+            if !self.by_angle.is_empty() {
+                let q = at.q.plus(0.5 * step, &at.w);
+                for wave in &self.by_angle {
+                    turn.load = wave.added_to(&turn.load, &q);
+                }
             }
             let equations = &self.equations;
+            if let Some(play) = &self.play {
+                play.step(equations, &turn, at, &command);
+                continue;
+            }
             let (drive, speed) = equations.advanced(&turn, &at.x, &at.w, &at.q, &command);
             if self.frame.position {
                 at.q = at.q.plus(0.5 * step, &at.w).plus(0.5 * step, &speed);
@@ -484,6 +716,7 @@ impl<const N: usize> Stepper<N> {
         }
         at.before = *now;
         let output = match &self.frame {
+            frame if frame.position && self.play.is_some() => at.shown,
             frame if frame.position => at.q,
             frame if frame.mean => mean.scaled(1.0 / steps as f64),
             _ => at.w,
@@ -521,16 +754,16 @@ impl<const N: usize> Kernel for Carried<'_, N> {
 }
 
 /// The states with their covariance, corrected by measured outputs (extended Kalman filter: Anderson and Moore 1979, section 8.2).
-struct Filter<'a> {
+struct Filter<'a, const N: usize> {
     model: &'a GreyBox,
-    stepper: Stepper<STATES>,
+    stepper: Stepper<N>,
     state: [f64; STATES],
     covariance: [[f64; FILTERED.len()]; FILTERED.len()],
 }
 
-impl Filter<'_> {
+impl<const N: usize> Filter<'_, N> {
     /// The predicted output and the state that follows, each with derivatives.
-    fn step(&self, v: f64) -> (Dual<STATES>, Moving<STATES>) {
+    fn step(&self, v: f64) -> (Dual<N>, Moving<N>) {
         let mut at = Moving::at(self.model, &self.state).seeded(self.model, 0);
         let y = self.stepper.step(&mut at, &Dual::constant(v));
         (y, at)
@@ -574,8 +807,8 @@ impl Filter<'_> {
                     .map(|(k, &c, l, &d)| next[a].by[c] * p[k][l] * next[b].by[d])
                     .sum();
             }
-            // a position moves with the speed only
-            if a < 2 {
+            // positions move with the speeds only
+            if a < POSITION || a == 6 {
                 self.covariance[i][i] += self.model.frame.process_noise;
             }
         }
@@ -610,127 +843,16 @@ impl Model for GreyBox {
     ) -> Result<Vec<f64>> {
         self.check(u, channels, state)?;
         check_predicted(y, u.len(), horizon)?;
-        let v = self.acting(u);
-        let noise = self.frame.process_noise;
-        let mut filter = Filter {
-            model: self,
-            stepper: Stepper::new(self, false),
-            state: std::array::from_fn(|j| state.get(j).copied().unwrap_or(0.0)),
-            covariance: std::array::from_fn(|i| {
-                std::array::from_fn(|j| if i == j { noise } else { 0.0 })
-            }),
-        };
-        let plain = Stepper::<0>::new(self, false);
-        let ahead = |state: &[f64], v: &[f64]| {
-            let mut at = Moving::at(self, &state[..self.order()]);
-            v.iter()
-                .map(|v| plain.step(&mut at, &Dual::constant(*v)).value)
-                .last()
-        };
-        // the first samples have no measured output a horizon before them
-        let first = horizon.min(u.len()) - usize::from(!u.is_empty());
-        let mut found = self.carried::<0>(&v[..first], state).0;
-        for k in 0..u.len() - first {
-            found.extend(ahead(&filter.state, &v[k..k + first + 1]));
-            filter.measure(v[k], y[k]);
-            filter.advance(v[k]);
+        match self.order() {
+            0..=4 => self.predicted::<4>(u, y, state, horizon),
+            _ => self.predicted::<STATES>(u, y, state, horizon),
         }
-        finite(found)
     }
 
     /// The states by least squares, close to what the first outputs say about them.
     fn estimate_state(&self, u: &[f64], channels: usize, y: &[f64]) -> Result<Vec<f64>> {
         self.check(u, channels, &self.rest_state())?;
-        let known: Vec<f64> = y.iter().copied().filter(|v| v.is_finite()).collect();
-        if known.is_empty() || y.len() != u.len() {
-            return Err(Error::data(
-                "expected measured outputs to estimate the initial state from, one per input, got none; give 20 or so",
-            ));
-        }
-        let (frame, scales, places) = (&self.frame, self.scales(), self.filtered());
-        let v = self.acting(u);
-        let first = &known[..known.len().min(3)];
-        let level = frame.unit * first.iter().sum::<f64>() / first.len() as f64;
-        // a step of one scale weighs as much as the output change it makes
-        let mut weight = [PRIOR * (frame.speed_scale / frame.unit).powi(2); STATES];
-        let mut prior = [level, v[0] - frame.values[0] * level, v[0], 0.0];
-        if frame.position {
-            weight = weight.map(|w| w * frame.sample_time.powi(2));
-            weight[3] = PRIOR;
-            let voltage = v[0] - frame.joint[K_Q] * level;
-            let reach = match frame.joint[REACH] {
-                0.0 => f64::INFINITY,
-                reach => reach,
-            };
-            prior = [0.0, voltage.clamp(-reach, reach), v[0], level];
-        }
-        let mut prior: [f64; STATES] = std::array::from_fn(|j| prior[j] / scales[j]);
-        prior[2] = v[0] / scales[2];
-        let plain = Self {
-            network: self.network.clone(),
-            frame: Frame {
-                free: Vec::new(),
-                ..frame.clone()
-            },
-        };
-        let off = |z: &[f64; STATES]| {
-            places
-                .iter()
-                .map(|&j| weight[j] * (z[j] - prior[j]).powi(2))
-                .sum::<f64>()
-        };
-        let cost = |z: &[f64; STATES]| -> f64 {
-            let run = plain.carried::<0>(&v, &z[..self.order()]).0;
-            let errors = run.iter().zip(y).filter(|(_, y)| !y.is_nan());
-            errors.map(|(run, y)| (y - run).powi(2)).sum::<f64>() + off(z)
-        };
-        let (mut z, mut damping) = (prior, 0.0);
-        let mut now = cost(&z);
-        let n = places.len();
-        for _ in 0..STATE_STEPS {
-            let (run, rows) = plain.slopes(&v, &z[..self.order()]);
-            let mut matrix =
-                DMatrix::from_fn(n, n, |i, j| if i == j { weight[places[i]] } else { 0.0 });
-            let mut slope = DVector::from_fn(n, |i, _| {
-                weight[places[i]] * (prior[places[i]] - z[places[i]])
-            });
-            for ((run, y), row) in run.iter().zip(y).zip(rows.chunks_exact(plain.columns())) {
-                let row = &row[row.len() - self.order()..];
-                if y.is_nan() {
-                    continue;
-                }
-                for (i, &a) in places.iter().enumerate() {
-                    slope[i] += row[a] * (y - run);
-                    for (j, &b) in places.iter().enumerate() {
-                        matrix[(i, j)] += row[a] * row[b];
-                    }
-                }
-            }
-            for i in 0..n {
-                matrix[(i, i)] *= 1.0 + damping;
-            }
-            let Some(step) = matrix.cholesky().map(|root| root.solve(&slope)) else {
-                break;
-            };
-            if !now.is_finite() {
-                break;
-            }
-            let mut trial = z;
-            for (i, &place) in places.iter().enumerate() {
-                trial[place] += step[i];
-            }
-            let after = cost(&trial);
-            if after < now {
-                let done = now - after <= 1e-12 * now;
-                (z, now, damping) = (trial, after, 0.1 * damping);
-                if done {
-                    break;
-                }
-            } else {
-                damping = f64::max(8.0 * damping, 1e-3);
-            }
-        }
-        finite(z[..self.order()].to_vec())
+        self.state_at(0, u, y)
     }
 
     fn jacobian(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<RunAndRows> {
@@ -787,6 +909,188 @@ impl Model for GreyBox {
 impl GreyBox {
     fn columns(&self) -> usize {
         self.frame.free.len() + WEIGHTS * self.network.len() + self.order()
+    }
+
+    /// Predictions from a filter with derivatives by `N` states or fewer.
+    fn predicted<const N: usize>(
+        &self,
+        u: &[f64],
+        y: &[f64],
+        state: &[f64],
+        horizon: usize,
+    ) -> Result<Vec<f64>> {
+        let v = self.acting(u);
+        let noise = self.frame.process_noise;
+        let mut filter = Filter::<N> {
+            model: self,
+            stepper: Stepper::new(self, false),
+            state: std::array::from_fn(|j| state.get(j).copied().unwrap_or(0.0)),
+            covariance: std::array::from_fn(|i| {
+                std::array::from_fn(|j| if i == j { noise } else { 0.0 })
+            }),
+        };
+        let plain = Stepper::<0>::new(self, false);
+        let ahead = |state: &[f64], v: &[f64]| {
+            let mut at = Moving::at(self, &state[..self.order()]);
+            v.iter()
+                .map(|v| plain.step(&mut at, &Dual::constant(*v)).value)
+                .last()
+        };
+        // the first samples have no measured output a horizon before them
+        let first = horizon.min(u.len()) - usize::from(!u.is_empty());
+        let mut found = self.carried::<0>(&v[..first], state).0;
+        for k in 0..u.len() - first {
+            found.extend(ahead(&filter.state, &v[k..k + first + 1]));
+            filter.measure(v[k], y[k]);
+            filter.advance(v[k]);
+        }
+        finite(found)
+    }
+
+    /// The command that acted last before a sample.
+    fn before(&self, first: usize, u: &[f64]) -> f64 {
+        self.acting(&u[..first.max(1)])[first.saturating_sub(1)]
+    }
+
+    /// The free run from a sample on, with what was commanded before it.
+    pub(super) fn run_from(&self, first: usize, u: &[f64], state: &[f64]) -> Result<Vec<f64>> {
+        self.check(u, 1, state)?;
+        let state = self.begun_at(first, u, state);
+        finite(self.carried::<0>(&self.acting(u)[first..], &state).0)
+    }
+
+    /// The same with its derivatives.
+    pub(super) fn slopes_from(&self, first: usize, u: &[f64], state: &[f64]) -> Result<RunAndRows> {
+        self.check(u, 1, state)?;
+        let state = self.begun_at(first, u, state);
+        let (run, rows) = self.slopes(&self.acting(u)[first..], &state);
+        Ok((finite(run)?, finite(rows)?))
+    }
+
+    fn begun_at(&self, first: usize, u: &[f64], state: &[f64]) -> Vec<f64> {
+        let mut state = state.to_vec();
+        state[2] = self.before(first, u) / self.frame.command_scale;
+        state
+    }
+
+    /// The states at a sample by least squares, close to what the first outputs say about them.
+    pub(super) fn state_at(&self, first: usize, u: &[f64], y: &[f64]) -> Result<Vec<f64>> {
+        let known: Vec<f64> = y.iter().copied().filter(|v| v.is_finite()).collect();
+        if known.is_empty() || first + y.len() != u.len() {
+            return Err(Error::data(
+                "expected measured outputs to estimate the initial state from, one per input, got none; give 20 or so",
+            ));
+        }
+        let (frame, scales, places) = (&self.frame, self.scales(), self.filtered());
+        let v = &self.acting(u)[first..];
+        let few = &known[..known.len().min(3)];
+        let level = frame.unit * few.iter().sum::<f64>() / few.len() as f64;
+        // a step of one scale weighs as much as the output change it makes
+        let mut weight = [PRIOR * (frame.speed_scale / frame.unit).powi(2); STATES];
+        let mut prior = [
+            level,
+            v[0] - frame.values[0] * level,
+            v[0],
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+        ];
+        if frame.position {
+            weight = weight.map(|w| w * frame.sample_time.powi(2));
+            (weight[POSITION], weight[SHOWN]) = (PRIOR, PRIOR);
+            let voltage = v[0] - frame.joint[K_Q] * level;
+            let reach = match frame.joint[REACH] {
+                0.0 => f64::INFINITY,
+                reach => reach,
+            };
+            prior = [
+                0.0,
+                voltage.clamp(-reach, reach),
+                v[0],
+                level,
+                v[0],
+                level,
+                0.0,
+            ];
+        }
+        let mut prior: [f64; STATES] = std::array::from_fn(|j| prior[j] / scales[j]);
+        prior[2] = self.before(first, u) / scales[2];
+        let plain = Self {
+            network: self.network.clone(),
+            frame: Frame {
+                free: Vec::new(),
+                ..frame.clone()
+            },
+        };
+        let off = |z: &[f64; STATES]| {
+            places
+                .iter()
+                .map(|&j| weight[j] * (z[j] - prior[j]).powi(2))
+                .sum::<f64>()
+        };
+        let cost = |z: &[f64; STATES]| -> f64 {
+            let run = plain.carried::<0>(v, &z[..self.order()]).0;
+            let errors = run.iter().zip(y).filter(|(_, y)| !y.is_nan());
+            errors.map(|(run, y)| (y - run).powi(2)).sum::<f64>() + off(z)
+        };
+        // at standstill friction holds a joint, and no derivative says how fast it may have been
+        let mut moving = prior;
+        if frame.position && known.len() > SLOPE {
+            moving[0] = (known[SLOPE] - known[0]) / (SLOPE as f64 * frame.sample_time) * frame.unit
+                / scales[0];
+        }
+        let (mut z, mut damping) = (prior, 0.0);
+        let mut now = cost(&z);
+        let other = cost(&moving);
+        if other < now {
+            (z, now) = (moving, other);
+        }
+        let n = places.len();
+        for _ in 0..STATE_STEPS {
+            let (run, rows) = plain.slopes(v, &z[..self.order()]);
+            let mut matrix =
+                DMatrix::from_fn(n, n, |i, j| if i == j { weight[places[i]] } else { 0.0 });
+            let mut slope = DVector::from_fn(n, |i, _| {
+                weight[places[i]] * (prior[places[i]] - z[places[i]])
+            });
+            for ((run, y), row) in run.iter().zip(y).zip(rows.chunks_exact(plain.columns())) {
+                let row = &row[row.len() - self.order()..];
+                if y.is_nan() {
+                    continue;
+                }
+                for (i, &a) in places.iter().enumerate() {
+                    slope[i] += row[a] * (y - run);
+                    for (j, &b) in places.iter().enumerate() {
+                        matrix[(i, j)] += row[a] * row[b];
+                    }
+                }
+            }
+            for i in 0..n {
+                matrix[(i, i)] *= 1.0 + damping;
+            }
+            let Some(step) = matrix.cholesky().map(|root| root.solve(&slope)) else {
+                break;
+            };
+            if !now.is_finite() {
+                break;
+            }
+            let mut trial = z;
+            for (i, &place) in places.iter().enumerate() {
+                trial[place] += step[i];
+            }
+            let after = cost(&trial);
+            if after < now {
+                let done = now - after <= 1e-12 * now;
+                (z, now, damping) = (trial, after, 0.1 * damping);
+                if done {
+                    break;
+                }
+            } else {
+                damping = f64::max(8.0 * damping, 1e-3);
+            }
+        }
+        finite(z[..self.order()].to_vec())
     }
 
     /// The free run and its derivatives by theta and the states.

@@ -1,7 +1,7 @@
 //! The motor's equations without derivatives, for one motor or eight side by side: [`Equations`] operation by operation, with selections
 //! in place of branches. Read `step` first.
 
-use super::model::Stepper;
+use super::model::{Stepper, TOUCHES};
 use super::{NEWTON, NEWTON_TOLERANCE};
 use crate::neural::Meanwhile;
 use crate::simd::{Arithmetic, F64x8, LANES};
@@ -26,10 +26,16 @@ pub(crate) struct Motor {
     sag: Option<f64>,
     k_l: Option<f64>,
     directional: Option<[f64; 3]>,
-    creep: Option<f64>,
+    /// `keep` and `gain` over half a step and a whole one.
+    soft: Option<[[f64; 2]; 2]>,
     exponent: Option<f64>,
     inner: Option<Inner>,
-    gravity: Option<[f64; 2]>,
+    /// Loads over the angle: `order`, `c` and `s`.
+    by_angle: Vec<[f64; 3]>,
+    rate: Option<f64>,
+    play: Option<Box<Play>>,
+    /// Whether a controller knows the position of the load, not of the motor.
+    shows_load: bool,
     network: Vec<[f64; 4]>,
     /// Integration steps per sample, and their length \[s\].
     steps: usize,
@@ -51,6 +57,17 @@ pub(crate) struct Motor {
     per_command: f64,
 }
 
+/// A load behind play; names as in [`Play`](super::model::Play).
+#[derive(Clone, Debug)]
+struct Play {
+    half: f64,
+    alone: Motor,
+    per_load: f64,
+    rub: f64,
+    share: f64,
+    rest: f64,
+}
+
 /// The drive's own controller; names as in [`Inner`](super::Inner), infinite where it has no limit.
 #[derive(Clone, Copy, Debug)]
 struct Inner {
@@ -68,6 +85,10 @@ pub(crate) struct Moving<A> {
     pub x: A,
     pub before: A,
     pub q: A,
+    /// What the controller goes for, with a limit of its rate; position and speed of a load behind play.
+    pub setpoint: A,
+    pub shown: A,
+    pub v: A,
 }
 
 impl<A: Arithmetic> Moving<A> {
@@ -78,6 +99,9 @@ impl<A: Arithmetic> Moving<A> {
             x: zero,
             before: zero,
             q: zero,
+            setpoint: zero,
+            shown: zero,
+            v: zero,
         }
     }
 }
@@ -85,6 +109,27 @@ impl<A: Arithmetic> Moving<A> {
 impl Motor {
     /// The motor of a stepper, whose command is late by `whole` samples and a fraction.
     pub(super) fn of(stepper: &Stepper<0>, whole: usize) -> Self {
+        let mut motor = Self::plain(stepper, whole);
+        motor.play = stepper.play.as_ref().map(|play| {
+            let mut alone = motor.clone();
+            alone.k_s = play.alone.k_s.value;
+            alone.k_t = play.alone.k_t.value;
+            alone.per_inertia = play.turn.per_inertia.value;
+            alone.shows_load = true;
+            motor.shows_load = true;
+            Box::new(Play {
+                half: play.half.value,
+                alone,
+                per_load: play.per_load.value,
+                rub: play.rub.value,
+                share: play.share.value,
+                rest: play.rest.value,
+            })
+        });
+        motor
+    }
+
+    fn plain(stepper: &Stepper<0>, whole: usize) -> Self {
         let (is, frame) = (&stepper.equations, &stepper.frame);
         Self {
             k_e: is.k_e.value,
@@ -104,7 +149,9 @@ impl Motor {
             sag: is.sag.map(|sag| sag.value),
             k_l: is.k_l.map(|k_l| k_l.value),
             directional: is.directional.map(|both| both.map(|one| one.value)),
-            creep: is.creep.map(|creep| creep.value),
+            soft: is
+                .soft
+                .map(|both| both.map(|soft| [soft.keep.value, soft.gain.value])),
             exponent: is.exponent.map(|exponent| exponent.value),
             inner: is.inner.map(|inner| Inner {
                 k_q: inner.k_q.value,
@@ -112,7 +159,14 @@ impl Motor {
                 dead_band: inner.dead_band.map_or(0.0, |band| band.value),
                 reach: inner.reach.map_or(f64::INFINITY, |reach| reach.value),
             }),
-            gravity: stepper.gravity.map(|waves| waves.map(|wave| wave.value)),
+            by_angle: stepper
+                .by_angle
+                .iter()
+                .map(|wave| [wave.order, wave.c, wave.s].map(|one| one.value))
+                .collect(),
+            rate: stepper.rate.map(|rate| rate.value),
+            play: None,
+            shows_load: false,
             network: stepper
                 .network
                 .iter()
@@ -158,8 +212,19 @@ impl Motor {
         let mut mean = all(0.0);
         for j in 0..self.steps {
             let old = (self.part * self.steps as f64 - j as f64).clamp(0.0, 1.0);
-            let command = now.mul(all(1.0 - old)).add(all(old).mul(at.before));
-            let load = self.with_gravity(load, at);
+            let (mut held, mut given) = (at.before, now);
+            if let Some(rate) = self.rate {
+                let before = old * self.time;
+                let (mean, end) = ramped(rate * before, at.setpoint, held);
+                held = mean;
+                (given, at.setpoint) = ramped(rate * (self.time - before), end, given);
+            }
+            let command = given.mul(all(1.0 - old)).add(all(old).mul(held));
+            let load = self.with_angle(load, at);
+            if let Some(play) = &self.play {
+                self.step_with_play(play, load, at, command, meanwhile);
+                continue;
+            }
             let (drive, speed) = self.advanced(load, at, command, meanwhile);
             if self.position {
                 let half = all(0.5 * self.time);
@@ -172,7 +237,8 @@ impl Motor {
         at.before = now;
         if self.position {
             // only a speed is measured by counts of its position
-            let output = at.q.mul(all(self.per_unit));
+            let q = if self.play.is_some() { at.shown } else { at.q };
+            let output = q.mul(all(self.per_unit));
             return (output, all(0.0));
         }
         let mean = mean.mul(all(self.per_steps));
@@ -181,16 +247,60 @@ impl Motor {
         (output.mul(all(self.per_unit)), moved)
     }
 
-    /// The load with gravity in the middle of a step.
+    /// A step with a load behind play: both ways, of which each lane takes its own.
     #[inline(always)]
-    fn with_gravity<A: Arithmetic>(&self, load: A, at: &Moving<A>) -> A {
-        let Some([c, s]) = self.gravity else {
-            return load;
-        };
+    fn step_with_play<A: Arithmetic>(
+        &self,
+        play: &Play,
+        load: A,
+        at: &mut Moving<A>,
+        command: A,
+        meanwhile: &mut impl Meanwhile,
+    ) {
         let all = A::splat;
-        let angle = at.q.add(all(0.5 * self.time).mul(at.w));
-        load.add(all(c).mul(angle.each(f64::cos)))
-            .add(all(s).mul(angle.each(f64::sin)))
+        let side_of = |x: A, size: f64| x.if_less(all(0.0), all(-size), all(size));
+        let half = all(0.5 * self.time);
+        let goes = |q: A, from: A, to: A| q.add(half.mul(from)).add(half.mul(to));
+        let free = at.v.add(all(-self.time).mul(load.mul(all(play.per_load))));
+        let most = play.rub * self.time;
+        let slides = free.sub(side_of(free, most));
+        let loose = all(most).if_less(free.abs(), slides, all(0.0));
+
+        let ahead = at.q.sub(at.shown);
+        let (drive, speed) = self.advanced(load, at, command, meanwhile);
+        let leaves = side_of(ahead, 1.0).mul(loose.sub(speed));
+        let apart = all(0.0).if_less(leaves, all(1.0), all(0.0));
+        let apart = ahead
+            .abs()
+            .if_less(all(TOUCHES * play.half), all(1.0), apart);
+        let q = goes(at.q, at.w, speed);
+        let shown = q.sub(side_of(ahead, play.half));
+
+        let (own_drive, own) = play.alone.advanced(all(0.0), at, command, meanwhile);
+        let (own_q, own_shown) = (goes(at.q, at.w, own), goes(at.shown, at.v, loose));
+        let ahead = own_q.sub(own_shown);
+        let common = own.mul(all(play.rest)).add(loose.mul(all(play.share)));
+        let hits = |then: A, none: A| all(play.half).if_less(ahead.abs(), then, none);
+
+        let either = |apart_: A, together: A| all(0.5).if_less(apart, apart_, together);
+        at.x = either(own_drive, drive);
+        at.w = either(hits(common, own), speed);
+        at.v = either(hits(common, loose), speed);
+        at.q = either(own_q, q);
+        at.shown = either(hits(own_q.sub(side_of(ahead, play.half)), own_shown), shown);
+    }
+
+    /// The load with gravity and cogging in the middle of a step.
+    #[inline(always)]
+    fn with_angle<A: Arithmetic>(&self, mut load: A, at: &Moving<A>) -> A {
+        let all = A::splat;
+        for &[order, c, s] in &self.by_angle {
+            let angle = all(order).mul(at.q.add(all(0.5 * self.time).mul(at.w)));
+            load = load
+                .add(all(c).mul(angle.each(f64::cos)))
+                .add(all(s).mul(angle.each(f64::sin)));
+        }
+        load
     }
 
     /// The output of the drive's own controller, and how it changes over a step at this speed.
@@ -246,7 +356,9 @@ impl Motor {
         let mut voltage = u;
         if let Some(inner) = &self.inner {
             let quarter = all(0.25 * self.time);
-            let half = at.q.add(quarter.mul(w)).add(quarter.mul(middle));
+            // a controller knows the position that shows
+            let q = if self.shows_load { at.shown } else { at.q };
+            let half = q.add(quarter.mul(w)).add(quarter.mul(middle));
             let (output, by) = self.controlled(inner, u, half, middle);
             (voltage, change) = (output, change.add(by));
         }
@@ -276,13 +388,14 @@ impl Motor {
                 .add(all(k_mm).mul(drive.mul(drive)));
         }
         let most = dry.mul(all(self.per_inertia)).mul(all(time));
-        let moved = free.sub(direction.mul(most));
-        if let Some(creep) = self.creep {
-            let whole = creep + time;
-            let (held, least) = (free.abs().mul(all(time)), most.mul(all(whole)));
-            let creeping = free.mul(all(creep / whole));
-            return least.if_less(held, moved, creeping);
+        if let Some([half, whole]) = self.soft {
+            let [keep, gain] = if time < self.time { half } else { whole };
+            let held = from.mul(all(keep)).add(free.sub(from).mul(all(gain)));
+            let taken = free.sub(held);
+            let side = taken.if_less(all(0.0), all(-1.0), all(1.0));
+            return most.if_less(taken.abs(), free.sub(side.mul(most)), held);
         }
+        let moved = free.sub(direction.mul(most));
         // friction that could take more than all of the speed stops the shaft; NaN is neither less nor equal, and stays
         let stopped = free.abs().if_less(most, all(0.0), moved);
         free.abs().if_equal(most, all(0.0), stopped)
@@ -372,6 +485,19 @@ impl Motor {
         let side = drive.if_less(all(0.0), all(-limit), all(limit));
         all(limit).if_less(drive.abs(), side, drive)
     }
+}
+
+/// A setpoint's mean and end, which goes for a command by `most` at most.
+#[inline(always)]
+fn ramped<A: Arithmetic>(most: f64, from: A, command: A) -> (A, A) {
+    let all = A::splat;
+    let left = command.sub(from);
+    let change = left.if_less(all(0.0), all(-most), all(most));
+    let limited = |value: A| all(most).if_less(left.abs(), value, command);
+    (
+        limited(from.add(all(0.5).mul(change))),
+        limited(from.add(change)),
+    )
 }
 
 /// `tanh` of one number as a lane computes it.

@@ -10,15 +10,13 @@ use super::GreyBox;
 use crate::bounded::{Ends, Normal, Squares, minimised};
 use crate::data::Samples;
 use crate::gram::Gram;
-use crate::model::Model;
+use crate::model::{Model, RunAndRows};
 use crate::sandwich::{self, Scores};
 use crate::simd::{self, F64x8, Kernel};
-use crate::{Error, Monitor, Record, Result};
+use crate::{Error, Monitor, Result};
 
 /// First measured outputs of a piece, which tell its state.
 const FIRST: usize = 30;
-/// Fitted states of a piece: speed and position.
-const FITTED: usize = 2;
 /// Least part of a parameter in a direction without information, for it to be undetermined.
 const LEAK: f64 = 1e-3;
 
@@ -28,15 +26,19 @@ pub struct Pieces<'a>(Vec<Piece<'a>>);
 
 #[derive(Clone, Debug)]
 struct Piece<'a> {
-    record: Record<'a>,
-    /// Roots of the weights; 0 where nothing was measured.
+    u: &'a [f64],
+    /// Sample of the first measured output. The commands before it may still act.
+    first: usize,
+    /// Outputs from there on.
+    y: &'a [f64],
+    /// Roots of their weights; 0 where nothing was measured.
     root: Vec<f64>,
 }
 
 impl Piece<'_> {
     /// Weighted errors of a run.
     fn errors<'b>(&'b self, run: &'b [f64]) -> impl Iterator<Item = f64> + 'b {
-        let pairs = self.root.iter().zip(run.iter().zip(self.record.y));
+        let pairs = self.root.iter().zip(run.iter().zip(self.y));
         pairs.map(|(root, (run, y))| if *root > 0.0 { root * (run - y) } else { 0.0 })
     }
 
@@ -46,14 +48,18 @@ impl Piece<'_> {
 
     /// The state at the beginning, from the first outputs.
     fn first_state(&self, model: &GreyBox) -> Result<Vec<f64>> {
-        let measured = self.record.y.iter().enumerate();
+        let measured = self.y.iter().enumerate();
         let mut measured = measured.filter(|(_, y)| !y.is_nan()).map(|(k, _)| k + 1);
-        let n = measured
-            .by_ref()
-            .take(FIRST)
-            .last()
-            .unwrap_or(self.record.y.len());
-        model.estimate_state(&self.record.u[..n], 1, &self.record.y[..n])
+        let n = measured.by_ref().take(FIRST).last().unwrap_or(self.y.len());
+        model.state_at(self.first, &self.u[..self.first + n], &self.y[..n])
+    }
+
+    fn run(&self, model: &GreyBox, state: &[f64]) -> Result<Vec<f64>> {
+        model.run_from(self.first, self.u, state)
+    }
+
+    fn slopes(&self, model: &GreyBox, state: &[f64]) -> Result<RunAndRows> {
+        model.slopes_from(self.first, self.u, state)
     }
 }
 
@@ -102,8 +108,14 @@ impl<'a> Pieces<'a> {
                 Some(weights) => weights[k].sqrt(),
                 None => 1.0,
             };
-            let root = record.y.iter().enumerate().map(root).collect();
-            Ok(Piece { record, root })
+            let root: Vec<f64> = record.y.iter().enumerate().map(root).collect();
+            let first = root.iter().position(|root| *root > 0.0).unwrap_or(0);
+            Ok(Piece {
+                u: record.u,
+                first,
+                y: &record.y[first..],
+                root: root[first..].to_vec(),
+            })
         };
         pieces.iter().map(piece).collect::<Result<_>>().map(Self)
     }
@@ -120,7 +132,7 @@ impl<'a> Pieces<'a> {
     pub fn squares(&self, model: &GreyBox, states: &[Vec<f64>]) -> f64 {
         let mut total = 0.0;
         for (piece, state) in self.0.iter().zip(states) {
-            match model.simulate(piece.record.u, 1, state) {
+            match piece.run(model, state) {
                 Ok(run) => total += piece.squares(&run),
                 Err(_) => return f64::INFINITY,
             }
@@ -153,8 +165,8 @@ impl<'a> Pieces<'a> {
             )));
         }
         let starts = self.states(model)?;
-        let last = model.order() - 1;
-        let fitted = |state: &Vec<f64>| [state[0], state[last]];
+        let places = model.begun();
+        let fitted = |state: &Vec<f64>| places.iter().map(|&j| state[j]).collect::<Vec<_>>();
         let begun = starts.iter().flat_map(fitted);
         let x: Vec<f64> = theta.into_iter().chain(begun).collect();
         let bounds = |of: &[f64], none: f64| {
@@ -201,33 +213,28 @@ impl<'a> Pieces<'a> {
         model: &GreyBox,
         states: &[Vec<f64>],
     ) -> Result<(Vec<f64>, Vec<bool>)> {
-        let (p, last) = (model.theta().len(), model.order() - 1);
-        let n = p + FITTED * self.0.len();
+        let (p, order, places) = (model.theta().len(), model.order(), model.begun());
+        let n = p + places.len() * self.0.len();
         let (mut jacobian, mut residuals, mut lengths) = (Vec::new(), Vec::new(), Vec::new());
         for (i, (piece, state)) in self.0.iter().zip(states).enumerate() {
-            let (run, rows) = model.jacobian(piece.record.u, 1, state)?;
-            for (row, root) in rows.chunks_exact(p + last + 1).zip(&piece.root) {
+            let (run, rows) = piece.slopes(model, state)?;
+            for (row, root) in rows.chunks_exact(p + order).zip(&piece.root) {
                 let at = jacobian.len();
                 jacobian.resize(at + n, 0.0);
                 let own = &mut jacobian[at..];
                 own[..p].copy_from_slice(&row[..p]);
-                let state = p + FITTED * i;
-                (own[state], own[state + 1]) = (row[p], row[p + last]);
+                for (j, place) in places.iter().enumerate() {
+                    own[p + places.len() * i + j] = row[p + place];
+                }
                 own.iter_mut().for_each(|v| *v *= root);
             }
             residuals.extend(piece.errors(&run));
             lengths.push(run.len());
         }
-        let window = |m: &usize| {
-            let root = (*m as f64).sqrt().round() as usize;
-            root.min(m / 15).max(1)
-        };
-        let windows: Vec<usize> = lengths.iter().map(window).collect();
         let scores = Scores {
             jacobian: &jacobian,
             residuals: &residuals,
             lengths: &lengths,
-            windows: &windows,
             channels: 1,
         };
         let whole = sandwich::covariance(&scores, &DMatrix::zeros(0, 0))?;
@@ -245,7 +252,7 @@ impl<'a> Pieces<'a> {
     pub fn independent(&self, model: &GreyBox, states: &[Vec<f64>]) -> Result<f64> {
         let (mut total, mut spread) = (0.0, 0.0);
         for (piece, state) in self.0.iter().zip(states) {
-            let run = model.simulate(piece.record.u, 1, state)?;
+            let run = piece.run(model, state)?;
             let errors: Vec<f64> = piece.errors(&run).collect();
             let at = |lag: usize| -> f64 {
                 let pairs = errors.iter().zip(&errors[lag..]);
@@ -279,12 +286,14 @@ impl Problem<'_> {
     }
 
     fn states(&self, x: &[f64]) -> Vec<Vec<f64>> {
-        let fitted = x[self.parameters()..].chunks_exact(FITTED);
+        let places = self.model.begun();
+        let fitted = x[self.parameters()..].chunks_exact(places.len());
         let states = self.starts.iter().zip(fitted);
         let state = |(start, fitted): (&Vec<f64>, &[f64])| {
             let mut state = start.clone();
-            let last = state.len() - 1;
-            (state[0], state[last]) = (fitted[0], fitted[1]);
+            for (&j, value) in places.iter().zip(fitted) {
+                state[j] = *value;
+            }
             state
         };
         states.map(state).collect()
@@ -309,7 +318,8 @@ impl Squares for Problem<'_> {
     type Stop = Error;
 
     fn normal(&mut self, x: &[f64]) -> Result<Normal> {
-        let (p, order) = (self.parameters(), self.model.order());
+        let (p, order, places) = (self.parameters(), self.model.order(), self.model.begun());
+        let fitted = places.len();
         let infinite = || {
             Error::fit(
                 "expected a free run that changes with the parameters by finite amounts, got infinite ones; record more moves in \
@@ -324,19 +334,18 @@ impl Squares for Problem<'_> {
         }
         for (i, (piece, state)) in self.pieces.iter().zip(self.states(x)).enumerate() {
             self.look()?;
-            let found = model.jacobian(piece.record.u, 1, &state);
-            let (run, rows) = found.map_err(|_| infinite())?;
-            let mut gram = Gram::new(p + FITTED + 1, 0);
-            simd::run(Sum(piece, &run, &rows, [p, order], &mut gram));
+            let (run, rows) = piece.slopes(&model, &state).map_err(|_| infinite())?;
+            let mut gram = Gram::new(p + fitted + 1, 0);
+            simd::run(Sum(piece, &run, &rows, [p, order], places, &mut gram));
             let sums = gram.matrix();
-            let at = |j: usize| if j < p { j } else { p + FITTED * i + j - p };
-            for j in 0..p + FITTED {
-                gradient[at(j)] += sums[(p + FITTED, j)];
-                for k in 0..p + FITTED {
+            let at = |j: usize| if j < p { j } else { p + fitted * i + j - p };
+            for j in 0..p + fitted {
+                gradient[at(j)] += sums[(p + fitted, j)];
+                for k in 0..p + fitted {
                     matrix[(at(j), at(k))] += sums[(j.max(k), j.min(k))];
                 }
             }
-            cost += sums[(p + FITTED, p + FITTED)];
+            cost += sums[(p + fitted, p + fitted)];
         }
         if !cost.is_finite() || matrix.iter().any(|v| !v.is_finite()) {
             return Err(infinite());
@@ -355,7 +364,7 @@ impl Squares for Problem<'_> {
         let mut total = self.of_prior(x);
         for (piece, state) in self.pieces.iter().zip(self.states(x)) {
             self.look()?;
-            match model.simulate(piece.record.u, 1, &state) {
+            match piece.run(&model, &state) {
                 Ok(run) => total += piece.squares(&run),
                 Err(_) => return Ok(f64::INFINITY),
             }
@@ -368,12 +377,13 @@ impl Squares for Problem<'_> {
     }
 }
 
-/// Sums a piece's rows: by theta, by speed and position of its start, and the error.
+/// Sums a piece's rows: by theta, by the states of its start at these places, and the error.
 struct Sum<'a>(
     &'a Piece<'a>,
     &'a [f64],
     &'a [f64],
     [usize; 2],
+    &'static [usize],
     &'a mut Gram,
 );
 
@@ -382,9 +392,9 @@ impl Kernel for Sum<'_> {
 
     #[inline(always)]
     fn run<V: F64x8>(self) {
-        let Self(piece, run, rows, [p, order], gram) = self;
+        let Self(piece, run, rows, [p, order], places, gram) = self;
         let rows = rows.chunks_exact(p + order).zip(&piece.root);
-        for ((row, root), (run, y)) in rows.zip(run.iter().zip(piece.record.y)) {
+        for ((row, root), (run, y)) in rows.zip(run.iter().zip(piece.y)) {
             if *root == 0.0 {
                 continue;
             }
@@ -392,9 +402,10 @@ impl Kernel for Sum<'_> {
                 for (sum, by) in sum.iter_mut().zip(&row[..p]) {
                     *sum = root * by;
                 }
-                sum[p] = root * row[p];
-                sum[p + 1] = root * row[p + order - 1];
-                sum[p + FITTED] = root * (run - y);
+                for (sum, place) in sum[p..].iter_mut().zip(places) {
+                    *sum = root * row[p + place];
+                }
+                sum[p + places.len()] = root * (run - y);
             });
         }
     }

@@ -39,16 +39,8 @@ pub struct Smoothing<'a> {
 /// # Errors
 /// Data errors for records that cannot be used.
 pub fn regressed(pieces: &[Samples<'_>], how: &Smoothing<'_>) -> Result<Vec<Option<[f64; 4]>>> {
-    let bell = Bell::new(how);
-    let mut rows = vec![Vec::<[f64; 5]>::new(); how.delays.len()];
-    for piece in pieces {
-        let record = piece.record()?;
-        if record.y.len() > bell.taps.len() + 3 {
-            bell.add(&record, how, &mut rows);
-        }
-    }
-    let found = |rows: Vec<[f64; 5]>| {
-        let (r, count) = triangle(5, rows);
+    let found = |rows: Vec<Row>| {
+        let (r, count) = triangle(5, rows.into_iter().map(|row| row.into_iter().take(5)));
         if count < LEAST {
             return None;
         }
@@ -62,7 +54,39 @@ pub fn regressed(pieces: &[Samples<'_>], how: &Smoothing<'_>) -> Result<Vec<Opti
         let fast = how.sample_time * (found[0].max(0.0) + how.k_q * how.sample_time);
         Some([found[0], fast, found[1], found[2]])
     };
-    Ok(rows.into_iter().map(found).collect())
+    Ok(smoothed(pieces, how)?.into_iter().map(found).collect())
+}
+
+/// What drives less friction, inertia and gravity, at the first delay: its squares that a wave of each order over the position leaves.
+///
+/// # Errors
+/// As [`regressed`].
+pub fn waves(pieces: &[Samples<'_>], how: &Smoothing<'_>, orders: &[f64]) -> Result<Vec<f64>> {
+    let rows = smoothed(pieces, how)?.swap_remove(0);
+    let left = |order: &f64| {
+        let wave = |&[v, bend, side, one, drive, q]: &Row| {
+            let ((s, c), (sin, cos)) = (q.sin_cos(), (order * q).sin_cos());
+            [v, bend, side, one, c, s, cos, sin, drive]
+        };
+        triangle(9, rows.iter().map(wave)).0[(8, 8)].powi(2)
+    };
+    Ok(orders.iter().map(left).collect())
+}
+
+/// Speed, acceleration, sign of the speed, 1, what drives, position.
+type Row = [f64; 6];
+
+/// Rows of smoothed signals, for each delay.
+fn smoothed(pieces: &[Samples<'_>], how: &Smoothing<'_>) -> Result<Vec<Vec<Row>>> {
+    let bell = Bell::new(how);
+    let mut rows = vec![Vec::new(); how.delays.len()];
+    for piece in pieces {
+        let record = piece.record()?;
+        if record.y.len() > bell.taps.len() + 3 {
+            bell.add(&record, how, &mut rows);
+        }
+    }
+    Ok(rows)
 }
 
 /// Taps that smooth, and smooth derivatives per second.
@@ -101,7 +125,7 @@ impl Bell {
     }
 
     /// Appends a piece's rows for every delay.
-    fn add(&self, record: &Record<'_>, how: &Smoothing<'_>, rows: &mut [Vec<[f64; 5]>]) {
+    fn add(&self, record: &Record<'_>, how: &Smoothing<'_>, rows: &mut [Vec<Row>]) {
         let (mut q, known) = bridged(record.y, how.width.max(BRIDGED));
         q.iter_mut().for_each(|q| *q *= how.unit);
         let speeds = filtered(&q, &self.slope);
@@ -122,7 +146,8 @@ impl Bell {
             let drive = filtered(&late, &self.taps);
             rows.extend(clear.iter().map(|&k| {
                 let v = speeds[k];
-                [v, bends[k], v.signum(), 1.0, drive[k] - how.k_q * smooth[k]]
+                let left = drive[k] - how.k_q * smooth[k];
+                [v, bends[k], v.signum(), 1.0, left, smooth[k]]
             }));
         }
     }
@@ -208,6 +233,18 @@ mod tests {
                 assert!((found - true_).abs() < 0.01, "{found:?} for {true_}");
             }
         }
+    }
+
+    #[test]
+    fn a_wave_over_the_position_is_seen_at_its_order() {
+        let (mut u, y) = moved(2000, 0.0);
+        u.iter_mut()
+            .zip(&y)
+            .for_each(|(u, q)| *u += 0.05 * (11.0 * q + 0.4).cos());
+        let piece = Samples::new(&u, 1, &y).unwrap();
+        let left = waves(&[piece], &how(&[0.0]), &[5.0, 8.0, 11.0, 14.0, 30.0]).unwrap();
+        let others = [0, 1, 3, 4].map(|j| left[j]);
+        assert!(others.iter().all(|other| left[2] < 0.5 * other), "{left:?}");
     }
 
     #[test]

@@ -349,7 +349,7 @@ proptest! {
         designs in of_a_search(),
         seed in any::<u64>(),
         (k_l, dead, reach, gravity) in (0.0..0.2_f64, 0.0..0.1_f64, 0.5..2.0_f64, -0.5..0.5_f64),
-        given in prop::array::uniform6(any::<bool>()),
+        given in prop::array::uniform9(any::<bool>()),
         inside in any::<bool>(),
         (units, steps, delay) in (0_usize..3, 1_usize..4, 0.0..3.5_f64),
     ) {
@@ -358,10 +358,14 @@ proptest! {
         let mut frame = base.frame().clone();
         frame.position = true;
         frame.joint[0] = with(given[0], k_l);
-        frame.joint[5..].copy_from_slice(&[with(given[4], 0.03), with(given[4], 0.02), with(given[5], 0.01), with(given[5], 1.5), with(given[4], 0.01)]);
+        frame.joint[5..].copy_from_slice(&[
+            with(given[4], 0.03), with(given[4], 0.02), with(given[5], 0.01), with(given[5], 1.5), with(given[4], 0.01),
+            with(given[6], 0.02), 0.0, with(given[7], 0.01), with(given[7], 0.3), with(given[7], 0.4), with(given[8], 0.1), with(given[8], 0.05), with(given[8], 6.5),
+        ]);
         frame.values[8] = with(given[5], 0.1);
         if inside {
             frame.joint[1..5].copy_from_slice(&[1.0, 0.02, with(given[1], dead), with(given[2], reach)]);
+            frame.joint[11] = with(given[6], 0.8);
         }
         (frame.values[10], frame.values[11]) = (with(given[3], gravity), with(given[3], 0.1));
         let model = GreyBox::new(frame, &Model::theta(&base)).unwrap();

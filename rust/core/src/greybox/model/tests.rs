@@ -143,14 +143,22 @@ fn joint(inside: bool, units: usize) -> GreyBox {
     (frame.position, frame.unit, frame.speed_scale) = (true, 0.5, 3.0);
     frame.values[..3].copy_from_slice(&[0.4, 0.0, 0.05]);
     (frame.values[10], frame.values[11]) = (0.3, -0.4);
-    frame.joint = [0.05, 2.0, 0.02, 0.05, 1.5, 0.03, 0.02, 1e-3, 1.4, 0.01];
+    frame.joint = [
+        0.05, 2.0, 0.02, 0.05, 1.5, 0.03, 0.02, 1e-3, 1.4, 0.01, 2e-3, 3.0, 0.02, 0.3, 0.4, 0.1,
+        -0.05, 5.0,
+    ];
     frame.free = vec![0, 2, 6, 7, 8, 9, 10, 11, DELAY];
     frame.free.extend(OF_JOINT..OF_JOINT + JOINT.len());
     if !inside {
         frame.joint[K_Q..K_M].fill(0.0);
+        frame.joint[RATE] = 0.0;
+        let inner = [
+            OF_JOINT + K_Q..OF_JOINT + K_M,
+            OF_JOINT + RATE..OF_JOINT + RATE + 1,
+        ];
         frame
             .free
-            .retain(|&j| !(OF_JOINT + K_Q..OF_JOINT + K_M).contains(&j));
+            .retain(|j| !inner.iter().any(|places| places.contains(j)));
     }
     let mut random = Random::new(7);
     let all: Vec<f64> = frame.values.iter().chain(&frame.joint).copied().collect();
@@ -164,7 +172,7 @@ fn the_derivatives_of_a_joint_are_those_of_its_values() {
     for (inside, units) in [(false, 0), (true, 0), (true, 3)] {
         let model = joint(inside, units);
         let u: Vec<f64> = commands(60).iter().map(|u| 0.5 * u).collect();
-        let state = [0.3, 0.2, 0.4, 0.7];
+        let state = [0.3, 0.2, 0.4, 0.7, 0.4, 0.7, 0.3];
         let (run, rows) = model.jacobian(&u, 1, &state).unwrap();
         assert_eq!(run, model.simulate(&u, 1, &state).unwrap());
         let (theta, columns) = (Model::theta(&model), model.columns());
@@ -197,6 +205,7 @@ fn the_derivatives_of_a_joint_are_those_of_its_values() {
 #[test]
 fn a_controller_without_an_integral_sags() {
     let mut model = joint(true, 0);
+    model.frame.free.clear();
     model.frame.values[4] = 0.0;
     model.frame.values[6..12].copy_from_slice(&[0.0, 0.0, 0.0, 1.0, 0.25, 0.0]);
     model.frame.joint = [0.0; JOINT.len()];
@@ -217,7 +226,7 @@ fn the_state_of_a_joint_is_found_from_its_first_outputs() {
     for inside in [false, true] {
         let model = joint(inside, 0);
         let u: Vec<f64> = commands(40).iter().map(|u| 0.5 * u).collect();
-        let true_ = [1.2, 0.2, u[0] / 3.0, -0.8];
+        let true_ = [1.2, 0.2, u[0] / 3.0, -0.8, u[0] / 3.0, -0.8, 1.2];
         let y = model.simulate(&u, 1, &true_).unwrap();
         let state = model.estimate_state(&u, 1, &y).unwrap();
         let run = model.simulate(&u, 1, &state).unwrap();

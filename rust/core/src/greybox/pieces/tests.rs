@@ -113,6 +113,20 @@ fn a_prior_holds_and_a_bound_is_kept() {
     assert!((found.model.theta()[0] - 0.06).abs() < 1e-12);
 }
 
+/// A start at rest has no derivative by the speed, as friction holds it, and the descent would stay there.
+#[test]
+fn a_piece_may_begin_just_before_a_stop() {
+    let (u, y) = recorded(0.0, 3);
+    let model = joint(&TRUE);
+    for at in (60..1100).step_by(7) {
+        let mut own = y[at - 10..at + 50].to_vec();
+        own[..10].fill(f64::NAN);
+        let pieces = Pieces::new(&[Samples::new(&u[at - 10..at + 50], 1, &own).unwrap()]).unwrap();
+        let left = pieces.squares(&model, &pieces.states(&model).unwrap());
+        assert!(left < 50.0 * 1e-3_f64.powi(2), "{at}: {left}");
+    }
+}
+
 /// A gap counts as nothing, whatever stands there.
 #[test]
 fn samples_without_weight_do_not_count() {
