@@ -32,11 +32,14 @@
 //! `k_b = B R/K`, `k_s = T R/K`. Derivatives are carried along as dual numbers (Griewank and Walther 2008, chapter 3):
 //! one more parameter adds a column but no code.
 
+mod filter;
 mod model;
 mod motor;
 mod normal;
 mod pieces;
+mod play;
 mod start;
+mod stepper;
 
 pub use model::{Frame, GreyBox, JOINT, MOST_UNITS};
 pub(crate) use motor::{Motor, Moving, tanh_of_one};

@@ -12,11 +12,10 @@
 //! If the output is a position, it is the fourth state, in units of the output. It then also says at which angle a record begins, which a
 //! speed does not: gravity (`load_1`) is allowed, and the friction and the controller of a joint ([`JOINT`]).
 
+use super::filter::Filter;
 use super::motor::{self, Motor};
-use super::{
-    DELAY, Dual, Equations, FIRST_OVER_THE_TURN, Inner, ORDERS, PARAMETERS, Run, Soft, Turn, check,
-    varies,
-};
+use super::stepper::{Moving, Stepper};
+use super::{DELAY, Dual, FIRST_OVER_THE_TURN, ORDERS, PARAMETERS, Run, check, varies};
 use crate::closed_loop::{KernelPlant, Known, Plant};
 use crate::embedded::Embedded;
 use crate::lagged::{check_predicted, finite};
@@ -48,39 +47,39 @@ pub const JOINT: [&str; 18] = [
     "cogging_s",
     "cogging_order",
 ];
-const K_L: usize = 0;
-const K_Q: usize = 1;
-const DAMPING: usize = 2;
-const DEAD_BAND: usize = 3;
-const REACH: usize = 4;
-const K_M: usize = 5;
-const K_G: usize = 6;
-const CREEP: usize = 7;
-const EXPONENT: usize = 8;
-const K_MM: usize = 9;
-const SETTLING: usize = 10;
-const RATE: usize = 11;
-const PLAY: usize = 12;
-const LOAD_SHARE: usize = 13;
-const RUB_SHARE: usize = 14;
-const COGGING: [usize; 3] = [15, 16, 17];
+pub(super) const K_L: usize = 0;
+pub(super) const K_Q: usize = 1;
+pub(super) const DAMPING: usize = 2;
+pub(super) const DEAD_BAND: usize = 3;
+pub(super) const REACH: usize = 4;
+pub(super) const K_M: usize = 5;
+pub(super) const K_G: usize = 6;
+pub(super) const CREEP: usize = 7;
+pub(super) const EXPONENT: usize = 8;
+pub(super) const K_MM: usize = 9;
+pub(super) const SETTLING: usize = 10;
+pub(super) const RATE: usize = 11;
+pub(super) const PLAY: usize = 12;
+pub(super) const LOAD_SHARE: usize = 13;
+pub(super) const RUB_SHARE: usize = 14;
+pub(super) const COGGING: [usize; 3] = [15, 16, 17];
 
 /// Parameters of a joint that may be negative.
 const SIGNED: [&str; 4] = ["k_q", "damping", "cogging_c", "cogging_s"];
 
 /// Most states: speed, drive, previous command; the position if it is the output; with a rate limit or play the controller's
 /// setpoint, and position and speed of the load.
-const STATES: usize = 7;
-const POSITION: usize = 3;
-const SHOWN: usize = 5;
+pub(super) const STATES: usize = 7;
+pub(super) const POSITION: usize = 3;
+pub(super) const SHOWN: usize = 5;
 /// Places of the states that a measurement corrects: all but the previous command.
-const FILTERED: [usize; 6] = [0, 1, 3, 4, 5, 6];
+pub(super) const FILTERED: [usize; 6] = [0, 1, 3, 4, 5, 6];
 /// Weights of a unit: `b`, `p`, `q`, `c`.
-const WEIGHTS: usize = 4;
+pub(super) const WEIGHTS: usize = 4;
 /// The first parameter of a joint.
-const OF_JOINT: usize = PARAMETERS.len();
+pub(super) const OF_JOINT: usize = PARAMETERS.len();
 /// Places of the load once per turn, which is gravity if the position is known.
-const GRAVITY: [usize; 2] = [FIRST_OVER_THE_TURN, FIRST_OVER_THE_TURN + 1];
+pub(super) const GRAVITY: [usize; 2] = [FIRST_OVER_THE_TURN, FIRST_OVER_THE_TURN + 1];
 /// Most units: whatever needs more is no residual of a motor.
 pub const MOST_UNITS: usize = 6;
 /// Weight of an initial state's distance from what the first outputs say, relative to a squared error.
@@ -121,8 +120,8 @@ pub struct Frame {
 /// A motor, with a network for what its equations leave unexplained.
 #[derive(Clone, Debug)]
 pub struct GreyBox {
-    frame: Frame,
-    network: Vec<[f64; WEIGHTS]>,
+    pub(super) frame: Frame,
+    pub(super) network: Vec<[f64; WEIGHTS]>,
 }
 
 impl GreyBox {
@@ -243,7 +242,7 @@ impl GreyBox {
     }
 
     /// Whether a term of a joint is there, or sought.
-    fn has(&self, term: usize) -> bool {
+    pub(super) fn has(&self, term: usize) -> bool {
         self.frame.joint[term] != 0.0 || self.frame.free.contains(&(OF_JOINT + term))
     }
 
@@ -259,12 +258,12 @@ impl GreyBox {
     }
 
     /// Places of the states that a measurement corrects.
-    fn filtered(&self) -> &'static [usize] {
+    pub(super) fn filtered(&self) -> &'static [usize] {
         &FILTERED[..self.order() - 1]
     }
 
     /// The scales of the states.
-    fn scales(&self) -> [f64; STATES] {
+    pub(super) fn scales(&self) -> [f64; STATES] {
         let frame = &self.frame;
         [
             frame.speed_scale,
@@ -293,11 +292,11 @@ impl GreyBox {
     }
 
     /// The delay \[samples\].
-    fn delay(&self) -> f64 {
+    pub(super) fn delay(&self) -> f64 {
         self.frame.values[DELAY] / self.frame.sample_time
     }
 
-    fn run(&self) -> Run<'_> {
+    pub(super) fn run(&self) -> Run<'_> {
         let frame = &self.frame;
         Run {
             theta: &frame.values,
@@ -355,376 +354,6 @@ impl GreyBox {
     }
 }
 
-/// The motor's state with its derivatives; the position stays 0 if it is not the output.
-#[derive(Clone, Copy, Debug)]
-struct Moving<const N: usize> {
-    w: Dual<N>,
-    x: Dual<N>,
-    before: Dual<N>,
-    q: Dual<N>,
-    /// What the controller goes for, with a limit of its rate.
-    setpoint: Dual<N>,
-    /// Position and speed of a load behind play.
-    shown: Dual<N>,
-    v: Dual<N>,
-}
-
-impl<const N: usize> Moving<N> {
-    fn at(model: &GreyBox, state: &[f64]) -> Self {
-        let scales = model.scales();
-        let one = |j: usize| Dual::constant(scales[j] * state.get(j).copied().unwrap_or(0.0));
-        Self {
-            w: one(0),
-            x: one(1),
-            before: one(2),
-            q: one(POSITION),
-            setpoint: one(4),
-            shown: one(SHOWN),
-            v: one(6),
-        }
-    }
-
-    /// With derivatives by the states, from index `place` on.
-    fn seeded(mut self, model: &GreyBox, place: usize) -> Self {
-        let states = [
-            &mut self.w,
-            &mut self.x,
-            &mut self.before,
-            &mut self.q,
-            &mut self.setpoint,
-            &mut self.shown,
-            &mut self.v,
-        ];
-        for (j, (state, scale)) in states.into_iter().zip(model.scales()).enumerate() {
-            if j < model.order() {
-                state.by[place + j] = scale;
-            }
-        }
-        self
-    }
-
-    fn states(&self) -> [Dual<N>; STATES] {
-        [
-            self.w,
-            self.x,
-            self.before,
-            self.q,
-            self.setpoint,
-            self.shown,
-            self.v,
-        ]
-    }
-
-    /// The states in units of their scales.
-    fn scaled(&self, model: &GreyBox) -> [Dual<N>; STATES] {
-        let (scales, states) = (model.scales(), self.states());
-        std::array::from_fn(|j| states[j].scaled(1.0 / scales[j]))
-    }
-
-    fn state(&self, model: &GreyBox) -> [f64; STATES] {
-        let (scales, states) = (model.scales(), self.states());
-        std::array::from_fn(|j| states[j].value / scales[j])
-    }
-}
-
-/// Steps by one sample with [`Equations`].
-#[derive(Clone, Debug)]
-pub(super) struct Stepper<const N: usize> {
-    pub equations: Equations<N>,
-    pub turn: Turn<N>,
-    pub network: Vec<[Dual<N>; WEIGHTS]>,
-    /// Loads over the angle: gravity and cogging.
-    pub by_angle: Vec<ByAngle<N>>,
-    /// Most change of the controller's setpoint per second.
-    pub rate: Option<Dual<N>>,
-    pub play: Option<Play<N>>,
-    pub frame: Frame,
-    /// Fraction of a sample in the command's delay.
-    pub part: f64,
-    /// Place of the delay among the free parameters.
-    pub late: Option<usize>,
-}
-
-/// `c cos(order q) + s sin(order q)`.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct ByAngle<const N: usize> {
-    pub order: Dual<N>,
-    pub c: Dual<N>,
-    pub s: Dual<N>,
-}
-
-/// A load with parts of inertia and friction, all forces from outside, and a position of its own within the play.
-#[derive(Clone, Debug)]
-pub(super) struct Play<const N: usize> {
-    /// Half of the play.
-    pub half: Dual<N>,
-    /// The motor without the load.
-    pub alone: Equations<N>,
-    pub turn: Turn<N>,
-    /// The load's acceleration per force, and by its friction.
-    pub per_load: Dual<N>,
-    pub rub: Dual<N>,
-    /// Parts of the inertia: the load's, and the motor's.
-    pub share: Dual<N>,
-    pub rest: Dual<N>,
-}
-
-impl<const N: usize> Play<N> {
-    fn new(equations: &Equations<N>, [half, share, rub]: [Dual<N>; 3]) -> Self {
-        let (turn, one) = (equations.at(0.0, 0.0), Dual::constant(1.0));
-        let (rest, held) = (one.plus(-1.0, &share), one.plus(-1.0, &rub));
-        let per_load = turn.per_inertia.times(&share.inverse());
-        Self {
-            half,
-            alone: Equations {
-                k_s: equations.k_s.times(&held),
-                k_t: equations.k_t.times(&held),
-                ..equations.clone()
-            },
-            turn: Turn {
-                per_inertia: turn.per_inertia.times(&rest.inverse()),
-                load: Dual::ZERO,
-                ..turn
-            },
-            rub: equations.k_s.times(&rub).times(&per_load),
-            per_load,
-            share,
-            rest,
-        }
-    }
-
-    /// The load's speed after a time of its own.
-    #[inline(always)]
-    fn loose(&self, v: &Dual<N>, load: &Dual<N>, time: f64) -> Dual<N> {
-        let free = v.plus(-time, &load.times(&self.per_load));
-        let most = self.rub.scaled(time);
-        if free.value.abs() <= most.value {
-            return Dual::ZERO;
-        }
-        free.plus(-side_of(&free), &most)
-    }
-
-    /// Advances by a step. A load that touches a flank goes with the motor unless it goes ahead of it; one that meets a flank
-    /// goes on at the common speed (perfectly inelastic impact).
-    #[inline(always)]
-    fn step(&self, together: &Equations<N>, turn: &Turn<N>, at: &mut Moving<N>, command: &Dual<N>) {
-        let step = together.step;
-        let goes = |q: &Dual<N>, from: &Dual<N>, to: &Dual<N>| {
-            q.plus(0.5 * step, from).plus(0.5 * step, to)
-        };
-        let loose = self.loose(&at.v, &turn.load, step);
-        let ahead = at.q.plus(-1.0, &at.shown);
-        if ahead.value.abs() >= TOUCHES * self.half.value {
-            let side = side_of(&ahead);
-            let (drive, speed) = together.advanced(turn, &at.x, &at.w, &at.shown, command);
-            if side * (loose.value - speed.value) <= 0.0 {
-                at.q = goes(&at.q, &at.w, &speed);
-                at.shown = at.q.plus(-side, &self.half);
-                (at.x, at.w, at.v) = (drive, speed, speed);
-                return;
-            }
-        }
-        let (drive, speed) = self
-            .alone
-            .advanced(&self.turn, &at.x, &at.w, &at.shown, command);
-        at.q = goes(&at.q, &at.w, &speed);
-        at.shown = goes(&at.shown, &at.v, &loose);
-        (at.x, at.w, at.v) = (drive, speed, loose);
-        let ahead = at.q.plus(-1.0, &at.shown);
-        if ahead.value.abs() > self.half.value {
-            let common = speed.times(&self.rest).plus(1.0, &loose.times(&self.share));
-            at.shown = at.q.plus(-side_of(&ahead), &self.half);
-            (at.w, at.v) = (common, common);
-        }
-    }
-}
-
-/// A setpoint's mean and end over a time in which it goes for a command at a limited rate.
-#[inline(always)]
-fn ramped<const N: usize>(
-    rate: &Dual<N>,
-    from: &Dual<N>,
-    command: &Dual<N>,
-    time: &Dual<N>,
-) -> (Dual<N>, Dual<N>) {
-    let (left, most) = (command.plus(-1.0, from), rate.times(time));
-    if left.value.abs() <= most.value {
-        return (*command, *command);
-    }
-    let change = most.scaled(side_of(&left));
-    (from.plus(0.5, &change), from.plus(1.0, &change))
-}
-
-/// Part of the play from which a load touches.
-pub(super) const TOUCHES: f64 = 1.0 - 1e-9;
-
-/// -1 or 1, with 1 for either zero.
-#[inline(always)]
-fn side_of<const N: usize>(dual: &Dual<N>) -> f64 {
-    if dual.value < 0.0 { -1.0 } else { 1.0 }
-}
-
-impl<const N: usize> ByAngle<N> {
-    #[inline(always)]
-    fn added_to(&self, load: &Dual<N>, q: &Dual<N>) -> Dual<N> {
-        let angle = self.order.times(q);
-        let (sin, cos) = angle.value.sin_cos();
-        load.plus(1.0, &self.c.times(&angle.through(cos, -sin)))
-            .plus(1.0, &self.s.times(&angle.through(sin, cos)))
-    }
-}
-
-impl<const N: usize> Stepper<N> {
-    /// With or without derivatives by theta.
-    fn new(model: &GreyBox, by_theta: bool) -> Self {
-        let frame = &model.frame;
-        let step = frame.sample_time / frame.steps as f64;
-        let run = Run {
-            free: if by_theta { &frame.free } else { &[] },
-            ..model.run()
-        };
-        let mut equations = Equations::new(&run, step);
-        let joint = |j: usize| {
-            let mut dual = Dual::constant(frame.joint[j]);
-            if let Some(place) = run.free.iter().position(|&free| free == OF_JOINT + j) {
-                dual.by[place] = 1.0;
-            }
-            dual
-        };
-        let some = |j: usize| frame.joint[j] != 0.0 || run.free.contains(&(OF_JOINT + j));
-        equations.k_l = some(K_L).then(|| joint(K_L));
-        let directional = [K_M, K_G, K_MM];
-        equations.directional = directional
-            .iter()
-            .any(|&j| some(j))
-            .then(|| directional.map(joint));
-        let (creep, settling) = (joint(CREEP), joint(SETTLING));
-        equations.soft = (some(CREEP) || some(SETTLING))
-            .then(|| [0.5 * step, step].map(|time| Soft::over(time, &creep, &settling)));
-        equations.exponent = some(EXPONENT).then(|| joint(EXPONENT));
-        equations.inner = some(K_Q).then(|| Inner {
-            k_q: joint(K_Q),
-            damping: joint(DAMPING),
-            dead_band: some(DEAD_BAND).then(|| joint(DEAD_BAND)),
-            reach: (frame.joint[REACH] > 0.0).then(|| joint(REACH)),
-        });
-        let [c, s, ..] = equations.turn;
-        let mut by_angle = Vec::new();
-        let pulls = GRAVITY
-            .iter()
-            .any(|&j| frame.values[j] != 0.0 || run.free.contains(&j));
-        if pulls {
-            (equations.turn[0], equations.turn[1]) = (Dual::ZERO, Dual::ZERO);
-            let order = Dual::constant(1.0);
-            by_angle.push(ByAngle { order, c, s });
-        }
-        if COGGING.iter().any(|&j| some(j)) {
-            let [c, s, order] = COGGING.map(joint);
-            by_angle.push(ByAngle { order, c, s });
-        }
-        let mut next = frame.free.len();
-        let mut weight = |value: f64| {
-            let mut dual = Dual::constant(value);
-            if by_theta {
-                dual.by[next] = 1.0;
-                next += 1;
-            }
-            dual
-        };
-        Self {
-            turn: equations.at(0.0, 0.0),
-            by_angle,
-            rate: (frame.joint[RATE] > 0.0).then(|| joint(RATE)),
-            play: some(PLAY)
-                .then(|| Play::new(&equations, [PLAY, LOAD_SHARE, RUB_SHARE].map(joint))),
-            equations,
-            network: model
-                .network
-                .iter()
-                .map(|unit| unit.map(&mut weight))
-                .collect(),
-            frame: frame.clone(),
-            part: model.delay().fract(),
-            late: run.free.iter().position(|&j| j == DELAY),
-        }
-    }
-
-    /// The network's load, in units of the command.
-    #[inline(always)]
-    fn residual(&self, w: &Dual<N>, x: &Dual<N>) -> Dual<N> {
-        let (speed, drive) = (
-            w.scaled(1.0 / self.frame.speed_scale),
-            x.scaled(1.0 / self.frame.command_scale),
-        );
-        let mut sum = Dual::ZERO;
-        for [b, p, q, c] in &self.network {
-            let argument = b.plus(1.0, &p.times(&speed)).plus(1.0, &q.times(&drive));
-            let value = argument.value.tanh();
-            sum = sum.plus(1.0, &c.times(&argument.through(value, 1.0 - value * value)));
-        }
-        sum.scaled(self.frame.command_scale)
-    }
-
-    /// Advances by a sample in which `now` comes to act; returns the output that follows.
-    #[inline(always)]
-    fn step(&self, at: &mut Moving<N>, now: &Dual<N>) -> Dual<N> {
-        let mut turn = self.turn;
-        if !self.network.is_empty() {
-            turn.load = turn.load.plus(1.0, &self.residual(&at.w, &at.x));
-        }
-        let steps = self.frame.steps;
-        let step = self.equations.step;
-        let mut mean = Dual::ZERO;
-        for j in 0..steps {
-            let left = self.part * steps as f64 - j as f64;
-            let old = left.clamp(0.0, 1.0);
-            let (mut held, mut given) = (at.before, *now);
-            let shifts = self.late.filter(|_| (0.0..1.0).contains(&left));
-            if let Some(rate) = &self.rate {
-                let mut before = Dual::constant(old * step);
-                if let Some(place) = shifts {
-                    before.by[place] = 1.0;
-                }
-                let after = Dual::constant(step).plus(-1.0, &before);
-                let (mean, end) = ramped(rate, &at.setpoint, &held, &before);
-                held = mean;
-                (given, at.setpoint) = ramped(rate, &end, &given, &after);
-            }
-            let mut command = given.scaled(1.0 - old).plus(old, &held);
-            if let Some(place) = shifts {
-                command.by[place] += (held.value - given.value) / step;
-            }
-            let mut turn = turn;
-            if !self.by_angle.is_empty() {
-                let q = at.q.plus(0.5 * step, &at.w);
-                for wave in &self.by_angle {
-                    turn.load = wave.added_to(&turn.load, &q);
-                }
-            }
-            let equations = &self.equations;
-            if let Some(play) = &self.play {
-                play.step(equations, &turn, at, &command);
-                continue;
-            }
-            let (drive, speed) = equations.advanced(&turn, &at.x, &at.w, &at.q, &command);
-            if self.frame.position {
-                at.q = at.q.plus(0.5 * step, &at.w).plus(0.5 * step, &speed);
-            } else {
-                mean = mean.plus(0.5, &at.w).plus(0.5, &speed);
-            }
-            (at.x, at.w) = (drive, speed);
-        }
-        at.before = *now;
-        let output = match &self.frame {
-            frame if frame.position && self.play.is_some() => at.shown,
-            frame if frame.position => at.q,
-            frame if frame.mean => mean.scaled(1.0 / steps as f64),
-            _ => at.w,
-        };
-        output.scaled(1.0 / self.frame.unit)
-    }
-}
-
 struct Carried<'a, const N: usize>(&'a GreyBox, &'a [f64], &'a [f64]);
 
 impl<const N: usize> Kernel for Carried<'_, N> {
@@ -750,69 +379,6 @@ impl<const N: usize> Kernel for Carried<'_, N> {
             }
         }
         (run, rows)
-    }
-}
-
-/// The states with their covariance, corrected by measured outputs (extended Kalman filter: Anderson and Moore 1979, section 8.2).
-struct Filter<'a, const N: usize> {
-    model: &'a GreyBox,
-    stepper: Stepper<N>,
-    state: [f64; STATES],
-    covariance: [[f64; FILTERED.len()]; FILTERED.len()],
-}
-
-impl<const N: usize> Filter<'_, N> {
-    /// The predicted output and the state that follows, each with derivatives.
-    fn step(&self, v: f64) -> (Dual<N>, Moving<N>) {
-        let mut at = Moving::at(self.model, &self.state).seeded(self.model, 0);
-        let y = self.stepper.step(&mut at, &Dual::constant(v));
-        (y, at)
-    }
-
-    /// Corrects the state by one output; NaN is skipped.
-    fn measure(&mut self, v: f64, y: f64) {
-        if y.is_nan() {
-            return;
-        }
-        let (predicted, _) = self.step(v);
-        let places = self.model.filtered();
-        let p = self.covariance;
-        let mut gain = [0.0; FILTERED.len()];
-        let mut spread = self.model.frame.residual_variance;
-        for (i, gain) in gain.iter_mut().enumerate().take(places.len()) {
-            for (j, &place) in places.iter().enumerate() {
-                *gain += p[i][j] * predicted.by[place];
-            }
-            spread += predicted.by[places[i]] * *gain;
-        }
-        for (i, &place) in places.iter().enumerate() {
-            self.state[place] += gain[i] * (y - predicted.value) / spread;
-            for j in 0..places.len() {
-                self.covariance[i][j] -= gain[i] * gain[j] / spread;
-            }
-        }
-    }
-
-    fn advance(&mut self, v: f64) {
-        let (_, at) = self.step(v);
-        let next = at.scaled(self.model);
-        let places = self.model.filtered();
-        let p = self.covariance;
-        for (i, &a) in places.iter().enumerate() {
-            for (j, &b) in places.iter().enumerate() {
-                self.covariance[i][j] = places
-                    .iter()
-                    .enumerate()
-                    .flat_map(|(k, c)| places.iter().enumerate().map(move |(l, d)| (k, c, l, d)))
-                    .map(|(k, &c, l, &d)| next[a].by[c] * p[k][l] * next[b].by[d])
-                    .sum();
-            }
-            // positions move with the speeds only
-            if a < POSITION || a == 6 {
-                self.covariance[i][i] += self.model.frame.process_noise;
-            }
-        }
-        self.state = at.state(self.model);
     }
 }
 

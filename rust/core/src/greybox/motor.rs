@@ -1,7 +1,8 @@
 //! The motor's equations without derivatives, for one motor or eight side by side: [`Equations`] operation by operation, with selections
 //! in place of branches. Read `step` first.
 
-use super::model::{Stepper, TOUCHES};
+use super::play::TOUCHES;
+use super::stepper::Stepper;
 use super::{NEWTON, NEWTON_TOLERANCE};
 use crate::neural::Meanwhile;
 use crate::simd::{Arithmetic, F64x8, LANES};
@@ -57,7 +58,7 @@ pub(crate) struct Motor {
     per_command: f64,
 }
 
-/// A load behind play; names as in [`Play`](super::model::Play).
+/// A load behind play; names as in [`Play`](super::play::Play).
 #[derive(Clone, Debug)]
 struct Play {
     half: f64,
