@@ -381,10 +381,11 @@ def default_steps(
 
 def _effect(point: PlantPoint, samples: int) -> float:
     """What a unit of input does to the output of a plant without control: its gain, or how far it
-    gets until the end if it does not settle before [y/u].
+    gets until the end if a pole is nearer to 1 than the end can tell [y/u].
     """
     slowest = max(np.abs(np.linalg.eigvals(point.A)), default=0.0)
-    if slowest**samples < math.exp(-1.0) and math.isfinite(point.gain):
+    settles = slowest == 0.0 or abs(samples * math.log(slowest)) > 1.0
+    if settles and math.isfinite(point.gain):
         return abs(point.gain)
     n = len(point.A)
     held = np.block([[point.A, point.B], [np.zeros((1, n)), np.ones((1, 1))]])

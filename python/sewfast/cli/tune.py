@@ -352,6 +352,15 @@ def _front(
 
     first = _started(args, models)
     start = _pid(first.get("start") or first_of(models[0], **first), "--pareto")
+    if start.feedforward is not None:
+        if args.feedforward == "causal" and start.feedforward.preview:
+            raise SettingError(
+                name="--feedforward", expected="preview or none with --pareto, whose loops keep "
+                "the feedforward of the start", received="causal",
+                remedy="tune the start with it first",
+            )  # fmt: skip
+        if args.feedforward == "none":
+            start = replace(start, feedforward=None)
     with Progress("tune", quiet=args.quiet) as progress:
         return pareto(
             models, references, objectives=args.pareto.split(","), start=start, **settings,

@@ -66,6 +66,8 @@ def grey_box(task: Task) -> Model:
     motors = Motors(task.seed, task.iterations_or_usual)
     hidden, tried = task.hidden or 0, list[Provenance]()
     part = later_part(task.data, task.validation) if task.select else None
+    if task.hidden is not None and part is not None and part.is_given:
+        part = None  # nothing to choose, and validation data judge the model itself
 
     def look(*_: object) -> None:
         if task.progress is not None:
@@ -73,13 +75,19 @@ def grey_box(task: Task) -> Model:
 
     found: MotorCandidate | None = None
     try:
-        if part is not None:
-            found = motors.alone(part, look)
-            tried = [found.held_out()]
-            more = motors.beside(found, part, look, task.hidden or HIDDEN)
-            tried.append(more.held_out())
-            found = more if task.hidden or _is_better(more, found) else found
-            hidden = found.hidden
+        try:
+            if part is not None:
+                found = motors.alone(part, look)
+                tried = [found.held_out()]
+                more = motors.beside(found, part, look, task.hidden or HIDDEN)
+                tried.append(more.held_out())
+                found = more if task.hidden or _is_better(more, found) else found
+                hidden = found.hidden
+        except DataError:
+            # too short to hold a part out, which a given structure does not need
+            if task.hidden is None:
+                raise
+            found = None
         core = motors.fitted(task.data, hidden, look)
     except TimeUp:
         # without time for all data, the motor of the earlier part

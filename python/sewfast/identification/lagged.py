@@ -349,7 +349,7 @@ def _chosen(
     Unless the order was given, one pole less is tried too: a superfluous pole follows trends and
     spoils the steady gain. If the share of a time budget is used up, it is the best so far.
     """
-    if part is None:
+    if part is None or (part.is_given and len(structures) == 1):
         return structures[-1], None
     progress = task.clock.limited(task.progress, SHARES.choice, _CHOICE)
     best = structures[0]

@@ -219,7 +219,7 @@ ORDERS, SMALL = (1, 2, 3, 4, 5, 6, 7, 8), 3
 DELAYS = (2, 3, 4, 5, 6)
 """Delays tried besides one sample, unless a delay is given."""
 SAMPLES_OF_DELAY = 2_000
-"""Samples for that estimate."""
+"""Samples by which a dead time is estimated."""
 SAMPLES = 6_000
 """Samples of a fit that is only used for a decision: blocks spread over the record."""
 ITERATIONS = 60

@@ -82,7 +82,7 @@ measured ones is left out."""
 LEAD = 10
 """Samples before a piece whose commands may still act in it. They count as not measured."""
 OTHER_UNIT = math.sqrt(180.0 / math.pi)
-"""Gain of a position over its command that is nearer to degrees per radian than to 1."""
+"""Range of a position over its command's that is nearer to degrees per radian than to 1."""
 STOPPED = 0.1
 """Least range of the commands, and how far they go beyond it, relative to all of them, that leave a
 joint at one place if that is a stop: friction holds a joint too, but not twice at one count."""
@@ -156,23 +156,28 @@ def fitted(
 
 def _require_following(data: Dataset) -> None:
     """`DataError` for a position that does not follow its command as under a controller: one in
-    another unit, before a gear, or at a stop.
+    another unit, before a gear, or at a stop. Their ranges tell a unit, not how they go together:
+    a joint that swings, or whose commands are quicker than it is, answers late or not at all.
     """
     given, unit = factor(data.input_units[0]), factor(data.output_unit)
     pairs = [(given * e.u[:, 0], unit * e.y) for e in data.experiments]
-    gain = max((_gain(pairs, round(delay)) for delay in DELAYS), key=abs)
-    if not 1.0 / OTHER_UNIT < abs(gain) < OTHER_UNIT:
+    commanded, moved = (np.concatenate(x) for x in zip(*pairs, strict=True))
+    span = float(np.ptp(commanded))
+    share = float(np.nanmax(moved) - np.nanmin(moved)) / span if span > 0.0 else 1.0
+    if not 1.0 / OTHER_UNIT < share < OTHER_UNIT:
         raise DataError(
             name=data.source,
             expected="a position that moves as far as its command, as one does under a controller",
-            received=f"one that moves {abs(gain):.3g} times as far; 57.3 would be degrees in place "
+            received=f"one that moves {share:.3g} times as far; 57.3 would be degrees in place "
             "of radians, another number a gear between the two",
             remedy="state the unit of each, and give both on the same side of the gear",
         )  # fmt: skip
+    # a command that comes late finds the joint where the one before it left it
+    delay = max((round(delay) for delay in DELAYS), key=lambda d: _gain(pairs, d))
     for side in (1.0, -1.0):
         for e, (u, y) in zip(data.experiments, pairs, strict=True):
-            if stop := _stop(side * u, side * y):
-                first, last, off = stop
+            if stop := _stop(side * u[: len(u) - delay], side * y[delay:]):
+                first, last, off = stop[0] + delay, stop[1] + delay, stop[2]
                 raise DataError(
                     name=data.source, expected="a joint that moves freely",
                     received=f"one at a stop at {e.y[first]:.4g} {data.output_unit}, such as in "
@@ -484,7 +489,9 @@ class _Fit:
             steps = np.abs(np.concatenate([np.diff(q) for q in y]))
             step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else span
             first, last = 4.0 * math.pi / span, 2.0 * math.pi / (4.0 * step)
-            tried = np.arange(first, last, math.pi / span)[:MOST_ORDERS]
+            # creep makes the steps as small as one likes
+            wide = min(MOST_ORDERS, (last - first) * span / math.pi)
+            tried = first + math.pi / span * np.arange(max(0, math.ceil(wide)))
             left = np.array(
                 _core.greybox_waves(
                     _arrays(self.data.experiments), width=self.width,

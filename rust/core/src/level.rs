@@ -30,7 +30,9 @@ impl Level {
                 y: 0.0,
             };
         };
-        let counts = |k: &usize| !first.y[*k].is_nan() && first.weight(*k) > 0.0;
+        // an outlier that weighs next to nothing is no level
+        let usual = first.total_weight() / first.measured().max(1) as f64;
+        let counts = |k: &usize| !first.y[*k].is_nan() && first.weight(*k) >= 0.5 * usual;
         let k = (0..first.len()).find(counts);
         Self {
             u: first.u[..first.channels.min(first.u.len())].to_vec(),

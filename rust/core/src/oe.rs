@@ -100,7 +100,8 @@ fn by_search(
         };
         finished(problem, best, spent, max_iterations, monitor)
     };
-    about_level(records, offset, |records, _| {
+    // a predictor's last input is the output itself, whose level is not that of the first sample alone
+    about_level(records, offset && !fed, |records, _| {
         from_rest_or_motion(records, iterations, monitor, found)
     })
 }
