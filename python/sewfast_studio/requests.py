@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sewfast.errors import DataError, SettingError
+from sewfast.errors import DataError, SettingError, SewfastError
 from sewfast.kinds import KINDS, Kind
 
 if TYPE_CHECKING:
@@ -107,7 +107,10 @@ class Step:
         """The data as this step uses them; `_changes` are the same calls."""
         data = data.shift_inputs(self.shift) if self.shift else data
         for span in self.mask:
-            data = data.mask(data.mark_outliers() if span == "outliers" else span)
+            try:
+                data = data.mask(data.mark_outliers() if span == "outliers" else span)
+            except SewfastError as error:
+                raise SettingError(f"mask: {error}") from None
         data = data.fill_inputs("hold") if self.hold else data
         return data if self.resample is None else data.resample(self.resample)
 

@@ -32,15 +32,26 @@ PHRASES = {
 
 _OPTION = r"(?P<option>--[a-z-]+)(?: (?P<value>[^()]+))?"
 _CALL = r"(?:,? (?:data|Dataset)\.\w+(?:\((?:[^()]|\([^()]*\))*\))?)?"
-_WAYS = re.compile(rf"{_CALL} \((?:\w+, )?(?:{_OPTION}|sewfast [^()]*)\)")
+_WAYS = re.compile(rf"{_CALL} \((?:\w+, )?(?:{_OPTION}|`?sewfast [^()]*)\)")
 """A call of Python and the option that does the same, or a command alone."""
+_GIVEN = r"(?:--[a-z-]+|\w+=[^(),]+)"
+_ASIDE = re.compile(rf" \({_GIVEN}(?:, {_GIVEN})*\)")
+"""Options and arguments alone between parentheses: the same once more, for others."""
+_BARE = re.compile(r"--[a-z-]+")
 
 
 def spoken(text: str) -> str:
     """A message with the fields of the page for options; ways that a page lacks are left out."""
     for theirs, ours in PHRASES.items():
         text = text.replace(theirs, ours)
-    return _WAYS.sub(_on_page, text)
+    text = _ASIDE.sub("", _WAYS.sub(_on_page, text))
+    return _BARE.sub(lambda bare: _label(bare[0]), text)
+
+
+def _label(option: str) -> str:
+    """The field that does the same, in quotes; the option itself if there is none."""
+    _, label = FIELDS.get(option, (None, None))
+    return option if label is None else f"“{label}”"
 
 
 def _on_page(way: re.Match[str]) -> str:

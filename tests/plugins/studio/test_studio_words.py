@@ -36,6 +36,10 @@ def test_every_field_that_is_named_is_on_the_page() -> None:
          "hold it, with “Hold missing inputs” set, or take the pieces between", "hold", True),
         ("name its columns (sewfast look FILE)", "name its columns", None, None),
         ("state it (Ts, --ts)", "state it (“Sample time of the file”)", None, None),
+        ("record with an excitation (`sewfast signals`)", "record with an excitation", None, None),
+        ("give both limits (--u-min, --u-max)", "give both limits", None, None),
+        ("choose a name (--overwrite, overwrite=True)", "choose a name", None, None),
+        ("longer: --watchdog 250 (watchdog=0.25)", "longer: “Watchdog” 250", None, None),
         ("lower the gains (by a half)", "lower the gains (by a half)", None, None),
     ],
 )  # fmt: skip
