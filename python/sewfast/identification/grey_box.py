@@ -137,7 +137,8 @@ def is_joint(task: Task) -> bool:
         return False
     spread = np.nanvar(np.concatenate([e.y for e in data.experiments]))
     left: float = fit.core.settings["residual_variance"]
-    return "gravity" not in fit.terms and left < UNEXPLAINED * spread
+    # cogging, too, pulls away from where it balances
+    return not {"gravity", "cogging"} & {*fit.terms} and left < UNEXPLAINED * spread
 
 
 # --- Motors with and without a network ------------------------------------------------------------

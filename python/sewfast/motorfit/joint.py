@@ -172,12 +172,10 @@ def _require_following(data: Dataset) -> None:
             "of radians, another number a gear between the two",
             remedy="state the unit of each, and give both on the same side of the gear",
         )  # fmt: skip
-    # a command that comes late finds the joint where the one before it left it
-    delay = max((round(delay) for delay in DELAYS), key=lambda d: _gain(pairs, d))
     for side in (1.0, -1.0):
         for e, (u, y) in zip(data.experiments, pairs, strict=True):
-            if stop := _stop(side * u[: len(u) - delay], side * y[delay:]):
-                first, last, off = stop[0] + delay, stop[1] + delay, stop[2]
+            if stop := _stop(side * u, side * y):
+                first, last, off = stop
                 raise DataError(
                     name=data.source, expected="a joint that moves freely",
                     received=f"one at a stop at {e.y[first]:.4g} {data.output_unit}, such as in "
@@ -185,15 +183,6 @@ def _require_following(data: Dataset) -> None:
                     f"{off / unit:.3g} {data.output_unit} further",
                     remedy="leave out what goes to the stop, or record commands within it",
                 )  # fmt: skip
-
-
-def _gain(pairs: Sequence[tuple[FloatArray, FloatArray]], delay: int) -> float:
-    """Movement of positions per movement of commands that are late by so many samples."""
-    late = [(u[: len(u) - delay], y[delay:]) for u, y in pairs if len(u) > delay + 1]
-    used = [(u[np.isfinite(y)], y[np.isfinite(y)]) for u, y in late]
-    rows = [(u - u.mean(), y - y.mean()) for u, y in used if len(u)]
-    size = sum(float(u @ u) for u, _ in rows)
-    return sum(float(u @ y) for u, y in rows) / size if size > 0.0 else 1.0
 
 
 def _stop(u: FloatArray, y: FloatArray) -> tuple[int, int, float] | None:

@@ -440,7 +440,9 @@ def test_pictures_share_a_cursor_and_become_files(tuned: Studio, browser: Any) -
     ActionChains(browser).move_to_element(canvas).perform()
     shown = [text for hidden, text in browser.execute_script(SEEN) if not hidden]
     assert len(shown) == 4  # those over time, and none over frequency
-    assert all(text.startswith("time ") and "now " in text for text in shown)
+    # beside others a curve has a name of its own, alone that of its picture
+    named = ("now ", "step: command ", "disturbance", "disturbance: command ")
+    assert all(t.startswith("time ") and n in t for t, n in zip(shown, named, strict=True)), shown
     canvas = browser.find_element("css selector", "#nichols-plot canvas")
     ActionChains(browser).move_to_element(canvas).perform()
     shown = [text for hidden, text in browser.execute_script(SEEN) if not hidden]
