@@ -56,11 +56,11 @@ class Judge:
     ) -> list[Judgement]:
         """The judgement of each, with the weights of a cost."""
         task = self._task if cost is None else replace(self._task, cost=cost)
-        given = [c.about(task.rest).core() for c in controllers]
-        found = _core.tuning_costs(task.core(), given, threads=threads_or_all(None))
         return [
             Judgement(cost, task.loops.worst(controller)[0], overshoot, u)
-            for controller, (cost, _, overshoot, u) in zip(controllers, found, strict=True)
+            for controller, (cost, _, overshoot, u) in zip(
+                controllers, _judged(task, controllers), strict=True
+            )
         ]
 
     def verdict(self, controller: SampledController) -> Verdict:
@@ -105,13 +105,7 @@ def costs(
     for controller in given:
         for plant in task.plants:
             check_fits(controller, plant)
-    judged = _core.tuning_costs(
-        task.core(),
-        [c.about(task.rest).core() for c in given],
-        threads=threads_or_all(threads),
-        progress=progress,
-    )
-    return np.array([cost for cost, *_ in judged])
+    return np.array([cost for cost, *_ in _judged(task, given, threads, progress)])
 
 
 def verdict_on(controller: SampledController, models: Plants) -> Verdict:
@@ -135,6 +129,17 @@ def led(controller: Controller, models: Plants) -> tuple[Controller, Led]:
     controller alone if none helps on every model.
     """
     return with_lead(_task_of(controller, models), controller, "preview")
+
+
+def _judged(
+    task: TuningTask, controllers: Sequence[SampledController], threads: int | None = None,
+    progress: Progress | None = None,
+) -> list[tuple[float, float, float, float]]:  # fmt: skip
+    """Cost, violation, overshoot and command of each controller on a task."""
+    cores = [c.about(task.rest).core() for c in controllers]
+    return _core.tuning_costs(
+        task.core(), cores, threads=threads_or_all(threads), progress=progress
+    )
 
 
 def _task_of(
