@@ -50,9 +50,7 @@ BY_LUCK = 10.0
 over that of samples, up to `AS_GOOD`: the best of dozens of structures leads by luck."""
 FAR = 2.0
 """A structure with an error of more than this many times the least has no part in any weights: the
-errors of bad models can cancel on some blocks, but a median of members does not cancel them. A
-network with nk = 0 stays only if those of its size are as far behind: it is no plant for a loop,
-and a smoothed speed anticipates the input a little."""
+errors of bad models can cancel on some blocks, but a median of members does not cancel them."""
 
 
 def blocked(

@@ -25,7 +25,7 @@ from ..dataset import Diagnosis, diagnose
 from ..dataset.pieces import thinned
 from ..models.base import EnsembleCore
 from . import grey_box, lagged
-from .blocks import FAR, Blocks, Mixture, Row, near
+from .blocks import Blocks, Mixture, Row, near
 from .folds import TRIAL
 from .grey_box import or_none
 from .linear import (
@@ -64,6 +64,9 @@ FAR_BEHIND = 3.0
 ROUNDS, LEAST_FURTHER, WORTH_A_STEP = 4, 40, 0.99
 """Steps of the climb, their iterations whatever the work, and the part below which each has to
 bring the error."""
+WORTH_A_FEEDTHROUGH = 0.5
+"""Error ratio required of nk = 0. It is no plant for a loop, and a smoothed speed anticipates the
+input a little."""
 LEADING = 3
 LEGS, LEG, FINISHED = 2, 80, 0.995
 """Stages on all samples of those that lead, and their iterations; one that does not bring the error
@@ -219,7 +222,7 @@ class Table:
         delayed = {replace(r.found, nk=0): r.rmse for r in found if r.found.nk == self.linear.nk}
         for row in tried:
             if row is not None and row not in found:
-                if FAR * row.rmse < delayed.get(row.found, math.inf):
+                if row.rmse < WORTH_A_FEEDTHROUGH * delayed.get(row.found, math.inf):
                     found.append(row)
                 else:
                     del self.rows[row.found]
