@@ -24,11 +24,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from sewfast.errors import Interrupted, LinkError, SettingError, SewfastError
+from sewfast.errors import Interrupted, LinkError, SettingError
 from sewfast.link.drive import Drive
 from sewfast.live import Feed
 
-from .words import spoken
+from .words import error_text
 
 if TYPE_CHECKING:
     from sewfast.dataset import FloatArray
@@ -331,13 +331,6 @@ class Bench:
             while True:
                 time.sleep(FRAME)
                 self.show()
-
-
-def error_text(error: Exception) -> str:
-    """The text of an error for the page: a refusal as it is, a fault with its type."""
-    if isinstance(error, (ValueError, RecursionError, SewfastError, OSError)):
-        return spoken(str(error))
-    return f"a fault in sewfast: {type(error).__name__}: {error}"
 
 
 def main() -> None:

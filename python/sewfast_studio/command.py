@@ -75,4 +75,5 @@ def command(args: argparse.Namespace) -> None:
             print(f"{studio.address}\nCtrl-C ends it", flush=True)
         if args.browser:
             webbrowser.open(studio.address)
+        studio.project.open_ahead()
         threading.Event().wait()

@@ -25,11 +25,11 @@ import numpy as np
 
 from sewfast.errors import Interrupted, SettingError
 
-from .bench import error_text
 from .loops import shown_loop, shown_response
 from .project import Project, checked_name
 from .requests import COMMISSIONED, Commission, Step, carry_out
 from .tuning import Found, Search, Tuning
+from .words import error_text
 
 if TYPE_CHECKING:
     from sewfast.dataset import FloatArray

@@ -247,6 +247,13 @@ class Project:
                 del self._tunings[next(iter(self._tunings))]
             return found
 
+    def open_ahead(self) -> None:
+        """Open the model that the page shows first, while a browser still loads the page."""
+        models = self.documents(MODEL_FORMAT)
+        if models and (self.demo or self.first in models):
+            with suppress(Exception):  # the page asks for it again, and says why not
+                self.tuning(self.first if self.first in models else models[0])
+
     def save_controller(self, tuning: Tuning, values: dict[str, Any], file: str) -> None:
         """Write a controller into the folder; it replaces only another controller.
 

@@ -20,13 +20,13 @@ from weakref import WeakSet
 
 from sewfast.errors import SettingError, not_installed
 
-from .bench import error_text
 from .driving import checked_recording
 from .jobs import Jobs, Steps
 from .line import Line
 from .project import CONTROLLER_FORMAT, Project, Upload
 from .requests import COMMISSIONED
 from .session import PROMPT, ROW, Session, checked, packed, to_text
+from .words import error_text
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response

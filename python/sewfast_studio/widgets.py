@@ -16,11 +16,11 @@ import numpy as np
 
 from sewfast.errors import SettingError, not_installed
 
-from .bench import error_text
 from .jobs import Jobs, Steps
 from .project import Project
 from .requests import MODEL
 from .session import checked, finite
+from .words import error_text
 
 if TYPE_CHECKING:
     from sewfast.control.controller import Controller

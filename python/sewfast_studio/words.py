@@ -7,6 +7,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from sewfast.errors import SewfastError
+
 FIELDS = {
     "--input": ("inputs", "Input"),
     "--output": ("output", "Output"),
@@ -72,3 +74,10 @@ def advice(text: str) -> dict[str, Any]:
         "text": spoken(text), "field": field, "value": chosen and (chosen["value"] or True),
         "idle": text.endswith("nothing needs to be done"),
     }  # fmt: skip
+
+
+def error_text(error: Exception) -> str:
+    """The text of an error for the page: a refusal as it is, a fault with its type."""
+    if isinstance(error, (ValueError, RecursionError, SewfastError, OSError)):
+        return spoken(str(error))
+    return f"a fault in sewfast: {type(error).__name__}: {error}"

@@ -17,6 +17,7 @@ import sewfast
 from cli import environment
 from commissioned import SMALL, short
 from moments import until
+from sewfast.errors import ModelFileError
 from sewfast.frequency import load_response
 from sewfast_studio import Commission, Project, Step, Studio
 from sewfast_studio.loops import shown_loop, shown_response
@@ -411,6 +412,16 @@ def test_a_link_to_a_closed_place_hides_nothing_else(
     monkeypatch.setattr(Path, "is_file", refuse)
     assert Project(folder).recordings() == ["run.csv", "run2.csv"]
     assert Project(folder).documents("sewfast.model") == []
+
+
+def test_the_model_that_a_page_shows_first_is_opened_ahead(tuned: Studio) -> None:
+    project = Project(tuned.project.folder / "drive.json")
+    project.open_ahead()
+    assert list(project._tunings.values()) == [project.tuning("drive.json")]
+    (project.folder / "drive.json").write_text('{"format": "sewfast.model", "version": 1}')
+    project.open_ahead()  # says nothing: the page does
+    with pytest.raises(ModelFileError):
+        project.tuning("drive.json")
 
 
 def test_pages_with_different_starts_keep_their_searches(tuned: Studio) -> None:
