@@ -135,7 +135,7 @@ def _state_space(
     settled = False
     for _ in range(_NEWTON):
         matrix = (np.eye(len(x)) - core.linearise(u, x)[0])[:free, :free]
-        if free and np.linalg.cond(matrix) > 1e12:
+        if not np.isfinite(matrix).all() or (free and np.linalg.cond(matrix) > 1e12):
             break
         step = np.linalg.solve(matrix, (core.states(held, x)[1] - x)[:free])
         settled = bool(np.abs(step).max(initial=0.0) <= 1e-9)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 sys.path.append(str(Path(__file__).parents[2] / "benches"))
@@ -16,6 +17,7 @@ import sewfast
 from kinds import model_of
 from refusals import refuses
 from sewfast.commissioning.result import numbers_in
+from sewfast.equilibrium import linearise
 from sewfast.errors import DataError, ModelFileError, SewfastError
 from sewfast.report.artefacts import drawing
 
@@ -67,6 +69,14 @@ def test_a_rest_that_the_kind_cannot_have_is_refused_on_load(tmp_path: Path) -> 
     edited(path, lambda v: v["training"].update(rest={"u": [1.0], "y": 5.0}))
     with pytest.raises(ModelFileError, match=r"training\.rest"):
         sewfast.load_model(path)
+
+
+def test_a_model_that_gives_no_number_says_so_in_use(tmp_path: Path) -> None:
+    path = tmp_path / "m.json"
+    model_of("grey_box").save(path)
+    edited(path, lambda v: v["parameters"].update(command_scale=5e-324))
+    with pytest.raises(SewfastError, match="got NaN at sample 0"):
+        linearise(sewfast.load_model(path).core, np.ones(1))
 
 
 @pytest.mark.parametrize(
