@@ -394,6 +394,54 @@ def test_stop_goes_ahead_of_a_long_question(studio: Studio, device: VirtualDevic
     assert read_recording(studio.project.folder / "long.mcap").outcome == "cancelled"
 
 
+def test_stop_in_every_state(studio: Studio, device: VirtualDevice, tmp_path: Path) -> None:
+    gains = sewfast.Gains.standard(0.02, 0.2, 0.004, u_unit="V", y_unit="RPM")
+    sewfast.Controller(gains, u_min=-20.0, u_max=20.0).save(tmp_path / "mine.json")
+    run = {"controller": "mine.json", "reference": "trapezoid", "seed": 0, "scale": 1.0}
+
+    def stopped(moving: bool) -> None:
+        assert page.ask("stop")["found"] is None
+        told = page.event("stopped")
+        assert (told["moving"], told["error"]) == (moving, "")
+        until(lambda: not _is_on(device))
+        # nothing moves again unasked
+        assert "press Arm" in page.ask("drive_record", **{**LONG, "file": "no.mcap"})["error"]
+
+    def moves(name: str, **asked: Any) -> None:
+        page.arm()
+        assert "found" in page.ask(name, **asked)
+        until(lambda: _is_on(device))
+        time.sleep(0.3)
+        stopped(moving=True)
+        assert "stopped" in page.event("driven")["error"].lower()
+
+    with Watching(studio) as page:
+        assert page.ask("stop")["found"] is None  # no drive
+        page.ask("drive_connect", port=device.port, watchdog=2.0)
+        stopped(moving=False)  # without limits
+        page.ask("drive_limits", volt=None, speed_rpm=None, acceleration=None, current=None)
+        page.arm()
+        stopped(moving=True)  # armed: it may move
+        moves("drive_record", **LONG)
+        moves("drive_run", **run, file="run.mcap")
+        page.arm()
+        page.ask("drive_commission", seed=0, members=1, evaluations=100, go_on=False)
+        page.event("stage")
+        page.ask("drive_go")
+        until(lambda: _is_on(device))
+        stopped(moving=True)
+        assert "stopped" in page.event("driven")["error"].lower()
+        page.ask("drive_limits", volt=None, speed_rpm=200.0, acceleration=None, current=None)
+        page.arm()
+        page.ask("drive_record", **{**LONG, "signal": "step", "scale": 1.0, "file": "trip.mcap"})
+        assert "the limit is 200 RPM" in page.event("driven")["error"]
+        page.event("drive", state="tripped")
+        assert page.ask("stop")["found"] is None
+        assert "has tripped" in page.ask("drive_arm")["error"]  # a stop clears nothing
+        assert "found" in page.ask("drive_clear")
+        page.arm()
+
+
 @pytest.mark.nightly("every way of being gone", by_day=["closed"])
 @pytest.mark.parametrize("fault", ["frozen", "closed"])
 def test_a_page_that_is_gone_stops_it(studio: Studio, device: VirtualDevice, fault: str) -> None:
