@@ -303,6 +303,22 @@ def _stops(random: Random, n: int) -> Columns:
     return u, noisy(lag(u), 0.01, random)
 
 
+def _resonates(random: Random, n: int) -> Columns:
+    """A sweep through a light resonance, on one or two masses."""
+    turn, t = random.uniform(12.0, 60.0), np.arange(n) / n
+    low, high = random.uniform(0.02, 0.3) / turn, min(random.uniform(1.5, 5.0) / turn, 0.3)
+    growth = np.log(high / low)
+    turns = (
+        low * (np.exp(growth * t) - 1.0) / growth
+        if random.random() < 0.5
+        else low * t + (high - low) * t**2 / 2.0
+    )
+    u = 5.0 * np.sin(2.0 * np.pi * (n * turns + random.random()))
+    y = swings(u, turn, random.choice([0.97, 0.985, 0.995]))
+    y = lag(y, random.uniform(0.9, 0.99), 1.0) if random.random() < 0.5 else y
+    return u, noisy(y, random.choice([0.0, 0.01, 0.05]), random)
+
+
 def _on(
     kind: str, of: Callable[[np.ndarray], np.ndarray], noise: float
 ) -> Callable[[Random, int], Columns]:
@@ -341,6 +357,7 @@ GOOD: dict[str, Callable[[Random, int], Columns]] = {
     "small, then large": _grows,
     "warms": _warms,
     "rests last": _stops,
+    "sweep through a resonance": _resonates,
 }
 
 

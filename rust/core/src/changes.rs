@@ -1,21 +1,23 @@
 //! Where a record changes its sign, scale or time: torn files, turned leads, files that were glued.
 //!
 //! What one part of a record says of the output predicts the other once it is multiplied or shifted. Input and past are means over ever
-//! longer times, so that neither noise nor the order of a plant matters. A change is believed if it leaves no more than half of what a
-//! curved model of the whole record leaves: a plant that is not linear has not changed. Where the output goes on as before while the input
-//! grows by what the gain falls, a line is enough to compare with: only a plant that is saturated already does the same.
+//! longer times, so that neither noise nor the order of a plant matters. A change is believed if it leaves no more than half of what plants
+//! leave that do not change: a curved one, and a linear one that swings longer than means can tell (a sweep through a resonance has other
+//! gains before and after it). Where the output goes on as before while the input grows by what the gain falls, a line is enough in place
+//! of the curve: only a plant that is saturated already does the same.
 
 mod pair;
 #[cfg(test)]
 mod tests;
 
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
 use pair::Pair;
 
 use crate::column::{LARGEST, SMALLEST};
 use crate::fourier::{correlation, spectrum};
-use crate::{Error, Monitor, Result};
+use crate::lagged::Lagged;
+use crate::{Error, Monitor, Record, Result, oe};
 
 /// Rows that are used; a longer record is taken in means, so that it has no more.
 const MOST: usize = 20_000;
@@ -33,6 +35,11 @@ const FARTHEST: usize = 4;
 const TIES: f64 = 1.05;
 /// Power of the inputs up to which a model of the whole record is curved.
 const CURVED: i32 = 3;
+/// Orders of the linear plant that does not change: of 240 sweeps through light resonances none is accused with it,
+/// 81 without.
+const ORDERS: RangeInclusive<usize> = 2..=4;
+/// Iterations of its fit.
+const ITERATIONS: usize = 20;
 /// Rows for each column, below which nothing is told.
 const ROWS_PER_COLUMN: usize = 10;
 /// Parts of an experiment, and halves of two beside each other, that are searched by themselves: of six records of each kind of
@@ -266,9 +273,11 @@ struct Found {
 struct Rows {
     us: Vec<Vec<f64>>,
     channels: usize,
+    /// The outputs, of deviation 1, and their changes.
+    ys: Vec<Vec<f64>>,
+    y: Vec<f64>,
     x: Vec<f64>,
     width: usize,
-    y: Vec<f64>,
     /// Where each experiment begins, and the last one ends.
     edges: Vec<usize>,
     span: usize,
@@ -295,11 +304,9 @@ impl Rows {
             column.for_each(|u| *u = (*u - mean) / deviation);
         }
         let (_, deviation) = spread(ys.iter().flatten().copied());
-        let y = ys
-            .iter()
-            .flat_map(|y| change(y, 1, span))
-            .map(|y| y / deviation)
-            .collect();
+        let scaled = |y: &Vec<f64>| y.iter().map(|y| y / deviation).collect();
+        let ys: Vec<Vec<f64>> = ys.iter().map(scaled).collect();
+        let y = ys.iter().flat_map(|y| change(y, 1, span)).collect();
         let mut edges = vec![0];
         edges.extend(ys.iter().scan(0, |end, y| {
             *end += y.len();
@@ -309,9 +316,10 @@ impl Rows {
         Self {
             us,
             channels,
+            ys,
+            y,
             x,
             width,
-            y,
             edges,
             span,
             is_part,
@@ -371,7 +379,38 @@ impl Rows {
         let is_other = is_inner && (best.shift != 0 || (best.gain - 1.0).abs() > NOTED);
         // an output that answers nothing any more has nothing to follow
         let is_change = left <= EXPLAINED && is_other && (follows || best.gain.abs() < NOTED);
-        Ok(is_change.then_some((best, left)))
+        if !is_change {
+            return Ok(None);
+        }
+        let unchanged = self.unchanged(&before, &after, monitor);
+        let left = left.max((best.error / unchanged.max(1e-300)).sqrt());
+        Ok((left <= EXPLAINED).then_some((best, left)))
+    }
+
+    /// The sum of squares that the best linear plant leaves of these rows in free run.
+    fn unchanged(&self, before: &[bool], after: &[bool], monitor: &Monitor) -> f64 {
+        let pairs = self.us.iter().zip(&self.ys);
+        let records: Result<Vec<_>> = pairs
+            .clone()
+            .map(|(u, y)| Record::new(u, self.channels, y))
+            .collect();
+        let Ok(records) = records else {
+            return f64::INFINITY;
+        };
+        let left = |order: usize| -> Result<f64> {
+            let fit = oe::fit(&records, order, order + 1, 0, true, ITERATIONS, monitor)?;
+            let mut errors = Vec::with_capacity(self.y.len());
+            for ((u, y), state) in pairs.clone().zip(&fit.initial_states) {
+                let run = fit.model.simulate(u, self.channels, state)?;
+                let error: Vec<f64> = y.iter().zip(run).map(|(y, run)| y - run).collect();
+                errors.extend(change(&error, 1, self.span));
+            }
+            let own = errors.iter().zip(before.iter().zip(after));
+            let own = own.filter(|(_, (before, after))| **before || **after);
+            Ok(own.map(|(error, _)| error * error).sum())
+        };
+        let found = ORDERS.map(|order| left(order).unwrap_or(f64::INFINITY));
+        found.fold(f64::INFINITY, f64::min)
     }
 
     /// By how much the input is larger after a change; NaN for several inputs.

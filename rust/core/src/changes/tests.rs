@@ -57,6 +57,23 @@ fn a_slow_answer_to_one_step_has_lost_no_rows() {
 }
 
 #[test]
+fn a_sweep_through_a_resonance_is_one_plant() {
+    for seed in 0..6 {
+        let mut random = Random::new(seed);
+        let (n, turn) = (3000, random.between(12.0, 40.0));
+        let damping = random.between(0.97, 0.995);
+        let a = 2.0 * damping * (std::f64::consts::TAU / turn).cos();
+        let (mut u, mut y) = (vec![0.0; n], vec![0.0; n]);
+        for k in 2..n {
+            let turns = k as f64 / turn * (0.1 + 1.5 * k as f64 / n as f64);
+            u[k] = (std::f64::consts::TAU * turns).sin();
+            y[k] = a * y[k - 1] - damping * damping * y[k - 2] + u[k - 1];
+        }
+        assert_eq!(change_of(&[(u, y)], 1), None, "seed {seed}");
+    }
+}
+
+#[test]
 fn another_scale_of_a_sweep_is_found() {
     for later in [3.0, 0.25] {
         let sine = |k: usize| (k as f64 * (0.015 + 2e-5 * k as f64)).sin();
