@@ -52,7 +52,7 @@ def followed(found: Any, plant: Any, reference: Any = RAMP) -> tuple[float, floa
 
 
 def test_a_tuned_loop_follows_what_its_model_can() -> None:
-    found = tune(drive(), [RAMP], evaluations=300, threads=2)
+    found = tune(drive(), [RAMP], evaluations=1000, threads=2)
     lead = found.pid.feedforward
     assert lead is not None
     assert (lead.late, found.pid.alpha, found.pid.beta) == (0.5, 0.0, 0.0)

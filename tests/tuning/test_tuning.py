@@ -4,6 +4,7 @@ import math
 import re
 import signal
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -210,6 +211,36 @@ def test_the_cost_of_runs_is_that_of_the_search() -> None:
     assert told["overshoot"] == metrics["overshoot_percent"]
     assert told["u_max"] == np.max(np.abs(runs[0].u))
     assert 0 < told["lag"] < 100
+
+
+def test_the_penalty_of_overshoot_begins_gradually_in_a_search_and_of_a_run() -> None:
+    start = first_controller(drive())
+    made = run(start, drive(), SHORT)
+    overshoot = terms(made)["overshoot"]
+    assert overshoot > 0.5
+    # at the limit a tenth of it is rounded: a fortieth costs
+    for limit, beyond in ((overshoot, overshoot / 40), (2 * overshoot, 0.0), (0.0, overshoot)):
+        cost = Cost(overshoot=300.0, overshoot_limit=limit)
+        free = replace(cost, overshoot=0.0).of(made)
+        assert cost.of(made) - free == pytest.approx(300.0 * beyond, abs=1e-9)
+        (same,) = costs(start, drive(), SHORT, cost=cost, variations=[(1.0, 0)])
+        assert same == pytest.approx(cost.of(made), rel=1e-12)
+
+
+def test_gains_do_not_depend_on_the_level_of_the_output() -> None:
+    rng = np.random.default_rng(3)
+    u, y = np.repeat(rng.uniform(-3.0, 3.0, 40), 50), np.zeros(2000)
+    u[:50] = 0.0
+    for k in range(1, len(u)):
+        y[k] = y[k - 1] + 0.1 * (60.0 * u[k - 1] - y[k - 1])
+    y += 0.5 * rng.standard_normal(len(u))
+    found = []
+    for level in (24.5, 293.15):
+        record = Dataset.from_arrays(u, y + level, 0.01, input_units="V", output_unit="degC")
+        model = identify(record, model="oe", threads=2)
+        gains = tune(model, feedforward="none", threads=2).pid.gains
+        found.append((gains.Kp, gains.integral, gains.derivative))
+    np.testing.assert_allclose(found[0], found[1], rtol=0.02)
 
 
 def test_the_worst_plant_counts_alone() -> None:

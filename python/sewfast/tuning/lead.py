@@ -214,6 +214,9 @@ class Led:
         return f"following costs {self.cost:.3g} {unit} with it and {self.alone_cost:.3g} without"
 
 
+_VIOLATED = "a constraint is violated with one"
+
+
 def with_lead(
     task: TuningTask,
     alone: Controller,
@@ -236,6 +239,8 @@ def with_lead(
     tried = [replace(alone, feedforward=one, **weights) for one in among.feedforwards]
     if not tried:
         return alone, Led(alone, reason=among.reason)
+    loaded = replace(task, constraints=replace(task.constraints, Ms=math.inf))
+    limits_loads = (task.constraints.recovery, task.constraints.load) != (None, None)
     task, others = _following(task), [_following(other) for other in others]
     *judged, (alone_cost, _) = _judged(task, [*tried, alone], effort)
     best = min(range(len(tried)), key=lambda k: judged[k][::-1])
@@ -246,6 +251,10 @@ def with_lead(
         controller = replace(tried[best], feedforward=part)
         said = (_objection(one, controller, alone, effort) for one in (task, *others))
         objection = next(filter(None, said), "")
+        # counts fall differently with it when the load comes, which may cost a sample of recovery
+        if limits_loads and not objection:
+            (_, violation), (_, own) = _judged(loaded, [controller, alone], effort)
+            objection = _VIOLATED if violation > own else ""
         if not objection:
             return controller, replace(led, cost=_judged(task, [controller], effort)[0][0])
     kept = [name for name in WEIGHTS if name not in weights and getattr(alone, name) != 0.0]
@@ -269,7 +278,7 @@ def _objection(task: TuningTask, controller: Controller, alone: Controller, effo
     if not cost < other:
         return f"following costs {cost:.3g} {unit} with one and {other:.3g} without"
     if violation > own:
-        return "a constraint is violated with one"
+        return _VIOLATED
     every = zip(task.plants, titles(task.plants), strict=True)
     for (plant, title), (gain, delay) in itertools.product(every, task.variations):
         one = replace(task, plants=[plant], variations=[(gain, delay)])

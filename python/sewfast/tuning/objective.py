@@ -19,6 +19,9 @@ from ..gains import real
 SHARES = ("chatter", "overshoot", "saturation")
 """Weights whose default depends on the references' span."""
 
+ROUNDING = 0.1
+"""The rounding of the penalty of overshoot, as a share of its limit, as in the core."""
+
 
 @dataclass(frozen=True)
 class Cost:
@@ -38,7 +41,7 @@ class Cost:
     overshoot : float or None
         Weight of the overshoot above its limit [%] on a step or trapezoid; R/100.
     overshoot_limit : float
-        Overshoot without a cost [%].
+        Overshoot without a cost [%]; within a tenth of it the slope begins gradually.
     rise : float
         Weight of the 10-to-90 % rise time beyond the reference's own [ms], on a step or trapezoid.
     lag : float
@@ -117,8 +120,16 @@ class Cost:
         cost = self.resolved(float(np.ptp(r)), limits.u_max - limits.u_min)
         return float(np.mean([cost._of(terms(run)) for run in several]))
 
+    def _beyond_limit(self, overshoot: float) -> float:
+        """The overshoot beyond its limit, with the kink rounded as in the core."""
+        excess, half = overshoot - self.overshoot_limit, ROUNDING * self.overshoot_limit
+        if excess >= half:
+            return excess
+        above = max(excess + half, 0.0)
+        return above * above / (4.0 * half)
+
     def _of(self, terms: dict[str, float]) -> float:
-        above = {**terms, "overshoot": max(terms["overshoot"] - self.overshoot_limit, 0.0)}
+        above = {**terms, "overshoot": self._beyond_limit(terms["overshoot"])}
         weights = self.named()
         return sum(weights[name] * value for name, value in above.items() if name in weights)
 

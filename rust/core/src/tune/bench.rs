@@ -73,6 +73,12 @@ impl<P: Plant + Clone> Bench<P> {
         self
     }
 
+    /// The same, with the penalty of overshoot rounded over the whole limit.
+    pub(super) fn smoothed(mut self) -> Self {
+        self.weights.rounding = 1.0;
+        self
+    }
+
     pub(super) fn weights(&self) -> &Weights {
         &self.weights
     }
