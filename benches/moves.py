@@ -4,8 +4,8 @@ Each machine is recorded as in the README's example, a model identified and gain
 a table of the trapezoid is planned on the model (`plan`), played on the machine, and learned on for
 eight repetitions (`learn`). Errors are those of the true speed [RPM rms]; learning sees counts.
 
-`--motors` does the same with motors of MuJoCo, on trapezoids to their working speed that take half
-again as long as the motor can.
+`--motors` does the same with motors of MuJoCo, on trapezoids to their working speed whose ramps
+take half again as long as the steepest that the motor can against its friction and load.
 
 `--runs` repeats learning on machines that changed after identification: inertia a quarter off
 either way, noise on the load that no two runs share, and a further load from repetition 5 on.
@@ -97,7 +97,11 @@ def row(
 
 def trapezoid(motor: Motor) -> np.ndarray:
     """To the working speed, half of that without load, and back [RPM]."""
-    ramp = 1.5 * math.log(2.0) * max(motor.lag, 0.02)
+    stall = motor.gear * motor.constant * motor.volt / motor.resistance
+    turning = motor.viscous * motor.speed * math.pi / 30.0 / motor.gear
+    # of the stall torque half is lost at half of the speed without load, and this to the load
+    held = (motor.coulomb + turning + motor.unbalance) / stall
+    ramp = 1.5 * max(motor.lag, 0.02) * 0.5 / (0.5 - held)
     times = np.cumsum([0.1, ramp, 0.4, ramp, 0.3])
     t = np.arange(round(times[-1] / 1e-3)) * 1e-3
     return np.interp(t, times[:4], [0.0, motor.speed, motor.speed, 0.0])

@@ -45,6 +45,7 @@ class MujocoMotor:
         self.data = mujoco.MjData(self.model)
         self.per_radian = gear * counts_per_rev / (2.0 * math.pi)
         self.rpm = gear * 30.0 / math.pi
+        self.before = 0.0
 
     @property
     def counts(self) -> float:
@@ -52,14 +53,20 @@ class MujocoMotor:
 
     @property
     def speed_rpm(self) -> float:
-        return float(self.data.qvel[0]) * self.rpm
+        # MuJoCo moves a position with the speed at the end of a step, so the speed that the
+        # positions have is half a step ahead of its own
+        now = float(self.data.qvel[0])
+        return (now + 0.5 * (now - self.before)) * self.rpm
 
     def reset(self) -> None:
         mujoco.mj_resetData(self.model, self.data)
+        self.before = 0.0
 
     def step(self, u: float) -> None:
         self.data.ctrl[0] = u
-        mujoco.mj_step(self.model, self.data, SUBSTEPS)
+        mujoco.mj_step(self.model, self.data, SUBSTEPS - 1)
+        self.before = float(self.data.qvel[0])
+        mujoco.mj_step(self.model, self.data, 1)
 
 
 # --- the motors -----------------------------------------------------------------------------------

@@ -108,11 +108,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=1, help="of model and gains (1)")
     parser.add_argument("--machines", type=int, default=8, help="virtual:1 to :N, too (8)")
+    parser.add_argument("--first", type=int, default=0, help="the first of them, 0 for virtual (0)")
     parser.add_argument("--stops", type=int, default=100, help="on each machine (100)")
     parser.add_argument("--model", default="auto", help="kind of the models (auto)")
     parser.add_argument("--kept", type=Path, help="folder for models and controllers")
     args = parser.parse_args()
-    names = ["virtual", *(f"virtual:{k}" for k in range(1, args.machines + 1))]
+    names = ["virtual", *(f"virtual:{k}" for k in range(1, args.machines + 1))][args.first :]
     header = ("machine", "seed", "worst [deg]", "median", "passed", "turns beyond", "median",
               "a turn later", "rms [deg]", "still [counts]", "[V]")  # fmt: skip
     print(" | ".join(header))
