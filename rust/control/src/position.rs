@@ -649,13 +649,15 @@ impl<T: Real> PositionLoop<T> {
         if !lands || size(left) > self.design.landing || size(self.rate) > self.design.creep {
             return false;
         }
-        let half = T::ONE / (T::ONE + T::ONE);
-        let ends = self.counts + self.places.at(0) - self.place();
-        if left > T::ZERO {
-            ends + half >= goal
+        let (place, half) = (self.place(), T::ONE / (T::ONE + T::ONE));
+        let (ahead, lead) = if left > T::ZERO {
+            (self.places.at(0) - place, self.counts - place)
         } else {
-            ends - half <= goal
-        }
+            (place - self.places.at(0), place - self.counts)
+        };
+        // one that leads by more swings, and dies away as the profile lands
+        let rests = T::ONE + T::ONE;
+        lead <= ahead + rests && lead + ahead + half >= size(goal - place)
     }
 
     /// The position before the mean, one sample on towards a goal.
