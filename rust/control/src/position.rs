@@ -655,9 +655,9 @@ impl<T: Real> PositionLoop<T> {
         } else {
             (place - self.places.at(0), place - self.counts)
         };
-        // one that leads by more swings, and dies away as the profile lands
+        // friction holds a lead of so many counts; a larger one swings, and dies away as the profile lands
         let rests = T::ONE + T::ONE;
-        lead <= ahead + rests && lead + ahead + half >= size(goal - place)
+        lead <= rests && lead + ahead + half >= size(goal - place)
     }
 
     /// The position before the mean, one sample on towards a goal.
