@@ -66,7 +66,7 @@ def at_rest(members: list[Model]) -> tuple[list[FloatArray], FloatArray]:
     return [m.rest_state() for m in members], np.array(members[0].rest.u)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # as in the C, without a word
+@np.errstate(over="ignore", invalid="ignore")  # test vectors of an unstable model, as in the C
 def combined_run(
     members: list[Model],
     embedded: list[_core.EmbeddedModel],

@@ -249,9 +249,9 @@ class Project:
 
     def open_ahead(self) -> None:
         """Open the model that the page shows first, while a browser still loads the page."""
-        models = self.documents(MODEL_FORMAT)
-        if models and (self.demo or self.first in models):
-            with suppress(Exception):  # the page asks for it again, and says why not
+        with suppress(Exception):  # the page asks for it again, and says why not
+            models = self.documents(MODEL_FORMAT)
+            if models and (self.demo or self.first in models):
                 self.tuning(self.first if self.first in models else models[0])
 
     def save_controller(self, tuning: Tuning, values: dict[str, Any], file: str) -> None:

@@ -52,6 +52,7 @@ def followed(found: Any, plant: Any, reference: Any = RAMP) -> tuple[float, floa
 
 
 def test_a_tuned_loop_follows_what_its_model_can() -> None:
+    # a search of 300 has not converged
     found = tune(drive(), [RAMP], evaluations=1000, threads=2)
     lead = found.pid.feedforward
     assert lead is not None

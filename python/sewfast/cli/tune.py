@@ -57,7 +57,7 @@ Several references are tuned for together.
 
 The cost of a run is a weighted sum of tracking [y], chatter [u], effort [u], overshoot [%], rise
 [ms], lag [ms], saturation (a share), and under load steps (--load) recovery [ms] and load (rms
-deviation); --cost NAME=WEIGHT sets a weight, overshoot_limit the overshoot without a cost.
+deviation); --cost NAME=WEIGHT sets a weight, overshoot_limit where its cost begins.
 --constraint sets limits that come first: Ms (1.8 without one; inf: none), overshoot, u, recovery,
 load. --pareto OBJECTIVES searches for a Pareto front instead, and picks its knee.
 

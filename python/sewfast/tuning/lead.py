@@ -215,6 +215,10 @@ class Led:
 
 
 _VIOLATED = "a constraint is violated with one"
+_LOADED = (
+    "a limit of recovery or load is exceeded with one by more than without; allow more, or leave "
+    "the limit out"
+)
 
 
 def with_lead(
@@ -251,10 +255,10 @@ def with_lead(
         controller = replace(tried[best], feedforward=part)
         said = (_objection(one, controller, alone, effort) for one in (task, *others))
         objection = next(filter(None, said), "")
-        # counts fall differently with it when the load comes, which may cost a sample of recovery
+        # with it counts fall differently when the load comes, and so do the samples of recovery
         if limits_loads and not objection:
             (_, violation), (_, own) = _judged(loaded, [controller, alone], effort)
-            objection = _VIOLATED if violation > own else ""
+            objection = _LOADED if violation > own else ""
         if not objection:
             return controller, replace(led, cost=_judged(task, [controller], effort)[0][0])
     kept = [name for name in WEIGHTS if name not in weights and getattr(alone, name) != 0.0]

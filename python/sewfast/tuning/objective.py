@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, cast
@@ -41,7 +42,7 @@ class Cost:
     overshoot : float or None
         Weight of the overshoot above its limit [%] on a step or trapezoid; R/100.
     overshoot_limit : float
-        Overshoot without a cost [%]; within a tenth of it the slope begins gradually.
+        Overshoot about which its cost begins, gradually within a tenth of it [%].
     rise : float
         Weight of the 10-to-90 % rise time beyond the reference's own [ms], on a step or trapezoid.
     lag : float
@@ -123,8 +124,8 @@ class Cost:
     def _beyond_limit(self, overshoot: float) -> float:
         """The overshoot beyond its limit, with the kink rounded as in the core."""
         excess, half = overshoot - self.overshoot_limit, ROUNDING * self.overshoot_limit
-        if excess >= half:
-            return excess
+        if excess >= half or half < sys.float_info.min:
+            return max(excess, 0.0)
         above = max(excess + half, 0.0)
         return above * above / (4.0 * half)
 

@@ -73,7 +73,8 @@ impl<P: Plant + Clone> Bench<P> {
         self
     }
 
-    /// The same, with the penalty of overshoot rounded over the whole limit.
+    /// The same, with the penalty of overshoot rounded over the whole limit: for two of four searches on a part, as with none one position of
+    /// eight plants ended in a dearer basin, and with all one axis cost 5.7 % more.
     pub(super) fn smoothed(mut self) -> Self {
         self.weights.rounding = 1.0;
         self

@@ -22,7 +22,7 @@ pub struct Cost {
     pub effort: f64,
     /// Per percent of overshoot above its limit, on steps and trapezoids; `R/100`.
     pub overshoot: Option<f64>,
-    /// Overshoot up to which there is no cost \[%\].
+    /// Overshoot about which its cost begins \[%\].
     pub overshoot_limit: f64,
     /// Per millisecond of rise time beyond the reference's own, on steps and trapezoids.
     pub rise: f64,
@@ -86,8 +86,8 @@ impl Cost {
 }
 
 /// The rounding of a cost, as a share of the limit of overshoot. Made on eight plants of seeds 60 to 63 of `benches/assumptions.py shifts`; with
-/// .3 the gains cost some .6 % more without rounding, up to 7 %. Held back, 12 heaters, axes, tanks and positions of seeds 100 to 102, each at
-/// three levels: gains more than 2 % apart on 3 (6 without); on seeds 80 to 82 costs without rounding .45 % higher in the mean, 1.4 % at worst.
+/// .3 the gains cost some .6 % more by the penalty with its kink, up to 7 %. Held back, 12 heaters, axes, tanks and positions of seeds 100 to 102, each at
+/// three levels: gains more than 2 % apart on 3 (6 without); on seeds 80 to 82 costs by the penalty with its kink .45 % higher in the mean, 1.4 % at worst.
 const ROUNDING: f64 = 0.1;
 
 /// A [`Cost`] in numbers.
@@ -147,8 +147,8 @@ impl Weights {
             overshoot - self.overshoot_limit,
             self.rounding * self.overshoot_limit,
         );
-        if excess >= half {
-            return excess;
+        if excess >= half || half < f64::MIN_POSITIVE {
+            return excess.max(0.0);
         }
         let above = (excess + half).max(0.0);
         above * above / (4.0 * half)
