@@ -313,6 +313,8 @@ def _read(row: Mapping[str, Any]) -> Row:
             value = math.nan if value in (None, "") else float(value)
             if storage.LARGEST_NUMBER < abs(value) < math.inf:
                 raise ValueError(f"{name}: a number larger than {storage.LARGEST_NUMBER:g}")
+            if name.endswith("_error") and value < 0.0:
+                raise ValueError(f"{name}: a standard error below 0")
         elif of.type == "int":
             value = int(value)
         else:

@@ -523,6 +523,9 @@ def test_a_number_that_nothing_can_be_computed_from_is_refused(tmp_path: Path) -
     Fleet((Row("a.csv", gain=1e300),)).save(table)
     with pytest.raises(SettingError, match="gain: a number larger than 1e"):
         load_fleet(table)
+    Fleet((Row("a.csv", gain=1.0, gain_error=-1.0),)).save(table)
+    with pytest.raises(SettingError, match="gain_error: a standard error below 0"):
+        load_fleet(table)
 
 
 def test_ctrl_c_says_what_is_kept(
