@@ -207,12 +207,6 @@ impl<T: Real> PidController<T> {
         }
     }
 
-    /// A reference that comes before its sample: what was told ahead is told one sample sooner.
-    pub(crate) fn refer(&mut self, r: T) {
-        let ramped = self.ramp.step(r, r);
-        self.ahead.take(ramped);
-    }
-
     /// The newest reference after the ramp; `None` before the first one.
     pub(crate) fn ramped(&self) -> Option<T> {
         self.ramp.newest()

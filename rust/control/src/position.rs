@@ -12,10 +12,6 @@
 //! stands exactly and without passing it. The speed loop follows the profile's speed with its own feedforward, which needs it
 //! `p` samples early; the position is compared with the profile's `p` samples ago.
 //!
-//! Three things follow the shaft instead of the plan. A stop from a steady speed begins as early as the drive can answer, because
-//! that speed is also what the preview holds. The last, slow part of a way ends where the counts meet the goal, so that a shaft
-//! which leads does not pass it. A shaft that brakes less than planned goes on to the next turn and does not turn back.
-//!
 //! Where the profile stands and the counts are within one of it, the integral of the speed loop lets go of the position error: it
 //! would rise until dry friction gives way, and the shaft would be pushed to and fro for ever.
 
@@ -112,14 +108,6 @@ impl<T: Real> Rates<T> {
         self.rows.get(..self.count.into()).unwrap_or_default()
     }
 
-    /// The same rows with this part of the rates.
-    fn scaled(mut self, part: T) -> Self {
-        for (row, way) in self.rows.iter_mut().zip(&mut self.ways) {
-            (row.up, row.down, *way) = (row.up * part, row.down * part, *way / part);
-        }
-        self
-    }
-
     /// The row at a speed, as a magnitude, and the way from its own speed to rest.
     fn at(&self, speed: T) -> (Rate<T>, T) {
         self.last(|row, _| row.speed <= speed)
@@ -186,21 +174,21 @@ pub struct PositionDesign<T> {
 }
 
 impl<T: Real> PositionDesign<T> {
-    /// By how much the landing makes a way at these rates longer \[y s\].
-    fn crept(&self, rates: &Rates<T>) -> T {
-        let more = self.landing / self.counts_per_unit - rates.way(self.creep);
+    /// By how much the landing makes a way longer \[y s\].
+    fn crept(&self) -> T {
+        let more = self.landing / self.counts_per_unit - self.rates.way(self.creep);
         if more > T::ZERO { more } else { T::ZERO }
     }
 
-    /// The speed of the next sample towards a goal at a distance of 0 or more, at these rates.
-    fn towards(&self, rates: &Rates<T>, distance: T, ts: T) -> T {
-        let last = rates.from(distance, ts);
-        let more = self.crept(rates);
+    /// The speed of the next sample towards a goal at a distance of 0 or more.
+    fn towards(&self, distance: T, ts: T) -> T {
+        let last = self.rates.from(distance, ts);
+        let more = self.crept();
         if more == T::ZERO {
             return last;
         }
         let first = if distance > more {
-            rates.from(distance - more, ts)
+            self.rates.from(distance - more, ts)
         } else {
             T::ZERO
         };
@@ -244,23 +232,8 @@ enum Mode<T> {
     Speed,
     /// References are goals \[counts\].
     Goals,
-    /// It goes to the goal, a place of this angle.
-    Stop(Angle<T>),
-}
-
-/// An angle of a stop.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Angle<T> {
-    /// At the angle 0 plus this \[counts\].
-    at: T,
-    /// Counts of a turn.
-    turn: T,
-    /// Whether the shaft must not turn back.
-    onward: bool,
-}
-
-fn size<T: Real>(x: T) -> T {
-    if x < T::ZERO { -x } else { x }
+    /// It goes to this count.
+    Stop(T),
 }
 
 /// A position loop over a speed loop, in counts of an encoder.
@@ -284,20 +257,10 @@ pub struct PositionLoop<T> {
     /// Goal of the last sample \[counts\], and its own speed \[y\].
     goal: T,
     own: T,
-    /// Rates and largest speed of this move \[y\].
-    rates: Rates<T>,
+    /// Largest speed of this move \[y\].
     fastest: T,
-    /// Largest way of a sample of the profile since this move was planned, and all the way that braking has taken off \[counts\].
-    top: T,
-    lost: T,
-    /// Samples for which the speed is held before a move is planned anew.
-    unplanned: usize,
-    /// The last command \[u\].
-    u: T,
     /// Samples since the last count.
     still: usize,
-    /// Samples for which the reference of the speed has been what it is.
-    steady: usize,
 }
 
 impl<T: Real> PositionLoop<T> {
@@ -339,14 +302,8 @@ impl<T: Real> PositionLoop<T> {
             rate: T::ZERO,
             goal: T::ZERO,
             own: T::ZERO,
-            rates: design.rates,
             fastest: design.speed,
-            top: T::ZERO,
-            lost: T::ZERO,
-            unplanned: 0,
-            u: T::ZERO,
             still: 0,
-            steady: 0,
             design,
             speed,
         })
@@ -357,9 +314,9 @@ impl<T: Real> PositionLoop<T> {
         self.speed.reset();
         self.mode = Mode::Speed;
         (self.counts, self.rate, self.goal) = (T::ZERO, T::ZERO, T::ZERO);
-        (self.own, self.u, self.still, self.steady) = (T::ZERO, T::ZERO, 0, 0);
+        (self.own, self.still) = (T::ZERO, 0);
         (self.path, self.places) = (Ring::filled(T::ZERO), Ring::filled(T::ZERO));
-        self.planned(self.design.rates, self.design.speed);
+        self.fastest = self.design.speed;
     }
 
     /// From the reference and the counts `moved` since the last sample to the command. The reference is a speed \[y\], after
@@ -380,24 +337,22 @@ impl<T: Real> PositionLoop<T> {
                 let referred = self.speed.ramped().unwrap_or(T::ZERO);
                 let place = self.places.at(0) + referred * self.per_sample;
                 self.places.push(place);
-                self.steady = if referred == self.rate {
-                    (self.steady + 1).min(KEPT)
-                } else {
-                    0
-                };
                 self.rate = referred;
                 return u;
             }
             Mode::Goals => reference,
-            Mode::Stop(_) => self.goal,
+            Mode::Stop(goal) => goal,
         };
-        let goal = self.within_reach(goal);
         let begins_again = self.speed.is_manual() && goal != self.goal;
         if begins_again {
             // the shaft may have been turned by hand
             self.shift();
         }
-        let speed = self.profile(goal);
+        self.advance(goal);
+        let samples = self.design.smoothing;
+        let (newest, oldest) = (self.path.at(0), self.path.at(samples));
+        let speed = (newest - oldest) / (T::from_count(samples) * self.per_sample);
+        self.places.push(self.mean());
         let error = self.place() - self.counts;
         let (one, stands) = (T::ONE, self.stands());
         let near = error <= one && error >= -one;
@@ -414,7 +369,6 @@ impl<T: Real> PositionLoop<T> {
             // its integral term is now that of a command of 0 here
             self.speed.set_automatic();
         }
-        self.u = u;
         u
     }
 
@@ -424,7 +378,7 @@ impl<T: Real> PositionLoop<T> {
         self.take_over();
         self.goal = self.path.at(0);
         self.own = self.rate;
-        self.planned(self.design.rates, self.design.speed);
+        self.fastest = self.design.speed;
         self.mode = Mode::Goals;
     }
 
@@ -452,54 +406,21 @@ impl<T: Real> PositionLoop<T> {
             "a speed within the position loop's",
             fast.to_f64(),
         )?;
-        let sooner = if self.mode == Mode::Speed {
-            self.sooner()
-        } else {
-            0
-        };
         self.take_over();
-        // the profile is that of as many samples later
-        self.move_by(-(T::from_count(sooner) * rate * self.per_sample));
-        // what the drive loses within a sample is rest: at that speed a turn could take minutes
-        let (row, _) = self.design.rates.at(fast);
-        let moves = fast > row.down * self.speed.settings().ts;
-        let fastest = if moves && onward {
-            fast
-        } else {
-            self.design.speed
-        };
-        self.planned(self.design.rates, fastest);
-        let asked = Angle {
-            at: angle,
-            turn,
-            onward,
-        };
-        (self.goal, self.own) = (self.reached(asked), T::ZERO);
-        self.mode = Mode::Stop(asked);
-        for _ in 0..sooner {
-            let speed = self.profile(self.goal);
-            self.speed.refer(speed);
-        }
-        Ok(self.goal)
-    }
-
-    /// The place at an angle to which the profile can go from where it is.
-    fn reached(&self, asked: Angle<T>) -> T {
-        let Angle { at, turn, onward } = asked;
-        let (rate, fast) = (self.rate, size(self.rate));
         let half = T::ONE / (T::ONE + T::ONE);
+        let ts = self.speed.settings().ts;
         // the speed falls from the next sample on
-        let way = self.rates.way(fast) - half * fast * self.speed.settings().ts;
+        let way = self.design.rates.way(fast) - half * fast * ts;
         let braked = if way > T::ZERO { way } else { T::ZERO };
         let creeps = if fast > self.design.creep {
-            self.design.crept(&self.rates)
+            self.design.crept()
         } else {
             T::ZERO
         };
         let way = (braked + creeps) * self.design.counts_per_unit;
         let (forwards, from) = (rate >= T::ZERO, self.path.at(0));
         let earliest = if forwards { from + way } else { from - way };
-        let turns = (earliest - at) / turn;
+        let turns = (earliest - angle) / turn;
         let whole = if !onward {
             (turns + half).floor()
         } else if forwards {
@@ -514,90 +435,25 @@ impl<T: Real> PositionLoop<T> {
             turns.floor()
         };
         // whole counts can be met exactly, and the nearest one may be too near
-        let rounded = |whole: T| (at + whole * turn + half).floor();
+        let rounded = |whole: T| (angle + whole * turn + half).floor();
         let goal = rounded(whole);
-        if onward && forwards && fast > T::ZERO && goal < earliest {
+        let goal = if onward && forwards && fast > T::ZERO && goal < earliest {
             rounded(whole + T::ONE)
         } else if onward && !forwards && goal > earliest {
             rounded(whole - T::ONE)
         } else {
             goal
-        }
-    }
-
-    /// By how many samples a stop may begin before the preview is over. All that the speed loop has been told ahead is one steady
-    /// speed, so it may have been told to brake. The drive answers as late as it does to a step of the command: half of what the
-    /// feedforward sends for a change of the rate comes by then, and half of the mean.
-    fn sooner(&self) -> usize {
-        let feedforward = &self.speed.design().feedforward;
-        let all = feedforward.taps().iter().fold(T::ZERO, |sum, t| sum + *t);
-        if self.steady < KEPT || all == T::ZERO {
-            return 0;
-        }
-        let mut sum = T::ZERO;
-        let before = |tap: &&T| {
-            sum += **tap / all;
-            sum + sum < T::ONE
         };
-        let half = feedforward.taps().iter().take_while(before).count();
-        (half + self.design.smoothing / 2).min(feedforward.preview())
-    }
-
-    /// A move with these rates and this largest speed begins.
-    fn planned(&mut self, rates: Rates<T>, fastest: T) {
-        (self.rates, self.fastest, self.unplanned) = (rates, fastest, 0);
-        (self.top, self.lost) = (T::ZERO, T::ZERO);
-    }
-
-    /// The goal, or that of a turn later if the shaft brakes less than was planned and would pass it: the command is at its limit,
-    /// and before the landing the shaft leads by more than the landing, the way of a sample and the counts between which it rests.
-    ///
-    /// How much of its rates the drive has is seen in the way that braking has taken off. The new plan leaves the feedback as much
-    /// room again as was missing, and goes on at the speed that the shaft has once it has been told all of the old one: to speed up
-    /// again would make a heavy shaft swing again.
-    fn within_reach(&mut self, goal: T) -> T {
-        let Mode::Stop(asked) = self.mode else {
-            return goal;
-        };
-        let preview = self.speed.design().feedforward.preview();
-        let moved = self.places.at(preview) - self.places.at(preview + 1);
-        // at this sample, which the profile has yet to take
-        let place = self.place() + moved;
-        if self.unplanned > 0 {
-            self.unplanned -= 1;
-            self.move_by(self.counts - place);
-            return if self.unplanned == 0 {
-                self.reached(asked)
-            } else {
-                goal
-            };
-        }
-        if size(moved) > self.top {
-            self.top = size(moved);
-        }
-        self.lost += self.top - size(moved);
-        let forwards = moved > T::ZERO;
-        let limits = self.speed.settings();
-        let limited = self.u <= limits.u_min || self.u >= limits.u_max;
-        let (lead, left) = if forwards {
-            (self.counts - place, goal - place)
+        (self.goal, self.own) = (goal, T::ZERO);
+        // what the drive loses within a sample is rest: at that speed a turn could take minutes
+        let (row, _) = self.design.rates.at(fast);
+        self.fastest = if fast > row.down * ts && onward {
+            fast
         } else {
-            (place - self.counts, place - goal)
+            self.design.speed
         };
-        let (rests, landing) = (T::ONE + T::ONE, self.design.landing);
-        let passes = left > landing && lead > landing + size(moved) + rests;
-        if !(asked.onward && limited && passes) {
-            return goal;
-        }
-        let half = T::ONE / (T::ONE + T::ONE);
-        let has = T::ONE - lead / self.lost;
-        let has = if has > half { has } else { half };
-        let top = self.top / self.per_sample;
-        let kept = top - (top - size(self.rate)) * has;
-        self.rate = if forwards { kept } else { -kept };
-        self.planned(self.rates.scaled(has * has), kept);
-        self.unplanned = preview + self.design.smoothing;
-        self.within_reach(goal)
+        self.mode = Mode::Stop(goal);
+        Ok(goal)
     }
 
     /// The profile goes on from the reference of the speed loop, whose position is now that of the counts.
@@ -616,55 +472,18 @@ impl<T: Real> PositionLoop<T> {
 
     /// Moves the profile to where the counts are.
     fn shift(&mut self) {
-        self.move_by(self.counts - self.place());
-    }
-
-    fn move_by(&mut self, shift: T) {
+        let shift = self.counts - self.place();
         for place in self.path.kept.iter_mut().chain(&mut self.places.kept) {
             *place += shift;
         }
-    }
-
-    /// The profile one sample on towards a goal; its speed \[y\].
-    fn profile(&mut self, goal: T) -> T {
-        if self.unplanned > 0 {
-            self.path
-                .push(self.path.at(0) + self.rate * self.per_sample);
-        } else if self.arrives(goal) {
-            (self.path, self.rate, self.own) = (Ring::filled(goal), T::ZERO, T::ZERO);
-        } else {
-            self.advance(goal);
-        }
-        let samples = self.design.smoothing;
-        let (newest, oldest) = (self.path.at(0), self.path.at(samples));
-        self.places.push(self.mean());
-        (newest - oldest) / (T::from_count(samples) * self.per_sample)
-    }
-
-    /// Whether the shaft would meet a goal that stands at the end of what the speed loop has been told ahead, while the profile lands;
-    /// the shaft may be half a count beyond its counts.
-    fn arrives(&self, goal: T) -> bool {
-        let left = goal - self.path.at(0);
-        let lands = goal == self.goal && left * self.rate > T::ZERO;
-        if !lands || size(left) > self.design.landing || size(self.rate) > self.design.creep {
-            return false;
-        }
-        let (place, half) = (self.place(), T::ONE / (T::ONE + T::ONE));
-        let (ahead, lead) = if left > T::ZERO {
-            (self.places.at(0) - place, self.counts - place)
-        } else {
-            (place - self.places.at(0), place - self.counts)
-        };
-        // friction holds a lead of so many counts; a larger one swings, and dies away as the profile lands
-        let rests = T::ONE + T::ONE;
-        lead <= rests && lead + ahead + half >= size(goal - place)
     }
 
     /// The position before the mean, one sample on towards a goal.
     fn advance(&mut self, goal: T) {
         let goal = if goal.is_finite() { goal } else { self.goal };
         let (ts, rate) = (self.speed.settings().ts, self.rate);
-        let (row, _) = self.rates.at(size(rate));
+        let size = |x: T| if x < T::ZERO { -x } else { x };
+        let (row, _) = self.design.rates.at(size(rate));
         let (up, down) = (row.up * ts, row.down * ts);
         // a goal that moves as the drive can is followed at its own speed, from its second sample on: before, it may be a step
         let (own, last) = ((goal - self.goal) / self.per_sample, self.own);
@@ -674,13 +493,13 @@ impl<T: Real> PositionLoop<T> {
         (self.goal, self.own) = (goal, own);
         let at = self.path.at(0);
         let left = (goal - at) / self.design.counts_per_unit - carried * ts;
-        let towards = self.design.towards(&self.rates, size(left), ts);
+        let towards = self.design.towards(size(left), ts);
         let wanted = carried + if left < T::ZERO { -towards } else { towards };
         let wanted = wanted.limit(-self.fastest, self.fastest);
         // on its way to a goal the speed may fall by the rate of the row below, and by an eighth more just before it, where the
         // last samples do not divide the way evenly
         let brakes = size(wanted) <= size(rate) && wanted * rate >= T::ZERO;
-        let (next, _) = self.rates.at(size(wanted));
+        let (next, _) = self.design.rates.at(size(wanted));
         let steeper = if next.down > row.down {
             next.down * ts
         } else {
