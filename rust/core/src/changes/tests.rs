@@ -70,7 +70,11 @@ fn a_sweep_through_a_resonance_is_one_plant() {
             y[k] = a * y[k - 1] - damping * damping * y[k - 2] + u[k - 1];
         }
         let (whole, unmeasured) = ((u.clone(), y.clone()), (u.clone(), vec![f64::NAN; n]));
-        assert_eq!(change_of(&[whole.clone()], 1), None, "seed {seed}");
+        assert_eq!(
+            change_of(std::slice::from_ref(&whole), 1),
+            None,
+            "seed {seed}"
+        );
         assert_eq!(change_of(&[unmeasured, whole], 1), None, "seed {seed}");
         y[n / 2] = f64::NAN;
         assert_eq!(change_of(&[(u, y)], 1), None, "seed {seed}");
