@@ -325,6 +325,23 @@ def test_a_late_command_is_found_and_shifted(tmp_path: Path, late: int) -> None:
     assert "samples late" not in sewfast(tmp_path, *fit, "--shift-input", str(late)).out
 
 
+@pytest.mark.parametrize("ending", ["csv", "npz", "mcap"])
+def test_a_recording_of_the_package_is_not_said_to_be_late(tmp_path: Path, ending: str) -> None:
+    """Its speed is smoothed from both sides, and begins to move before the command does."""
+    u = api.signals.excitation("saturating", 0)[:8000]
+    recording = api.record(api.VirtualMachine(seed=1), u)
+    recording.save(tmp_path / f"r.{ending}")
+    data = api.read(tmp_path / f"r.{ending}", inputs="u", output="y")
+    assert data.looks_ahead
+    assert diagnose(data).find("late_input") is None
+    # the same columns under other names are anybody's
+    api.write_table(tmp_path / "x.csv", {"t": 0.001 * np.arange(8000), "u": u, "y": recording.y})
+    smoothed = diagnose(api.read(tmp_path / "x.csv", inputs="u", output="y")).find("late_input")
+    assert smoothed is not None
+    assert "or y was smoothed with later samples" in smoothed.text
+    assert "take y as it was measured" in smoothed.remedy
+
+
 def test_an_answer_in_the_same_sample_says_why_it_closes_no_loop() -> None:
     random = np.random.default_rng(0)
     u = np.repeat(random.choice([-1.0, 1.0], 400), 5)

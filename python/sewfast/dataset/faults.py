@@ -184,8 +184,9 @@ def _order_fault(data: Dataset) -> Iterator[Fault]:
             "late_input",
             f"{y} moves {late - 1} sample{'s' if late > 2 else ''} before {u} does: "
             f"{name} was logged {late} samples late, counted to one sample from the command "
-            "to the output; every delay and time constant would be wrong",
-            f"read it earlier, {shift}",
+            f"to the output, or {data.output_name} was smoothed with later samples; every delay "
+            "and time constant would be wrong",
+            f"read {name} earlier, {shift}, or take {data.output_name} as it was measured",
             evidence,
         )
     else:

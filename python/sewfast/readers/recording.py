@@ -84,6 +84,10 @@ def read_mcap(path: Path, raw: bytes) -> Table:
     return Table(path, columns, found.units, Ts=header.Ts, counts_per_rev=header.counts_per_rev)
 
 
+RECORDED = ("t", "u", "counts", "y")
+"""Columns of a recording of the package, whose y is smoothed from the counts on both sides."""
+
+
 # --- Formats of other packages -> Table -----------------------------------------------------------
 
 # An entry point `sewfast.readers` of any installed package reads a file. Its name is the file's
@@ -345,7 +349,9 @@ def read_columns(
     data = Dataset(
         (experiment,), base.Ts, names, label, tuple(table.unit(n) for n in names), unit, source,
         (*table.notes, *base.notes),
-        looks_ahead=source is not None or (base.grid is not None and not base.grid.exact),
+        looks_ahead=source is not None
+        or (label == "y" and set(RECORDED) <= set(table.names))
+        or (base.grid is not None and not base.grid.exact),
     )  # fmt: skip
     return data.resample(wanted) if slower else data
 
