@@ -137,8 +137,9 @@ export function mount(root, { ask, on, mark = () => {} }) {
       failed = "";
       requestAnimationFrame(() => setTimeout(() => document.dispatchEvent(new CustomEvent("drawn", { detail: performance.now() - began }))));
     } catch (error) { tell(error); failed = $("tune-error").textContent; }
-    asking = false;
-    if (again !== null) { const since = again; again = null; move(since); } else resting = setTimeout(judge, 250);
+    // what has come meanwhile waits for the next picture, as then the newest does
+    if (again !== null) return requestAnimationFrame(() => { const since = again; again = null; asking = false; move(since); });
+    asking = false; resting = setTimeout(judge, 250);
   }
 
   async function loopOf(values) { return { ...await ask("tune_move", question({ values, noise: $("noise").checked && !opened.counts })), values }; }
