@@ -358,9 +358,7 @@ class Project:
         from sewfast.readers import read
 
         columns = self._columns(step, reference)
-        data = read(self._table(step.file), **columns)
-        if "counts" in columns:
-            data = unsmoothed(self.folder / step.file, data)
+        data = unsmoothed(self.folder / step.file, read(self._table(step.file), **columns))
         return bode(step.changed(data), reference=reference, segment=segment)
 
     def python(

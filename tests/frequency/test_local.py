@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 import sewfast
 from refusals import refuses
 from sewfast import bode, load_response
+from sewfast.commissioning import unsmoothed
 from sewfast.errors import DataError, SettingError
 from sewfast.frequency import FrequencyResponse, local_polynomial, spectral
 
@@ -218,3 +220,27 @@ def test_what_a_linear_response_does_not_describe_is_said() -> None:
     y = 1e3 + filtered(B, A, binary)
     plain = bode(sewfast.Dataset.from_arrays(binary, y, TS, output_unit="RPM"))
     assert "cautions" not in plain.provenance
+
+
+@pytest.mark.parametrize("unit", ["RPM", "rad/s"])
+def test_a_recording_of_the_package_is_taken_by_its_counts(tmp_path: Path, unit: str) -> None:
+    """Its y is smoothed on both sides, which hides the delay."""
+    u = sewfast.signals.excitation("chirp_lo_hi", 0)[:8000]
+    recorded = sewfast.record(sewfast.VirtualMachine(seed=1), u)
+    factor = 1.0 if unit == "RPM" else math.pi / 30.0
+    columns = recorded.columns() | {"y": factor * recorded.y}
+    sewfast.write_table(tmp_path / "r.csv", columns, units={"u": "V", "y": unit})
+    data = sewfast.read(tmp_path / "r.csv", inputs="u", output="y")
+    with refuses(DataError, name="data", expected="an output as it was measured"):
+        bode(data)
+    by_y = unsmoothed(tmp_path / "r.csv", data)
+    counted = sewfast.read(
+        tmp_path / "r.csv", inputs="u", counts="counts", counts_per_rev=recorded.counts_per_rev
+    )
+    by_counts = unsmoothed(tmp_path / "r.csv", counted)
+    assert not by_y.looks_ahead
+    y, difference = by_y.experiments[0].y, by_counts.experiments[0].y
+    np.testing.assert_allclose(y[1:], factor * difference[1:], rtol=1e-3)
+    assert bode(by_y).coherence.max() > 0.9
+    # an output that was measured stays as it is
+    assert unsmoothed(tmp_path / "r.csv", by_y) is by_y

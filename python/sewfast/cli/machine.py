@@ -299,8 +299,8 @@ def _of_record(args: argparse.Namespace) -> FrequencyResponse | ResponsesOverSpe
     source, args.data = args.data, [args.data]
     data = read_training(args)
     found: FrequencyResponse = bode(
-        data if data.counts is None else unsmoothed(source, data), reference=args.reference,
-        method=args.method, segment=args.segment,
+        unsmoothed(source, data), reference=args.reference, method=args.method,
+        segment=args.segment,
     )  # fmt: skip
     return found
 

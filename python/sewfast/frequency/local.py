@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
@@ -17,6 +18,7 @@ from ..arrays import FloatArray
 from ..dataset import Dataset, Experiment
 from ..errors import DataError, SettingError
 from ..readers import parse_source, read_table
+from ..readers.recording import is_recording
 from ..recording import Recording
 from ..speed import speed_from_counts
 from .estimate import record_of, spectral
@@ -141,7 +143,8 @@ def _one_of(on: Dataset) -> Experiment:
         raise DataError(
             name="data", expected="an output as it was measured",
             received="a speed that was smoothed with samples after it, which hides the delay",
-            remedy="take bode(recording), or a speed by method=\"difference\"",
+            remedy="take bode(recording), unsmoothed(file, data), or a speed by "
+                'method="difference"',
         )  # fmt: skip
     return on.experiments[0]
 
@@ -197,28 +200,38 @@ def _limited(u: FloatArray) -> Any:
 def unsmoothed(source: str | os.PathLike[str], data: Dataset) -> Dataset:
     """The same record with the difference of counts as its speed, for `bode`.
 
-    A speed estimated with the help of later counts hides the delay.
+    A speed estimated with the help of later counts hides the delay. Data whose output was measured
+    are returned as they are; so is a speed that another tool has smoothed, which `bode` refuses.
 
     Parameters
     ----------
     source : path
         The recording that the data were read from; columns after a colon as on the command line.
     data : Dataset
-        A data set with a speed from counts.
 
     Raises
     ------
     DataError
         For a record in pieces.
     """
-    assert data.counts is not None
-    column, per_rev = data.counts
-    counts = read_table(parse_source(os.fspath(source))[0])[column]
+    if not data.looks_ahead:
+        return data
+    table = read_table(parse_source(os.fspath(source))[0])
+    if data.counts is None and not is_recording(table, data.output_name):
+        return data
+    column, per_rev = data.counts or ("counts", math.nan)
+    counts = table[column]
     one = data.experiments[0]
     if len(data.experiments) > 1 or len(counts) != len(one.y):
         raise DataError(
             name=str(source), expected="one even record without gaps",
             received=f"{len(data.experiments)} pieces", remedy="cut one out",
         )  # fmt: skip
-    y = speed_from_counts(counts, data.Ts, per_rev, method="difference")
+    if data.counts is None:
+        y = np.diff(counts, prepend=counts[:1])
+        # a speed that is smoothed on both sides keeps its way: its sum over that of the counts
+        way = counts - counts.mean()
+        y *= (way @ np.cumsum(one.y)) / (way @ way)
+    else:
+        y = speed_from_counts(counts, data.Ts, per_rev, method="difference")
     return replace(data, experiments=(replace(one, y=y),), looks_ahead=False)

@@ -8,18 +8,21 @@ this computer), `doctor`, and `virtual` (a device without a motor). Plug-ins add
 unit by entry points `link.NAME` of the group `sewfast.names`.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from ..plugins import on_first_use as _on_first_use
 from ..plugins import public_name as _public_name
-from .connection import ClockBounds
-from .doctor import Diagnosis, Finding, examine
-from .drive import Drive, connect
-from .host_loop import at_period, run_on_host
-from .host_run import HostLoopRun, Jitter
-from .plan import Layout, Outcome, Plan, Sink
-from .ports import Port, PortInfo, list_ports, open_port
-from .virtual import VirtualDevice
-from .wire import Channel, Event, Identity, Limits, Status
+
+if TYPE_CHECKING:
+    from .connection import ClockBounds
+    from .doctor import Diagnosis, Finding, examine
+    from .drive import Drive, connect
+    from .host_loop import at_period, run_on_host
+    from .host_run import HostLoopRun, Jitter
+    from .plan import Layout, Outcome, Plan, Sink
+    from .ports import Port, PortInfo, list_ports, open_port
+    from .virtual import VirtualDevice
+    from .wire import Channel, Event, Identity, Limits, Status
 
 __all__ = [
     "Channel",
@@ -48,9 +51,24 @@ __all__ = [
     "run_on_host",
 ]
 
+# whether a text names a port is asked before anything else, and needs `ports` alone
+_own, __dir__ = _on_first_use(
+    __name__,
+    {
+        "connection": "ClockBounds",
+        "doctor": "Diagnosis Finding examine",
+        "drive": "Drive connect",
+        "host_loop": "at_period run_on_host",
+        "host_run": "HostLoopRun Jitter",
+        "plan": "Layout Outcome Plan Sink",
+        "ports": "Port PortInfo list_ports open_port",
+        "virtual": "VirtualDevice",
+        "wire": "Channel Event Identity Limits Status",
+    },
+)
+
 
 def __getattr__(name: str) -> Any:
-    # a module of this folder is asked for as an attribute first
-    if not name[:1].isupper():
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in __all__ or not name[:1].isupper():
+        return _own(name)
     return _public_name(f"link.{name}")

@@ -84,8 +84,11 @@ def read_mcap(path: Path, raw: bytes) -> Table:
     return Table(path, columns, found.units, Ts=header.Ts, counts_per_rev=header.counts_per_rev)
 
 
-RECORDED = ("t", "u", "counts", "y")
-"""Columns of a recording of the package, whose y is smoothed from the counts on both sides."""
+def is_recording(table: Table, output: str) -> bool:
+    """Whether an output is the `y` of a recording of the package (`Recording.columns`), which is
+    smoothed from the counts beside it on both sides.
+    """
+    return output == "y" and {"t", "u", "counts"} <= set(table.names)
 
 
 # --- Formats of other packages -> Table -----------------------------------------------------------
@@ -350,7 +353,7 @@ def read_columns(
         (experiment,), base.Ts, names, label, tuple(table.unit(n) for n in names), unit, source,
         (*table.notes, *base.notes),
         looks_ahead=source is not None
-        or (label == "y" and set(RECORDED) <= set(table.names))
+        or is_recording(table, label)
         or (base.grid is not None and not base.grid.exact),
     )  # fmt: skip
     return data.resample(wanted) if slower else data
