@@ -19,6 +19,17 @@ websockets = pytest.importorskip("websockets.sync.client")
 EVIL = '<script>document.title="run"</script>'
 """Name of a column, which a page must show and not run."""
 
+FOLDS = """
+document.querySelectorAll("main details:not(.menu, #loop-fold)").forEach(d => { d.open = true; });
+"""
+
+
+NUMBER = """
+const rows = [...document.querySelectorAll('#numbers tr')];
+const row = rows.find(r => r.cells[0].textContent === arguments[0]);
+return row && row.cells[1].textContent;
+"""
+
 
 class Page:
     """A socket that gave its token."""

@@ -108,7 +108,7 @@ let received = null;
 on("received", m => { if (received) m.error ? received[1](new Error(m.error)) : received[0](m.bytes); });
 
 async function upload(file) {
-  if (uploading || !writes) return;
+  if (uploading || !writes) return false;
   tell(null); uploading = true; enable();
   try {
     await send("upload", { file: file.name, size: file.size });
@@ -120,14 +120,16 @@ async function upload(file) {
     await send("upload_end");
     $("uploaded").textContent = `${file.name} is in the project folder`;
     $("file").value = file.name; stale = true; await open();
-  } catch (error) { $("uploaded").textContent = ""; tell(error); }
-  uploading = false; received = null; enable();
+    return true;
+  } catch (error) { $("uploaded").textContent = ""; tell(error); return false; }
+  finally { uploading = false; received = null; enable(); }
 }
 
 async function uploadAll(list) {
-  for (const file of [...list]) await upload(file);
-  // a person who adds a file wants to see it
-  if ($("error").hidden && $("inputs").selectedOptions.length) await look();
+  let all = list.length > 0;
+  for (const file of [...list]) all = await upload(file) && all;
+  // a person who adds a file wants to see it; a refusal stays until something else is done
+  if (all && $("error").hidden && $("inputs").selectedOptions.length) await look();
 }
 $("upload").onchange = async () => { await uploadAll($("upload").files); $("upload").value = ""; };
 // a file that misses the step must not replace the page

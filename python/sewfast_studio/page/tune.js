@@ -341,6 +341,12 @@ export function mount(root, { ask, on, mark = () => {} }) {
     const seconds = $("tune-seconds").valueAsNumber, effort = { evaluations: $("evaluations").valueAsNumber, seed: $("tune-seed").valueAsNumber, seconds: seconds > 0 ? seconds : null };
     try { await ask(what, question({ ...effort, weights: weights(), constraints })); busy = true; enable(); } catch (error) { tell(error); }
   }
+  /** Whether gains are of what is shown: another page, or this one before, can have asked for those of another model. */
+  function mine(found, values) {
+    const is = found.stamp === opened?.stamp && opened.knobs.every(k => k.name in values);
+    if (!is) $("tune-progress").textContent = "A search for another model or start has ended.";
+    return is;
+  }
   $("tune-cancel").onclick = () => ask("cancel").catch(tell);
   $("save").onclick = async () => {
     tell(null);
@@ -367,14 +373,14 @@ export function mount(root, { ask, on, mark = () => {} }) {
   on("searched", m => {
     busy = false; $("tune-progress").textContent = ""; enable();
     if (m.error) return tell(new Error(m.error));
-    if (!opened) return;
+    if (!mine(m.found, m.found.values)) return;
     $("tune-progress").textContent = m.found.interrupted ? "Cancelled. These are the best gains so far." : `${m.found.ended === "time" ? "Time is up. " : ""}Found gains with cost ${m.found.cost.toPrecision(4)} ${opened.y_unit}, from ${m.found.start_cost.toPrecision(4)}.`;
     set(m.found.values); sought = values; enable();
   });
   on("traded", m => {
     busy = false; $("tune-progress").textContent = ""; enable();
     if (m.error) return tell(new Error(m.error));
-    if (!opened || !m.found.front.length) return;
+    if (!m.found.front.length || !mine(m.found, m.found.front[0].values)) return;
     front = m.found.front; const most = front.length - 1;
     for (const id of ["front-response", "front-robust"]) $(id).max = most;
     $("front").hidden = false; $("knobs-fold").open = false;
