@@ -144,13 +144,14 @@ class GreyBox(SingleModel):
             gravity = math.hypot(of["load_1c"], of["load_1s"])
             cogging = math.hypot(of["cogging_c"], of["cogging_s"])
             of |= {"gravity": gravity, "stribeck": of["k_t"], "cogging": cogging}
+            of["backlash"] = 2.0 * of["play"] / self.settings["unit"]
             named |= {
                 "gravity": ("gravity", u), "stribeck": ("Stribeck friction", u),
                 "k_l": ("friction per load", ""), "k_m": ("friction per drive", ""),
                 "k_g": ("friction per load from outside", ""), "creep": ("creep", "s"),
                 "settling": ("settling of the friction", "s"),
                 "dead_band": ("dead band", u), "rate": ("rate of the setpoint", f"{u}/s"),
-                "play": ("half of the play", "rad or m"), "cogging": ("cogging", u),
+                "backlash": ("backlash", self.output_unit or "output"), "cogging": ("cogging", u),
                 "reach": ("largest output of the controller", u), "damping": ("k_d / k_p", "s"),
             }  # fmt: skip
         parts += [
