@@ -242,5 +242,9 @@ def test_a_recording_of_the_package_is_taken_by_its_counts(tmp_path: Path, unit:
     y, difference = by_y.experiments[0].y, by_counts.experiments[0].y
     np.testing.assert_allclose(y[1:], factor * difference[1:], rtol=1e-3)
     assert bode(by_y).coherence.max() > 0.9
-    # an output that was measured stays as it is
+    # an output that was measured stays as it is, also beside counts
     assert unsmoothed(tmp_path / "r.csv", by_y) is by_y
+    for slow in (1, 4):
+        late = np.convolve(recorded.speed("difference"), np.full(slow, 1.0 / slow))[: len(u)]
+        sewfast.write_table(tmp_path / "d.csv", columns | {"y": factor * late})
+        assert not sewfast.read(tmp_path / "d.csv", inputs="u", output="y").looks_ahead

@@ -18,7 +18,7 @@ from ..arrays import FloatArray
 from ..dataset import Dataset, Experiment
 from ..errors import DataError, SettingError
 from ..readers import parse_source, read_table
-from ..readers.recording import is_recording
+from ..readers.recording import is_smoothed
 from ..recording import Recording
 from ..speed import speed_from_counts
 from .estimate import record_of, spectral
@@ -217,7 +217,7 @@ def unsmoothed(source: str | os.PathLike[str], data: Dataset) -> Dataset:
     if not data.looks_ahead:
         return data
     table = read_table(parse_source(os.fspath(source))[0])
-    if data.counts is None and not is_recording(table, data.output_name):
+    if data.counts is None and not is_smoothed(table, data.output_name):
         return data
     column, per_rev = data.counts or ("counts", math.nan)
     counts = table[column]

@@ -84,11 +84,24 @@ def read_mcap(path: Path, raw: bytes) -> Table:
     return Table(path, columns, found.units, Ts=header.Ts, counts_per_rev=header.counts_per_rev)
 
 
-def is_recording(table: Table, output: str) -> bool:
-    """Whether an output is the `y` of a recording of the package (`Recording.columns`), which is
-    smoothed from the counts beside it on both sides.
+def is_smoothed(table: Table, output: str) -> bool:
+    """Whether an output is a speed that was smoothed on both sides from the column `counts` beside
+    it, as the `y` of a `Recording` is: its way follows the counts to their rounding and without
+    lag. A difference lags by half a sample, and what looks back alone by more.
     """
-    return output == "y" and {"t", "u", "counts"} <= set(table.names)
+    if "counts" not in table or len(table["counts"]) != len(table[output]):
+        return False
+    counts, y = table["counts"], table[output]
+
+    def off(way: FloatArray) -> float:
+        """Root mean square in counts after the best scale."""
+        c, w = counts - counts.mean(), way - way.mean()
+        return float(np.sqrt(np.mean((c - w * (c @ w) / (w @ w)) ** 2)))
+
+    with np.errstate(all="ignore"):  # what is no number is no answer
+        back = np.cumsum(y)
+        even = off(back - 0.5 * y)
+        return even < 0.5 and even < off(back)
 
 
 # --- Formats of other packages -> Table -----------------------------------------------------------
@@ -353,7 +366,7 @@ def read_columns(
         (experiment,), base.Ts, names, label, tuple(table.unit(n) for n in names), unit, source,
         (*table.notes, *base.notes),
         looks_ahead=source is not None
-        or is_recording(table, label)
+        or (output is not None and is_smoothed(table, label))
         or (base.grid is not None and not base.grid.exact),
     )  # fmt: skip
     return data.resample(wanted) if slower else data

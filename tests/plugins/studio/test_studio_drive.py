@@ -389,7 +389,7 @@ def test_stop_goes_ahead_of_a_long_question(studio: Studio, device: VirtualDevic
         told = page.event("stopped")
         assert (told["moving"], told["error"]) == (True, "")
         assert told["off_ms"] <= told["rest_ms"]
-        assert "stopped" in page.event("driven")["error"]
+        assert page.event("driven")["error"].startswith("Stopped")
     assert _ends(device) == ["on", "off"]
     assert read_recording(studio.project.folder / "long.mcap").outcome == "cancelled"
 
@@ -413,7 +413,7 @@ def test_stop_in_every_state(studio: Studio, device: VirtualDevice, tmp_path: Pa
         until(lambda: _is_on(device))
         time.sleep(0.3)
         stopped(moving=True)
-        assert "stopped" in page.event("driven")["error"].lower()
+        assert page.event("driven")["error"].startswith("Stopped").lower()
 
     with Watching(studio) as page:
         assert page.ask("stop")["found"] is None  # no drive
@@ -430,7 +430,7 @@ def test_stop_in_every_state(studio: Studio, device: VirtualDevice, tmp_path: Pa
         page.ask("drive_go")
         until(lambda: _is_on(device))
         stopped(moving=True)
-        assert "stopped" in page.event("driven")["error"].lower()
+        assert page.event("driven")["error"].startswith("Stopped").lower()
         page.ask("drive_limits", volt=None, speed_rpm=200.0, acceleration=None, current=None)
         page.arm()
         page.ask("drive_record", **{**LONG, "signal": "step", "scale": 1.0, "file": "trip.mcap"})
@@ -570,7 +570,7 @@ def test_a_commissioning_that_waits_is_stopped(studio: Studio) -> None:
         page.ask("drive_commission", seed=0, members=1, evaluations=100, go_on=True)
         page.event("stage")
         page.send("stop")
-        assert "stopped" in page.event("driven")["error"]
+        assert page.event("driven")["error"].startswith("Stopped")
         assert "on" not in _ends(device)
 
 
