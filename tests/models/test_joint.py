@@ -14,7 +14,7 @@ import pytest
 
 import sewfast
 from sewfast import Dataset, motorfit, physics
-from sewfast.errors import DataError, ModelFileError, SettingError
+from sewfast.errors import DataError, FitError, ModelFileError, SettingError
 from sewfast.greybox import Joint, load_joint
 from sewfast.models.grey_box import GreyBox
 
@@ -354,6 +354,14 @@ def test_a_position_that_does_not_follow_its_command_is_refused_by_its_cause() -
     assert "gear" in refused(e.u[:, 0], 50.0 * e.y)
     assert "at a stop at 0.2 rad" in refused(e.u[:, 0], np.minimum(e.y, 0.2))
     assert "at a stop at -0.1 rad" in refused(e.u[:, 0], np.maximum(e.y, -0.1))
+    assert "one that goes the other way; turn the sign" in refused(-e.u[:, 0], e.y)
+
+
+def test_a_force_of_the_other_sign_is_refused() -> None:
+    e = _axis(600, 2).experiments[0]
+    data = Dataset.from_arrays(e.u[:, 0], -e.y, TS, input_units=("N",), output_unit="m")
+    with pytest.raises((DataError, FitError), match="sign"):
+        physics(data, structure="joint")
 
 
 def test_what_is_no_joint_is_refused() -> None:

@@ -142,6 +142,7 @@ def fitted(
         _require_following(data)
     fit = _Fit(data, look)
     core = fit.started(integrates)
+    _require_sign(fit, integrates)
     for share in (32, 16, 8, PIECES):
         fit.cut(share)
         found = fit.descended(core)
@@ -185,6 +186,20 @@ def _require_following(data: Dataset) -> None:
                 )  # fmt: skip
 
 
+def _require_sign(fit: _Fit, integrates: bool) -> None:
+    """`DataError` for a position that a joint would reach if its command had the other sign."""
+    data = fit.data
+    turned = tuple(replace(e, u=-e.u) for e in data.experiments)
+    other = _Fit(replace(data, experiments=turned), fit.look)
+    with contextlib.suppress(FitError):
+        other.started(integrates, (fit.width,))
+    if other.begun < fit.begun:
+        raise DataError(
+            name=data.source, expected="a position that goes where its command sends it",
+            received="one that goes the other way", remedy="turn the sign of one of the two",
+        )  # fmt: skip
+
+
 def _stop(u: FloatArray, y: FloatArray) -> tuple[int, int, float] | None:
     """First and last sample of a rest at the largest position, and how far beyond it the command
     goes in such rests; None unless different commands leave the joint at that same place.
@@ -224,6 +239,8 @@ class _Fit:
         self.pieces: Sequence[Experiment] = data.experiments
         self.width = WIDTHS[0]
         """Width of the bell with which the start was best."""
+        self.begun = math.inf
+        """Sum of squares of that start, over short pieces."""
         self.orders: list[float] | None = None
         self.tried = 0
         """Orders of cogging from which those are the best."""
@@ -250,12 +267,12 @@ class _Fit:
 
     # --- the start ------------------------------------------------------------------------------
 
-    def started(self, integrates: bool) -> _core.GreyBox:
+    def started(self, integrates: bool, widths: Sequence[float] = WIDTHS) -> _core.GreyBox:
         """The best of regressions of smoothed signals, by free run over short pieces."""
         self.cut(32)
-        best, least = None, math.inf
+        best = None
         k_q = 0.0 if integrates else 1.0 / self.command_unit
-        for width in WIDTHS:
+        for width in widths:
             self.look()
             starts = _core.greybox_regressed(
                 _arrays(self.data.experiments), width=width, delays=DELAYS, Ts=self.data.Ts,
@@ -271,8 +288,8 @@ class _Fit:
                 }  # fmt: skip
                 core = self.core(known, k_q, list(known))
                 cost = squares(core, self.pieces, core.first_states(_arrays(self.pieces)))
-                if cost < least:
-                    best, least, self.width = core, cost, width
+                if cost < self.begun:
+                    best, self.begun, self.width = core, cost, width
                     # what turns faster than the integration can follow is not told apart
                     h = RESOLVED * self.data.Ts / core.settings["steps"]
                     self.least = {"k_a": max(FLOOR * k_a, h * (known["k_e"] + h * k_q))}
@@ -280,7 +297,7 @@ class _Fit:
             raise FitError(
                 name="data", expected="a position that follows its command as a joint does",
                 received="one of which no start is a joint",
-                remedy="is the output a position, and the input what drives it?",
+                remedy="is the output a position, the input what drives it, and no sign turned?",
             )  # fmt: skip
         return best
 
