@@ -334,7 +334,11 @@ def test_a_recording_of_the_package_is_not_said_to_be_late(tmp_path: Path, endin
     data = api.read(tmp_path / f"r.{ending}", inputs="u", output="y")
     assert data.looks_ahead
     assert diagnose(data).find("late_input") is None
-    # the same columns under other names are anybody's
+    y = recording.y.copy()
+    y[3000:3100] = np.nan
+    api.write_table(tmp_path / "gap.csv", recording.columns() | {"y": y})
+    assert api.read(tmp_path / "gap.csv", inputs="u", output="y").looks_ahead
+    # without the counts nothing tells it
     api.write_table(tmp_path / "x.csv", {"t": 0.001 * np.arange(8000), "u": u, "y": recording.y})
     smoothed = diagnose(api.read(tmp_path / "x.csv", inputs="u", output="y")).find("late_input")
     assert smoothed is not None

@@ -18,7 +18,7 @@ from ..arrays import FloatArray
 from ..dataset import Dataset, Experiment
 from ..errors import DataError, SettingError
 from ..readers import parse_source, read_table
-from ..readers.recording import is_smoothed
+from ..readers.recording import smoothed_by
 from ..recording import Recording
 from ..speed import speed_from_counts
 from .estimate import record_of, spectral
@@ -217,7 +217,8 @@ def unsmoothed(source: str | os.PathLike[str], data: Dataset) -> Dataset:
     if not data.looks_ahead:
         return data
     table = read_table(parse_source(os.fspath(source))[0])
-    if data.counts is None and not is_smoothed(table, data.output_name):
+    slope = smoothed_by(table, data.output_name) if data.counts is None else None
+    if data.counts is None and slope is None:
         return data
     column, per_rev = data.counts or ("counts", math.nan)
     counts = table[column]
@@ -227,11 +228,8 @@ def unsmoothed(source: str | os.PathLike[str], data: Dataset) -> Dataset:
             name=str(source), expected="one even record without gaps",
             received=f"{len(data.experiments)} pieces", remedy="cut one out",
         )  # fmt: skip
-    if data.counts is None:
-        y = np.diff(counts, prepend=counts[:1])
-        # a speed that is smoothed on both sides keeps its way: its sum over that of the counts
-        way = counts - counts.mean()
-        y *= (way @ np.cumsum(one.y)) / (way @ way)
+    if slope is not None:
+        y = slope * np.diff(counts, prepend=counts[:1])
     else:
         y = speed_from_counts(counts, data.Ts, per_rev, method="difference")
     return replace(data, experiments=(replace(one, y=y),), looks_ahead=False)

@@ -84,24 +84,32 @@ def read_mcap(path: Path, raw: bytes) -> Table:
     return Table(path, columns, found.units, Ts=header.Ts, counts_per_rev=header.counts_per_rev)
 
 
-def is_smoothed(table: Table, output: str) -> bool:
-    """Whether an output is a speed that was smoothed on both sides from the column `counts` beside
-    it, as the `y` of a `Recording` is: its way follows the counts to their rounding and without
-    lag. A difference lags by half a sample, and what looks back alone by more.
+def smoothed_by(table: Table, output: str) -> float | None:
+    """The output over the counts of a sample, if it is a speed that was smoothed on both sides from
+    the column `counts` beside it, as the `y` of a `Recording` is; else None.
+
+    Its way follows the counts to their rounding and without lag. A difference lags by half a
+    sample, and what looks back alone by more.
     """
     if "counts" not in table or len(table["counts"]) != len(table[output]):
-        return False
+        return None
     counts, y = table["counts"], table[output]
+    gaps = np.r_[-1, np.flatnonzero(~np.isfinite(counts + y)), len(y)]
+    k = int(np.argmax(np.diff(gaps)))
+    counts, y = (x[gaps[k] + 1 : gaps[k + 1]] for x in (counts, y))
+    if len(y) == 0:
+        return None
 
-    def off(way: FloatArray) -> float:
-        """Root mean square in counts after the best scale."""
+    def followed(way: FloatArray) -> tuple[float, float]:
+        """Root mean square in counts after the best scale, and that scale."""
         c, w = counts - counts.mean(), way - way.mean()
-        return float(np.sqrt(np.mean((c - w * (c @ w) / (w @ w)) ** 2)))
+        scale = (c @ w) / (w @ w)
+        return float(np.sqrt(np.mean((c - scale * w) ** 2))), float(scale)
 
     with np.errstate(all="ignore"):  # what is no number is no answer
         back = np.cumsum(y)
-        even = off(back - 0.5 * y)
-        return even < 0.5 and even < off(back)
+        (off, scale), (lagged, _) = followed(back - 0.5 * y), followed(back)
+        return 1.0 / scale if off < 0.5 and off < lagged else None
 
 
 # --- Formats of other packages -> Table -----------------------------------------------------------
@@ -366,7 +374,7 @@ def read_columns(
         (experiment,), base.Ts, names, label, tuple(table.unit(n) for n in names), unit, source,
         (*table.notes, *base.notes),
         looks_ahead=source is not None
-        or (output is not None and is_smoothed(table, label))
+        or (output is not None and smoothed_by(table, label) is not None)
         or (base.grid is not None and not base.grid.exact),
     )  # fmt: skip
     return data.resample(wanted) if slower else data
