@@ -15,141 +15,18 @@
 //! Where the profile stands and the counts are within one of it, the integral of the speed loop lets go of the position error: it
 //! would rise until dry friction gives way, and the shaft would be pushed to and fro for ever.
 
+mod rates;
+mod stop;
+
 use crate::pid_controller::Correction;
 use crate::{Controller, PidController, Real, Refused};
 
-/// The most rows of rates.
-pub const RATES: usize = 8;
+pub use rates::{RATES, Rate, Rates};
+
 /// The longest mean over the samples of a profile.
 pub const SMOOTHED: usize = 31;
 /// Samples kept: the longest preview or mean, and one more.
 const KEPT: usize = 32;
-
-/// How fast a drive's speed can change from a speed on.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rate<T> {
-    /// Speed, as a magnitude \[y\].
-    pub speed: T,
-    /// Largest rate away from rest \[y/s\].
-    pub up: T,
-    /// Largest rate towards rest \[y/s\].
-    pub down: T,
-}
-
-/// Rates over the speed, the same in both directions; each holds from its speed to the next one.
-///
-/// ```
-/// use sewfast_control::{Rate, Rates};
-///
-/// let rates = Rates::new(&[
-///     Rate { speed: 0.0, up: 20e3, down: 20e3 },
-///     Rate { speed: 1e3, up: 10e3, down: 25e3 },
-/// ])?;
-/// assert_eq!(rates.way(1e3), 25.0);
-/// assert_eq!(rates.way(2e3), 25.0 + 60.0);
-/// # Ok::<(), sewfast_control::Refused>(())
-/// ```
-#[derive(Clone, Copy, Debug)]
-pub struct Rates<T> {
-    rows: [Rate<T>; RATES],
-    /// The way from the speed of each row to rest \[y s\].
-    ways: [T; RATES],
-    count: u8,
-}
-
-impl<T: Real> Rates<T> {
-    /// Rates by growing speeds, the first of which is 0.
-    ///
-    /// # Errors
-    /// No row or more than [`RATES`], speeds that do not grow from 0, rates that are not above 0 and finite.
-    pub fn new(rows: &[Rate<T>]) -> Result<Self, Refused> {
-        let refuse = |holds, expected, received: T| {
-            Refused::unless(holds, "rates", expected, received.to_f64())
-        };
-        let none = Rate {
-            speed: T::ZERO,
-            up: T::ZERO,
-            down: T::ZERO,
-        };
-        let mut made = Self {
-            rows: [none; RATES],
-            ways: [T::ZERO; RATES],
-            count: rows.len() as u8,
-        };
-        let some = (1..=RATES).contains(&rows.len());
-        refuse(some, "1 to 8 rows", T::from_count(rows.len()))?;
-        let (mut before, mut way): (Option<Rate<T>>, T) = (None, T::ZERO);
-        let places = made.rows.iter_mut().zip(&mut made.ways);
-        for (row, (place, passed)) in rows.iter().zip(places) {
-            let grows = before.map_or(row.speed == T::ZERO, |last| row.speed > last.speed);
-            refuse(
-                grows && row.speed.is_finite(),
-                "growing speeds from 0 on",
-                row.speed,
-            )?;
-            for rate in [row.up, row.down] {
-                refuse(
-                    rate > T::ZERO && rate.is_finite(),
-                    "finite rates above 0",
-                    rate,
-                )?;
-            }
-            if let Some(last) = before {
-                way += (row.speed * row.speed - last.speed * last.speed) / (last.down + last.down);
-            }
-            (*place, *passed, before) = (*row, way, Some(*row));
-        }
-        refuse(way.is_finite(), "a finite way to rest", way)?;
-        Ok(made)
-    }
-
-    /// The rows, by growing speed.
-    pub fn rows(&self) -> &[Rate<T>] {
-        self.rows.get(..self.count.into()).unwrap_or_default()
-    }
-
-    /// The row at a speed, as a magnitude, and the way from its own speed to rest.
-    fn at(&self, speed: T) -> (Rate<T>, T) {
-        self.last(|row, _| row.speed <= speed)
-    }
-
-    /// The last row that holds, with its way; the first one if none does.
-    fn last(&self, holds: impl Fn(&Rate<T>, T) -> bool) -> (Rate<T>, T) {
-        let ([first, ..], [none, ..]) = (self.rows, self.ways);
-        let known = self.rows().iter().zip(self.ways);
-        known
-            .filter(|(row, way)| holds(row, *way))
-            .last()
-            .map_or((first, none), |(row, way)| (*row, way))
-    }
-
-    /// The way from a speed, as a magnitude, to rest \[y s\].
-    pub fn way(&self, speed: T) -> T {
-        let (row, way) = self.at(speed);
-        way + (speed * speed - row.speed * row.speed) / (row.down + row.down)
-    }
-
-    /// The speed of the next sample from which a distance of 0 or more ends at rest, if the speed then falls from sample to sample
-    /// at these rates: it solves `way(v) + v ts/2 = distance`, and is exact for sampled steps of one rate.
-    fn from(&self, distance: T, ts: T) -> T {
-        let half = T::ONE / (T::ONE + T::ONE);
-        let ([first, ..], last) = (self.rows, distance / ts);
-        // the last step of the speed, in which the distance is met in one sample
-        if last <= first.down * ts {
-            return last;
-        }
-        let (row, way) = self.last(|row, way| way + half * row.speed * ts <= distance);
-        let (lost, left) = (half * row.down * ts, distance - way);
-        let v = (lost * lost + row.speed * row.speed + (row.down + row.down) * left).sqrt() - lost;
-        v.limit(T::ZERO, last)
-    }
-}
-
-impl<T: PartialEq> PartialEq for Rates<T> {
-    fn eq(&self, other: &Self) -> bool {
-        self.rows.get(..self.count.into()) == other.rows.get(..other.count.into())
-    }
-}
 
 /// The settings of a position loop.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -380,80 +257,6 @@ impl<T: Real> PositionLoop<T> {
         self.own = self.rate;
         self.fastest = self.design.speed;
         self.mode = Mode::Goals;
-    }
-
-    /// From the next sample on it goes to a place that differs from `angle` by whole `turn`s, both in counts, and stays there; returns the count.
-    ///
-    /// Moving `onward` it is the first one that is reached without turning back, at no more than the present speed unless that is
-    /// lost within a sample;
-    /// otherwise the one that is nearest to where the shaft can be at rest first. From rest it goes forwards, or the shorter way.
-    ///
-    /// # Errors
-    /// An angle or a turn that is not finite, a turn that is not above 0, a present speed above [`PositionDesign::speed`].
-    pub fn stop(&mut self, angle: T, turn: T, onward: bool) -> Result<T, Refused> {
-        let rate = self.rate;
-        let fast = if rate < T::ZERO { -rate } else { rate };
-        Refused::unless(angle.is_finite(), "angle", "a finite angle", angle.to_f64())?;
-        Refused::unless(
-            turn > T::ZERO && turn.is_finite(),
-            "turn",
-            "counts of a turn above 0",
-            turn.to_f64(),
-        )?;
-        Refused::unless(
-            fast <= self.design.speed,
-            "speed",
-            "a speed within the position loop's",
-            fast.to_f64(),
-        )?;
-        self.take_over();
-        let half = T::ONE / (T::ONE + T::ONE);
-        let ts = self.speed.settings().ts;
-        // the speed falls from the next sample on
-        let way = self.design.rates.way(fast) - half * fast * ts;
-        let braked = if way > T::ZERO { way } else { T::ZERO };
-        let creeps = if fast > self.design.creep {
-            self.design.crept()
-        } else {
-            T::ZERO
-        };
-        let way = (braked + creeps) * self.design.counts_per_unit;
-        let (forwards, from) = (rate >= T::ZERO, self.path.at(0));
-        let earliest = if forwards { from + way } else { from - way };
-        let turns = (earliest - angle) / turn;
-        let whole = if !onward {
-            (turns + half).floor()
-        } else if forwards {
-            // a shaft that stands within a count of the angle stays
-            let near = if fast > T::ZERO {
-                T::ZERO
-            } else {
-                T::ONE / turn
-            };
-            -(near - turns).floor()
-        } else {
-            turns.floor()
-        };
-        // whole counts can be met exactly, and the nearest one may be too near
-        let rounded = |whole: T| (angle + whole * turn + half).floor();
-        let goal = rounded(whole);
-        let goal = if onward && forwards && fast > T::ZERO && goal < earliest {
-            rounded(whole + T::ONE)
-        } else if onward && !forwards && goal > earliest {
-            rounded(whole - T::ONE)
-        } else {
-            goal
-        };
-        (self.goal, self.own) = (goal, T::ZERO);
-        // what the drive loses within a sample is rest: at that speed a turn could take minutes
-        let (row, _) = self.design.rates.at(fast);
-        self.fastest = if fast > row.down * ts && onward {
-            fast
-        } else {
-            self.design.speed
-        };
-        self.mode = Mode::Stop(goal);
-        Ok(goal)
     }
 
     /// The profile goes on from the reference of the speed loop, whose position is now that of the counts.

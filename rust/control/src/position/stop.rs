@@ -1,0 +1,80 @@
+//! Stops at an angle: which place at it is gone to.
+
+use super::{Mode, PositionLoop};
+use crate::{Real, Refused};
+
+impl<T: Real> PositionLoop<T> {
+    /// From the next sample on it goes to a place that differs from `angle` by whole `turn`s, both in counts, and stays there; returns the count.
+    ///
+    /// Moving `onward` it is the first one that is reached without turning back, at no more than the present speed unless that is
+    /// lost within a sample;
+    /// otherwise the one that is nearest to where the shaft can be at rest first. From rest it goes forwards, or the shorter way.
+    ///
+    /// # Errors
+    /// An angle or a turn that is not finite, a turn that is not above 0, a present speed above [`PositionDesign::speed`](crate::PositionDesign::speed).
+    pub fn stop(&mut self, angle: T, turn: T, onward: bool) -> Result<T, Refused> {
+        let rate = self.rate;
+        let fast = if rate < T::ZERO { -rate } else { rate };
+        Refused::unless(angle.is_finite(), "angle", "a finite angle", angle.to_f64())?;
+        Refused::unless(
+            turn > T::ZERO && turn.is_finite(),
+            "turn",
+            "counts of a turn above 0",
+            turn.to_f64(),
+        )?;
+        Refused::unless(
+            fast <= self.design.speed,
+            "speed",
+            "a speed within the position loop's",
+            fast.to_f64(),
+        )?;
+        self.take_over();
+        let half = T::ONE / (T::ONE + T::ONE);
+        let ts = self.speed.settings().ts;
+        // the speed falls from the next sample on
+        let way = self.design.rates.way(fast) - half * fast * ts;
+        let braked = if way > T::ZERO { way } else { T::ZERO };
+        let creeps = if fast > self.design.creep {
+            self.design.crept()
+        } else {
+            T::ZERO
+        };
+        let way = (braked + creeps) * self.design.counts_per_unit;
+        let (forwards, from) = (rate >= T::ZERO, self.path.at(0));
+        let earliest = if forwards { from + way } else { from - way };
+        let turns = (earliest - angle) / turn;
+        let whole = if !onward {
+            (turns + half).floor()
+        } else if forwards {
+            // a shaft that stands within a count of the angle stays
+            let near = if fast > T::ZERO {
+                T::ZERO
+            } else {
+                T::ONE / turn
+            };
+            -(near - turns).floor()
+        } else {
+            turns.floor()
+        };
+        // whole counts can be met exactly, and the nearest one may be too near
+        let rounded = |whole: T| (angle + whole * turn + half).floor();
+        let goal = rounded(whole);
+        let goal = if onward && forwards && fast > T::ZERO && goal < earliest {
+            rounded(whole + T::ONE)
+        } else if onward && !forwards && goal > earliest {
+            rounded(whole - T::ONE)
+        } else {
+            goal
+        };
+        (self.goal, self.own) = (goal, T::ZERO);
+        // what the drive loses within a sample is rest: at that speed a turn could take minutes
+        let (row, _) = self.design.rates.at(fast);
+        self.fastest = if fast > row.down * ts && onward {
+            fast
+        } else {
+            self.design.speed
+        };
+        self.mode = Mode::Stop(goal);
+        Ok(goal)
+    }
+}
