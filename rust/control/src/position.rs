@@ -220,7 +220,7 @@ impl<T: Real> PositionLoop<T> {
             Mode::Goals => reference,
             Mode::Stop(goal) => goal,
         };
-        let begins_again = self.speed.is_manual() && goal != self.goal;
+        let begins_again = self.speed.is_manual() && (goal != self.goal || !self.stands());
         if begins_again {
             // the shaft may have been turned by hand
             self.shift();

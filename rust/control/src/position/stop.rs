@@ -29,6 +29,10 @@ impl<T: Real> PositionLoop<T> {
             fast.to_f64(),
         )?;
         self.take_over();
+        if self.speed.is_manual() {
+            // the shaft may have been turned by hand since it was let go
+            self.shift();
+        }
         let half = T::ONE / (T::ONE + T::ONE);
         let ts = self.speed.settings().ts;
         // the speed falls from the next sample on

@@ -290,6 +290,44 @@ fn at_rest_it_lets_go_if_asked() {
 }
 
 #[test]
+fn a_shaft_that_was_let_go_stops_again() {
+    let releasing = PositionDesign {
+        releases: true,
+        ..design(rates(&[(0.0, 3e4, 3e4)]), 8)
+    };
+    let mut law = PositionLoop::new(releasing, speed_loop()).unwrap();
+    let mut motor = Motor::new();
+    let stopped = |law: &mut PositionLoop<f64>, motor: &mut Motor, angle: f64| {
+        let goal = law.stop(angle, TURN, false).unwrap();
+        let first = law.step(0.0, motor.moved());
+        motor.advance(first);
+        let mut last = first;
+        for _ in 0..2000 {
+            last = law.step(0.0, motor.moved());
+            motor.advance(last);
+        }
+        assert_eq!(last, 0.0, "let go");
+        assert!(
+            (motor.before - goal).abs() <= 1.0,
+            "{} {goal}",
+            motor.before
+        );
+        // it begins without a jump
+        assert!(first.abs() < 1.0, "{first}");
+    };
+    stopped(&mut law, &mut motor, 100.0);
+    stopped(&mut law, &mut motor, 500.0);
+    // somebody turns the shaft, and it is asked for the same angle again
+    for _ in 0..100 {
+        motor.position += 2.0 / PER;
+        assert_eq!(law.step(0.0, motor.moved()), 0.0);
+    }
+    stopped(&mut law, &mut motor, 500.0);
+    // where it is already it may stay
+    stopped(&mut law, &mut motor, 500.0);
+}
+
+#[test]
 fn bad_settings_are_refused_by_name() {
     let good = design(rates(&[(0.0, 3e4, 3e4)]), 8);
     let refused = |design| PositionLoop::new(design, speed_loop()).unwrap_err().name;
