@@ -113,6 +113,10 @@ enum Mode<T> {
     Stop(T),
 }
 
+fn size<T: Real>(x: T) -> T {
+    if x < T::ZERO { -x } else { x }
+}
+
 /// A position loop over a speed loop, in counts of an encoder.
 ///
 /// It begins as the speed loop alone. [`follow`](Self::follow) and [`stop`](Self::stop) take over without a bump.
@@ -225,11 +229,7 @@ impl<T: Real> PositionLoop<T> {
             // the shaft may have been turned by hand
             self.shift();
         }
-        self.advance(goal);
-        let samples = self.design.smoothing;
-        let (newest, oldest) = (self.path.at(0), self.path.at(samples));
-        let speed = (newest - oldest) / (T::from_count(samples) * self.per_sample);
-        self.places.push(self.mean());
+        let speed = self.profile(goal);
         let error = self.place() - self.counts;
         let (one, stands) = (T::ONE, self.stands());
         let near = error <= one && error >= -one;
@@ -281,11 +281,23 @@ impl<T: Real> PositionLoop<T> {
         }
     }
 
+    /// The profile one sample on towards a goal; its speed \[y\].
+    fn profile(&mut self, goal: T) -> T {
+        if self.arrives(goal) {
+            (self.path, self.rate, self.own) = (Ring::filled(goal), T::ZERO, T::ZERO);
+        } else {
+            self.advance(goal);
+        }
+        let samples = self.design.smoothing;
+        let (newest, oldest) = (self.path.at(0), self.path.at(samples));
+        self.places.push(self.mean());
+        (newest - oldest) / (T::from_count(samples) * self.per_sample)
+    }
+
     /// The position before the mean, one sample on towards a goal.
     fn advance(&mut self, goal: T) {
         let goal = if goal.is_finite() { goal } else { self.goal };
         let (ts, rate) = (self.speed.settings().ts, self.rate);
-        let size = |x: T| if x < T::ZERO { -x } else { x };
         let (row, _) = self.design.rates.at(size(rate));
         let (up, down) = (row.up * ts, row.down * ts);
         // a goal that moves as the drive can is followed at its own speed, from its second sample on: before, it may be a step

@@ -1,7 +1,14 @@
-//! Stops at an angle: which place at it is gone to.
+//! Stops at an angle: which place at it is gone to, and where the landing of any way ends.
+//!
+//! The last, slow part of a way ends where the counts meet the goal, so that a shaft which leads does not pass it.
 
-use super::{Mode, PositionLoop};
+use super::{Mode, PositionLoop, size};
 use crate::{Real, Refused};
+
+/// Counts by which friction holds a shaft off its goal.
+fn rests<T: Real>() -> T {
+    T::ONE + T::ONE
+}
 
 impl<T: Real> PositionLoop<T> {
     /// From the next sample on it goes to a place that differs from `angle` by whole `turn`s, both in counts, and stays there; returns the count.
@@ -14,7 +21,7 @@ impl<T: Real> PositionLoop<T> {
     /// An angle or a turn that is not finite, a turn that is not above 0, a present speed above [`PositionDesign::speed`](crate::PositionDesign::speed).
     pub fn stop(&mut self, angle: T, turn: T, onward: bool) -> Result<T, Refused> {
         let rate = self.rate;
-        let fast = if rate < T::ZERO { -rate } else { rate };
+        let fast = size(rate);
         Refused::unless(angle.is_finite(), "angle", "a finite angle", angle.to_f64())?;
         Refused::unless(
             turn > T::ZERO && turn.is_finite(),
@@ -80,5 +87,23 @@ impl<T: Real> PositionLoop<T> {
         };
         self.mode = Mode::Stop(goal);
         Ok(goal)
+    }
+
+    /// Whether the shaft would meet a goal that stands at the end of what the speed loop has been told ahead, while the profile lands;
+    /// the shaft may be half a count beyond its counts.
+    pub(super) fn arrives(&self, goal: T) -> bool {
+        let left = goal - self.path.at(0);
+        let lands = goal == self.goal && left * self.rate > T::ZERO;
+        if !lands || size(left) > self.design.landing || size(self.rate) > self.design.creep {
+            return false;
+        }
+        let (place, half) = (self.place(), T::ONE / (T::ONE + T::ONE));
+        let (ahead, lead) = if left > T::ZERO {
+            (self.places.at(0) - place, self.counts - place)
+        } else {
+            (place - self.places.at(0), place - self.counts)
+        };
+        // a larger lead swings, and dies away as the profile lands
+        lead <= rests() && lead + ahead + half >= size(goal - place)
     }
 }

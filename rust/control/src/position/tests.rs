@@ -221,6 +221,30 @@ fn the_last_counts_are_passed_slowly() {
 }
 
 #[test]
+fn a_landing_ends_where_the_counts_meet_the_goal() {
+    let slow = PositionDesign {
+        landing: 20.0,
+        ..design(rates(&[(0.0, 2e4, 2e4)]), 4)
+    };
+    // samples until the profile stands if the shaft leads by so many counts
+    let lands = |lead: f64| {
+        let mut law = PositionLoop::new(slow, speed_loop()).unwrap();
+        law.follow();
+        for k in 0..3000 {
+            let at = Real::floor(law.place() + lead + 0.5);
+            law.step(3000.0, at - law.counts());
+            if law.stands() {
+                return k;
+            }
+        }
+        panic!("it does not land");
+    };
+    // 2 counts at 20 RPM are 4 samples; a lead that friction does not hold dies away first
+    let [exact, led, far] = [0.0, 2.0, 4.0].map(lands);
+    assert!(led + 4 <= exact && far > led, "{exact} {led} {far}");
+}
+
+#[test]
 fn a_motor_goes_to_a_goal_stops_at_an_angle_and_stands() {
     let bounded = design(rates(&[(0.0, 3e4, 3e4)]), 8);
     let mut law = PositionLoop::new(bounded, speed_loop()).unwrap();
