@@ -142,6 +142,8 @@ pub struct PositionLoop<T> {
     fastest: T,
     /// Samples since the last count.
     still: usize,
+    /// Samples that the speed loop has yet to be told of the profile, beyond one at each sample.
+    untold: usize,
 }
 
 impl<T: Real> PositionLoop<T> {
@@ -185,6 +187,7 @@ impl<T: Real> PositionLoop<T> {
             own: T::ZERO,
             fastest: design.speed,
             still: 0,
+            untold: 0,
             design,
             speed,
         })
@@ -195,7 +198,7 @@ impl<T: Real> PositionLoop<T> {
         self.speed.reset();
         self.mode = Mode::Speed;
         (self.counts, self.rate, self.goal) = (T::ZERO, T::ZERO, T::ZERO);
-        (self.own, self.still) = (T::ZERO, 0);
+        (self.own, self.still, self.untold) = (T::ZERO, 0, 0);
         (self.path, self.places) = (Ring::filled(T::ZERO), Ring::filled(T::ZERO));
         self.fastest = self.design.speed;
     }
@@ -228,6 +231,12 @@ impl<T: Real> PositionLoop<T> {
         if begins_again {
             // the shaft may have been turned by hand
             self.shift();
+        }
+        // what was missed is made up for sample by sample
+        if self.untold > 0 {
+            let sooner = self.profile(goal);
+            self.speed.refer(sooner);
+            self.untold -= 1;
         }
         let speed = self.profile(goal);
         let error = self.place() - self.counts;
@@ -275,7 +284,10 @@ impl<T: Real> PositionLoop<T> {
 
     /// Moves the profile to where the counts are.
     fn shift(&mut self) {
-        let shift = self.counts - self.place();
+        self.move_by(self.counts - self.place());
+    }
+
+    fn move_by(&mut self, shift: T) {
         for place in self.path.kept.iter_mut().chain(&mut self.places.kept) {
             *place += shift;
         }
@@ -349,11 +361,16 @@ impl<T: Real> PositionLoop<T> {
         self.goal + off / T::from_count(samples)
     }
 
+    /// The age of the position of this sample among those of the profile.
+    fn now(&self) -> usize {
+        self.speed.design().feedforward.preview() - self.untold
+    }
+
     /// The profile's position at this sample \[counts\]. The speed of a sample is the mean over it, and the speed loop takes it
     /// for that at its end, so the position is half a sample later.
     pub fn place(&self) -> T {
-        let preview = self.speed.design().feedforward.preview();
-        let (now, before) = (self.places.at(preview), self.places.at(preview + 1));
+        let now = self.now();
+        let (now, before) = (self.places.at(now), self.places.at(now + 1));
         now + (before - now) / (T::ONE + T::ONE)
     }
 

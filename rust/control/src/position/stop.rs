@@ -1,5 +1,6 @@
-//! Stops at an angle: which place at it is gone to, and where the landing of any way ends.
+//! Stops at an angle: which place at it is gone to and how early, and where the landing of any way ends.
 //!
+//! A stop from a steady speed begins before the preview is over, because all that the speed loop has been told ahead is that speed.
 //! The last, slow part of a way ends where the counts meet the goal, so that a shaft which leads does not pass it.
 
 use super::{Mode, PositionLoop, size};
@@ -35,11 +36,18 @@ impl<T: Real> PositionLoop<T> {
             "a speed within the position loop's",
             fast.to_f64(),
         )?;
+        let sooner = if self.mode == Mode::Speed {
+            self.sooner()
+        } else {
+            0
+        };
         self.take_over();
         if self.speed.is_manual() {
             // the shaft may have been turned by hand since it was let go
             self.shift();
         }
+        // the profile is that of as many samples later
+        self.move_by(-(T::from_count(sooner) * rate * self.per_sample));
         let half = T::ONE / (T::ONE + T::ONE);
         let ts = self.speed.settings().ts;
         // the speed falls from the next sample on
@@ -86,7 +94,33 @@ impl<T: Real> PositionLoop<T> {
             self.design.speed
         };
         self.mode = Mode::Stop(goal);
+        self.untold = sooner;
         Ok(goal)
+    }
+
+    /// By how many samples a stop may begin before the preview is over: what the speed loop has been told ahead is the present speed
+    /// to within half a count of way, so it may have been told to brake. The drive answers as late as it does to a step of the
+    /// command: half of what the feedforward sends for a change of the rate comes by then, and half of the mean. The loop is told two
+    /// samples of the profile at each sample until it is told all that it has missed, so that the command does not jump, and half of
+    /// that time is left.
+    fn sooner(&self) -> usize {
+        let feedforward = &self.speed.design().feedforward;
+        let (two, preview) = (T::ONE + T::ONE, feedforward.preview());
+        let apart = (0..=preview).fold(T::ZERO, |sum, age| {
+            sum + size(self.speed.told(age) - self.rate)
+        });
+        let steady = two * apart * self.per_sample <= T::ONE;
+        let all = feedforward.taps().iter().fold(T::ZERO, |sum, t| sum + *t);
+        if !steady || self.rate == T::ZERO || all == T::ZERO {
+            return 0;
+        }
+        let mut sum = T::ZERO;
+        let before = |tap: &&T| {
+            sum += **tap / all;
+            two * sum < T::ONE
+        };
+        let taps = feedforward.taps().iter().take_while(before).count();
+        ((taps + self.design.smoothing / 2) / 2).min(preview)
     }
 
     /// Whether the shaft would meet a goal that stands at the end of what the speed loop has been told ahead, while the profile lands;

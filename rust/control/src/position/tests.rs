@@ -4,6 +4,8 @@ use std::vec::Vec;
 use super::*;
 use crate::{Design, Feedforward, Level, Settings, Standard};
 
+mod stops;
+
 const TS: f64 = 1e-3;
 const TURN: f64 = 1572.0;
 const PER: f64 = TURN / 60.0;
