@@ -20,6 +20,7 @@ mod stop;
 
 use crate::pid_controller::Correction;
 use crate::{Controller, PidController, Real, Refused};
+use stop::Angle;
 
 pub use rates::{RATES, Rate, Rates};
 
@@ -51,21 +52,21 @@ pub struct PositionDesign<T> {
 }
 
 impl<T: Real> PositionDesign<T> {
-    /// By how much the landing makes a way longer \[y s\].
-    fn crept(&self) -> T {
-        let more = self.landing / self.counts_per_unit - self.rates.way(self.creep);
+    /// By how much the landing makes a way at these rates longer \[y s\].
+    fn crept(&self, rates: &Rates<T>) -> T {
+        let more = self.landing / self.counts_per_unit - rates.way(self.creep);
         if more > T::ZERO { more } else { T::ZERO }
     }
 
-    /// The speed of the next sample towards a goal at a distance of 0 or more.
-    fn towards(&self, distance: T, ts: T) -> T {
-        let last = self.rates.from(distance, ts);
-        let more = self.crept();
+    /// The speed of the next sample towards a goal at a distance of 0 or more, at these rates.
+    fn towards(&self, rates: &Rates<T>, distance: T, ts: T) -> T {
+        let last = rates.from(distance, ts);
+        let more = self.crept(rates);
         if more == T::ZERO {
             return last;
         }
         let first = if distance > more {
-            self.rates.from(distance - more, ts)
+            rates.from(distance - more, ts)
         } else {
             T::ZERO
         };
@@ -109,8 +110,8 @@ enum Mode<T> {
     Speed,
     /// References are goals \[counts\].
     Goals,
-    /// It goes to this count.
-    Stop(T),
+    /// It goes to the goal; with an angle it may go on to a later place at it.
+    Stop(Option<Angle<T>>),
 }
 
 fn size<T: Real>(x: T) -> T {
@@ -138,8 +139,16 @@ pub struct PositionLoop<T> {
     /// Goal of the last sample \[counts\], and its own speed \[y\].
     goal: T,
     own: T,
-    /// Largest speed of this move \[y\].
+    /// Rates and largest speed of this move \[y\].
+    rates: Rates<T>,
     fastest: T,
+    /// Largest way of a sample of the profile since this move was planned, and all the way that braking has taken off \[counts\].
+    top: T,
+    lost: T,
+    /// Samples for which the speed is held before a move is planned anew.
+    unplanned: usize,
+    /// The last command \[u\].
+    u: T,
     /// Samples since the last count.
     still: usize,
     /// Samples that the speed loop has yet to be told of the profile, beyond one at each sample.
@@ -185,7 +194,12 @@ impl<T: Real> PositionLoop<T> {
             rate: T::ZERO,
             goal: T::ZERO,
             own: T::ZERO,
+            rates: design.rates,
             fastest: design.speed,
+            top: T::ZERO,
+            lost: T::ZERO,
+            unplanned: 0,
+            u: T::ZERO,
             still: 0,
             untold: 0,
             design,
@@ -198,9 +212,9 @@ impl<T: Real> PositionLoop<T> {
         self.speed.reset();
         self.mode = Mode::Speed;
         (self.counts, self.rate, self.goal) = (T::ZERO, T::ZERO, T::ZERO);
-        (self.own, self.still, self.untold) = (T::ZERO, 0, 0);
+        (self.own, self.u, self.still, self.untold) = (T::ZERO, T::ZERO, 0, 0);
         (self.path, self.places) = (Ring::filled(T::ZERO), Ring::filled(T::ZERO));
-        self.fastest = self.design.speed;
+        self.planned(self.design.rates, self.design.speed);
     }
 
     /// From the reference and the counts `moved` since the last sample to the command. The reference is a speed \[y\], after
@@ -225,8 +239,9 @@ impl<T: Real> PositionLoop<T> {
                 return u;
             }
             Mode::Goals => reference,
-            Mode::Stop(goal) => goal,
+            Mode::Stop(_) => self.goal,
         };
+        let goal = self.within_reach(goal);
         let begins_again = self.speed.is_manual() && (goal != self.goal || !self.stands());
         if begins_again {
             // the shaft may have been turned by hand
@@ -255,6 +270,7 @@ impl<T: Real> PositionLoop<T> {
             // its integral term is now that of a command of 0 here
             self.speed.set_automatic();
         }
+        self.u = u;
         u
     }
 
@@ -264,7 +280,7 @@ impl<T: Real> PositionLoop<T> {
         self.take_over();
         self.goal = self.path.at(0);
         self.own = self.rate;
-        self.fastest = self.design.speed;
+        self.planned(self.design.rates, self.design.speed);
         self.mode = Mode::Goals;
     }
 
@@ -295,7 +311,10 @@ impl<T: Real> PositionLoop<T> {
 
     /// The profile one sample on towards a goal; its speed \[y\].
     fn profile(&mut self, goal: T) -> T {
-        if self.arrives(goal) {
+        if self.unplanned > 0 {
+            self.path
+                .push(self.path.at(0) + self.rate * self.per_sample);
+        } else if self.arrives(goal) {
             (self.path, self.rate, self.own) = (Ring::filled(goal), T::ZERO, T::ZERO);
         } else {
             self.advance(goal);
@@ -310,7 +329,7 @@ impl<T: Real> PositionLoop<T> {
     fn advance(&mut self, goal: T) {
         let goal = if goal.is_finite() { goal } else { self.goal };
         let (ts, rate) = (self.speed.settings().ts, self.rate);
-        let (row, _) = self.design.rates.at(size(rate));
+        let (row, _) = self.rates.at(size(rate));
         let (up, down) = (row.up * ts, row.down * ts);
         // a goal that moves as the drive can is followed at its own speed, from its second sample on: before, it may be a step
         let (own, last) = ((goal - self.goal) / self.per_sample, self.own);
@@ -320,13 +339,13 @@ impl<T: Real> PositionLoop<T> {
         (self.goal, self.own) = (goal, own);
         let at = self.path.at(0);
         let left = (goal - at) / self.design.counts_per_unit - carried * ts;
-        let towards = self.design.towards(size(left), ts);
+        let towards = self.design.towards(&self.rates, size(left), ts);
         let wanted = carried + if left < T::ZERO { -towards } else { towards };
         let wanted = wanted.limit(-self.fastest, self.fastest);
         // on its way to a goal the speed may fall by the rate of the row below, and by an eighth more just before it, where the
         // last samples do not divide the way evenly
         let brakes = size(wanted) <= size(rate) && wanted * rate >= T::ZERO;
-        let (next, _) = self.design.rates.at(size(wanted));
+        let (next, _) = self.rates.at(size(wanted));
         let steeper = if next.down > row.down {
             next.down * ts
         } else {

@@ -88,6 +88,14 @@ impl<T: Real> Rates<T> {
         self.rows.get(..self.count.into()).unwrap_or_default()
     }
 
+    /// The same rows with this part of the rates.
+    pub(super) fn scaled(mut self, part: T) -> Self {
+        for (row, way) in self.rows.iter_mut().zip(&mut self.ways) {
+            (row.up, row.down, *way) = (row.up * part, row.down * part, *way / part);
+        }
+        self
+    }
+
     /// The row at a speed, as a magnitude, and the way from its own speed to rest.
     pub(super) fn at(&self, speed: T) -> (Rate<T>, T) {
         self.last(|row, _| row.speed <= speed)

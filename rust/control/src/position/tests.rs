@@ -52,11 +52,12 @@ fn design(rates: Rates<f64>, smoothing: usize) -> PositionDesign<f64> {
     }
 }
 
-/// A motor with a time constant of 50 ms and an encoder.
+/// A motor with a time constant of 50 ms, if nothing else is said, and an encoder.
 struct Motor {
     y: f64,
     position: f64,
     before: f64,
+    lag: f64,
 }
 
 impl Motor {
@@ -65,6 +66,7 @@ impl Motor {
             y: 0.0,
             position: 0.0,
             before: 0.0,
+            lag: 0.05,
         }
     }
 
@@ -78,7 +80,7 @@ impl Motor {
         let held = self.y == 0.0 && u.abs() <= 0.3;
         let way = if self.y == 0.0 { u } else { self.y };
         let drive = if held { 0.0 } else { u - 0.3_f64.copysign(way) };
-        let y = self.y + TS * (490.0 * drive - self.y) / 0.05;
+        let y = self.y + TS * (490.0 * drive - self.y) / self.lag;
         let y = if y * self.y < 0.0 { 0.0 } else { y };
         self.position += TS * 0.5 * (self.y + y);
         self.y = y;
