@@ -126,6 +126,55 @@ def test_an_s_curve_is_followed_as_it_is() -> None:
     assert (found.metrics()["rms"] or 1.0) < 0.05
 
 
+def changed(**factors: float) -> VirtualMachine:
+    own = VirtualMachine().parameters
+    return VirtualMachine(
+        parameters={**own, **{name: own[name] * f for name, f in factors.items()}}
+    )
+
+
+@pytest.mark.parametrize("speed", [-3500.0, 3500.0])
+def test_a_shaft_that_brakes_less_goes_on_to_a_later_turn(speed: float) -> None:
+    # what the virtual machine can do, for which its command comes near its limit
+    own = replace(SPEED, feedforward=Feedforward(8, 0.5, LEVELS, (0.068,) * 8))
+    rates = ((0.0, 24e3, 24e3), (2000.0, 22e3, 25e3))
+    law = replace(LAW, speed=own, rates=rates, share=0.95, landing=40.0)
+    able = stop_at(law, VirtualMachine(), "90deg", speed=speed, after=2.0)
+    assert np.ptp(able.goal[able.start :]) == 0.0
+    found = stop_at(law, changed(inertia=1.25), "90deg", speed=speed, after=4.0)
+    goals, way = found.goal[found.start :], math.copysign(1.0, speed)
+    later = way * (goals[-1] - goals[0])
+    assert later >= 1572.0
+    assert later % 1572.0 == 0.0
+    assert "went on to a later turn" in found.warnings[0]
+    beyond = way * found.position[found.start :]
+    assert np.max(np.maximum.accumulate(beyond) - beyond) < 1572.0 / 8.0
+    assert abs(found.counts[-1] - goals[-1]) <= 2.0
+
+
+def test_a_shaft_that_cannot_be_stopped_as_planned_goes_on_once() -> None:
+    for heavy in (2.0, 6.0):
+        found = stop_at(LAW, changed(inertia=heavy), "90deg", speed=3500.0, after=8.0)
+        goals = found.goal[found.start :]
+        assert np.count_nonzero(np.diff(goals)) == 1
+        # a loop with six times its inertia swings
+        assert abs(found.counts[-1] - goals[-1]) <= (2.0 if heavy == 2.0 else 3.0 * 1572.0)
+
+
+def test_a_stop_takes_little_more_than_the_way_to_brake() -> None:
+    speed = 3000.0
+    # 13,500 RPM/s below 2,000 RPM, 16,200 above
+    least = (2000.0**2 / 13.5e3 + (speed**2 - 2000.0**2) / 16.2e3) / 120.0
+    beyond = []
+    for angle in range(0, 360, 30):
+        m = stop_at(LAW, VirtualMachine(), f"{angle}deg", speed=speed, after=2.0).metrics()
+        assert m["turns"] is not None
+        beyond.append(m["turns"] - least)
+    # 2 samples, a tenth of a turn, more if it began when the preview is over
+    assert min(beyond) < 0.55
+    assert max(beyond) < 1.5
+
+
 def test_it_holds_against_a_load_or_lets_go() -> None:
     held = stop_at(LAW, drive(), "0deg", speed=0.0, after=2.0, disturbance=np.full(2501, 1.0))
     assert abs(held.metrics()["counts_off"] or 0.0) <= 1.0

@@ -78,7 +78,8 @@ class PositionRun(Plotted):
     position : array, shape (N,)
         The true position of a model or a virtual machine [counts]; of another machine its counts.
     place, goal : array, shape (N,)
-        The profile's position at that time, and where it goes [counts]; NaN before a stop.
+        The profile's position at that time, and where it goes [counts]; NaN before a stop. A stop
+        goes to a later turn than at first if the drive brakes less than its models.
     start : int
         The sample at which the stop, or the first move, begins.
     controller : PositionController
@@ -173,10 +174,16 @@ class PositionRun(Plotted):
         m, unit = self.metrics(), self.unit
         count = abs(self._in_unit(1.0))
         found = []
+        remedy = "use less of what they can do (share), or identify it again"
+        if self.is_stop and np.any(np.diff(self.goal[self.start :])):
+            found.append(
+                "went on to a later turn, as it would have passed its goal: the drive brakes less "
+                f"than its models; {remedy}"
+            )
         if (passed := m["passed"]) is not None and passed > 2.0 * count:
             found.append(
                 f"passed its goal by {passed:.3g} {unit}: the drive brakes less than its models; "
-                "use less of what they can do (share), or identify it again"
+                f"{remedy}"
             )
         if m["time"] is None and m["rest_counts"] is not None:
             found.append(f"does not stay within a count: rests {m['off']:.3g} {unit} off")

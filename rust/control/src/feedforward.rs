@@ -217,7 +217,7 @@ impl<T: Real> Ahead<T> {
     }
 
     /// The reference `age` samples before the newest.
-    fn at(&self, age: usize) -> T {
+    pub(crate) fn at(&self, age: usize) -> T {
         let place = (self.newest + KEPT - age % KEPT) % KEPT;
         self.kept.get(place).copied().unwrap_or(T::ZERO)
     }

@@ -207,6 +207,17 @@ impl<T: Real> PidController<T> {
         }
     }
 
+    /// A reference that comes before its sample: what was told ahead is told one sample sooner.
+    pub(crate) fn refer(&mut self, r: T) {
+        let ramped = self.ramp.step(r, r);
+        self.ahead.take(ramped);
+    }
+
+    /// The reference that was told `age` samples before the newest one, of a controller with feedforward.
+    pub(crate) fn told(&self, age: usize) -> T {
+        self.ahead.at(age)
+    }
+
     /// The newest reference after the ramp; `None` before the first one.
     pub(crate) fn ramped(&self) -> Option<T> {
         self.ramp.newest()

@@ -15,141 +15,19 @@
 //! Where the profile stands and the counts are within one of it, the integral of the speed loop lets go of the position error: it
 //! would rise until dry friction gives way, and the shaft would be pushed to and fro for ever.
 
+mod rates;
+mod stop;
+
 use crate::pid_controller::Correction;
 use crate::{Controller, PidController, Real, Refused};
+use stop::Angle;
 
-/// The most rows of rates.
-pub const RATES: usize = 8;
+pub use rates::{RATES, Rate, Rates};
+
 /// The longest mean over the samples of a profile.
 pub const SMOOTHED: usize = 31;
 /// Samples kept: the longest preview or mean, and one more.
 const KEPT: usize = 32;
-
-/// How fast a drive's speed can change from a speed on.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rate<T> {
-    /// Speed, as a magnitude \[y\].
-    pub speed: T,
-    /// Largest rate away from rest \[y/s\].
-    pub up: T,
-    /// Largest rate towards rest \[y/s\].
-    pub down: T,
-}
-
-/// Rates over the speed, the same in both directions; each holds from its speed to the next one.
-///
-/// ```
-/// use sewfast_control::{Rate, Rates};
-///
-/// let rates = Rates::new(&[
-///     Rate { speed: 0.0, up: 20e3, down: 20e3 },
-///     Rate { speed: 1e3, up: 10e3, down: 25e3 },
-/// ])?;
-/// assert_eq!(rates.way(1e3), 25.0);
-/// assert_eq!(rates.way(2e3), 25.0 + 60.0);
-/// # Ok::<(), sewfast_control::Refused>(())
-/// ```
-#[derive(Clone, Copy, Debug)]
-pub struct Rates<T> {
-    rows: [Rate<T>; RATES],
-    /// The way from the speed of each row to rest \[y s\].
-    ways: [T; RATES],
-    count: u8,
-}
-
-impl<T: Real> Rates<T> {
-    /// Rates by growing speeds, the first of which is 0.
-    ///
-    /// # Errors
-    /// No row or more than [`RATES`], speeds that do not grow from 0, rates that are not above 0 and finite.
-    pub fn new(rows: &[Rate<T>]) -> Result<Self, Refused> {
-        let refuse = |holds, expected, received: T| {
-            Refused::unless(holds, "rates", expected, received.to_f64())
-        };
-        let none = Rate {
-            speed: T::ZERO,
-            up: T::ZERO,
-            down: T::ZERO,
-        };
-        let mut made = Self {
-            rows: [none; RATES],
-            ways: [T::ZERO; RATES],
-            count: rows.len() as u8,
-        };
-        let some = (1..=RATES).contains(&rows.len());
-        refuse(some, "1 to 8 rows", T::from_count(rows.len()))?;
-        let (mut before, mut way): (Option<Rate<T>>, T) = (None, T::ZERO);
-        let places = made.rows.iter_mut().zip(&mut made.ways);
-        for (row, (place, passed)) in rows.iter().zip(places) {
-            let grows = before.map_or(row.speed == T::ZERO, |last| row.speed > last.speed);
-            refuse(
-                grows && row.speed.is_finite(),
-                "growing speeds from 0 on",
-                row.speed,
-            )?;
-            for rate in [row.up, row.down] {
-                refuse(
-                    rate > T::ZERO && rate.is_finite(),
-                    "finite rates above 0",
-                    rate,
-                )?;
-            }
-            if let Some(last) = before {
-                way += (row.speed * row.speed - last.speed * last.speed) / (last.down + last.down);
-            }
-            (*place, *passed, before) = (*row, way, Some(*row));
-        }
-        refuse(way.is_finite(), "a finite way to rest", way)?;
-        Ok(made)
-    }
-
-    /// The rows, by growing speed.
-    pub fn rows(&self) -> &[Rate<T>] {
-        self.rows.get(..self.count.into()).unwrap_or_default()
-    }
-
-    /// The row at a speed, as a magnitude, and the way from its own speed to rest.
-    fn at(&self, speed: T) -> (Rate<T>, T) {
-        self.last(|row, _| row.speed <= speed)
-    }
-
-    /// The last row that holds, with its way; the first one if none does.
-    fn last(&self, holds: impl Fn(&Rate<T>, T) -> bool) -> (Rate<T>, T) {
-        let ([first, ..], [none, ..]) = (self.rows, self.ways);
-        let known = self.rows().iter().zip(self.ways);
-        known
-            .filter(|(row, way)| holds(row, *way))
-            .last()
-            .map_or((first, none), |(row, way)| (*row, way))
-    }
-
-    /// The way from a speed, as a magnitude, to rest \[y s\].
-    pub fn way(&self, speed: T) -> T {
-        let (row, way) = self.at(speed);
-        way + (speed * speed - row.speed * row.speed) / (row.down + row.down)
-    }
-
-    /// The speed of the next sample from which a distance of 0 or more ends at rest, if the speed then falls from sample to sample
-    /// at these rates: it solves `way(v) + v ts/2 = distance`, and is exact for sampled steps of one rate.
-    fn from(&self, distance: T, ts: T) -> T {
-        let half = T::ONE / (T::ONE + T::ONE);
-        let ([first, ..], last) = (self.rows, distance / ts);
-        // the last step of the speed, in which the distance is met in one sample
-        if last <= first.down * ts {
-            return last;
-        }
-        let (row, way) = self.last(|row, way| way + half * row.speed * ts <= distance);
-        let (lost, left) = (half * row.down * ts, distance - way);
-        let v = (lost * lost + row.speed * row.speed + (row.down + row.down) * left).sqrt() - lost;
-        v.limit(T::ZERO, last)
-    }
-}
-
-impl<T: PartialEq> PartialEq for Rates<T> {
-    fn eq(&self, other: &Self) -> bool {
-        self.rows.get(..self.count.into()) == other.rows.get(..other.count.into())
-    }
-}
 
 /// The settings of a position loop.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -174,21 +52,21 @@ pub struct PositionDesign<T> {
 }
 
 impl<T: Real> PositionDesign<T> {
-    /// By how much the landing makes a way longer \[y s\].
-    fn crept(&self) -> T {
-        let more = self.landing / self.counts_per_unit - self.rates.way(self.creep);
+    /// By how much the landing makes a way at these rates longer \[y s\].
+    fn crept(&self, rates: &Rates<T>) -> T {
+        let more = self.landing / self.counts_per_unit - rates.way(self.creep);
         if more > T::ZERO { more } else { T::ZERO }
     }
 
-    /// The speed of the next sample towards a goal at a distance of 0 or more.
-    fn towards(&self, distance: T, ts: T) -> T {
-        let last = self.rates.from(distance, ts);
-        let more = self.crept();
+    /// The speed of the next sample towards a goal at a distance of 0 or more, at these rates.
+    fn towards(&self, rates: &Rates<T>, distance: T, ts: T) -> T {
+        let last = rates.from(distance, ts);
+        let more = self.crept(rates);
         if more == T::ZERO {
             return last;
         }
         let first = if distance > more {
-            self.rates.from(distance - more, ts)
+            rates.from(distance - more, ts)
         } else {
             T::ZERO
         };
@@ -232,8 +110,12 @@ enum Mode<T> {
     Speed,
     /// References are goals \[counts\].
     Goals,
-    /// It goes to this count.
-    Stop(T),
+    /// It goes to the goal; with an angle it may go on to a later place at it.
+    Stop(Option<Angle<T>>),
+}
+
+fn size<T: Real>(x: T) -> T {
+    if x < T::ZERO { -x } else { x }
 }
 
 /// A position loop over a speed loop, in counts of an encoder.
@@ -257,10 +139,20 @@ pub struct PositionLoop<T> {
     /// Goal of the last sample \[counts\], and its own speed \[y\].
     goal: T,
     own: T,
-    /// Largest speed of this move \[y\].
+    /// Rates and largest speed of this move \[y\].
+    rates: Rates<T>,
     fastest: T,
+    /// Largest way of a sample of the profile since this move was planned, and all the way that braking has taken off \[counts\].
+    top: T,
+    lost: T,
+    /// Samples for which the speed is held before a move is planned anew.
+    unplanned: usize,
+    /// The last command \[u\].
+    u: T,
     /// Samples since the last count.
     still: usize,
+    /// Samples that the speed loop has yet to be told of the profile, beyond one at each sample.
+    untold: usize,
 }
 
 impl<T: Real> PositionLoop<T> {
@@ -302,8 +194,14 @@ impl<T: Real> PositionLoop<T> {
             rate: T::ZERO,
             goal: T::ZERO,
             own: T::ZERO,
+            rates: design.rates,
             fastest: design.speed,
+            top: T::ZERO,
+            lost: T::ZERO,
+            unplanned: 0,
+            u: T::ZERO,
             still: 0,
+            untold: 0,
             design,
             speed,
         })
@@ -314,9 +212,9 @@ impl<T: Real> PositionLoop<T> {
         self.speed.reset();
         self.mode = Mode::Speed;
         (self.counts, self.rate, self.goal) = (T::ZERO, T::ZERO, T::ZERO);
-        (self.own, self.still) = (T::ZERO, 0);
+        (self.own, self.u, self.still, self.untold) = (T::ZERO, T::ZERO, 0, 0);
         (self.path, self.places) = (Ring::filled(T::ZERO), Ring::filled(T::ZERO));
-        self.fastest = self.design.speed;
+        self.planned(self.design.rates, self.design.speed);
     }
 
     /// From the reference and the counts `moved` since the last sample to the command. The reference is a speed \[y\], after
@@ -341,18 +239,21 @@ impl<T: Real> PositionLoop<T> {
                 return u;
             }
             Mode::Goals => reference,
-            Mode::Stop(goal) => goal,
+            Mode::Stop(_) => self.goal,
         };
-        let begins_again = self.speed.is_manual() && goal != self.goal;
+        let goal = self.within_reach(goal);
+        let begins_again = self.speed.is_manual() && (goal != self.goal || !self.stands());
         if begins_again {
             // the shaft may have been turned by hand
             self.shift();
         }
-        self.advance(goal);
-        let samples = self.design.smoothing;
-        let (newest, oldest) = (self.path.at(0), self.path.at(samples));
-        let speed = (newest - oldest) / (T::from_count(samples) * self.per_sample);
-        self.places.push(self.mean());
+        // what was missed is made up for sample by sample
+        if self.untold > 0 {
+            let sooner = self.profile(goal);
+            self.speed.refer(sooner);
+            self.untold -= 1;
+        }
+        let speed = self.profile(goal);
         let error = self.place() - self.counts;
         let (one, stands) = (T::ONE, self.stands());
         let near = error <= one && error >= -one;
@@ -369,6 +270,7 @@ impl<T: Real> PositionLoop<T> {
             // its integral term is now that of a command of 0 here
             self.speed.set_automatic();
         }
+        self.u = u;
         u
     }
 
@@ -378,82 +280,8 @@ impl<T: Real> PositionLoop<T> {
         self.take_over();
         self.goal = self.path.at(0);
         self.own = self.rate;
-        self.fastest = self.design.speed;
+        self.planned(self.design.rates, self.design.speed);
         self.mode = Mode::Goals;
-    }
-
-    /// From the next sample on it goes to a place that differs from `angle` by whole `turn`s, both in counts, and stays there; returns the count.
-    ///
-    /// Moving `onward` it is the first one that is reached without turning back, at no more than the present speed unless that is
-    /// lost within a sample;
-    /// otherwise the one that is nearest to where the shaft can be at rest first. From rest it goes forwards, or the shorter way.
-    ///
-    /// # Errors
-    /// An angle or a turn that is not finite, a turn that is not above 0, a present speed above [`PositionDesign::speed`].
-    pub fn stop(&mut self, angle: T, turn: T, onward: bool) -> Result<T, Refused> {
-        let rate = self.rate;
-        let fast = if rate < T::ZERO { -rate } else { rate };
-        Refused::unless(angle.is_finite(), "angle", "a finite angle", angle.to_f64())?;
-        Refused::unless(
-            turn > T::ZERO && turn.is_finite(),
-            "turn",
-            "counts of a turn above 0",
-            turn.to_f64(),
-        )?;
-        Refused::unless(
-            fast <= self.design.speed,
-            "speed",
-            "a speed within the position loop's",
-            fast.to_f64(),
-        )?;
-        self.take_over();
-        let half = T::ONE / (T::ONE + T::ONE);
-        let ts = self.speed.settings().ts;
-        // the speed falls from the next sample on
-        let way = self.design.rates.way(fast) - half * fast * ts;
-        let braked = if way > T::ZERO { way } else { T::ZERO };
-        let creeps = if fast > self.design.creep {
-            self.design.crept()
-        } else {
-            T::ZERO
-        };
-        let way = (braked + creeps) * self.design.counts_per_unit;
-        let (forwards, from) = (rate >= T::ZERO, self.path.at(0));
-        let earliest = if forwards { from + way } else { from - way };
-        let turns = (earliest - angle) / turn;
-        let whole = if !onward {
-            (turns + half).floor()
-        } else if forwards {
-            // a shaft that stands within a count of the angle stays
-            let near = if fast > T::ZERO {
-                T::ZERO
-            } else {
-                T::ONE / turn
-            };
-            -(near - turns).floor()
-        } else {
-            turns.floor()
-        };
-        // whole counts can be met exactly, and the nearest one may be too near
-        let rounded = |whole: T| (angle + whole * turn + half).floor();
-        let goal = rounded(whole);
-        let goal = if onward && forwards && fast > T::ZERO && goal < earliest {
-            rounded(whole + T::ONE)
-        } else if onward && !forwards && goal > earliest {
-            rounded(whole - T::ONE)
-        } else {
-            goal
-        };
-        (self.goal, self.own) = (goal, T::ZERO);
-        // what the drive loses within a sample is rest: at that speed a turn could take minutes
-        let (row, _) = self.design.rates.at(fast);
-        self.fastest = if fast > row.down * ts && onward {
-            fast
-        } else {
-            self.design.speed
-        };
-        self.mode = Mode::Stop(goal);
-        Ok(goal)
     }
 
     /// The profile goes on from the reference of the speed loop, whose position is now that of the counts.
@@ -472,18 +300,36 @@ impl<T: Real> PositionLoop<T> {
 
     /// Moves the profile to where the counts are.
     fn shift(&mut self) {
-        let shift = self.counts - self.place();
+        self.move_by(self.counts - self.place());
+    }
+
+    fn move_by(&mut self, shift: T) {
         for place in self.path.kept.iter_mut().chain(&mut self.places.kept) {
             *place += shift;
         }
+    }
+
+    /// The profile one sample on towards a goal; its speed \[y\].
+    fn profile(&mut self, goal: T) -> T {
+        if self.unplanned > 0 {
+            self.path
+                .push(self.path.at(0) + self.rate * self.per_sample);
+        } else if self.arrives(goal) {
+            (self.path, self.rate, self.own) = (Ring::filled(goal), T::ZERO, T::ZERO);
+        } else {
+            self.advance(goal);
+        }
+        let samples = self.design.smoothing;
+        let (newest, oldest) = (self.path.at(0), self.path.at(samples));
+        self.places.push(self.mean());
+        (newest - oldest) / (T::from_count(samples) * self.per_sample)
     }
 
     /// The position before the mean, one sample on towards a goal.
     fn advance(&mut self, goal: T) {
         let goal = if goal.is_finite() { goal } else { self.goal };
         let (ts, rate) = (self.speed.settings().ts, self.rate);
-        let size = |x: T| if x < T::ZERO { -x } else { x };
-        let (row, _) = self.design.rates.at(size(rate));
+        let (row, _) = self.rates.at(size(rate));
         let (up, down) = (row.up * ts, row.down * ts);
         // a goal that moves as the drive can is followed at its own speed, from its second sample on: before, it may be a step
         let (own, last) = ((goal - self.goal) / self.per_sample, self.own);
@@ -493,13 +339,13 @@ impl<T: Real> PositionLoop<T> {
         (self.goal, self.own) = (goal, own);
         let at = self.path.at(0);
         let left = (goal - at) / self.design.counts_per_unit - carried * ts;
-        let towards = self.design.towards(size(left), ts);
+        let towards = self.design.towards(&self.rates, size(left), ts);
         let wanted = carried + if left < T::ZERO { -towards } else { towards };
         let wanted = wanted.limit(-self.fastest, self.fastest);
         // on its way to a goal the speed may fall by the rate of the row below, and by an eighth more just before it, where the
         // last samples do not divide the way evenly
         let brakes = size(wanted) <= size(rate) && wanted * rate >= T::ZERO;
-        let (next, _) = self.design.rates.at(size(wanted));
+        let (next, _) = self.rates.at(size(wanted));
         let steeper = if next.down > row.down {
             next.down * ts
         } else {
@@ -534,11 +380,16 @@ impl<T: Real> PositionLoop<T> {
         self.goal + off / T::from_count(samples)
     }
 
+    /// The age of the position of this sample among those of the profile.
+    fn now(&self) -> usize {
+        self.speed.design().feedforward.preview() - self.untold
+    }
+
     /// The profile's position at this sample \[counts\]. The speed of a sample is the mean over it, and the speed loop takes it
     /// for that at its end, so the position is half a sample later.
     pub fn place(&self) -> T {
-        let preview = self.speed.design().feedforward.preview();
-        let (now, before) = (self.places.at(preview), self.places.at(preview + 1));
+        let now = self.now();
+        let (now, before) = (self.places.at(now), self.places.at(now + 1));
         now + (before - now) / (T::ONE + T::ONE)
     }
 

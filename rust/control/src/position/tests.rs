@@ -4,6 +4,8 @@ use std::vec::Vec;
 use super::*;
 use crate::{Design, Feedforward, Level, Settings, Standard};
 
+mod stops;
+
 const TS: f64 = 1e-3;
 const TURN: f64 = 1572.0;
 const PER: f64 = TURN / 60.0;
@@ -50,11 +52,12 @@ fn design(rates: Rates<f64>, smoothing: usize) -> PositionDesign<f64> {
     }
 }
 
-/// A motor with a time constant of 50 ms and an encoder.
+/// A motor with a time constant of 50 ms, if nothing else is said, and an encoder.
 struct Motor {
     y: f64,
     position: f64,
     before: f64,
+    lag: f64,
 }
 
 impl Motor {
@@ -63,6 +66,7 @@ impl Motor {
             y: 0.0,
             position: 0.0,
             before: 0.0,
+            lag: 0.05,
         }
     }
 
@@ -76,7 +80,7 @@ impl Motor {
         let held = self.y == 0.0 && u.abs() <= 0.3;
         let way = if self.y == 0.0 { u } else { self.y };
         let drive = if held { 0.0 } else { u - 0.3_f64.copysign(way) };
-        let y = self.y + TS * (490.0 * drive - self.y) / 0.05;
+        let y = self.y + TS * (490.0 * drive - self.y) / self.lag;
         let y = if y * self.y < 0.0 { 0.0 } else { y };
         self.position += TS * 0.5 * (self.y + y);
         self.y = y;
@@ -221,6 +225,30 @@ fn the_last_counts_are_passed_slowly() {
 }
 
 #[test]
+fn a_landing_ends_where_the_counts_meet_the_goal() {
+    let slow = PositionDesign {
+        landing: 20.0,
+        ..design(rates(&[(0.0, 2e4, 2e4)]), 4)
+    };
+    // samples until the profile stands if the shaft leads by so many counts
+    let lands = |lead: f64| {
+        let mut law = PositionLoop::new(slow, speed_loop()).unwrap();
+        law.follow();
+        for k in 0..3000 {
+            let at = Real::floor(law.place() + lead + 0.5);
+            law.step(3000.0, at - law.counts());
+            if law.stands() {
+                return k;
+            }
+        }
+        panic!("it does not land");
+    };
+    // 2 counts at 20 RPM are 4 samples; a lead that friction does not hold dies away first
+    let [exact, led, far] = [0.0, 2.0, 4.0].map(lands);
+    assert!(led + 4 <= exact && far > led, "{exact} {led} {far}");
+}
+
+#[test]
 fn a_motor_goes_to_a_goal_stops_at_an_angle_and_stands() {
     let bounded = design(rates(&[(0.0, 3e4, 3e4)]), 8);
     let mut law = PositionLoop::new(bounded, speed_loop()).unwrap();
@@ -287,6 +315,44 @@ fn at_rest_it_lets_go_if_asked() {
     );
     law.reset();
     assert_eq!((law.counts(), law.stands()), (0.0, false));
+}
+
+#[test]
+fn a_shaft_that_was_let_go_stops_again() {
+    let releasing = PositionDesign {
+        releases: true,
+        ..design(rates(&[(0.0, 3e4, 3e4)]), 8)
+    };
+    let mut law = PositionLoop::new(releasing, speed_loop()).unwrap();
+    let mut motor = Motor::new();
+    let stopped = |law: &mut PositionLoop<f64>, motor: &mut Motor, angle: f64| {
+        let goal = law.stop(angle, TURN, false).unwrap();
+        let first = law.step(0.0, motor.moved());
+        motor.advance(first);
+        let mut last = first;
+        for _ in 0..2000 {
+            last = law.step(0.0, motor.moved());
+            motor.advance(last);
+        }
+        assert_eq!(last, 0.0, "let go");
+        assert!(
+            (motor.before - goal).abs() <= 1.0,
+            "{} {goal}",
+            motor.before
+        );
+        // it begins without a jump
+        assert!(first.abs() < 1.0, "{first}");
+    };
+    stopped(&mut law, &mut motor, 100.0);
+    stopped(&mut law, &mut motor, 500.0);
+    // somebody turns the shaft, and it is asked for the same angle again
+    for _ in 0..100 {
+        motor.position += 2.0 / PER;
+        assert_eq!(law.step(0.0, motor.moved()), 0.0);
+    }
+    stopped(&mut law, &mut motor, 500.0);
+    // where it is already it may stay
+    stopped(&mut law, &mut motor, 500.0);
 }
 
 #[test]
