@@ -227,8 +227,9 @@ PATIENCE = 2
 """Number of orders without gain after which larger ones are skipped."""
 MISLED = 1.2
 """A model whose error exceeds a smaller one's by this factor is no start for a network."""
-ROUNDING = 1e-11
-"""Error of a linear model, relative to the largest output, that is only rounding."""
+ROUNDING = 1e-9
+"""Error of a linear model, relative to the largest output, that is only rounding: that of a fit's
+differences, on a grid of 2^-30 of their span."""
 INTEGRATING_POLE = 0.9995
 """Real pole of the linear models above which an integrator is tried."""
 ENDLESS_GAIN = 5.0

@@ -68,7 +68,10 @@ class Model(DynamicModel):
         known = self.training.get("rest")
         if known is None:
             return Rest((0.0,) * len(self.input_names), 0.0)
-        return Rest(tuple(map(float, known["u"])), float(known["y"]), str(known.get("source", "")))
+        return Rest(
+            tuple(map(float, known["u"])), float(known["y"]), str(known.get("source", "")),
+            bool(known.get("near_zero", False)),
+        )  # fmt: skip
 
     @property
     def noise(self) -> float:
