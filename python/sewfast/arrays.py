@@ -58,6 +58,25 @@ def in_unit(number: str, unit: str) -> str:
 FloatArray: TypeAlias = NDArray[np.float64]
 
 
+def on_grid(values: ArrayLike, span: float, bits: int = 24) -> FloatArray:
+    """Deviations from a level, rounded to so many bits of a span.
+    Beside a level, numbers lose their last digits, and a search may end elsewhere by one of them:
+    on a grid the same deviations are the same bits at every level.
+    """
+    found = np.asarray(values, dtype=np.float64)
+    if not 0.0 < span < math.inf:
+        return found
+    step = math.ldexp(1.0, math.frexp(span)[1] - bits)
+    return found if step == 0.0 else np.round(found / step) * step
+
+
+def deviations(values: FloatArray, level: float) -> FloatArray:
+    """Values as deviations from a level, on a grid of their span; at a level of 0 as they are."""
+    if level == 0.0 or not len(values):
+        return values
+    return on_grid(values - level, float(np.ptp(values)))
+
+
 def is_whole(value: object) -> TypeGuard[int]:
     """Whether a value is a whole number of Python or NumPy; True and False are none."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)

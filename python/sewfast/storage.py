@@ -459,6 +459,7 @@ _TYPES: Mapping[str, tuple[str, tuple[type, ...]]] = {
     "string": ("text", (str,)),
     "array": ("a list", (list, tuple)),
     "object": ("an object", (dict,)),
+    "boolean": ("true or false", (bool,)),
     "null": ("null", (type(None),)),
 }
 """Types of a JSON schema, in words and as Python has them."""

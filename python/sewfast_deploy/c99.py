@@ -25,6 +25,7 @@ from sewfast.dataset import FloatArray
 from sewfast.errors import SettingError
 from sewfast.gains import Gains
 from sewfast.models import Model
+from sewfast.models.base import Combine, kept
 
 from .precision import (
     Lead,
@@ -257,7 +258,7 @@ def _model_source(
     code: Code,
     members: list[Model],
     embedded: list[_core.EmbeddedModel],
-    combined: str,
+    combined: Combine,
     about: list[str],
 ) -> str:
     prefixes = _prefixes(code, embedded)
@@ -326,7 +327,7 @@ def _whole(
     prefixes: list[str],
     members: list[Model],
     embedded: list[_core.EmbeddedModel],
-    combined: str,
+    combined: Combine,
 ) -> str:
     """The public functions, which run all members and combine their outputs."""
     count = len(prefixes)
@@ -342,9 +343,11 @@ def _whole(
     else:
         runs = "".join(f"    y[{i}] = {s};\n" for i, s in enumerate(steps))
         step = f"    @_real y[{count}];\n{runs}    return @_combined(y);\n"
-        half = count // 2
-        middle = f"y[{half}]" if count % 2 else f"R(0.5) * (y[{half - 1}] + y[{half}])"
-        combine = code.template(f"{combined}.c", COUNT=str(count), MIDDLE=middle)
+        middle = range(*kept(combined, count))
+        total = " + ".join(f"y[{i}]" for i in middle)
+        mean = f"({total}) / R({len(middle)}.0)" if len(middle) > 1 else total
+        template = "mean.c" if combined == "mean" else "median.c"
+        combine = code.template(template, COUNT=str(count), NAME=combined, MIDDLE=mean)
     states, held = at_rest(members)
     rest, before = (code.literals(v, " " * 8) for v in (np.concatenate(states), held))
     return combine + code.template("model.c", BEGINS=begins, REST=rest, HELD=before, STEP=step)
@@ -355,7 +358,7 @@ def _model_test(
     code: Code,
     members: list[Model],
     embedded: list[_core.EmbeddedModel],
-    combined: str,
+    combined: Combine,
 ) -> str:
     u = excitation(model, _VECTORS)
     if code.single:

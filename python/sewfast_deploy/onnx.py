@@ -17,6 +17,7 @@ from sewfast.control import Controller
 from sewfast.dataset import FloatArray
 from sewfast.errors import SettingError, not_installed
 from sewfast.models import Model
+from sewfast.models.base import kept
 
 from .precision import at_rest, embedded_members
 
@@ -281,13 +282,12 @@ def _combined(g: _Graph, outputs: list[str], combined: str) -> str:
     together = g.joined(outputs)
     if combined == "mean":
         return g.node("ReduceMean", together, axes=[1], keepdims=1)
-    n = len(outputs)
     ordered = g.name()
-    count = g.constant([n], integer=True)
+    count = g.constant([len(outputs)], integer=True)
     g.nodes.append(
         g.onnx.helper.make_node("TopK", [together, count], [ordered, g.name()], axis=1, largest=0)
     )
-    middle = g.columns(ordered, (n - 1) // 2, n // 2 + 1)
+    middle = g.columns(ordered, *kept(combined, len(outputs)))
     return g.node("ReduceMean", middle, axes=[1], keepdims=1)
 
 

@@ -18,6 +18,7 @@ from sewfast.control import Controller
 from sewfast.dataset import FloatArray
 from sewfast.errors import FitError, SettingError
 from sewfast.models import Ensemble, Model
+from sewfast.models.base import Combine, EnsembleCore, kept
 from sewfast.validation import doubling, largest_pole
 
 MOST_LOSS = 0.01
@@ -32,7 +33,7 @@ _MOST_MEMBERS = 64
 
 def embedded_members(
     model: Model, precision: str
-) -> tuple[list[Model], list[_core.EmbeddedModel], str]:
+) -> tuple[list[Model], list[_core.EmbeddedModel], Combine]:
     """A model's members, their steps (a network's in scaled units), how outputs combine."""
     members = list(model.members) if isinstance(model, Ensemble) else [model]
     if len(members) > _MOST_MEMBERS:
@@ -70,7 +71,7 @@ def at_rest(members: list[Model]) -> tuple[list[FloatArray], FloatArray]:
 def combined_run(
     members: list[Model],
     embedded: list[_core.EmbeddedModel],
-    combined: str,
+    combined: Combine,
     u: FloatArray,
     precision: str,
 ) -> FloatArray:
@@ -81,24 +82,18 @@ def combined_run(
         for state, e in zip(states, embedded, strict=True)
     ]
     if precision == "f64":
-        stacked = np.array(runs)
-        return np.asarray(
-            np.median(stacked, axis=0) if combined == "median" else np.mean(stacked, axis=0)
-        )
+        return EnsembleCore((), combined).combined(np.array(runs))
     single = np.array(runs, dtype=np.float32)
-    ordered = np.sort(single, axis=0)
-    n, half = len(runs), np.float32(0.5)
-    if combined == "median":
-        middle = half * (ordered[(n - 1) // 2] + ordered[n // 2])
-        return np.asarray(ordered[n // 2] if n % 2 else middle, dtype=np.float64)
+    if combined != "mean":
+        single = np.sort(single, axis=0)[slice(*kept(combined, len(runs)))]
     total = np.zeros(single.shape[1], dtype=np.float32)
     for run in single:
         total = total + run
-    return np.asarray(total / np.float32(n), dtype=np.float64)
+    return np.asarray(total / np.float32(len(single)), dtype=np.float64)
 
 
 def model_loss(
-    model: Model, members: list[Model], embedded: list[_core.EmbeddedModel], combined: str
+    model: Model, members: list[Model], embedded: list[_core.EmbeddedModel], combined: Combine
 ) -> str:
     """A note on the loss of single precision; `SettingError` if it is more than `MOST_LOSS`."""
     _, exact, _ = embedded_members(model, "f64")

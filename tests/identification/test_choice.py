@@ -401,7 +401,7 @@ def test_a_record_that_nothing_can_be_held_out_of_is_not_praised() -> None:
     data = linear_data(75)
     own = identify(data, model="oe").training["verdict"]
     assert own["grade"] == "fair"
-    assert "nothing of the record was held out" in own["text"]
+    assert "judged by no data but those that it was fitted to" in own["text"]
     longer = identify(linear_data(100), model="oe").training["verdict"]
     assert (longer["grade"], "of data not trained on" in longer["text"]) == ("good", True)
 
@@ -425,7 +425,7 @@ def test_a_network_that_nothing_was_held_out_of_is_fair_at_best() -> None:
     options: dict[str, Any] = {"model": "neural_oe", "starts": 2, "iterations": 20}
     own = identify(linear_data(800), select=False, **options).training["verdict"]
     assert own["grade"] == "fair"
-    assert "nothing of the record was held out" in own["text"]
+    assert "judged by no data but those that it was fitted to" in own["text"]
     assert own["next"][0] == "give validation data"
 
 

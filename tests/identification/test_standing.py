@@ -9,7 +9,7 @@ from effort import FULL
 from sewfast import Dataset, LinearOE, _core, identify
 from sewfast.arrays import FloatArray
 from sewfast.control import fit_fopdt
-from sewfast.dataset.standing import standing
+from sewfast.dataset.standing import Standing, standing
 
 
 def two_lags(k: FloatArray, slow: float, fast: float) -> FloatArray:
@@ -63,13 +63,17 @@ def test_only_outputs_that_stand_still_are_a_rest() -> None:
     u = np.repeat([0.0, 1.0], [50, 150])
     noise = 0.01 * np.random.default_rng(1).standard_normal(200)
 
-    def found(y: FloatArray) -> float | None:
-        at_rest = standing(Dataset.from_arrays(u, y, Ts=1.0).experiments[0])
-        return None if at_rest is None else at_rest.y
+    def found(y: FloatArray) -> Standing | None:
+        return standing(Dataset.from_arrays(u, y, Ts=1.0).experiments[0])
 
     response = two_lags(np.arange(200.0) - 50.0, 20.0, 5.0)
-    assert found(response + noise) == 0.0
-    assert found(response + noise + 22.0) == pytest.approx(22.0, abs=0.01)
+    here, there = found(response + noise), found(response + noise + 22.0)
+    assert here is not None
+    assert there is not None
+    # the mean at every level; beside it, whether noise explains what differs from zero
+    assert (here.near_zero, there.near_zero) == (True, False)
+    assert here.y == pytest.approx(0.0, abs=0.01)
+    assert there.y == pytest.approx(here.y + 22.0, abs=1e-12)
     # an output that still cools down is at no rest
     assert found(response + noise + np.exp(-np.arange(200.0) / 40.0)) is None
     # and neither is a record that never moves, or moves at once

@@ -11,6 +11,7 @@ import pytest
 
 from plants import bent_data, linear_data
 from sewfast import _core
+from sewfast.arrays import FloatArray
 from sewfast.control.loop import run
 from sewfast.dataset import Dataset
 from sewfast.dynamic_model import DynamicModel
@@ -45,9 +46,39 @@ def test_a_member_is_linearised_in_the_middle_of_the_ensembles_inputs(tmp_path: 
 # --- a model like any other -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("combine", "reduce"), [("median", np.median), ("mean", np.mean)])
+def midmean(runs: FloatArray, axis: int) -> FloatArray:
+    """Of 5 to 7 members: the mean without the two least and the two largest."""
+    found: FloatArray = np.sort(runs, axis=axis)[2:-2].mean(axis=axis)
+    return found
+
+
+@pytest.mark.parametrize("combine", ["median", "midmean"])
+@pytest.mark.parametrize("count", range(1, 5))
+def test_a_midmean_of_four_is_their_median(combine: Any, count: int) -> None:
+    data = bent_data(40)
+    lags = [lag(g, p) for g, p in ((1.0, 0.5), (2.0, 0.7), (9.0, 0.5), (4.0, 0.6))[:count]]
+    expected = Ensemble.of(lags, "median").simulate(data)[0]
+    np.testing.assert_array_equal(Ensemble.of(lags, combine).simulate(data)[0], expected)
+
+
+def test_a_midmean_follows_both_of_two_groups_and_no_quarter_that_goes_astray() -> None:
+    u, few, many = np.ones(200), [lag(1.0)] * 7, [lag(2.0)] * 8
+    for combine, expected in (("median", 2.0), ("midmean", 11.0 / 7.0)):
+        found = Ensemble.of([*few, *many], combine).simulate(u)[-1]
+        assert found == pytest.approx(expected * lag(1.0).dc_gain[0])
+    # the median of these jumps if one member changes sides
+    other = Ensemble.of([*few, *many[1:], lag(1.0)], "midmean").simulate(u)[-1]
+    assert other == pytest.approx(10.0 / 7.0 * lag(1.0).dc_gain[0])
+    astray = [lag(1.0)] * 11 + [lag(50.0)] * 4
+    assert Ensemble.of(astray, "midmean").simulate(u)[-1] == pytest.approx(lag(1.0).dc_gain[0])
+
+
+@pytest.mark.parametrize(
+    ("combine", "reduce"), [("median", np.median), ("mean", np.mean), ("midmean", midmean)]
+)
 def test_runs_are_combined_sample_by_sample(combine: Any, reduce: Any) -> None:
-    model, data = three(combine), bent_data(60)
+    lags = [lag(g, p) for g, p in ((1.0, 0.5), (2.0, 0.7), (9.0, 0.5), (4.0, 0.6), (3.0, 0.8))]
+    model, data = Ensemble.of(lags, combine), bent_data(60)
     for free in (lambda m: m.simulate(data), lambda m: m.predict(data, 2)):
         each = np.array([free(m)[0] for m in model.members])
         np.testing.assert_array_equal(free(model)[0], reduce(each, axis=0))
@@ -67,7 +98,7 @@ def test_it_validates_and_tells_its_members() -> None:
     assert "median of 3 x Linear output error" in str(model)
 
 
-@pytest.mark.parametrize("combine", ["median", "mean"])
+@pytest.mark.parametrize("combine", ["median", "mean", "midmean"])
 def test_its_jacobian_is_the_derivative_of_its_run(combine: Any) -> None:
     poles, gains = (0.5, 0.7, 0.6), (1.0, 2.0, 1.5)
     u, state = bent_data(30).experiments[0].u, np.array([0.1, 0.2, 0.3])
@@ -100,7 +131,7 @@ def test_what_is_no_ensemble_is_refused() -> None:
         Ensemble.of([])
     with pytest.raises(SettingError, match="received Ensemble"):
         Ensemble.of([three()])
-    with pytest.raises(SettingError, match="median or mean"):
+    with pytest.raises(SettingError, match="midmean, median, mean"):
         three("mode")
     other = LinearOE(lag(1.0).core, 0.02, ("u",), "y", ("V",), "RPM")
     with pytest.raises(SettingError, match="models of one plant"):

@@ -11,6 +11,7 @@ import numpy as np
 
 from sewfast import ARX, IV, Dataset, Ensemble, LinearOE, Model, NeuralOE, NeuralSS, _core
 from sewfast.evidence import with_training_evidence
+from sewfast.models.base import Combine
 from sewfast.models.grey_box import NAMES, GreyBox
 from sewfast.models.hammerstein import HammersteinWiener
 
@@ -157,7 +158,7 @@ def _neural_ss(
     return _wrapped(NeuralSS, core, inputs, weight_decay=1e-4)
 
 
-def _ensemble(*members: Model, combine: Literal["median", "mean"] = "median") -> Ensemble:
+def _ensemble(*members: Model, combine: Combine = "median") -> Ensemble:
     """As `identify` gives one: the range of the inputs is stored with the ensemble alone."""
     single = [type(m)(*(getattr(m, f) for f in _FIELDS)) for m in members]
     return Ensemble.of(single, combine, dict(members[0].training))
@@ -212,6 +213,11 @@ CASES: dict[str, Case] = {
     ),
     "ensemble of oe, mean": Case(
         lambda: _ensemble(_linear(LinearOE), _linear(LinearOE, pole=0.78, na=1), combine="mean")
+    ),
+    "ensemble of oe, midmean": Case(
+        lambda: _ensemble(
+            *(_linear(LinearOE, pole=0.70 + 0.03 * i) for i in range(7)), combine="midmean"
+        )
     ),
     "ensemble of integrators": Case(
         lambda: _ensemble(

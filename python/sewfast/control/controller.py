@@ -110,7 +110,7 @@ class SampledController(storage.Stored, Shown):
         """
         if rest.is_zero:
             return self
-        if getattr(self, "schedule", ()) and rest.y != 0.0:
+        if getattr(self, "schedule", ()) and rest.y != 0.0 and not rest.near_zero:
             raise SettingError(
                 name="schedule", expected="constant gains for a plant that does not rest at 0",
                 received=f"a schedule over the output, with a rest at {rest.y:g}",

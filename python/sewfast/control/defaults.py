@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from .. import _core, signals
+from ..arrays import on_grid
 from ..dataset import FloatArray
 from ..errors import DataError, FitError, SettingError
 from ..evidence.operating import INTEGRATES, integrating_pole
@@ -155,11 +156,12 @@ def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
     for u, at in _steps(size):
         try:
             y = _from_rest(model, u)
-            fopdt = fit_fopdt(u + about.u[0], y, Ts=model.Ts)
+            fopdt = fit_fopdt(u, y, Ts=model.Ts)
         except (DataError, FitError) as error:
             reason = error
             continue
-        return DriveStep(fopdt, float(y[at - 1]), _slowest(fopdt, y[at:], model.Ts))
+        slowest = _slowest(fopdt, y[at:], model.Ts)
+        return DriveStep(_raised(fopdt, about.u[0], about.y), float(y[at - 1]) + about.y, slowest)
     raise FitError(
         name="model", expected="one whose step response settles",
         received=f"none up to u = {about.u[0] + 0.5 * size:g} ({reason})",
@@ -183,11 +185,12 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
         try:
             # exclude the decay of a pole slightly below 1 from the rate
             rate = (y[1:] - y[0] - pole * (y[:-1] - y[0])) / model.Ts
-            fopdt = fit_fopdt(u[1:] + model.rest.u[0], rate, Ts=model.Ts)
+            fopdt = fit_fopdt(u[1:], rate, Ts=model.Ts)
         except (DataError, FitError) as error:
             reason = error
             continue
-        return DriveStep(fopdt, float(y[0]), fopdt.T)
+        fopdt = _raised(fopdt, model.rest.u[0], 0.0)
+        return DriveStep(fopdt, float(y[0]) + model.rest.y, fopdt.T)
     raise FitError(
         name="model", expected="one that integrates its input and whose rate settles after a step",
         received=f"{reason}", remedy="give a controller to start from",
@@ -196,8 +199,17 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
 
 def _largest_step(model: Model, u_min: float, u_max: float) -> float:
     """The larger of the two changes of the command from rest to its limits [u]."""
-    up, down = u_max - model.rest.u[0], u_min - model.rest.u[0]
+    up, down = _room(model, u_min, u_max)
     return up if up >= -down else down
+
+
+def _room(model: Model, u_min: float, u_max: float) -> tuple[float, float]:
+    """The changes of the command from rest to its upper and its lower limit [u]."""
+    if model.rest.is_zero:
+        return u_max, u_min
+    rest = model.rest.u[0]
+    up, down = on_grid([u_max - rest, u_min - rest], u_max - u_min, bits=34)
+    return float(up), float(down)
 
 
 def _known_step(model: Model, u_min: float, u_max: float) -> float:
@@ -206,13 +218,14 @@ def _known_step(model: Model, u_min: float, u_max: float) -> float:
     was recorded in one direction has any sign in the other.
     """
     size = _largest_step(model, u_min, u_max)
-    up, down = u_max - model.rest.u[0], u_min - model.rest.u[0]
+    up, down = _room(model, u_min, u_max)
     other = down if size == up else up
     known = recorded_outputs(model)
     if not (math.isfinite(size) and math.isfinite(other)) or size * other >= 0.0 or known is None:
         return size
     (ours, theirs), margin = _moved(model, (size, other)), 0.1 * (known[1] - known[0])
-    inside = [known[0] - margin <= model.rest.y + y <= known[1] + margin for y in (ours, theirs)]
+    low, high = known[0] - margin - model.rest.y, known[1] + margin - model.rest.y
+    inside = [low <= y <= high for y in (ours, theirs)]
     is_lost = inside == [False, True] or (ours * theirs > 0.0 and abs(theirs) > abs(ours))
     return other if is_lost else size
 
@@ -220,14 +233,24 @@ def _known_step(model: Model, u_min: float, u_max: float) -> float:
 def _moved(model: Model, sizes: Sequence[float]) -> tuple[float, ...]:
     """Changes of the output after the first of the steps of each size [y]."""
     first = [next(_steps(size))[0] for size in sizes]
-    return tuple(float(_from_rest(model, u)[-1]) - model.rest.y for u in first)
+    return tuple(float(_from_rest(model, u)[-1]) for u in first)
 
 
 def _from_rest(model: Model, u: FloatArray) -> FloatArray:
-    """The free run from rest under changes of the command [u], shape (N,)."""
+    """Changes of the output from rest in the free run under changes of the command [u], shape (N,).
+    Levels are added to what is found of them: beside one, numbers lose digits.
+    """
     core = model.about_rest
-    y: FloatArray = core.simulate(u[:, None], core.rest_state()) + model.rest.y
+    y: FloatArray = core.simulate(u[:, None], core.rest_state())
     return y
+
+
+def _raised(fopdt: Fopdt, u: float, y: float) -> Fopdt:
+    """What was fitted to deviations from a level of command and output, of the values."""
+    return replace(
+        fopdt, u_low=fopdt.u_low + u, u_high=fopdt.u_high + u,
+        offset=fopdt.offset + y - fopdt.K * u,
+    )  # fmt: skip
 
 
 def _steps(size: float) -> Iterator[tuple[FloatArray, int]]:
@@ -293,7 +316,7 @@ def catalogue_fits(model: Any, u_min: float, u_max: float, unit: str) -> bool:
     known = _output_range(model) if isinstance(model, Model) else None
     if known is None:
         return True
-    if not model.rest.is_zero:
+    if not model.rest.is_standstill:
         return False  # the catalogue begins at a standstill
     try:
         fopdt = drive_step(model, u_min, u_max).fopdt
@@ -500,7 +523,7 @@ def _shapes(span: _Span, Ts: float, seed: int) -> dict[str, FloatArray]:
     holds = 0.25 * pace * wider, 0.9 * pace * wider
     usual = 10.0 * pace * wider
     least = _EDGES * 0.5 * sum(holds)
-    return {
+    made = {
         "trapezoid": drawn(
             [
                 (0.1 * pace, span.rest), (first, span.top), (0.6 * pace, span.top),
@@ -516,6 +539,10 @@ def _shapes(span: _Span, Ts: float, seed: int) -> dict[str, FloatArray]:
         ),
         "trapezoids": drawn(steps),
     }  # fmt: skip
+    if span.rest == 0.0:
+        return made
+    # on the grid on which a search has them
+    return {n: span.rest + on_grid(r - span.rest, float(np.ptp(r))) for n, r in made.items()}
 
 
 def default_references(

@@ -154,7 +154,7 @@ class PositionController(SampledController):
         SettingError
             For a plant that does not stand at rest: its position would move on.
         """
-        if rest.y != 0.0:
+        if rest.y != 0.0 and not rest.near_zero:
             raise SettingError(
                 name="plant", expected="one whose speed is 0 at rest", received=f"{rest.y:g}",
                 remedy="a position loop needs a drive that stands without a command",

@@ -21,15 +21,16 @@ SIGMAS = 3.0
 @dataclass(frozen=True)
 class Standing:
     """The samples of an experiment before its inputs first move, if its output stood still.
-    `samples` is their number. `y` is the mean output; zero if the inputs are zero and noise
-    explains the difference. `scatter` is the standard deviation of the outputs, of the whole
-    record's white noise at least.
+    `samples` is their number, `y` the mean output; `near_zero` says that the inputs are zero and
+    noise explains the difference of `y` from zero. `scatter` is the standard deviation of the
+    outputs, of the whole record's white noise at least.
     """
 
     samples: int
     u: tuple[float, ...]
     y: float
     scatter: float
+    near_zero: bool = False
 
 
 def standing(experiment: Experiment) -> Standing | None:
@@ -59,9 +60,8 @@ def standing(experiment: Experiment) -> Standing | None:
     u = tuple(float(v) for v in e.u[0])
     deviation = float(y.std(ddof=1))
     noise = deviation / math.sqrt(len(y))
-    if not any(u) and abs(level) <= _student(len(y) - 1) * noise + rounding * spread:
-        level = 0.0
-    return Standing(n, u, level, max(deviation, white))
+    near = abs(level) <= _student(len(y) - 1) * noise + rounding * spread
+    return Standing(n, u, level, max(deviation, white), near_zero=near and not any(u))
 
 
 def _student(freedom: int) -> float:

@@ -100,7 +100,7 @@ def identify(
         units if they are credibly better on held-out data). `neural_oe`: the lagged network,
         trained in free run from the linear output-error model. `neural_ss`: the state-space
         network. `auto`: one of `oe`, `neural_ss`, `neural_oe` and, for speeds, `grey_box`, by the
-        free-run error on held-out data; on little data the median of several models, an
+        free-run error on held-out data; on little data the midmean of several models, an
         `Ensemble`. A kind requested by name is always returned. A model is trained further on
         these data, in its own structure.
     preset : "paper" or None
@@ -380,7 +380,7 @@ def _verdict(model: Model, task: Task) -> Provenance:
         found["grade"] = "fair"
         measured = found["text"].partition(": ")[2]
         found["text"] = (
-            f"{TEXTS['fair']}: nothing of the record was held out to judge by; {measured}"
+            f"{TEXTS['fair']}: judged by no data but those that it was fitted to; {measured}"
         )
         found["next"] = ["give validation data", *what_to_record(data)]
     if is_linear and found["grade"] != "useless":

@@ -147,8 +147,6 @@ def linear_provenance(fit: _core.LinearFit) -> Provenance:
 
 UNSEEN = 3.0
 """Time constants of more than this many times the longest experiment are trends, not dynamics."""
-EARLIER = 0.7
-"""Part of every experiment to fit to when two orders are compared on the rest."""
 
 
 def short(task: Task, reason: str) -> Model:
@@ -191,7 +189,9 @@ def _tried(data: Dataset, options: Mapping[str, Any]) -> _core.LinearFit | None:
 
 def _later(data: Dataset, options: Mapping[str, Any]) -> Errors:
     """Errors on the later part of a model of the earlier one; infinite if there is no model."""
-    pairs = [(e, round(EARLIER * len(e))) for e in data.experiments]
+    # part of every experiment to fit to; two orders are compared on the rest
+    earlier = 0.7
+    pairs = [(e, round(earlier * len(e))) for e in data.experiments]
     fitted = replace(data, experiments=tuple(e.cut(0, at) for e, at in pairs))
     held = tuple(with_run_up(e, at, len(e)) for e, at in pairs)
     part = Split(fitted, replace(data, experiments=held))
@@ -218,8 +218,6 @@ ORDERS, SMALL = (1, 2, 3, 4, 5, 6, 7, 8), 3
 """Orders that are tried, and the largest of them with a delay: large ones mimic it with poles."""
 DELAYS = (2, 3, 4, 5, 6)
 """Delays tried besides one sample, unless a delay is given."""
-SAMPLES_OF_DELAY = 2_000
-"""Samples by which a dead time is estimated."""
 SAMPLES = 6_000
 """Samples of a fit that is only used for a decision: blocks spread over the record."""
 ITERATIONS = 60
@@ -227,13 +225,11 @@ PATIENCE = 2
 """Number of orders without gain after which larger ones are skipped."""
 MISLED = 1.2
 """A model whose error exceeds a smaller one's by this factor is no start for a network."""
-ROUNDING = 1e-11
-"""Error of a linear model, relative to the largest output, that is only rounding."""
+ROUNDING = 1e-9
+"""Error of a linear model, relative to the largest output, that is only rounding: that of a fit's
+differences, on a grid of 2^-30 of their span."""
 INTEGRATING_POLE = 0.9995
 """Real pole of the linear models above which an integrator is tried."""
-ENDLESS_GAIN = 5.0
-"""Steady gain times the input's range, in widths of the output's range, of an integrating plant."""
-SPARE_POLES = (0.6, 0.8, 0.4, 0.9, 0.7, 0.5, 0.3)
 LEAST_GAIN = math.log(1.005)
 """Differences in error below half a per cent count as zero, however significant."""
 
@@ -324,7 +320,8 @@ class LinearTable:
         Large orders mimic a dead time with poles that the drive does not have. The estimate can be
         late by a sample.
         """
-        data = thinned(self.folds[0].fitted, SAMPLES_OF_DELAY)
+        # samples by which a dead time is estimated
+        data = thinned(self.folds[0].fitted, 2_000)
         try:
             found = delay(data, longest=reach(data)).nk
         except (DataError, FitError):
@@ -441,10 +438,12 @@ class LinearTable:
         low, high = data.output_range
         swing = np.ptp(np.concatenate([e.u for e in data.experiments]), axis=0)
         asked = [c.models[0] for c in (self.choice, self.best)]
+        # an integrator's steady gain takes the input's range beyond the output's
+        endless = 5.0 * (high - low)
         return all(
             m is not None
             and slowest_pole(m) > INTEGRATING_POLE
-            and float(np.abs(m.dc_gain() * swing).max()) > ENDLESS_GAIN * (high - low)
+            and float(np.abs(m.dc_gain() * swing).max()) > endless
             for m in asked
         )
 
@@ -492,7 +491,9 @@ def is_misled(model: _core.LinearModel, smaller: _core.LinearModel, part: Split)
 def raised(model: _core.LinearModel, order: int) -> _core.LinearModel:
     """The same behaviour in a larger order: further poles, each nearly cancelled by a zero."""
     a, b = np.concatenate([[1.0], model.a]), np.array(model.b)
-    for pole in SPARE_POLES[: order - model.na]:
+    # apart from each other and from 1
+    spare = (0.6, 0.8, 0.4, 0.9, 0.7, 0.5, 0.3)
+    for pole in spare[: order - model.na]:
         zero = pole - 0.02
         a = np.convolve(a, [1.0, -pole])
         # the same steady gain

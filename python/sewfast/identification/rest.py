@@ -54,7 +54,7 @@ def _standing(data: Dataset) -> Rest | None:
     if not levels:
         return None
     best = min(levels, key=lambda s: (math.hypot(*s.u), -s.samples))
-    return Rest(best.u, best.y, "standing samples")
+    return Rest(best.u, best.y, "standing samples", best.near_zero)
 
 
 def _equilibrium(model: Model, data: Dataset) -> Rest | None:

@@ -45,8 +45,6 @@ from .training import Request, Start, Structure, counting, guarded, train
 LIKELY, TRIED = 2, 4
 """Numbers of states that are tried with an output function, or another delay; and in any case,
 beside those of the best linear models."""
-MOST_HIDDEN = 32
-SAMPLES_PER_PARAMETER = 4
 DECAYS = (0.1, 10.0)
 """Weight decays in the beginning, times the number of samples: a prior of the weights, which counts
 the less the more data there are. With the smaller one only, the geometric mean of test errors is
@@ -59,8 +57,6 @@ ones of the better halves, and of each step of the climb."""
 WORK, CLIMBED = 1e11, 5e9
 """Multiplications of a stage, and of one structure in a step of the climb; a core does some 1.4e10
 per second. Training to the end pays on few samples, where it costs little."""
-FAR_BEHIND = 3.0
-"""Ratio to the best error above which a network is not trained further."""
 ROUNDS, LEAST_FURTHER, WORTH_A_STEP = 4, 40, 0.99
 """Steps of the climb, their iterations whatever the work, and the part below which each has to
 bring the error."""
@@ -117,7 +113,8 @@ class Table:
         alive = self._screened()
         for iterations in HALVINGS:
             half = sorted(alive, key=lambda r: r.rmse)[: max(2, (len(alive) + 1) // 2)]
-            going = [r for r in half if r.rmse <= FAR_BEHIND * half[0].rmse]
+            # what is far behind the best is not trained further
+            going = [r for r in half if r.rmse <= 3.0 * half[0].rmse]
             alive = self._further(going, iterations)
         if not self.is_hopeless:
             self._climb()
@@ -310,7 +307,8 @@ class Table:
         """Whether every fold has enough samples for the parameters; for the core, if asked for."""
         parameters = s.parameters(self.task.data.n_inputs)
         is_given = None not in (self.task.nx, self.task.hidden)
-        each = 1 if is_given else SAMPLES_PER_PARAMETER
+        # samples of each parameter
+        each = 1 if is_given else 4
         for part in self.folds:
             known = sum(len(e) - e.unmeasured for e in part.fitted.experiments)
             if known <= each * parameters + s.nx * len(part.fitted.experiments):
@@ -453,7 +451,8 @@ class Table:
         task = self.task
         factors = (0.1, 10.0) if is_first else ()
         found = [replace(s, decay=float(f"{s.decay * f:.0e}")) for f in factors]
-        if task.hidden is None and 2 * s.hidden <= MOST_HIDDEN:
+        # at most 32 hidden units
+        if task.hidden is None and 2 * s.hidden <= 32:
             found.append(replace(s, hidden=2 * s.hidden))
         if task.nx is None and s.nx < ORDERS[-1]:
             found.append(replace(s, nx=s.nx + 1))

@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -68,7 +68,10 @@ class Model(DynamicModel):
         known = self.training.get("rest")
         if known is None:
             return Rest((0.0,) * len(self.input_names), 0.0)
-        return Rest(tuple(map(float, known["u"])), float(known["y"]), str(known.get("source", "")))
+        return Rest(
+            tuple(map(float, known["u"])), float(known["y"]), str(known.get("source", "")),
+            bool(known.get("near_zero", False)),
+        )  # fmt: skip
 
     @property
     def noise(self) -> float:
@@ -236,18 +239,26 @@ class StructuredModel(SingleModel):
 # --- Ensemble: several models of one plant as one -------------------------------------------------
 
 
-Combine: TypeAlias = Literal["median", "mean"]
-COMBINATIONS: tuple[Combine, ...] = ("median", "mean")
+Combine: TypeAlias = Literal["midmean", "median", "mean"]
+COMBINATIONS: tuple[Combine, ...] = ("midmean", "median", "mean")
 MOST_MEMBERS = 1000
 _OF_ALL_MEMBERS = ("input_range", "output_range", "region", "rest", "noise", "verdict")
 """Entries that a file stores once for all members."""
 
 
+def kept(combine: str, count: int) -> tuple[int, int]:
+    """The outputs that are averaged of so many in their order: the first, and the one after the
+    last. A midmean leaves out a quarter at each end, and at least one value remains.
+    """
+    ends = {"mean": 0, "median": (count - 1) // 2, "midmean": min(-(-count // 4), (count - 1) // 2)}
+    return ends[combine], count - ends[combine]
+
+
 @dataclass(frozen=True, eq=False)
 class EnsembleCore:
     """The members' arithmetic; the state consists of the members' states in order.
-    A member that diverges on an input is left out of that run; the median of the others remains. If
-    fewer than half are left, a `FitError` is raised.
+    A member that diverges on an input is left out of that run; the others remain. If fewer than
+    half are left, a `FitError` is raised.
     """
 
     members: tuple[Core, ...]
@@ -262,39 +273,38 @@ class EnsembleCore:
         return np.concatenate([m.estimate_initial_state(u, y) for m in self.members])
 
     def simulate(self, u: FloatArray, state: FloatArray) -> FloatArray:
-        """Median or mean of the members' free runs, sample by sample, (N,)."""
-        return self._combined(self.simulations(u, state))
+        """The members' free runs combined sample by sample, (N,)."""
+        return self.combined(self.simulations(u, state))
 
     def simulations(self, u: FloatArray, state: FloatArray) -> FloatArray:
         """Free runs of the members that do not diverge on this input, (members, N)."""
         return self._runs(state, lambda m, x: m.simulate(u, x))
 
     def predict(self, u: FloatArray, y: FloatArray, state: FloatArray, horizon: int) -> FloatArray:
-        """Median or mean of the members' predictions, (N,)."""
-        return self._combined(self._runs(state, lambda m, x: m.predict(u, y, x, horizon)))
+        """The members' predictions combined sample by sample, (N,)."""
+        return self.combined(self._runs(state, lambda m, x: m.predict(u, y, x, horizon)))
 
     def jacobian(self, u: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The run and its derivatives with respect to all members' parameters and states.
-        Columns are member by member. The median has the derivative of the middle member or two.
+        Columns are member by member. A median has the derivative of the middle member or two.
         """
         found = [m.jacobian(u, x) for m, x in self._with_states(state)]
         runs = np.array([run for run, _ in found])
         weights = self._weights(runs)
         rows = [w[:, None] * rows for w, (_, rows) in zip(weights, found, strict=True)]
-        return self._combined(runs), np.hstack(rows)
+        return self.combined(runs), np.hstack(rows)
 
     def _weights(self, runs: FloatArray) -> FloatArray:
         """Weight of each member at each sample, (members, N)."""
-        n = len(runs)
-        if self.combine == "mean":
-            return np.full(runs.shape, 1.0 / n)
+        first, after = kept(self.combine, len(runs))
         rank = runs.argsort(axis=0, kind="stable").argsort(axis=0, kind="stable")
-        middle = (rank == (n - 1) // 2).astype(np.float64) + (rank == n // 2)
-        return cast(FloatArray, middle / 2.0)
+        return ((rank >= first) & (rank < after)) / np.float64(after - first)
 
-    def _combined(self, runs: FloatArray) -> FloatArray:
-        reduce = np.median if self.combine == "median" else np.mean
-        return np.asarray(reduce(runs, axis=0), dtype=np.float64)
+    def combined(self, runs: FloatArray) -> FloatArray:
+        if self.combine != "mean":
+            first, after = kept(self.combine, len(runs))
+            runs = np.sort(runs, axis=0)[first:after]
+        return np.asarray(np.mean(runs, axis=0), dtype=np.float64)
 
     def _runs(self, state: FloatArray, run: Callable[[Core, FloatArray], FloatArray]) -> FloatArray:
         found: list[FloatArray] = []
@@ -341,9 +351,10 @@ class Ensemble(Model):
         ----------
         members : sequence of Model
             With the same inputs, output and sample time; none of them an ensemble.
-        combine : {"median", "mean"}
-            How to combine the members' runs, sample by sample. A median ignores a few members that
-            go astray on a new input.
+        combine : {"median", "midmean", "mean"}
+            How to combine the members' runs, sample by sample. A median ignores members that go
+            astray on a new input, but follows the majority alone; a midmean, the mean without a
+            quarter at each end, ignores a quarter of them and is still a mean of the others.
         training : mapping, optional
             Provenance of the ensemble.
 
@@ -354,7 +365,8 @@ class Ensemble(Model):
         """
         _require_members(members)
         if combine not in COMBINATIONS:
-            raise SettingError(f"combine: expected median or mean, received {combine!r}")
+            expected = ", ".join(COMBINATIONS)
+            raise SettingError(f"combine: expected one of {expected}, received {combine!r}")
         first = members[0]
         core = _ModelsCore(tuple(m.core for m in members), combine, tuple(members))
         names = (first.input_names, first.output_name, first.input_units, first.output_unit)
@@ -371,7 +383,7 @@ class Ensemble(Model):
 
     @property
     def combine(self) -> Combine:
-        """`median` or `mean`."""
+        """`midmean`, `median` or `mean`."""
         return self.core.combine
 
     @property

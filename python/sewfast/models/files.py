@@ -93,7 +93,7 @@ def _ensemble(fields: Fields) -> Model:
     parameters.require_only(("combine", "members"))
     combine = next((c for c in COMBINATIONS if c == parameters.text("combine")), None)
     if combine is None:
-        raise parameters.refuse("combine", "median or mean", parameters.any("combine"))
+        raise parameters.refuse("combine", " or ".join(COMBINATIONS), parameters.any("combine"))
     listed = parameters.items("members")
     if not 1 <= len(listed) <= MOST_MEMBERS:
         raise parameters.refuse("members", f"1 to {MOST_MEMBERS} models", len(listed))

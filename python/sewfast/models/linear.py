@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import _core
-from ..dataset import FloatArray, labelled
+from ..arrays import FloatArray, labelled, on_grid
 from ..errors import SettingError
 from ..storage import Fields
 from ..units import duration
@@ -75,7 +75,9 @@ class LinearDifference(SingleModel):
         return {"b": (factor * self.core.b).tolist(), "offset": factor * self.core.offset}
 
     def with_zero_at(self, u: FloatArray, y: float) -> dict[str, Any]:
-        return {"offset": self.core.offset - offset_at(self.core, u, y)}
+        moved = self.core.offset - offset_at(self.core, u, y)
+        low, high = self.training.get("output_range", (0.0, 0.0))
+        return {"offset": float(on_grid(moved, high - low, bits=34))}
 
     @staticmethod
     def core_from(fields: Fields) -> _core.LinearModel:

@@ -192,7 +192,7 @@ def sound_speed_loop(task: TuningTask, result: TuningResult) -> Controller:
             received="a gain schedule" if isinstance(speed, Controller) else type(speed).__name__,
             remedy="leave out the kind of the controller, or its schedule",
         )  # fmt: skip
-    if task.rest.y != 0.0:
+    if task.rest.y != 0.0 and not task.rest.near_zero:
         raise SettingError(
             name="loop", expected="a speed that is 0 at rest", received=f"{task.rest.y:g}",
             remedy="a position loop needs a drive that stands without a command",

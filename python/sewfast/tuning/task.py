@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import _core
+from ..arrays import deviations, on_grid
 from ..control.controller import GAIN_NAMES, NOTCH_NAMES, Controller, SampledController
 from ..control.defaults import (
     beyond_record,
@@ -128,6 +129,15 @@ class TuningTask:
         """The task with the linear loops on which Ms is limited and looked at."""
         return replace(self, loops=linear_loops(self, time))
 
+    def _about(self, rest: Rest) -> SampledController:
+        """The start for deviations from rest, its limits on a grid as all deviations are."""
+        start = self.start.about(rest)
+        if rest.is_zero:
+            return start
+        limits = on_grid([start.u_min, start.u_max], start.u_max - start.u_min, bits=34)
+        changes = {"u_min": float(limits[0]), "u_max": float(limits[1])}
+        return replace(start, **changes)  # type: ignore[type-var]
+
     def core(self, names: Sequence[Wanted] | None = None, *, ms: bool = False) -> _core._Task:
         """The task for the core, with variables by name; `ms` if Ms is an objective."""
         asked = ms or self.constraints.limits_Ms
@@ -140,11 +150,14 @@ class TuningTask:
         rest = self.rest
         return {
             "plants": cores_about(rest, self.plants),
-            "references": [r - rest.y for r in self.references],
+            "references": [deviations(r, rest.y) for r in self.references],
             "disturbances": self.disturbances,
-            "noise": [noise_in_loop(self.start, p) for p in self.plants],
+            "noise": [
+                n if rest.is_zero else float(np.float32(n))
+                for n in (noise_in_loop(self.start, p) for p in self.plants)
+            ],
             "load_steps": [step.samples(self.start.Ts, rest.y) for step in self.loads],
-            "start": self.start.about(rest).core(),
+            "start": self._about(rest).core(),
             "counts_per_unit": self.start.counts_per_unit,
             "variations": self.variations,
             "variables": wanted(

@@ -1,4 +1,4 @@
-/* The median, by insertion. */
+/* The @NAME, by insertion. */
 static @_real @_combined(@_real *y)
 {
     int i, j;
