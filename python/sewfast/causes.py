@@ -145,19 +145,15 @@ def cause_among(
     if np.ptp(last.counts) == 0.0 and moved:
         return _idle(runs)
     look = _look(last, volt, speed)
-    recent: list[Recording] = []
     known: list[_Look] = []
     unseen: list[Cause] = []
-    # runs that are looked at, the last ones of a series: each takes some tenths of a second
-    for recording in moved[-12:]:
-        earlier = _look(recording, volt, speed)
-        if earlier is None:
-            continue
-        recent.append(recording)
+    looks = _looks(moved, volt, speed)
+    recent = [earlier.recording for earlier in looks]
+    for earlier in looks:
         # less may be left on a run that did not end the series
         if cause := earlier.change(0.25):
             unseen.append(cause)
-        elif earlier.found["error"] <= ALIKE * earlier.found["size"]:
+        elif earlier.is_alike:
             known.append(earlier)
     if look is not None:
         changes, own = [look.explanation()], look.always()
@@ -177,6 +173,28 @@ def cause_among(
         if own is not None:
             return own
     return unseen[0] if unseen else _between(recent, known, volt, speed)
+
+
+def cause_after(
+    sound: Sequence[Recording],
+    recording: Recording,
+    *,
+    volt: float = math.inf,
+    speed: float = math.inf,
+) -> Cause | None:
+    """The cause that came in a run after others in which the machine was sound. The run is compared
+    with those only: a motor that is fitted to a part of it alone could be any.
+    """
+    looks = _looks([r for r in sound if np.ptp(r.counts) > 0.0], volt, speed)
+    before = [earlier.recording for earlier in looks if earlier.is_alike]
+    return _Look.at(recording, before, volt, speed).change() if before else None
+
+
+def _looks(runs: Sequence[Recording], volt: float, speed: float) -> list[_Look]:
+    """Each run of a series looked at alone, if it is long enough."""
+    # the last ones of the series: each takes some tenths of a second
+    looks = [_look(recording, volt, speed) for recording in runs[-12:]]
+    return [look for look in looks if look is not None]
 
 
 def _between(
@@ -268,6 +286,11 @@ class _Look:
             counts_per_rev=recording.counts_per_rev, most=volt,
         )  # fmt: skip
         return cls(recording, found, volt, speed)
+
+    @property
+    def is_alike(self) -> bool:
+        """Whether its own motor explains the run well enough to be compared with."""
+        return bool(self.found["error"] <= ALIKE * self.found["size"])
 
     @property
     def name(self) -> str:

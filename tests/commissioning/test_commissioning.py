@@ -33,6 +33,7 @@ from sewfast import (
     Gains,
     Interrupted,
     LinearOE,
+    Recording,
     SettingError,
     VirtualMachine,
     _core,
@@ -43,11 +44,18 @@ from sewfast import (
     load_response,
     read_table,
 )
+from sewfast.causes import cause_after
 from sewfast.commissioning import STAGES, Refusal, gains, training, verification
-from sewfast.commissioning.bench import DriveBench, MachineBench, bench_of
+from sewfast.commissioning.bench import (
+    DriveBench,
+    MachineBench,
+    RecordedBench,
+    SteppedBench,
+    bench_of,
+)
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.gains import Requirements
-from sewfast.commissioning.positions import position_loop, unmet, verified_stops
+from sewfast.commissioning.positions import Unsuited, position_loop, telling, unmet, verified_stops
 from sewfast.errors import LinkError
 from sewfast.link import VirtualDevice, connect
 from sewfast.report import commissioned, report
@@ -284,10 +292,11 @@ def test_a_position_loop_stops_where_it_is_predicted(whole: Commissioning, tmp_p
     assert kept[-1] == stops
     assert unmet(stops) == ""
     assert all(s.measured is not None and s.measured.metrics()["passed"] < 0.5 for s in stops)
-    # a drive that brakes less than its models is not verified
-    weak = VirtualMachine(parameters={"inertia": 0.003})
+    # a drive that brakes less than its models is not verified, and makes no further stop
+    weak = VirtualMachine(parameters={"inertia": 0.004})
     missed = verified_stops(position.controller, MachineBench(weak), models, 2000.0, kept.append)
     assert "passed its goal" in unmet(missed)
+    assert [s.measured is None for s in missed] == [False, True, True]
     found = replace(whole, position=position, stops=stops)
     page = found.save(tmp_path / "positions").read_text()
     assert "Stops at an angle" in page
@@ -296,8 +305,64 @@ def test_a_position_loop_stops_where_it_is_predicted(whole: Commissioning, tmp_p
     law = load_controller(tmp_path / "positions/controllers/position.json")
     assert law == position.controller
     slow = replace(controller, Ts=1e-4, filter_samples=1, feedforward=None)
-    with pytest.raises(Refusal, match="slow drive"):
+    with pytest.raises(Unsuited, match="slow drive"):
         position_loop(slow, models, practice, cost, None, 1500.0)
+
+
+def test_a_missed_stop_has_the_cause_that_came_with_it(whole: Commissioning) -> None:
+    controller, models, cost = whole.controller, whole.models, whole.cost
+    assert isinstance(controller, Controller)
+    assert models is not None
+    assert cost is not None
+    practice = {c.reference: c.predicted.r for c in whole.comparisons}
+    law = position_loop(controller, models, practice, cost, None, 1500.0).controller
+
+    def stopped(machine: MachineBench | SteppedBench) -> tuple[list[Recording], list[bool]]:
+        bench = RecordedBench(machine, lambda *_: None, lambda *_: None, lambda *_: None)
+        stops = verified_stops(law, bench, models, 2000.0, lambda _: None)
+        found = telling(bench.runs, stops, law)
+        return found, [len(part) < len(run) for part, run in zip(found, bench.runs, strict=True)]
+
+    (*sound, last), landed = stopped(MachineBench(VirtualMachine()))
+    assert landed == [True, True, True], "what lands is left out"
+    sound = [whole.recordings["trapezoids"], whole.recordings["levels"], *sound]
+    limits = {"volt": 20.0, "speed": 3000.0}
+    assert cause_after(sound, last, **limits) is None
+    assert cause_after([], last, **limits) is None, "no earlier run to compare with"
+    heavy = VirtualMachine(parameters={"inertia": 0.006})
+    cause = cause_after(sound, stopped(MachineBench(heavy))[0][-1], **limits)
+    assert cause is not None
+    assert cause.name == "inertia"
+    assert cause.value == pytest.approx(3.0, rel=0.4)
+    (never,), landed = stopped(SteppedBench(Sticks(), 0.001, 1572.0, 20.0))
+    assert landed == [False]
+    cause = cause_after(sound, never, **limits)
+    assert cause is not None
+    assert cause.name == "stage stuck"
+    # it shows where the command changes next
+    assert cause.at == pytest.approx(Sticks.AFTER * 0.001, abs=0.1)
+
+
+class Sticks:
+    """The virtual machine, whose stage holds its command from some sample on."""
+
+    AFTER = 500
+
+    def __init__(self) -> None:
+        self.machine, self.u, self.taken = VirtualMachine(), 0.0, 0
+
+    @property
+    def counts(self) -> float:
+        return float(self.machine.counts)
+
+    def reset(self) -> None:
+        self.machine.reset()
+        self.taken = 0
+
+    def step(self, u: float) -> None:
+        self.taken += 1
+        self.u = u if self.taken < self.AFTER else self.u
+        self.machine.step(self.u)
 
 
 def test_positions_are_asked_for_by_name_and_not_of_a_device() -> None:

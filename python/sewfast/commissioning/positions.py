@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from ..control.controller import Controller
 from ..control.machine import Machine
 from ..control.position import PositionController
@@ -14,6 +16,7 @@ from ..control.stops import AFTER, PositionRun, stop_at
 from ..dataset import FloatArray
 from ..errors import FitError
 from ..models import Ensemble, Model
+from ..recording import Recording
 from ..tuning.objective import Constraints, Cost
 from ..tuning.position import DYING, PositionTuning, with_position
 from ..tuning.task import Budget, TuningTask
@@ -21,6 +24,12 @@ from .demands import Refusal
 
 STOPS = ((0.25, "90deg"), (0.5, "180deg"), (1.0, "270deg"))
 """Speeds of the stops that verify, as parts of the top of the working range, and their angles."""
+
+
+class Unsuited(Refusal):
+    """The models allow no position loop. The machine has kept to its references: nothing is wrong
+    with it.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +69,13 @@ def position_loop(
     controller: Controller, ensemble: Ensemble, practice: Mapping[str, FloatArray], cost: Cost,
     small: Model | None, top: float,
 ) -> PositionTuning:  # fmt: skip
-    """The position loop over a verified speed loop; `Refusal` if there is none within its limits.
+    """The position loop over a verified speed loop; `Unsuited` if there is none within its limits.
 
     Ms is that on the machine's `small` signals or, without them, on every member. No stop begins
     above the `top` of the planned speeds [RPM].
     """
     if ensemble.members[0].Ts > 1.01 * controller.Ts:
-        raise Refusal(
+        raise Unsuited(
             "expected models at the machine's sample time for a position loop, got slower ones of "
             f"a slow drive at {ensemble.members[0].Ts:g} s; the speed loop is verified and kept"
         )
@@ -77,7 +86,7 @@ def position_loop(
     try:
         found = with_position(task, controller)
     except FitError as error:
-        raise Refusal(f"{error}; the speed loop is verified and kept") from error
+        raise Unsuited(f"{error}; the speed loop is verified and kept") from error
     law = replace(found.controller, fastest=min(found.controller.fastest, top))
     return replace(found, controller=law)
 
@@ -86,7 +95,9 @@ def verified_stops(
     law: PositionController, machine: Machine, ensemble: Ensemble, speed: float,
     keep: Callable[[tuple[Stop, ...]], object],
 ) -> tuple[Stop, ...]:  # fmt: skip
-    """The stops on the models, then on the machine; `keep` gets them as they come."""
+    """The stops on the models, then on the machine until it misses one: the next ones are faster.
+    `keep` gets them as they come.
+    """
     asked = [(angle, min(share * speed, law.fastest)) for share, angle in STOPS]
 
     def run(on: Model | Machine, angle: str, begun: float) -> PositionRun:
@@ -100,7 +111,34 @@ def verified_stops(
     for k, (angle, begun) in enumerate(asked):
         stops[k] = replace(stops[k], measured=run(machine, angle, begun))
         keep(tuple(stops))
+        if unmet(stops):
+            break
     return tuple(stops)
+
+
+def telling(
+    runs: Sequence[Recording], stops: Sequence[Stop], law: PositionController
+) -> list[Recording]:
+    """The runs of a machine, of which the last are its stops, without what says little about it: a
+    shaft that lands creeps, or is held, and friction decides which commands move it.
+    """
+    made = [stop.measured for stop in stops if stop.measured is not None]
+    first = len(runs) - len(made)
+    return [
+        *runs[:first],
+        *(_until(r, _landed(m, law)) for r, m in zip(runs[first:], made, strict=True)),
+    ]
+
+
+def _landed(run: PositionRun, law: PositionController) -> int:
+    """The sample from which a shaft stays within the landing before its goal; N if it does not."""
+    far = np.abs(run.counts - run.goal[-1]) > law.landing
+    return int(np.max(np.flatnonzero(far), initial=-1)) + 1
+
+
+def _until(recording: Recording, samples: int) -> Recording:
+    columns = {name: getattr(recording, name)[:samples] for name in ("u", "counts", "y")}
+    return replace(recording, **columns, speed_true=None)
 
 
 def unmet(stops: Sequence[Stop]) -> str:

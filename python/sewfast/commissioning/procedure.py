@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..causes import Cause, Seen, cause_among, turns_at_rest
+from ..causes import Cause, Seen, cause_after, cause_among, turns_at_rest
 from ..control.controller import Controller, SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import Machine, RecordedRun
@@ -43,7 +43,7 @@ from .gains import (
     start_of,
 )
 from .journal import Journal, Progress
-from .positions import position_loop, unmet, verified_stops
+from .positions import Unsuited, position_loop, telling, unmet, verified_stops
 from .references import References, references_of, samples_of
 from .result import UNREACHED, VERIFIED, VERIFIED_POORLY, Commissioning, require_own
 from .shaking import margins_at_work
@@ -246,7 +246,9 @@ def commission(
             known = stop.cause if knows else None
             if known is not None and known.name == "out of reach":
                 known = None
-            cause = journal.cause or known or _cause(recorded) or stop.cause
+            cause = journal.cause or known
+            if not isinstance(stop, Unsuited):
+                cause = cause or _cause(recorded) or stop.cause
             if cause is not None:
                 stop.explain(cause)
                 journal.keep(cause=cause)
@@ -266,6 +268,13 @@ def commission(
 def _cause(machine: RecordedBench) -> Cause | None:
     """What is wrong with the machine, if its runs show it."""
     return cause_among(machine.runs, volt=machine.volt, speed=machine.speed)
+
+
+def _missed(missed: str, why: Cause | None, journal: Journal) -> Commissioning:
+    """The result of a machine that did not reach what was asked, and why, if that is known."""
+    if why is not None:
+        journal.keep(cause=why)
+    return journal.result(UNREACHED, f"{missed}; {why}" if why else missed)
 
 
 def _require_kinds(cost: Any, progress: Any, cancel: Any, between: Any) -> None:
@@ -404,9 +413,7 @@ def _carry_out(
         else:
             journal.say(f"the margins could not be measured at {speed:g} RPM")
     if missed := unreached(journal.result(VERIFIED).comparisons):
-        if why := journal.cause or _cause(machine):
-            journal.keep(cause=why)
-        return journal.result(UNREACHED, f"{missed}; {why}" if why else missed)
+        return _missed(missed, journal.cause or _cause(machine), journal)
     if asked.positions:
         model = None if small is None else small.model
         position = position_loop(controller, ensemble, practice, weights, model, asked.top)
@@ -415,7 +422,9 @@ def _carry_out(
             position.controller, machine, ensemble, asked.speed, lambda new: journal.keep(stops=new)
         )
         if missed := unmet(stops):
-            return journal.result(UNREACHED, missed)
+            *sound, last = telling(machine.runs, stops, position.controller)
+            why = cause_after(sound, last, volt=machine.volt, speed=machine.speed)
+            return _missed(missed, journal.cause or why, journal)
     journal.finish()
     found = journal.result(VERIFIED)
     return replace(found, verdict=VERIFIED_POORLY) if found.is_predicted_poorly else found
