@@ -4,10 +4,12 @@ The machines are drives that commissioning was not made with (`drives.drawn`), m
 (`mujoco_motors.drawn`) and the motor of the emulated board, which its device guards. One fault is
 put into it, from the start or from a time in one run of the commissioning on. The commissioning
 must end without calling the machine verified, name the cause, and command rest before the machine
-is much faster than its owner said. `--healthy` puts nothing into them: no cause may be named then.
+is much faster than its owner said. `--healthy` puts nothing into them, nor into the virtual
+machines that join them: no cause may be named then.
 
     python benches/faults.py --out faults.json           600 runs; those that the file has are kept
     python benches/faults.py --drives 3 --motors 0       fewer
+    python benches/faults.py --stops --boards 0          in the stops of a position loop
 """
 
 from __future__ import annotations
@@ -183,7 +185,8 @@ class Bench(SteppedBench):
 
     def follow(self, controller: Any, r: Any, name: str, *, watch: Any = None) -> Any:
         assert isinstance(self.machine, Motor)
-        self.machine.run = name
+        # a stop's name goes on with the speed it is made from
+        self.machine.run = name.partition(" from ")[0]
         return super().follow(controller, r, name, watch=watch)
 
 
@@ -204,7 +207,7 @@ class Fault:
 
 # seen from rest, the signs of command and encoder are one, as are a dead encoder and stage
 SIGNS, LOST = ("sign", "command sign", "encoder sign"), ("no motion", "encoder lost", "stage off")
-LOOP, EXCITED, LAST = "trapezoids", "pulses", "trapezoid"
+LOOP, EXCITED, LAST, STOP = "trapezoids", "pulses", "trapezoid", "stop at 90deg"
 FAULTS = (
     Fault("sign turned", {"command": -1.0}, SIGNS),
     Fault("encoder dead", {"encoder": 0.0}, LOST),
@@ -239,17 +242,38 @@ FAULTS = (
 )  # fmt: skip
 
 
+IN_STOPS = (
+    Fault("sound stops", {}, (), STOP, 0.4, True),
+    Fault("command turns in a stop", {"command": -1.0}, ("command sign",), STOP, 0.4),
+    Fault("encoder freezes in a stop", {"encoder": 0.0}, ("encoder lost",), STOP, 0.4),
+    Fault("encoder loses a channel in a stop", {"encoder": 0.5}, ("counts scaled",), STOP, 0.4),
+    Fault("counts jump in a stop", {"jump": 30000.0}, ("counts jumped",), STOP, 0.4),
+    Fault("stage sticks in a stop", {"holds": 1.0}, ("stage stuck",), STOP, 0.4),
+    Fault("stage fails in a stop", {"command": 0.0}, ("stage off",), STOP, 0.4),
+    Fault("supply falls in a stop", {"command": 0.33}, ("gain",), STOP, 0.4, True),
+    Fault("brake in a stop", {"brake": 0.7}, ("friction", "load", "gain"), STOP, 0.4, True),
+    Fault("load drives in a stop", {"load": 0.2}, ("load",), STOP, 0.4, True),
+    Fault("delay of 30 ms in a stop", {"delay": 0.03}, ("delay",), STOP, 0.4, True),
+    Fault("four times the inertia in a stop", {"inertia": 4.0}, ("inertia",), STOP, 0.4, True),
+)  # fmt: skip
+"""Of `--stops`: they begin in the first of the stops at an angle that verify a position loop."""
+
+
 HEALTHY = Fault("healthy", {}, (), may_verify=True)
 
 
 @dataclass(frozen=True)
 class Machine:
-    """One to commission: a drive, a motor of MuJoCo, or, without either, the emulated board."""
+    """One to commission: a drive, a motor of MuJoCo, the name of a virtual machine, which nothing
+    can be put into, or, without any, the emulated board.
+    """
 
-    of: Drive | mujoco_motors.Motor | None
+    of: Drive | mujoco_motors.Motor | str | None
 
     @property
     def name(self) -> str:
+        if isinstance(self.of, str):
+            return self.of
         return "board" if self.of is None else self.of.name
 
     @property
@@ -271,8 +295,18 @@ class Machine:
     def Ts(self) -> float:
         return self.of.Ts if isinstance(self.of, Drive) else 1e-3
 
-    def plant(self) -> Plant:
+    @property
+    def counts(self) -> float:
+        """Of the encoder, to a turn."""
         assert self.of is not None
+        if isinstance(self.of, str):
+            return float(self.plant().counts_per_rev)
+        return self.of.counts
+
+    def plant(self) -> Any:
+        """A `Plant`, or a virtual machine."""
+        if isinstance(self.of, str):
+            return sewfast.VirtualMachine.from_name(self.of)
         return Drawn(self.of) if isinstance(self.of, Drive) else Hinge(self.of)
 
 
@@ -289,14 +323,15 @@ def tried(case: tuple[Fault, Machine, int]) -> dict[str, Any]:
     if machine.of is not None:
         motor = Motor(machine.plant(), machine, fault)
         on = nullcontext(
-            Bench(motor, machine.Ts, machine.of.counts, machine.volt, machine.name, machine.stated)
+            Bench(motor, machine.Ts, machine.counts, machine.volt, machine.name, machine.stated)
         )
     found: Any = None
     with on as bench:
         try:
             found = sewfast.commission(
-                bench, speed=machine.speed, members=1, evaluations=100, threads=1, seed=seed
-            )
+                bench, speed=machine.speed, members=1, evaluations=100, threads=1, seed=seed,
+                loop="position" if fault.run == STOP else "speed",
+            )  # fmt: skip
             verdict, text, cause = found.verdict, found.reason, found.cause
         except SewfastError as error:
             verdict, text, cause = type(error).__name__, str(error), error.cause
@@ -368,7 +403,8 @@ class _Board(AbstractContextManager[Any]):
 
 def machines(args: argparse.Namespace) -> Iterator[tuple[Machine, int]]:
     """Each with its seed, of every kind by turns."""
-    for i in range(max(args.drives, args.motors, args.boards)):
+    virtuals = args.virtuals if args.healthy else 0
+    for i in range(max(args.drives, args.motors, args.boards, virtuals)):
         seed = args.first + i
         if i < args.drives:
             yield Machine(drawn(seed)), seed
@@ -376,6 +412,8 @@ def machines(args: argparse.Namespace) -> Iterator[tuple[Machine, int]]:
             yield Machine(mujoco_motors.drawn(seed, seed=1)), seed
         if i < args.boards:
             yield BOARD, seed
+        if i < virtuals:
+            yield Machine(f"virtual:{seed}"), seed
 
 
 def cases(args: argparse.Namespace) -> Iterator[tuple[Fault, Machine, int]]:
@@ -383,9 +421,11 @@ def cases(args: argparse.Namespace) -> Iterator[tuple[Fault, Machine, int]]:
         yield from ((HEALTHY, Machine(d), seed) for d in FAMILY for seed in range(2))
         yield from ((HEALTHY, m, seed) for m, seed in machines(args))
         return
+    faults = IN_STOPS if args.stops else FAULTS
     for i, (machine, seed) in enumerate(machines(args)):
-        for fault in FAULTS[i % args.every :: args.every]:
-            can_be = machine is not BOARD or fault.wrong.keys() <= ON_BOARD
+        for fault in faults[i % args.every :: args.every]:
+            # no device has positions
+            can_be = machine is not BOARD or (not args.stops and fault.wrong.keys() <= ON_BOARD)
             if args.only in fault.name and can_be:
                 yield fault, machine, seed
 
@@ -395,11 +435,13 @@ def main() -> None:
     parser.add_argument("--drives", type=int, default=12, help="drives of another simulator")
     parser.add_argument("--motors", type=int, default=7, help="motors of MuJoCo")
     parser.add_argument("--boards", type=int, default=1, help="times on the emulated board")
+    parser.add_argument("--virtuals", type=int, default=0, help="virtual machines, if healthy")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--every", type=int, default=1, help="every so many faults of a machine")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", default="", help="part of a fault's name")
     parser.add_argument("--healthy", action="store_true", help="machines without a fault")
+    parser.add_argument("--stops", action="store_true", help="faults in stops of a position loop")
     parser.add_argument("--out", type=Path, help="JSON; what it has already is not run again")
     args = parser.parse_args()
     if args.boards and not FIRMWARE.exists():
@@ -417,20 +459,20 @@ def main() -> None:
             )
             if args.out:
                 args.out.write_text(json.dumps(found, indent=1), encoding="utf-8")
-    print(f"{'fault':28s} right  not named  wrong  false verified  latest [s]  over speed")
-    for fault in (HEALTHY, *FAULTS):
+    print(f"{'fault':33s} right  not named  wrong  false verified  latest [s]  over speed")
+    for fault in (HEALTHY, *FAULTS, *IN_STOPS):
         its = [f for f in found if f["fault"] == fault.name]
         if not its:
             continue
         wrong = Counter(f["cause"] for f in its if f["cause"] and not f["is_right"])
         late = max((f["late"] for f in its if f["late"] is not None), default=None)
         print(
-            f"{fault.name:28s} {sum(f['is_right'] for f in its):5d} "
+            f"{fault.name:33s} {sum(f['is_right'] for f in its):5d} "
             f"{sum(not f['cause'] for f in its):10d} {sum(wrong.values()):6d} "
             f"{sum(f['is_false'] for f in its):15d}  {'-' if late is None else f'{late:.3f}':>10s} "
             f"{max(f['over'] for f in its):10.2f}  {dict(wrong) or ''}"
         )
-    for kind in ("", "drawn", "motor", "board"):
+    for kind in ("", "drawn", "motor", "virtual", "board"):
         its = [f for f in found if f["machine"].startswith(kind)]
         print(
             f"{kind or 'all':8s}{sum(f['is_right'] for f in its)} of {len(its)} named rightly, "
