@@ -48,10 +48,18 @@ impl<T: Real> PositionLoop<T> {
             "a speed within the position loop's",
             fast.to_f64(),
         )?;
-        let sooner = if self.mode == Mode::Speed {
-            self.sooner()
-        } else {
-            0
+        let asked = Angle {
+            at: angle,
+            turn,
+            onward,
+        };
+        // a stop that is asked for once more goes on as it was
+        if self.mode == Mode::Stop(Some(asked)) && !self.speed.is_manual() {
+            return Ok(self.goal);
+        }
+        let sooner = match self.mode {
+            Mode::Speed => Some(self.sooner()),
+            _ => None,
         };
         self.take_over();
         if self.speed.is_manual() {
@@ -59,7 +67,8 @@ impl<T: Real> PositionLoop<T> {
             self.shift();
         }
         // the profile is that of as many samples later
-        self.move_by(-(T::from_count(sooner) * rate * self.per_sample));
+        let missed = T::from_count(sooner.unwrap_or(0));
+        self.move_by(-(missed * rate * self.per_sample));
         // what the drive loses within a sample is rest: at that speed a turn could take minutes
         let (row, _) = self.design.rates.at(fast);
         let moves = fast > row.down * self.speed.settings().ts;
@@ -69,14 +78,10 @@ impl<T: Real> PositionLoop<T> {
             self.design.speed
         };
         self.planned(self.design.rates, fastest);
-        let asked = Angle {
-            at: angle,
-            turn,
-            onward,
-        };
         (self.goal, self.own) = (self.reached(asked), T::ZERO);
         self.mode = Mode::Stop(onward.then_some(asked));
-        self.untold = sooner;
+        // what the first of two stops had not told yet is told all the same
+        self.untold = sooner.unwrap_or(self.untold);
         Ok(self.goal)
     }
 
@@ -124,9 +129,8 @@ impl<T: Real> PositionLoop<T> {
 
     /// By how many samples a stop may begin before the preview is over: what the speed loop has been told ahead is the present speed
     /// to within half a count of way, so it may have been told to brake. The drive answers as late as it does to a step of the
-    /// command: half of what the feedforward sends for a change of the rate comes by then, and half of the mean. The loop is told two
-    /// samples of the profile at each sample until it is told all that it has missed, so that the command does not jump, and half of
-    /// that time is left.
+    /// command: half of what the feedforward sends for a change of the rate comes by then. The loop is told two samples of the profile
+    /// at each sample until it is told all that it has missed, so that the command does not jump, and half of that time is left.
     fn sooner(&self) -> usize {
         let feedforward = &self.speed.design().feedforward;
         let (two, preview) = (T::ONE + T::ONE, feedforward.preview());
@@ -144,7 +148,7 @@ impl<T: Real> PositionLoop<T> {
             two * sum < T::ONE
         };
         let taps = feedforward.taps().iter().take_while(before).count();
-        ((taps + self.design.smoothing / 2) / 2).min(preview)
+        (taps / 2).min(preview)
     }
 
     /// A move with these rates and this largest speed begins.
