@@ -159,7 +159,7 @@ def script(
     """
     read = ", ".join([repr(step.file), *(f"{k}={v!r}" for k, v in columns.items())])
     lines = ["import sewfast", "", f"data = sewfast.read({read})"]
-    if name == "bode":
+    if name == "bode" and (step.output is None or columns.get("output") == "y"):
         lines.insert(1, "from sewfast.commissioning import unsmoothed")
         lines.append(f"data = unsmoothed({step.file!r}, data)")
     lines += _changes(step)

@@ -205,8 +205,6 @@ def _largest_step(model: Model, u_min: float, u_max: float) -> float:
 
 def _room(model: Model, u_min: float, u_max: float) -> tuple[float, float]:
     """The changes of the command from rest to its upper and its lower limit [u]."""
-    if model.rest.is_zero:
-        return u_max, u_min
     rest = model.rest.u[0]
     up, down = on_grid([u_max - rest, u_min - rest], u_max - u_min, bits=34)
     return float(up), float(down)
@@ -361,7 +359,9 @@ def drive_references(
     SettingError, FitError
         If the model has neither a step response that settles nor a stored range of its record.
     """
-    return _shapes(_span(model, u_min, u_max, pace), model.Ts, seed)
+    made, rest = _shapes(_span(model, u_min, u_max, pace), model.Ts, seed), model.rest.y
+    # on the grid on which a search has them
+    return {n: rest + on_grid(r - rest, float(np.ptp(r))) for n, r in made.items()}
 
 
 def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span:
@@ -523,7 +523,7 @@ def _shapes(span: _Span, Ts: float, seed: int) -> dict[str, FloatArray]:
     holds = 0.25 * pace * wider, 0.9 * pace * wider
     usual = 10.0 * pace * wider
     least = _EDGES * 0.5 * sum(holds)
-    made = {
+    return {
         "trapezoid": drawn(
             [
                 (0.1 * pace, span.rest), (first, span.top), (0.6 * pace, span.top),
@@ -539,10 +539,6 @@ def _shapes(span: _Span, Ts: float, seed: int) -> dict[str, FloatArray]:
         ),
         "trapezoids": drawn(steps),
     }  # fmt: skip
-    if span.rest == 0.0:
-        return made
-    # on the grid on which a search has them
-    return {n: span.rest + on_grid(r - span.rest, float(np.ptp(r))) for n, r in made.items()}
 
 
 def default_references(

@@ -343,8 +343,11 @@ def rest(model: DynamicModel, data: Dataset) -> list[Line]:
     stored = model.training.get("rest") or {}
     u, y = tuple(stored.get("u", [0.0] * data.n_inputs)), float(stored.get("y", 0.0))
     unit = data.output_unit
+    near_zero = bool(stored.get("near_zero", y == 0.0 and not any(u)))
     for found in map(standing, data.experiments):
         if found is None or found.u != u or abs(found.y - y) <= SIGMAS * found.scatter:
+            continue
+        if found.near_zero and near_zero:
             continue
         text = (
             "the record stands still there, and loops on the model begin at "

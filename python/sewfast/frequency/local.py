@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from dataclasses import replace
 from typing import Any, Literal, TypeAlias, get_args
@@ -144,7 +143,7 @@ def _one_of(on: Dataset) -> Experiment:
             name="data", expected="an output as it was measured",
             received="a speed that was smoothed with samples after it, which hides the delay",
             remedy="take bode(recording), unsmoothed(file, data), or a speed by "
-                'method="difference"',
+                'method="difference" (--counts, --counts-per-rev)',
         )  # fmt: skip
     return on.experiments[0]
 
@@ -217,19 +216,26 @@ def unsmoothed(source: str | os.PathLike[str], data: Dataset) -> Dataset:
     if not data.looks_ahead:
         return data
     table = read_table(parse_source(os.fspath(source))[0])
-    slope = smoothed_by(table, data.output_name) if data.counts is None else None
-    if data.counts is None and slope is None:
-        return data
-    column, per_rev = data.counts or ("counts", math.nan)
-    counts = table[column]
     one = data.experiments[0]
+    if data.counts is None:
+        slope = smoothed_by(table, data.output_name)
+        if slope is None or not _is_part(one.y, table[data.output_name]):
+            return data
+        y = slope * np.diff(table["counts"], prepend=table["counts"][:1])
+        y[np.isnan(one.y)] = np.nan
+        return replace(data, experiments=(replace(one, y=y),), looks_ahead=False)
+    column, per_rev = data.counts
+    counts = table[column]
     if len(data.experiments) > 1 or len(counts) != len(one.y):
         raise DataError(
-            name=str(source), expected="one even record without gaps",
-            received=f"{len(data.experiments)} pieces", remedy="cut one out",
+            name=str(source), expected="one even record without gaps, not shifted or cut",
+            received=f"{len(data.experiments)} pieces, {len(one.y):,} of {len(counts):,} rows",
+            remedy="cut one out",
         )  # fmt: skip
-    if slope is not None:
-        y = slope * np.diff(counts, prepend=counts[:1])
-    else:
-        y = speed_from_counts(counts, data.Ts, per_rev, method="difference")
+    y = speed_from_counts(counts, data.Ts, per_rev, method="difference")
     return replace(data, experiments=(replace(one, y=y),), looks_ahead=False)
+
+
+def _is_part(y: FloatArray, column: FloatArray) -> bool:
+    """Whether an output is a column as it was read, but for what was left out."""
+    return len(y) == len(column) and bool(np.all((y == column) | np.isnan(y)))

@@ -193,9 +193,13 @@ class SingleModel(Model):
         return None
 
     def about(self, rest: Rest) -> Any:
-        if rest.is_zero:
-            return self.core
+        return self.core if rest.is_zero else self.counted_from(rest)
+
+    def counted_from(self, rest: Rest) -> Any:
+        """The compiled model of deviations from a level, of which noise may be all."""
         moved = self.with_zero_at(np.array(rest.u), rest.y)
+        if moved is None and rest.near_zero:
+            return self.core
         if moved is None:
             raise SettingError(
                 name="rest", expected=f"zero for {self.title}, which has a zero of its own",

@@ -31,6 +31,7 @@ from .conversion import (
     scipy_system,
     transfer_function,
 )
+from .rest import Rest
 
 
 class LinearDifference(SingleModel):
@@ -74,10 +75,20 @@ class LinearDifference(SingleModel):
     def with_output_scaled(self, factor: float) -> dict[str, Any]:
         return {"b": (factor * self.core.b).tolist(), "offset": factor * self.core.offset}
 
+    def about(self, rest: Rest) -> Any:
+        if not rest.is_zero:
+            return self.counted_from(rest)
+        # at zero, too, the offset is on the grid on which it is at other levels
+        zero = Rest((0.0,) * len(self.input_names), 0.0)
+        return self.counted_from(zero) if self.core.offset else self.core
+
     def with_zero_at(self, u: FloatArray, y: float) -> dict[str, Any]:
-        moved = self.core.offset - offset_at(self.core, u, y)
+        core, level = self.core, offset_at(self.core, u, y)
         low, high = self.training.get("output_range", (0.0, 0.0))
-        return {"offset": float(on_grid(moved, high - low, bits=34))}
+        # as fine as the steady output asks for, and coarser than what the level has taken away
+        steady = abs(1.0 + float(core.a.sum())) * (high - low)
+        taken = math.ldexp(abs(core.offset) + abs(level), -8)
+        return {"offset": float(on_grid(core.offset - level, max(steady, taken), bits=34))}
 
     @staticmethod
     def core_from(fields: Fields) -> _core.LinearModel:

@@ -74,8 +74,9 @@ WAVES_TRIED, MOST_ORDERS = 2, 400
 """Orders from which a fit of cogging starts, of so many in which smoothed signals are searched."""
 GLANCE = 3
 """Iterations of each start of a term; the best start is fitted further."""
-PIECES = 4
-"""Pieces of the last fit, beside which the drift of a whole record is another error."""
+STARTED, PIECES = 32, 4
+"""Pieces over which starts are compared, and those of the last fit, beside which the drift of a
+whole record is another error."""
 SHORTEST, FIRST = 50, 30
 """Least samples of a piece, and those of its first outputs that give its state. A piece with fewer
 measured ones is left out."""
@@ -142,8 +143,7 @@ def fitted(
         _require_following(data)
     fit = _Fit(data, look)
     core = fit.started(integrates)
-    _require_sign(fit, integrates)
-    for share in (32, 16, 8, PIECES):
+    for share in (STARTED, 16, 8, PIECES):
         fit.cut(share)
         found = fit.descended(core)
         core = found.core
@@ -152,6 +152,7 @@ def fitted(
     known: tuple[Any, Any] = (None, None)
     if covariance:
         known = fit.covariance(found, terms)
+    _require_sign(fit, found.core, integrates)
     return JointFit(found.core, terms, missing, *known)
 
 
@@ -186,14 +187,18 @@ def _require_following(data: Dataset) -> None:
                 )  # fmt: skip
 
 
-def _require_sign(fit: _Fit, integrates: bool) -> None:
-    """`DataError` for a position that a joint would reach if its command had the other sign."""
+def _require_sign(fit: _Fit, core: _core.GreyBox, integrates: bool) -> None:
+    """`DataError` for a position that a mere start explains better than the whole fit does, if the
+    command has the other sign.
+    """
     data = fit.data
     turned = tuple(replace(e, u=-e.u) for e in data.experiments)
     other = _Fit(replace(data, experiments=turned), fit.look)
     with contextlib.suppress(FitError):
         other.started(integrates, (fit.width,))
-    if other.begun < fit.begun:
+    fit.cut(STARTED)
+    found = squares(core, fit.pieces, core.first_states(_arrays(fit.pieces)))
+    if other.begun < found:
         raise DataError(
             name=data.source, expected="a position that goes where its command sends it",
             received="one that goes the other way", remedy="turn the sign of one of the two",
@@ -269,7 +274,7 @@ class _Fit:
 
     def started(self, integrates: bool, widths: Sequence[float] = WIDTHS) -> _core.GreyBox:
         """The best of regressions of smoothed signals, by free run over short pieces."""
-        self.cut(32)
+        self.cut(STARTED)
         best = None
         k_q = 0.0 if integrates else 1.0 / self.command_unit
         for width in widths:

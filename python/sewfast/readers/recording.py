@@ -84,14 +84,20 @@ def read_mcap(path: Path, raw: bytes) -> Table:
     return Table(path, columns, found.units, Ts=header.Ts, counts_per_rev=header.counts_per_rev)
 
 
-def smoothed_by(table: Table, output: str) -> float | None:
-    """The output over the counts of a sample, if it is a speed that was smoothed on both sides from
-    the column `counts` beside it, as the `y` of a `Recording` is; else None.
+RECORDED = {"t", "u", "counts", "y"}
+"""Columns of a recording of the package."""
 
-    Its way follows the counts to their rounding and without lag. A difference lags by half a
-    sample, and what looks back alone by more.
+
+def smoothed_by(table: Table, output: str) -> float | None:
+    """The `y` of a recording of the package over the counts of a sample, if it was smoothed from
+    the counts beside it on both sides, as `Recording` does; None for another output.
+
+    The way of such a speed follows the counts to their rounding and without lag. A difference lags
+    by half a sample, and what looks back alone by more.
     """
-    if "counts" not in table or len(table["counts"]) != len(table[output]):
+    if output != "y" or not set(table.names) >= RECORDED:
+        return None
+    if len(table["counts"]) != len(table[output]):
         return None
     counts, y = table["counts"], table[output]
     gaps = np.r_[-1, np.flatnonzero(~np.isfinite(counts + y)), len(y)]
@@ -358,6 +364,8 @@ def read_columns(
     weigh = None if weights is None else _weights(table, weights, names[0])
     if base.grid is not None:
         measured = (counts,) if counts else (output,) if output else ()
+        if set(table.names) >= RECORDED:
+            measured = tuple(dict.fromkeys((*measured, "counts")))  # which tells what its y is
         if weigh is not None:
             if output and not counts:
                 table = _without_weightless(table, output, weigh)

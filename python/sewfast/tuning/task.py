@@ -132,11 +132,13 @@ class TuningTask:
     def _about(self, rest: Rest) -> SampledController:
         """The start for deviations from rest, its limits on a grid as all deviations are."""
         start = self.start.about(rest)
-        if rest.is_zero:
-            return start
         limits = on_grid([start.u_min, start.u_max], start.u_max - start.u_min, bits=34)
         changes = {"u_min": float(limits[0]), "u_max": float(limits[1])}
         return replace(start, **changes)  # type: ignore[type-var]
+
+    def _noise(self, plant: Plant, span: float) -> float:
+        """The noise in single precision, without what a level alone has rounded."""
+        return float(np.float32(on_grid(noise_in_loop(self.start, plant), span, bits=40)))
 
     def core(self, names: Sequence[Wanted] | None = None, *, ms: bool = False) -> _core._Task:
         """The task for the core, with variables by name; `ms` if Ms is an objective."""
@@ -148,14 +150,13 @@ class TuningTask:
                 "those that the controller has to serve",
             )  # fmt: skip
         rest = self.rest
+        references = [deviations(r, rest.y) for r in self.references]
+        span = max((float(np.ptp(r)) for r in references if len(r)), default=0.0)
         return {
             "plants": cores_about(rest, self.plants),
-            "references": [deviations(r, rest.y) for r in self.references],
+            "references": references,
             "disturbances": self.disturbances,
-            "noise": [
-                n if rest.is_zero else float(np.float32(n))
-                for n in (noise_in_loop(self.start, p) for p in self.plants)
-            ],
+            "noise": [self._noise(p, span) for p in self.plants],
             "load_steps": [step.samples(self.start.Ts, rest.y) for step in self.loads],
             "start": self._about(rest).core(),
             "counts_per_unit": self.start.counts_per_unit,
