@@ -383,14 +383,14 @@ class Tuning:
             {"values": self._values_of(controller), "cost": cost, "Ms": Ms}
             for controller, (cost, Ms) in zip(found.controllers, found.values.tolist(), strict=True)
         ]
-        return {"stamp": self.stamp, "front": front[::-1]}
+        return {"model": self.name, "front": front[::-1]}
 
     def keep(self, found: Found) -> dict[str, Any]:
         """Store a search, so that its copy repeats it; return its result for the page."""
         if found.search is not None:
             self._found.append(found)
         return {
-            "stamp": self.stamp,
+            "model": self.name,
             "values": found.values,
             "interrupted": found.ended == "interrupted",
             "ended": found.ended,

@@ -108,28 +108,26 @@ let received = null;
 on("received", m => { if (received) m.error ? received[1](new Error(m.error)) : received[0](m.bytes); });
 
 async function upload(file) {
-  if (uploading || !writes) return false;
-  tell(null); uploading = true; enable();
-  try {
-    await send("upload", { file: file.name, size: file.size });
-    for (let at = 0; at < file.size; at += PIECE) {
-      const piece = await file.slice(at, at + PIECE).arrayBuffer();
-      await new Promise((done, failed) => { received = [done, failed]; sendBytes(piece); });
-      $("uploaded").textContent = `${file.name}: ${(100 * Math.min(1, (at + PIECE) / file.size)).toFixed(0)} %`;
-    }
-    await send("upload_end");
-    $("uploaded").textContent = `${file.name} is in the project folder`;
-    $("file").value = file.name; stale = true; await open();
-    return true;
-  } catch (error) { $("uploaded").textContent = ""; tell(error); return false; }
-  finally { uploading = false; received = null; enable(); }
+  await send("upload", { file: file.name, size: file.size });
+  for (let at = 0; at < file.size; at += PIECE) {
+    const piece = await file.slice(at, at + PIECE).arrayBuffer();
+    await new Promise((done, failed) => { received = [done, failed]; sendBytes(piece); });
+    $("uploaded").textContent = `${file.name}: ${(100 * Math.min(1, (at + PIECE) / file.size)).toFixed(0)} %`;
+  }
+  await send("upload_end");
 }
 
 async function uploadAll(list) {
-  let all = list.length > 0;
-  for (const file of [...list]) all = await upload(file) && all;
-  // a person who adds a file wants to see it; a refusal stays until something else is done
-  if (all && $("error").hidden && $("inputs").selectedOptions.length) await look();
+  if (uploading || !writes) return;
+  tell(null); uploading = true; enable();
+  const added = [], refused = [];
+  for (const file of [...list]) try { await upload(file); added.push(file.name); } catch (error) { refused.push(error.message); }
+  uploading = false; received = null; enable();
+  $("uploaded").textContent = added.length ? `${added.join(", ")} ${added.length > 1 ? "are" : "is"} in the project folder` : "";
+  if (added.length) { $("file").value = added.at(-1); stale = true; await open(); }
+  if (refused.length) return tell(new Error(refused.join(" ")));
+  // a person who adds a file wants to see it
+  if (added.length && $("error").hidden && $("inputs").selectedOptions.length) await look();
 }
 $("upload").onchange = async () => { await uploadAll($("upload").files); $("upload").value = ""; };
 // a file that misses the step must not replace the page

@@ -52,6 +52,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
       $("noise-what").textContent = opened.counts ? "Noise of the encoder's counts" : opened.noise ? `Noise of ${text(opened.noise)} ${opened.y_unit}, as recorded` : "Noise: none was recorded";
       $("knob-feedforward-value").disabled = false;
       sliders(); move(); listNotches();
+      if (untaken) takeIt(...untaken);
     } catch (error) { opened = null; $("knobs").replaceChildren(); tell(error); }
   }
 
@@ -138,7 +139,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
       requestAnimationFrame(() => setTimeout(() => document.dispatchEvent(new CustomEvent("drawn", { detail: performance.now() - began }))));
     } catch (error) { tell(error); failed = $("tune-error").textContent; }
     // what has come meanwhile waits for the next picture, as then the newest does
-    if (again !== null) return requestAnimationFrame(() => { const since = again; again = null; asking = false; move(since); });
+    if (again !== null) return requestAnimationFrame(() => { const since = again; again = null; asking = false; if (opened) move(since); });
     asking = false; resting = setTimeout(judge, 250);
   }
 
@@ -341,11 +342,14 @@ export function mount(root, { ask, on, mark = () => {} }) {
     const seconds = $("tune-seconds").valueAsNumber, effort = { evaluations: $("evaluations").valueAsNumber, seed: $("tune-seed").valueAsNumber, seconds: seconds > 0 ? seconds : null };
     try { await ask(what, question({ ...effort, weights: weights(), constraints })); busy = true; enable(); } catch (error) { tell(error); }
   }
-  /** Whether gains are of what is shown: another page, or this one before, can have asked for those of another model. */
-  function mine(found, values) {
-    const is = found.stamp === opened?.stamp && opened.knobs.every(k => k.name in values);
-    if (!is) $("tune-progress").textContent = "A search for another model or start has ended.";
-    return is;
+  let untaken = null;
+  /** Takes what a search found if it is of the model that is shown; else once that is: another page, or this one before, can have asked. */
+  function takeIt(of, values, take) {
+    const same = of === $("tune-model").value && opened;
+    untaken = null;
+    if (same && opened.knobs.length === Object.keys(values).length && opened.knobs.every(k => k.name in values)) return take();
+    if (!same) untaken = [of, values, take];
+    $("tune-progress").textContent = same ? "A search with other notches has ended." : `A search for ${of} has ended. Choose this model to see what was found.`;
   }
   $("tune-cancel").onclick = () => ask("cancel").catch(tell);
   $("save").onclick = async () => {
@@ -373,21 +377,23 @@ export function mount(root, { ask, on, mark = () => {} }) {
   on("searched", m => {
     busy = false; $("tune-progress").textContent = ""; enable();
     if (m.error) return tell(new Error(m.error));
-    if (!mine(m.found, m.found.values)) return;
-    $("tune-progress").textContent = m.found.interrupted ? "Cancelled. These are the best gains so far." : `${m.found.ended === "time" ? "Time is up. " : ""}Found gains with cost ${m.found.cost.toPrecision(4)} ${opened.y_unit}, from ${m.found.start_cost.toPrecision(4)}.`;
-    set(m.found.values); sought = values; enable();
+    takeIt(m.found.model, m.found.values, () => {
+      $("tune-progress").textContent = m.found.interrupted ? "Cancelled. These are the best gains so far." : `${m.found.ended === "time" ? "Time is up. " : ""}Found gains with cost ${m.found.cost.toPrecision(4)} ${opened.y_unit}, from ${m.found.start_cost.toPrecision(4)}.`;
+      set(m.found.values); sought = values; enable();
+    });
   });
   on("traded", m => {
     busy = false; $("tune-progress").textContent = ""; enable();
     if (m.error) return tell(new Error(m.error));
-    if (!m.found.front.length || !mine(m.found, m.found.front[0].values)) return;
-    front = m.found.front; const most = front.length - 1;
-    for (const id of ["front-response", "front-robust"]) $(id).max = most;
-    $("front").hidden = false; $("knobs-fold").open = false;
-    $("tune-progress").textContent = `Found ${front.length} controllers. Each is better than every other in response or in robustness.`;
-    // where it begins: the fastest that keeps the limit
-    const limit = parseFloat($("limit-Ms").value) || 1.8, kept = front.map((f, k) => f.Ms <= limit ? k : 0);
-    set({ ...values, ...trade(Math.max(...kept)) }); sought = values; enable();
+    if (m.found.front.length) takeIt(m.found.model, m.found.front[0].values, () => {
+      front = m.found.front; const most = front.length - 1;
+      for (const id of ["front-response", "front-robust"]) $(id).max = most;
+      $("front").hidden = false; $("knobs-fold").open = false;
+      $("tune-progress").textContent = `Found ${front.length} controllers. Each is better than every other in response or in robustness.`;
+      // where it begins: the fastest that keeps the limit
+      const limit = parseFloat($("limit-Ms").value) || 1.8, kept = front.map((f, k) => f.Ms <= limit ? k : 0);
+      set({ ...values, ...trade(Math.max(...kept)) }); sought = values; enable();
+    });
   });
   on("state", s => {
     writes = s.writes; enable();

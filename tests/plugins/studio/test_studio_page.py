@@ -338,6 +338,14 @@ def test_a_recording_is_added_by_a_file_picker_and_by_a_drop(studio: Studio, bro
     assert "Expected a plain name" in browser.find_element("class name", "refused").text
     browser.execute_script(DROP, "small.csv", "t,u,y\n0,1,2\n0.1,1,2\n0.2,1,2\n")
     until(lambda: "small.csv is in" in browser.find_element("id", "uploaded").text)
+    # of several, what is refused is said beside what is taken
+    browser.execute_script(
+        DROP.replace("new File", "new File(['x'], 'no.exe')); data.items.add(new File", 1),
+        "more.csv",
+        "t,u,y\n0,1,2\n0.1,1,2\n0.2,1,2\n",
+    )
+    until(lambda: "more.csv is in" in browser.find_element("id", "uploaded").text)
+    until(lambda: "no.exe" in browser.find_element("class name", "refused").text)
     assert browser.title == "sewfast studio"
 
 

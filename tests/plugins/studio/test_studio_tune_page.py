@@ -243,11 +243,16 @@ def test_what_is_shown_follows_its_files(tuned: Studio, browser: Any) -> None:
 @pytest.mark.nightly("a search from a browser")
 @pytest.mark.alone
 def test_gains_of_another_model_are_not_taken(tuned: Studio, browser: Any) -> None:
-    """A search ends on every page, and on some another model is shown by then."""
+    """A search ends on every page, and on some another model is shown by then: they wait for it."""
+    from selenium.webdriver.support.ui import Select
+
     drive = tuned.project.folder / "drive.json"
     shutil.copy(drive, drive.with_name("other.json"))
     at = _searching(browser, tuned, "60", "search")
-    at("tune-model").send_keys("other.json")
-    until(lambda: "A search for another model" in at("tune-progress").text)
+    Select(at("tune-model")).select_by_value("other.json")
+    until(lambda: "A search for drive.json has ended" in at("tune-progress").text)
     assert at("tune-model").get_attribute("value") == "other.json"
     assert "that of the start" in at("cost").text
+    Select(at("tune-model")).select_by_value("drive.json")
+    until(lambda: "Found gains" in at("tune-progress").text)
+    until(lambda: "below the start" in at("cost").text)
