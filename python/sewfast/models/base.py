@@ -193,10 +193,8 @@ class SingleModel(Model):
         return None
 
     def about(self, rest: Rest) -> Any:
-        return self.core if rest.is_zero else self.counted_from(rest)
-
-    def counted_from(self, rest: Rest) -> Any:
-        """The compiled model of deviations from a level, of which noise may be all."""
+        if rest.is_zero:
+            return self.core
         moved = self.with_zero_at(np.array(rest.u), rest.y)
         if moved is None and rest.near_zero:
             return self.core

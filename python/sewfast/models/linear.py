@@ -75,12 +75,11 @@ class LinearDifference(SingleModel):
     def with_output_scaled(self, factor: float) -> dict[str, Any]:
         return {"b": (factor * self.core.b).tolist(), "offset": factor * self.core.offset}
 
-    def about(self, rest: Rest) -> Any:
-        if not rest.is_zero:
-            return self.counted_from(rest)
+    def about(self, rest: Rest) -> _core.LinearModel:
         # at zero, too, the offset is on the grid on which it is at other levels
-        zero = Rest((0.0,) * len(self.input_names), 0.0)
-        return self.counted_from(zero) if self.core.offset else self.core
+        u = np.zeros(len(self.input_names)) if rest.is_zero else np.array(rest.u)
+        core, offset = self.core, self.with_zero_at(u, rest.y)["offset"]
+        return _core.LinearModel(core.a, core.b, core.nk, offset)
 
     def with_zero_at(self, u: FloatArray, y: float) -> dict[str, Any]:
         core, level = self.core, offset_at(self.core, u, y)
