@@ -187,7 +187,10 @@ def cause_after(
     """
     looks = _looks([r for r in sound if np.ptp(r.counts) > 0.0], volt, speed)
     before = [earlier.recording for earlier in looks if earlier.is_alike]
-    return _Look.at(recording, before, volt, speed).change() if before else None
+    try:
+        return _Look.at(recording, before, volt, speed).change() if before else None
+    except DataError:  # it landed within a few samples
+        return None
 
 
 def _looks(runs: Sequence[Recording], volt: float, speed: float) -> list[_Look]:

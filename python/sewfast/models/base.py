@@ -355,8 +355,8 @@ class Ensemble(Model):
             With the same inputs, output and sample time; none of them an ensemble.
         combine : {"median", "midmean", "mean"}
             How to combine the members' runs, sample by sample. A median ignores members that go
-            astray on a new input, but follows the majority alone; a midmean, the mean without a
-            quarter at each end, ignores a quarter of them and is still a mean of the others.
+            astray on a new input, but follows the majority alone; a midmean, the mean without at
+            least a quarter at each end, ignores as many and is still a mean of the others.
         training : mapping, optional
             Provenance of the ensemble.
 
