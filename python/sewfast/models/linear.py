@@ -82,12 +82,13 @@ class LinearDifference(SingleModel):
         return _core.LinearModel(core.a, core.b, core.nk, offset)
 
     def with_zero_at(self, u: FloatArray, y: float) -> dict[str, Any]:
-        core, level = self.core, offset_at(self.core, u, y)
+        moved = self.core.offset - offset_at(self.core, u, y)
         low, high = self.training.get("output_range", (0.0, 0.0))
-        # as fine as the steady output asks for, and coarser than what the level has taken away
-        steady = abs(1.0 + float(core.a.sum())) * (high - low)
-        taken = math.ldexp(abs(core.offset) + abs(level), -8)
-        return {"offset": float(on_grid(core.offset - level, max(steady, taken), bits=34))}
+        # so fine that a steady output is right to a millionth of the span, but for plants that come
+        # near to integrate: a level of some hundred spans takes away what is below 2^-40 of one
+        steady = math.frexp(1.0 + float(self.core.a.sum()))[1]
+        bits = min(max(34, 20 - steady), 40)
+        return {"offset": float(on_grid(moved, high - low, bits=bits))}
 
     @staticmethod
     def core_from(fields: Fields) -> _core.LinearModel:
