@@ -171,7 +171,7 @@ def test_a_stop_takes_little_more_than_the_way_to_brake() -> None:
         assert m["turns"] is not None
         beyond.append(m["turns"] - least)
     # 2 samples, a tenth of a turn, more if it began when the preview is over
-    assert min(beyond) < 0.55
+    assert min(beyond) < 0.6
     assert max(beyond) < 1.5
 
 

@@ -79,6 +79,8 @@ class LinearDifference(SingleModel):
         # at zero, too, the offset is on the grid on which it is at other levels
         u = np.zeros(len(self.input_names)) if rest.is_zero else np.array(rest.u)
         core, offset = self.core, self.with_zero_at(u, rest.y)["offset"]
+        if offset == core.offset:
+            return core
         return _core.LinearModel(core.a, core.b, core.nk, offset)
 
     def with_zero_at(self, u: FloatArray, y: float) -> dict[str, Any]:

@@ -278,7 +278,7 @@ def pareto(
     try:
         found = _core.pareto(
             task.core(variables, ms="Ms" in names),
-            others=[tuned.pid.about(task.rest).core()],
+            others=[task.about(tuned.pid).core()],
             objectives=names,
             size=whole("size", size),
             evaluations=rest,

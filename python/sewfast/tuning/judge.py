@@ -136,7 +136,7 @@ def _judged(
     progress: Progress | None = None,
 ) -> list[tuple[float, float, float, float]]:  # fmt: skip
     """Cost, violation, overshoot and command of each controller on a task."""
-    cores = [c.about(task.rest).core() for c in controllers]
+    cores = [task.about(c).core() for c in controllers]
     return _core.tuning_costs(
         task.core(), cores, threads=threads_or_all(threads), progress=progress
     )

@@ -300,8 +300,7 @@ def _judged(
     task: TuningTask, controllers: Sequence[Controller], effort: Effort
 ) -> list[tuple[float, float]]:
     """Cost and violation of the constraints of each controller; raises `TimeUp` at a deadline."""
-    rest = task.rest
-    cores = [controller.about(rest).core() for controller in controllers]
+    cores = [task.about(controller).core() for controller in controllers]
     judged = _core.tuning_costs(
         task.core(), cores, threads=effort.threads, progress=effort.deadline
     )

@@ -129,12 +129,12 @@ class TuningTask:
         """The task with the linear loops on which Ms is limited and looked at."""
         return replace(self, loops=linear_loops(self, time))
 
-    def _about(self, rest: Rest) -> SampledController:
-        """The start for deviations from rest, its limits on a grid as all deviations are."""
-        start = self.start.about(rest)
-        limits = on_grid([start.u_min, start.u_max], start.u_max - start.u_min, bits=34)
+    def about(self, controller: SampledController) -> SampledController:
+        """A controller for deviations from rest, its limits on a grid as all deviations are."""
+        moved = controller.about(self.rest)
+        limits = on_grid([moved.u_min, moved.u_max], moved.u_max - moved.u_min, bits=34)
         changes = {"u_min": float(limits[0]), "u_max": float(limits[1])}
-        return replace(start, **changes)  # type: ignore[type-var]
+        return replace(moved, **changes)  # type: ignore[type-var]
 
     def _noise(self, plant: Plant, span: float) -> float:
         """The noise in single precision, without what a level alone has rounded."""
@@ -158,7 +158,7 @@ class TuningTask:
             "disturbances": self.disturbances,
             "noise": [self._noise(p, span) for p in self.plants],
             "load_steps": [step.samples(self.start.Ts, rest.y) for step in self.loads],
-            "start": self._about(rest).core(),
+            "start": self.about(self.start).core(),
             "counts_per_unit": self.start.counts_per_unit,
             "variations": self.variations,
             "variables": wanted(
