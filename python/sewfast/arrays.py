@@ -70,6 +70,12 @@ def on_grid(values: ArrayLike, span: float, bits: int = 24) -> FloatArray:
     return found if step == 0.0 else np.round(found / step) * step
 
 
+def limits_about(low: float, high: float, level: float) -> tuple[float, float]:
+    """A lower and an upper limit as deviations from a level, on a grid of the room between them."""
+    found = on_grid([low - level, high - level], high - low, bits=34)
+    return float(found[0]), float(found[1])
+
+
 def deviations(values: FloatArray, level: float) -> FloatArray:
     """Values as deviations from a level, on a grid of their span; at a level of 0 as they are."""
     if level == 0.0 or not len(values):

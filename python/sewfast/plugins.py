@@ -143,7 +143,7 @@ def public_name(name: str) -> Any:
 def on_first_use(
     package: str, homes: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """`__getattr__` and `__dir__` of a package whose names are loaded on first use.
+    """`__getattr__` and `__dir__` of a package whose names and modules are loaded on first use.
     `homes` has the names for each module. A plug-in takes it so that its command can be listed
     without loading what carries it out.
     """
@@ -153,6 +153,8 @@ def on_first_use(
     def found(name: str) -> Any:
         from importlib import import_module
 
+        if name in homes:
+            return import_module(f"{package}.{name}")
         if name not in home_of:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         own[name] = getattr(import_module(f"{package}.{home_of[name]}"), name)

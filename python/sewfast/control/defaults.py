@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from .. import _core, signals
-from ..arrays import on_grid
+from ..arrays import limits_about, on_grid
 from ..dataset import FloatArray
 from ..errors import DataError, FitError, SettingError
 from ..evidence.operating import INTEGRATES, integrating_pole
@@ -199,15 +199,8 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
 
 def _largest_step(model: Model, u_min: float, u_max: float) -> float:
     """The larger of the two changes of the command from rest to its limits [u]."""
-    up, down = _room(model, u_min, u_max)
+    down, up = limits_about(u_min, u_max, model.rest.u[0])
     return up if up >= -down else down
-
-
-def _room(model: Model, u_min: float, u_max: float) -> tuple[float, float]:
-    """The changes of the command from rest to its upper and its lower limit [u]."""
-    rest = model.rest.u[0]
-    up, down = on_grid([u_max - rest, u_min - rest], u_max - u_min, bits=34)
-    return float(up), float(down)
 
 
 def _known_step(model: Model, u_min: float, u_max: float) -> float:
@@ -216,7 +209,7 @@ def _known_step(model: Model, u_min: float, u_max: float) -> float:
     was recorded in one direction has any sign in the other.
     """
     size = _largest_step(model, u_min, u_max)
-    up, down = _room(model, u_min, u_max)
+    down, up = limits_about(u_min, u_max, model.rest.u[0])
     other = down if size == up else up
     known = recorded_outputs(model)
     if not (math.isfinite(size) and math.isfinite(other)) or size * other >= 0.0 or known is None:

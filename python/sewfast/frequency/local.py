@@ -223,16 +223,16 @@ def unsmoothed(source: str | os.PathLike[str], data: Dataset) -> Dataset:
             return data
         y = slope * np.diff(table["counts"], prepend=table["counts"][:1])
         y[np.isnan(one.y)] = np.nan
-        return replace(data, experiments=(replace(one, y=y),), looks_ahead=False)
-    column, per_rev = data.counts
-    counts = table[column]
-    if len(data.experiments) > 1 or len(counts) != len(one.y):
-        raise DataError(
-            name=str(source), expected="one even record without gaps, not shifted or cut",
-            received=f"{len(data.experiments)} pieces, {len(one.y):,} of {len(counts):,} rows",
-            remedy="cut one out",
-        )  # fmt: skip
-    y = speed_from_counts(counts, data.Ts, per_rev, method="difference")
+    else:
+        column, per_rev = data.counts
+        counts = table[column]
+        if len(data.experiments) > 1 or len(counts) != len(one.y):
+            raise DataError(
+                name=str(source), expected="one even record without gaps, not shifted or cut",
+                received=f"{len(data.experiments)} pieces, {len(one.y):,} of {len(counts):,} rows",
+                remedy="cut one out",
+            )  # fmt: skip
+        y = speed_from_counts(counts, data.Ts, per_rev, method="difference")
     return replace(data, experiments=(replace(one, y=y),), looks_ahead=False)
 
 

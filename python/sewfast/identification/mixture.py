@@ -1,8 +1,8 @@
 """The end of the search: from the table of structures to one model.
 
 Structures with weight are trained on everything; of several the model is the midmean of members in
-proportion to their weights: a start can go astray on a new input, and what is left without a
-quarter of the members at each end ignores it where a weighted mean is lost with it.
+proportion to their weights: a start can go astray on a new input, and what is left without at
+least a quarter of the members at each end ignores it where a weighted mean is lost with it.
 """
 
 from __future__ import annotations

@@ -8,7 +8,6 @@ this computer), `doctor`, and `virtual` (a device without a motor). Plug-ins add
 unit by entry points `link.NAME` of the group `sewfast.names`.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ..plugins import on_first_use as _on_first_use
@@ -53,23 +52,23 @@ __all__ = [
 ]
 
 # whether a text names a port is asked before anything else, and needs `ports` alone
-_HOMES = {
-    "connection": "ClockBounds",
-    "doctor": "Diagnosis Finding examine",
-    "drive": "Drive connect",
-    "host_loop": "at_period run_on_host",
-    "host_run": "HostLoopRun Jitter",
-    "plan": "Layout Outcome Plan Sink",
-    "ports": "Port PortInfo list_ports open_port",
-    "virtual": "VirtualDevice",
-    "wire": "Channel Event Identity Limits Status",
-}
-_own, __dir__ = _on_first_use(__name__, _HOMES)
+_own, __dir__ = _on_first_use(
+    __name__,
+    {
+        "connection": "ClockBounds",
+        "doctor": "Diagnosis Finding examine",
+        "drive": "Drive connect",
+        "host_loop": "at_period run_on_host",
+        "host_run": "HostLoopRun Jitter",
+        "plan": "Layout Outcome Plan Sink",
+        "ports": "Port PortInfo list_ports open_port",
+        "virtual": "VirtualDevice",
+        "wire": "Channel Event Identity Limits Status",
+    },
+)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return import_module(f"{__name__}.{name}")
     if name in __all__ or not name[:1].isupper():
         return _own(name)
     return _public_name(f"link.{name}")

@@ -250,7 +250,7 @@ _OF_ALL_MEMBERS = ("input_range", "output_range", "region", "rest", "noise", "ve
 
 def kept(combine: str, count: int) -> tuple[int, int]:
     """The outputs that are averaged of so many in their order: the first, and the one after the
-    last. A midmean leaves out a quarter at each end, and at least one value remains.
+    last. A midmean leaves out at least a quarter at each end, and at least one value remains.
     """
     ends = {"mean": 0, "median": (count - 1) // 2, "midmean": min(-(-count // 4), (count - 1) // 2)}
     return ends[combine], count - ends[combine]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import _core
-from ..arrays import deviations, on_grid
+from ..arrays import deviations, limits_about, on_grid
 from ..control.controller import GAIN_NAMES, NOTCH_NAMES, Controller, SampledController
 from ..control.defaults import (
     beyond_record,
@@ -131,10 +131,10 @@ class TuningTask:
 
     def about(self, controller: SampledController) -> SampledController:
         """A controller for deviations from rest, its limits on a grid as all deviations are."""
-        moved = controller.about(self.rest)
-        limits = on_grid([moved.u_min, moved.u_max], moved.u_max - moved.u_min, bits=34)
-        changes = {"u_min": float(limits[0]), "u_max": float(limits[1])}
-        return replace(moved, **changes)  # type: ignore[type-var]
+        low, high = limits_about(controller.u_min, controller.u_max, self.rest.u[0])
+        changes: dict[str, Any] = {"u_min": low, "u_max": high}
+        # the base class alone is no dataclass
+        return replace(controller.about(self.rest), **changes)  # type: ignore[type-var]
 
     def _noise(self, plant: Plant, span: float) -> float:
         """The noise in single precision, without what a level alone has rounded."""
