@@ -73,11 +73,12 @@ def wait_for_rest(link: Connection, timeout: float) -> None:
     status = link.status()
     since = began = status.time_us
     # the host's clock too: the time of a device that takes no credit stands still
-    deadline = time.monotonic() + timeout + (5.0 if link.identity.on_credit else 0.0)
-    half = math.inf
+    patience = timeout + (5.0 if link.identity.on_credit else 0.0)
+    start, half = time.monotonic(), math.inf
     # device time without a count after which a motor counts as at rest; ARM requires 100 ms
     while status.time_us - since < 120_000:
-        if status.time_us - began > timeout * 1e6 or time.monotonic() > deadline:
+        passed, past = (status.time_us - began) * 1e-6, time.monotonic() - start
+        if passed > timeout or past > patience:
             error = LinkError(
                 name=link.port.url, expected=f"the motor at rest within {timeout:g} s",
                 received=f"{status.speed_rpm:.0f} RPM", remedy="brake it or wait longer",
@@ -88,7 +89,7 @@ def wait_for_rest(link: Connection, timeout: float) -> None:
                 error.remedy = ""  # both are said
                 error.explain(turning(status.speed_rpm, "before a run"))
             raise error
-        if math.isinf(half) and status.time_us - began > 0.5e6 * timeout:
+        if math.isinf(half) and (passed > 0.5 * timeout or past > 0.5 * patience):
             half = abs(status.speed_rpm)
         link.let_pass(STEP_US)
         before, status = status, link.status()
