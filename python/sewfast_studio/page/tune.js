@@ -305,7 +305,8 @@ export function mount(root, { ask, on, mark = () => {} }) {
   function lights() {
     const limit = limitMs(), over = parseFloat($("limit-overshoot").value), most = parseFloat($("limit-u").value);
     const row = (what, found, limit, unit = "") => [what, judged && found !== null && found <= limit * HAIR, `${judged ? ` ${found === null ? "without end" : text(found) + unit},` : ""} at most ${limit}${unit}`];
-    const rows = [row("Ms", judged?.Ms, limit)];
+    // a search has no linear loops of some models: then that of the table counts
+    const rows = [row("Ms", judged?.Ms === 0 ? now.Ms : judged?.Ms, limit)];
     if (Number.isFinite(over)) rows.push(row("overshoot", judged?.overshoot, over, " %"));
     if (Number.isFinite(most)) rows.push(row("command", judged?.u, most, ` ${opened.u_unit}`));
     if (limit > 1) $("Ms-means").textContent = `Ms ${limit} leaves a gain margin of at least ${text(limit / (limit - 1))} and a phase margin of at least ${text(2 * Math.asin(.5 / limit) * 180 / Math.PI)} degrees.` +

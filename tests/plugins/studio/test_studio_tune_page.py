@@ -360,3 +360,19 @@ def test_a_model_that_is_gone_is_said_and_leaves_nothing(tuned: Studio, browser:
     assert not at("search").is_enabled()
     assert not at("lights").text
     assert browser.get_log("browser") == []
+
+
+@pytest.mark.alone
+def test_a_model_without_loops_to_limit_shows_the_sensitivity_of_the_table(
+    tuned: Studio, browser: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The judgement of some networks has an Ms of 0, which is none and no good one."""
+    from sewfast_studio.tuning import Tuning
+
+    judged = Tuning.judged
+    monkeypatch.setattr(Tuning, "judged", lambda *given: {**judged(*given), "Ms": 0.0})
+    browser.get(tuned.address)
+    until(lambda: "at most 10 %" in browser.find_element("id", "lights").text)
+    until(lambda: browser.find_element("id", "cost").text.startswith("cost"))
+    Ms = browser.execute_script(NUMBER, "Ms")
+    assert f"Ms {Ms}, at most 1.8" in browser.find_element("id", "lights").text
