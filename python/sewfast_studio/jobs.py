@@ -394,10 +394,12 @@ class Steps:
             fields["model"], fields.get("controller"), _notches(fields.get("notches", [])), values,
             search,
         )  # fmt: skip
+        # a page takes it where the same model and start are open
+        of = {"model": fields["model"], "start": fields.get("controller")}
         if name == "tune_search":
-            self.jobs.start("searched", "tune", *task, finish=tuning.keep)
+            self.jobs.start("searched", "tune", *task, finish=lambda f: {**tuning.keep(f), **of})
         else:
-            self.jobs.start("traded", "front", *task)
+            self.jobs.start("traded", "front", *task, finish=lambda found: {**found, **of})
 
     def _copies(self, step: Step, name: str) -> dict[str, str]:
         return {

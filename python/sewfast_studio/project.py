@@ -450,7 +450,11 @@ class Upload:
 
     def __init__(self, folder: Path, file: str, size: int) -> None:
         self.file, self.size, self.received = checked_recording_name(file), size, 0
-        require(0 < size <= LARGEST, "size", f"1 byte to {LARGEST >> 20} MB", size)
+        if not 0 < size <= LARGEST:
+            raise SettingError(
+                f"{file}: expected 1 byte to {LARGEST >> 20} MB, received "
+                f"{'an empty file' if not size else f'{size / 2**20:.6g} MB'}"
+            )
         self._place = folder / file
         self._require_new()
         # hidden and without a recording's ending, so that it is not used before it is complete

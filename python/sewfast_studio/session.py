@@ -228,7 +228,7 @@ _MESSAGES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
         ("file",),
     ),
     "report": ({}, ()),
-    "upload": ({"file": NAME, "size": {"type": "integer", "minimum": 1}}, ("file", "size")),
+    "upload": ({"file": NAME, "size": {"type": "integer", "minimum": 0}}, ("file", "size")),
     "upload_end": ({}, ()),
     "tune_save": ({**_TUNE, "file": NAME}, ("model", "values", "file")),
     "tune_copy": ({**_TUNE, "file": NAME}, ("model", "values", "file")),

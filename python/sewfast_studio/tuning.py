@@ -383,14 +383,13 @@ class Tuning:
             {"values": self._values_of(controller), "cost": cost, "Ms": Ms}
             for controller, (cost, Ms) in zip(found.controllers, found.values.tolist(), strict=True)
         ]
-        return {"model": self.name, "front": front[::-1]}
+        return {"front": front[::-1]}
 
     def keep(self, found: Found) -> dict[str, Any]:
         """Store a search, so that its copy repeats it; return its result for the page."""
         if found.search is not None:
             self._found.append(found)
         return {
-            "model": self.name,
             "values": found.values,
             "interrupted": found.ended == "interrupted",
             "ended": found.ended,

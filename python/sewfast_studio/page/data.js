@@ -1,11 +1,11 @@
 // The step Look: which recording and columns; its signals; files that are dropped or chosen.
 import { ask as send, on, mark, sendBytes } from "/server.js";
-import { teller } from "/tell.js";
+import { sentences, teller } from "/tell.js";
 import { copies } from "/copies.js";
 import { showLook } from "/look.js";
 
 const $ = id => document.getElementById(id), PIECE = 48 * 1024;
-let writes = false, files = null, stale = false, uploading = false, looking = false;
+let writes = false, files = null, stale = false, uploading = false, looking = false, turn = 0;
 
 const number = id => $(id).valueAsNumber > 0 ? $(id).valueAsNumber : null;
 
@@ -39,7 +39,7 @@ on("state", s => {
     fill($("file"), s.recordings.map(n => [n, n]), [s.recordings.includes(before) ? before : s.first]);
     // a recording may be large, so it is opened only where its columns are asked for
     if ($("file").value !== before) { stale = true; if (!$("data").hidden) open(); }
-    $("what-to-look-at").textContent = s.recordings.length ? "Drop a file here, or choose one at the side. Then press Look." : "There is no recording in this folder. Drop a CSV, log, JSON, .mat, .npz, Parquet or MCAP file here.";
+    $("what-to-look-at").textContent = s.recordings.length ? "Drop a file here, or choose one in the list. Then press Look." : "There is no recording in this folder. Drop a CSV, log, JSON, .mat, .npz, Parquet or MCAP file here.";
     mark("data", s.recordings.length === 1 ? "1 file" : `${s.recordings.length || "no"} files`);
     document.dispatchEvent(new CustomEvent("recordings", { detail: s.recordings }));
   }
@@ -50,18 +50,20 @@ on("state", s => {
 export async function open() {
   if (!stale || !$("file").value) return;
   stale = false; tell(null);
+  const mine = ++turn;
   // what was found on another recording would pass for this one's
   for (const id of ["signals", "advice", "summary", "look-copy", "looked", "rows", "inputs", "output", "counts"]) $(id).replaceChildren();
   $("summary-fold").hidden = $("rows-fold").hidden = true; $("no-look").hidden = false; next(false); mark("data", "not looked at");
   $("mask").value = $("shift").value = ""; $("hold").checked = false;
   try {
     const c = await send("columns", chosen()), names = c.names.map(n => [n, n]);
+    if (mine !== turn) return;
     fill($("inputs"), names, c.inputs); $("inputs").size = Math.min(6, Math.max(2, names.length));
     fill($("output"), [["", c.encoder ? "speed from counts" : "speed from the counts below"], ...names], [c.output ?? ""]);
     fill($("counts"), [["", c.encoder ? "counts" : "none"], ...names], [""]);
     rows(c);
     document.dispatchEvent(new CustomEvent("columns"));
-  } catch (error) { tell(error); mark("data", "not read", "bad"); }
+  } catch (error) { if (mine !== turn) return; tell(error); mark("data", "not read", "bad"); }
 }
 
 /** The first rows of a file, under names and units, so that a person sees which column is which. */
@@ -87,15 +89,17 @@ function next(on) { $("look").classList.toggle("primary", !on); $("to-model").hi
 
 async function look() {
   tell(null); looking = true; enable();
+  const mine = turn;  // another recording may be chosen meanwhile
   try {
     const f = await send("look", chosen());
+    if (mine !== turn) return;
     $("rows-fold").open = false;  // the signals say more
     showLook($("data"), f, follow); copies($("look-copy"), f); $("no-look").hidden = true; next(true);
     const n = f.advice.filter(a => !a.idle).length;
     $("looked").textContent = n ? `${n} thing${n > 1 ? "s" : ""} to improve` : "Good to identify a model from";
     mark("data", n ? `${n} to improve` : "good", n ? "warn" : "good");
-  } catch (error) { tell(error); mark("data", "not read", "bad"); }
-  looking = false; enable();
+  } catch (error) { if (mine === turn) { tell(error); mark("data", "not read", "bad"); } }
+  finally { looking = false; enable(); }
 }
 
 $("file").onchange = () => { stale = true; open(); };
@@ -117,15 +121,23 @@ async function upload(file) {
   await send("upload_end");
 }
 
+const queue = [];  // files that are dropped during an upload follow it
 async function uploadAll(list) {
-  if (uploading || !writes) return;
+  if (!list.length) return;
+  if (!writes) return tell(new Error("This page looks on. Press Take control, then add the files again."));
+  queue.push(...list);
+  if (uploading) return;
   tell(null); uploading = true; enable();
   const added = [], refused = [];
-  for (const file of [...list]) try { await upload(file); added.push(file.name); } catch (error) { refused.push(error.message); }
+  while (queue.length) {
+    const file = queue.shift();
+    // each refusal names its file
+    try { await upload(file); added.push(file.name); } catch (error) { refused.push(sentences(`${file.name}: ${error.message.replace(`${file.name}: `, "").replace(/^file: /, "")}`)); }
+  }
   uploading = false; received = null; enable();
   $("uploaded").textContent = added.length ? `${added.join(", ")} ${added.length > 1 ? "are" : "is"} in the project folder` : "";
   if (added.length) { $("file").value = added.at(-1); stale = true; await open(); }
-  if (refused.length) return tell(new Error(refused.join(" ")));
+  if (refused.length) return tell(new Error(`upload: ${refused.join(" ")}`));
   // a person who adds a file wants to see it
   if (added.length && $("error").hidden && $("inputs").selectedOptions.length) await look();
 }

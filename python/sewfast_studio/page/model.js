@@ -6,7 +6,7 @@ import { panels } from "/look.js";
 import { chosen, fill, open } from "/data.js";
 
 const $ = id => document.getElementById(id);
-let writes = false, busy = false, tune = null, view = null;
+let writes = false, busy = false, tune = null, view = null, turn = 0;
 
 /** The step Tune, and the way to a step. */
 export function connect(tuning, viewing) { tune = tuning; view = viewing; }
@@ -29,7 +29,7 @@ document.addEventListener("columns", () => { clear(); enable(); });
 $("against").onchange = clear;
 
 /** A verdict on another recording, or of the model before, would pass for this one's. */
-function clear() { $("validated").hidden = true; for (const id of ["verdict", "free", "card", "validate-copy"]) $(id).replaceChildren(); }
+function clear() { turn++; $("validated").hidden = true; for (const id of ["verdict", "free", "card", "validate-copy"]) $(id).replaceChildren(); }
 
 async function identify() {
   tell(null); $("identify").disabled = true;
@@ -75,15 +75,17 @@ function chip(word, kind) { const made = document.createElement("span"); made.cl
 
 async function validate() {
   tell(null); $("validate").disabled = true;
+  const mine = turn, file = $("against").value;
   try {
-    const f = await ask("validate", step($("against").value));
+    const f = await ask("validate", step(file));
+    if (mine !== turn) return;
     $("verdict").textContent = sentences(f.verdict); $("verdict").className = `chip ${f.grade}`; panels($("free"), shown(f));
     const lines = table(["question", "found", "limit", "verdict", "what it means"], f.lines.map(l => [l.name, l.shown, l.limit, chip(l.verdict, GRADES[l.verdict]), l.meaning]));
-    lines.className = "blocks"; lines.createCaption().textContent = `Report card on ${$("against").value}`;
+    lines.className = "blocks"; lines.createCaption().textContent = `Report card on ${file}`;
     $("card").replaceChildren(lines); copies($("validate-copy"), f); $("validated").hidden = false;
     mark("model", `fit ${f.fit.toFixed(1)} %`, f.grade);
-  } catch (error) { tell(error); }
-  $("validate").disabled = false;
+  } catch (error) { if (mine === turn) tell(error); }
+  finally { $("validate").disabled = false; }
 }
 
 $("identify").onclick = identify; $("validate").onclick = validate;

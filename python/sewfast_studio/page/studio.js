@@ -58,4 +58,4 @@ for (const v of VIEWS) $(`view-${v}`).onclick = () => view(v);
 $("to-deploy").onclick = () => { choose($("save-name").value); view("deploy"); };
 $("verified").onclick = () => { choose("commissioned/controllers/tuned.json"); view("deploy"); };
 // a file that is dropped anywhere goes to the step Look
-addEventListener("drop", () => { if ($("data").hidden) view("data"); }, { capture: true });
+addEventListener("drop", event => { if ($("data").hidden && event.dataTransfer.files.length) view("data"); }, { capture: true });

@@ -36,15 +36,30 @@ export function mount(root, { ask, on, mark = () => {} }) {
   const weights = () => given(WEIGHTS.map(([name]) => [name, `weight-${name}`]));
   const tell = teller(root, "tune-error");
 
+  let turn = 0, opening = 0, shown = null, missed = "";
+  const place = (model, start) => JSON.stringify([model, start || null]), chosen = () => place($("tune-model").value, $("tune-start").value);
+
+  /** Opens what is chosen. Until then nothing is open, as the values are another one's. False if it was refused, null if something else was chosen meanwhile. */
   async function open(kept = {}) {
-    tell(null);
-    if (!$("tune-model").value) return;
+    tell(null); opened = null;
+    if (shown !== chosen()) { shown = chosen(); $("saved").textContent = ""; waits(); }
+    enable();
+    const mine = ++turn;
+    if (!$("tune-model").value) { blank(); return false; }
+    opening++;
     try {
-      opened = await ask("tune_open", question({ values: {} }));
+      const found = await ask("tune_open", question({ values: {} }));
+      if (mine !== turn) return null;
+      opened = found;
       const start = Object.fromEntries(opened.knobs.map(k => [k.name, k.value]));
       values = { ...start, ...Object.fromEntries(Object.entries(kept).filter(([name]) => name in start)) };
       history = []; pins = {}; first = before = now = judged = verdict = null; front = []; $("front").hidden = true;
-      if (Object.keys(kept).length) first = await loopOf(start);
+      if (Object.keys(kept).length) {
+        const begun = await loopOf(start);
+        if (mine !== turn) return null;
+        first = begun;
+      }
+      $("figures").hidden = $("step-plot").parentNode.hidden = false;
       $("tune-members").textContent = opened.members > 1 ? `${opened.members} models. A curve is their median. Its band holds all of them.` : ""; $("limit-unit").textContent = `[${opened.u_unit}]`;
       for (const [name, per] of WEIGHTS) $(`weight-${name}`).previousSibling.textContent = `${name}, per ${{ u: opened.u_unit, y: opened.y_unit }[per] || per} `;
       const measures = opened.counts || !opened.noise;
@@ -52,8 +67,22 @@ export function mount(root, { ask, on, mark = () => {} }) {
       $("noise-what").textContent = opened.counts ? "Noise of the encoder's counts" : opened.noise ? `Noise of ${text(opened.noise)} ${opened.y_unit}, as recorded` : "Noise: none was recorded";
       $("knob-feedforward-value").disabled = false;
       sliders(); move(); listNotches();
-      if (untaken) takeIt(...untaken);
-    } catch (error) { opened = null; $("knobs").replaceChildren(); tell(error); }
+      if (missed) tell(new Error(missed));
+      missed = "";
+      if (untaken.has(shown)) takeIt(...untaken.get(shown));
+      return true;
+    } catch (error) {
+      if (mine !== turn) return null;
+      opened = null; blank(); tell(error);
+      return false;
+    } finally { opening--; }
+  }
+
+  /** Nothing is open: what is shown of the one before would pass for that of the one that is chosen. */
+  function blank() {
+    now = first = before = judged = verdict = null; pins = {}; history = [];
+    for (const id of ["knobs", "lights", "reasons", "cost", "notches"]) $(id).replaceChildren();
+    $("figures").hidden = $("step-plot").parentNode.hidden = $("front").hidden = true; enable();
   }
 
   function sliders() {
@@ -62,8 +91,9 @@ export function mount(root, { ask, on, mark = () => {} }) {
       label.textContent = (KNOBS[k.name] ?? k.name.replaceAll("_", " ")) + (k.unit ? ` [${k.unit}]` : ""); label.htmlFor = `knob-${k.name}`;
       const to = v => k.log ? Math.log(v / k.low) / Math.log(k.high / k.low) : (v - k.low) / (k.high - k.low);
       const from = p => k.log ? k.low * (k.high / k.low) ** p : k.low + p * (k.high - k.low);
-      Object.assign(slider, { type: "range", id: label.htmlFor, min: 0, max: 1, step: k.whole ? 1 / (k.high - k.low) : .005 });
-      Object.assign(field, { type: "number", id: `${label.htmlFor}-value`, step: "any" }); field.setAttribute("aria-label", label.textContent);
+      // a browser that keeps fields over a reload gives these values to the next ones of the page: they are made later
+      Object.assign(slider, { type: "range", autocomplete: "off", id: label.htmlFor, min: 0, max: 1, step: k.whole ? 1 / (k.high - k.low) : .005 });
+      Object.assign(field, { type: "number", autocomplete: "off", id: `${label.htmlFor}-value`, step: "any" }); field.setAttribute("aria-label", label.textContent);
       const show = () => {
         slider.value = to(values[k.name]); field.value = Number(values[k.name].toPrecision(5));
         slider.setAttribute("aria-valuetext", `${field.value} ${k.unit}`);
@@ -113,10 +143,9 @@ export function mount(root, { ask, on, mark = () => {} }) {
   function withoutNotches(v) { return Object.fromEntries(Object.entries(v).filter(([name]) => !name.startsWith("notch_"))); }
 
   async function addNotch(numbers) {
-    const before = notches, kept = values;
+    const before = notches, kept = opened ? values : {};
     notches = [...notches, numbers];
-    await open(kept);
-    if (!opened) { const said = $("tune-error").textContent; notches = before; await open(kept); tell(new Error(`notch: ${said}`)); }
+    if (await open(kept) === false) { const said = $("tune-error").textContent; notches = before; await open(kept); tell(new Error(`notch: ${said}`)); }
   }
 
   function keep(v) { tell(null); before = now; history.push({ ...v }); if (history.length > 200) history.shift(); enable(); }
@@ -126,18 +155,21 @@ export function mount(root, { ask, on, mark = () => {} }) {
   /** Asks for the loop with the present values; while one question is under way only the latest waits. */
   async function move(began = performance.now()) {
     enable();
+    if (!opened) return;
     if (asking) { again = began; return; }
     asking = true; clearTimeout(resting); clearTimeout(weighing); $("cost").classList.add("old"); $("reasons").classList.add("old");
-    const asked = values;
+    const asked = values, of = opened;
     try {
       const found = await loopOf(asked);
+      // the answer is of one that was open before
+      if (of !== opened) { asking = false; again = null; return move(); }
       if (found.stamp !== opened.stamp) return await anew();
       now = found; first ??= now; judged = verdict = null; paint();
       // what something else has said stays until a person goes on
       if (failed && $("tune-error").textContent === failed) tell(null);
       failed = "";
       requestAnimationFrame(() => setTimeout(() => document.dispatchEvent(new CustomEvent("drawn", { detail: performance.now() - began }))));
-    } catch (error) { tell(error); failed = $("tune-error").textContent; }
+    } catch (error) { if (of === opened) { tell(error); failed = $("tune-error").textContent; } }
     // what has come meanwhile waits for the next picture, as then the newest does
     if (again !== null) return requestAnimationFrame(() => { const since = again; again = null; asking = false; if (opened) move(since); });
     asking = false; resting = setTimeout(judge, 250);
@@ -148,8 +180,11 @@ export function mount(root, { ask, on, mark = () => {} }) {
   /** Curves that stand beside the present ones, with noise or without as those. */
   async function withNoise() {
     try {
-      const fresh = new Map([[null, null]]);
-      for (const f of [first, before, pins.A, pins.B]) if (f && !fresh.has(f)) fresh.set(f, await loopOf(f.values));
+      const fresh = new Map([[null, null]]), of = opened;
+      for (const f of [first, before, pins.A, pins.B]) if (f && !fresh.has(f)) {
+        fresh.set(f, await loopOf(f.values));
+        if (of !== opened) return;
+      }
       first = fresh.get(first); before = fresh.get(before); for (const p of PINS) if (pins[p]) pins[p] = fresh.get(pins[p]);
     } catch (error) { tell(error); }
     move();
@@ -159,36 +194,36 @@ export function mount(root, { ask, on, mark = () => {} }) {
   async function anew() {
     const was = opened, kept = values, moved = was.knobs.some(k => values[k.name] !== k.value);
     asking = false; again = null;
-    await open();
+    if (!await open()) return;
     // gains that were set by hand stay, unless they are in other units now
-    if (opened && moved && was.u_unit === opened.u_unit && was.y_unit === opened.y_unit) await open(kept);
+    if (moved && was.u_unit === opened.u_unit && was.y_unit === opened.y_unit) await open(kept);
     if (opened) tell(new Error("The model or the controller in the folder has changed. The start was computed again."));
   }
 
   /** What a search would find of these gains: their cost, and what its limits count. It takes longer, so it waits for a rest. */
   async function judge() {
     if (asking || !opened) return;
-    const asked = values;
+    const asked = values, of = opened;
     try {
       const found = await ask("tune_judge", question({ weights: weights() }));
-      if (asked !== values) return;
+      if (asked !== values || of !== opened) return;
       judged = found;
       const { cost, start_cost: start } = judged, share = 100 * (cost / start - 1), off = Math.abs(share).toFixed(1);
       $("cost").textContent = cost === null ? "cost: the loop diverges" : `cost ${cost.toPrecision(4)} ${opened.y_unit}` + (start === null ? ", while the start diverges" : off === "0.0" ? ", that of the start" : `, ${off} % ${share < 0 ? "below" : "above"} the start`);
       $("cost").classList.remove("old"); weighing = setTimeout(weigh, CALM); lights();
-    } catch (error) { tell(error); }
+    } catch (error) { if (of === opened) tell(error); }
   }
 
   /** The verdict of the core on these gains; it runs the references, so it waits for a longer rest. */
   async function weigh() {
     if (asking || !opened) return;
-    const asked = values;
+    const asked = values, of = opened;
     try {
       const found = await ask("tune_verdict", question());
-      if (asked !== values) return;
+      if (asked !== values || of !== opened) return;
       verdict = found; const said = found.text.slice(found.grade.length + 2);
       $("reasons").textContent = said ? sentences(said) : ""; $("reasons").classList.remove("old"); lights();
-    } catch (error) { tell(error); }
+    } catch (error) { if (of === opened) tell(error); }
   }
 
   const STYLES = { now: 0, A: 1, B: 3, before: BESIDE, start: BESIDE };
@@ -270,7 +305,8 @@ export function mount(root, { ask, on, mark = () => {} }) {
   function lights() {
     const limit = limitMs(), over = parseFloat($("limit-overshoot").value), most = parseFloat($("limit-u").value);
     const row = (what, found, limit, unit = "") => [what, judged && found !== null && found <= limit * HAIR, `${judged ? ` ${found === null ? "without end" : text(found) + unit},` : ""} at most ${limit}${unit}`];
-    const rows = [row("Ms", judged?.Ms, limit)];
+    // a search has no linear loops of some models: then that of the table counts
+    const rows = [row("Ms", judged?.Ms === 0 ? now.Ms : judged?.Ms, limit)];
     if (Number.isFinite(over)) rows.push(row("overshoot", judged?.overshoot, over, " %"));
     if (Number.isFinite(most)) rows.push(row("command", judged?.u, most, ` ${opened.u_unit}`));
     if (limit > 1) $("Ms-means").textContent = `Ms ${limit} leaves a gain margin of at least ${text(limit / (limit - 1))} and a phase margin of at least ${text(2 * Math.asin(.5 / limit) * 180 / Math.PI)} degrees.` +
@@ -310,7 +346,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
   for (const id of ["tune-model", "tune-start"]) $(id).onchange = () => { notches = []; open(); };
   $("weights").replaceChildren(...WEIGHTS.map(([name, per]) => {
     const label = document.createElement("label"), field = document.createElement("input");
-    label.textContent = `${name}, ${per} `; Object.assign(field, { type: "number", min: 0, step: "any", id: `weight-${name}`, placeholder: "usual" });
+    label.textContent = `${name}, ${per} `; Object.assign(field, { type: "number", autocomplete: "off", min: 0, step: "any", id: `weight-${name}`, placeholder: "usual" });
     field.onchange = () => { if (opened) { $("cost").classList.add("old"); judge(); } };
     label.append(field); return label;
   }));
@@ -324,9 +360,9 @@ export function mount(root, { ask, on, mark = () => {} }) {
     $(`pin-${p}`).onclick = () => { pins[p] = now; enable(); paint(); };
     $(`take-${p}`).onclick = () => set(pins[p].values);
   }
-  $("compare").oninput = () => { if (now) paint(); };
+  $("compare").oninput = () => { if (opened && now) paint(); };
   // who sets a limit wants it kept
-  for (const id of ["limit-Ms", "limit-overshoot", "limit-u"]) $(id).oninput = () => { $("tune-within").checked = true; if (now) paint(); };
+  for (const id of ["limit-Ms", "limit-overshoot", "limit-u"]) $(id).oninput = () => { $("tune-within").checked = true; if (opened && now) paint(); };
   $("noise").onchange = withNoise;
   let alone = null;  // the weights of the reference, whose work a feedforward does
   $("knob-feedforward-value").onchange = event => {
@@ -342,25 +378,32 @@ export function mount(root, { ask, on, mark = () => {} }) {
     const seconds = $("tune-seconds").valueAsNumber, effort = { evaluations: $("evaluations").valueAsNumber, seed: $("tune-seed").valueAsNumber, seconds: seconds > 0 ? seconds : null };
     try { await ask(what, question({ ...effort, weights: weights(), constraints })); busy = true; enable(); } catch (error) { tell(error); }
   }
-  let untaken = null;
-  /** Takes what a search found if it is of the model that is shown; else once that is: another page, or this one before, can have asked. */
-  function takeIt(of, values, take) {
-    const same = of === $("tune-model").value && opened;
-    untaken = null;
-    if (same && opened.knobs.length === Object.keys(values).length && opened.knobs.every(k => k.name in values)) return take();
-    if (!same) untaken = [of, values, take];
-    $("tune-progress").textContent = same ? "A search with other notches has ended." : `A search for ${of} has ended. Choose this model to see what was found.`;
+  const untaken = new Map();
+  /** Takes what a search found if it is of the model and start that are open; else once they are: another page, or this one before, can have asked. */
+  function takeIt(found, values, take) {
+    const of = place(found.model, found.start), same = of === shown && opened;
+    untaken.delete(of);
+    if (!same) { untaken.set(of, [found, values, take]); return waits(); }
+    if (opened.knobs.length === Object.keys(values).length && opened.knobs.every(k => k.name in values)) return take();
+    $("tune-progress").textContent = "A search with other notches has ended.";
+  }
+  /** Says which search waits for its model or start to be chosen, the newest first. */
+  function waits() {
+    if (busy) return;
+    const [found] = [...untaken].filter(([of]) => of !== chosen()).at(-1)?.[1] ?? [], start = found?.start ? titleOf(found.start) : "computed from the model";
+    $("tune-progress").textContent = !found ? "" : found.model !== $("tune-model").value ? `A search for ${titleOf(found.model)} has ended. Choose this model to see what was found.` : `A search from another start has ended. Choose the start “${start}” to see what was found.`;
   }
   $("tune-cancel").onclick = () => ask("cancel").catch(tell);
   $("save").onclick = async () => {
     tell(null);
-    const file = $("save-name").value;
+    const file = $("save-name").value, written = values;
     saving = true;
     try {
       await ask("tune_save", question({ file })); $("saved").textContent = `Written: ${file}`;
+      stored = written;
       // the start is this controller now, and has the notches that were put into it
-      if (file === $("tune-start").value) { notches = []; await open(values); }
-      stored = values; enable();
+      if (file === $("tune-start").value) { const same = values === written; notches = []; if (await open(values) && same) stored = values; }
+      enable();
     } catch (error) { tell(error); }
     saving = false;
   };
@@ -377,7 +420,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
   on("searched", m => {
     busy = false; $("tune-progress").textContent = ""; enable();
     if (m.error) return tell(new Error(m.error));
-    takeIt(m.found.model, m.found.values, () => {
+    takeIt(m.found, m.found.values, () => {
       $("tune-progress").textContent = m.found.interrupted ? "Cancelled. These are the best gains so far." : `${m.found.ended === "time" ? "Time is up. " : ""}Found gains with cost ${m.found.cost.toPrecision(4)} ${opened.y_unit}, from ${m.found.start_cost.toPrecision(4)}.`;
       set(m.found.values); sought = values; enable();
     });
@@ -385,7 +428,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
   on("traded", m => {
     busy = false; $("tune-progress").textContent = ""; enable();
     if (m.error) return tell(new Error(m.error));
-    if (m.found.front.length) takeIt(m.found.model, m.found.front[0].values, () => {
+    if (m.found.front.length) takeIt(m.found, m.found.front[0].values, () => {
       front = m.found.front; const most = front.length - 1;
       for (const id of ["front-response", "front-robust"]) $(id).max = most;
       $("front").hidden = false; $("knobs-fold").open = false;
@@ -398,9 +441,12 @@ export function mount(root, { ask, on, mark = () => {} }) {
   on("state", s => {
     writes = s.writes; enable();
     fill($("tune-model"), s.models.map(n => [n, titleOf(n)]), s.first); fill($("tune-start"), [["", "computed from the model"], ...s.controllers.map(n => [n, titleOf(n)])], s.start ?? "");
-    $("no-model").hidden = s.models.length > 0; $("figures").hidden = !s.models.length; $("step-plot").parentNode.hidden = !s.models.length;
+    $("no-model").hidden = s.models.length > 0;
+    const [model, start] = shown === null ? [] : JSON.parse(shown), gone = shown !== null && shown !== chosen();
+    if (gone) { missed = model ? `${titleOf(model !== $("tune-model").value ? model : start)} is no longer in the folder.` : ""; notches = []; opened = null; turn++; }
+    if (gone || !s.models.length) blank();
     if (!opened) mark("tune", s.models.length ? "ready" : "needs a model");
-    if (!$("tune").hidden && !saving) opened ? move() : open();
+    if (!$("tune").hidden && !saving) opened ? move() : opening && !gone || open();
   });
 
   function fill(select, pairs, chosen) {
@@ -412,5 +458,5 @@ export function mount(root, { ask, on, mark = () => {} }) {
   enable();
   /** Takes a model of the folder, as one that was just identified. */
   function choose(name) { if ([...$("tune-model").options].some(o => o.value === name) && $("tune-model").value !== name) { $("tune-model").value = name; notches = []; open(); } }
-  return { choose, show: async () => { await (opened ? move() : open()); }, question, addNotch, unit: () => opened ? opened.y_unit : "" };
+  return { choose, show: async () => { await (opened ? move() : opening || open()); }, question, addNotch, unit: () => opened ? opened.y_unit : "" };
 }

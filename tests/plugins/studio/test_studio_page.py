@@ -7,6 +7,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -190,9 +191,16 @@ def test_no_view_keeps_anybody_out(tuned: Studio, browser: Any) -> None:
 def test_the_page_finds_its_state_again(tuned: Studio, browser: Any) -> None:
     browser.get(tuned.address)
     until(lambda: browser.execute_script(NUMBER, "Ms"))
+    fields = "return [...document.querySelectorAll('#tune input')].map(e => e.id + e.value)"
+    before = browser.execute_script(fields)
     browser.refresh()
     until(lambda: browser.execute_script(NUMBER, "Ms"))
     assert browser.find_element("id", "control").text == "in control"
+    # a browser that keeps what is in fields must not give gains to the limits
+    browser.back()
+    browser.forward()
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    assert browser.execute_script(fields) == before
 
 
 def _take_pictures(
@@ -335,7 +343,7 @@ def test_a_recording_is_added_by_a_file_picker_and_by_a_drop(studio: Studio, bro
     until(lambda: browser.find_element("id", "file").get_attribute("value") == "other.csv")
     browser.execute_script(DROP, EVIL.replace("/", "") + ".csv", "t,u,y\n0,1,2\n")
     until(lambda: browser.find_elements("class name", "refused"))
-    assert "Expected a plain name" in browser.find_element("class name", "refused").text
+    assert "expected a plain name" in browser.find_element("class name", "refused").text
     browser.execute_script(DROP, "small.csv", "t,u,y\n0,1,2\n0.1,1,2\n0.2,1,2\n")
     until(lambda: "small.csv is in" in browser.find_element("id", "uploaded").text)
     # of several, what is refused is said beside what is taken
@@ -346,6 +354,25 @@ def test_a_recording_is_added_by_a_file_picker_and_by_a_drop(studio: Studio, bro
     )
     until(lambda: "more.csv is in" in browser.find_element("id", "uploaded").text)
     until(lambda: "no.exe" in browser.find_element("class name", "refused").text)
+    # each by its name, and below the field that files are added by
+    browser.execute_script(
+        DROP.replace("new File", "new File([], 'empty.csv')); data.items.add(new File", 1),
+        "more.csv",
+        "t,u,y\n0,1,2\n",
+    )
+    until(lambda: any("empty" in e.text for e in browser.find_elements("class name", "refused")))
+    said = browser.find_element("class name", "refused").text
+    assert "empty.csv: expected 1 byte to 512 MB, received an empty file. more.csv: " in said
+    assert browser.find_element("id", "upload").get_attribute("aria-invalid") == "true"
+    # of two drops the second waits for the first; a drop without files adds none
+    browser.execute_script(DROP, "third.csv", "t,u,y\n" + "0,1,2\n" * 30_000)
+    browser.execute_script(DROP, "fourth.csv", "t,u,y\n0,1,2\n0.1,1,2\n0.2,1,2\n")
+    until(lambda: "third.csv, fourth.csv are in" in browser.find_element("id", "uploaded").text)
+    browser.find_element("id", "view-tune").click()
+    browser.execute_script(
+        DROP.replace("data.items.add(new File([arguments[1]], arguments[0]));", "")
+    )
+    assert browser.find_element("id", "tune").is_displayed()
     assert browser.title == "sewfast studio"
 
 
@@ -354,6 +381,37 @@ const data = new DataTransfer(); data.items.add(new File([arguments[1]], argumen
 const how = { dataTransfer: data, bubbles: true, cancelable: true };
 document.querySelector("main").dispatchEvent(new DragEvent("drop", how));
 """
+
+
+@pytest.mark.alone
+def test_what_was_found_on_a_file_before_is_not_shown_for_another(
+    studio: Studio, browser: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from selenium.webdriver.support.ui import Select
+
+    go, look = threading.Event(), studio.project.look
+
+    def slowly(step: Any) -> dict[str, Any]:
+        assert go.wait(60.0)
+        return look(step)
+
+    monkeypatch.setattr(studio.project, "look", slowly)
+    browser.get(studio.address)
+    until(lambda: browser.find_element("id", "look").is_enabled())
+    until(lambda: browser.find_elements("css selector", "#inputs option"))
+    Select(browser.find_element("id", "inputs")).select_by_value("u")
+    Select(browser.find_element("id", "output")).select_by_value("y")
+    browser.find_element("id", "look").click()
+    Select(browser.find_element("id", "file")).select_by_value("run2.csv")
+    go.set()
+    until(lambda: browser.find_elements("css selector", "#inputs option"))
+    assert not browser.find_elements("css selector", "#signals canvas")
+    assert "not looked at" in browser.find_element("id", "view-data").text
+    until(lambda: browser.find_element("id", "look").is_enabled())
+    Select(browser.find_element("id", "inputs")).select_by_value("u")
+    Select(browser.find_element("id", "output")).select_by_value("y")
+    browser.find_element("id", "look").click()
+    until(lambda: len(browser.find_elements("css selector", "#signals canvas")) == 2)
 
 
 @pytest.mark.alone

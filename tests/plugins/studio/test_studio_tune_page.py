@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -256,3 +257,122 @@ def test_gains_of_another_model_are_not_taken(tuned: Studio, browser: Any) -> No
     Select(at("tune-model")).select_by_value("drive.json")
     until(lambda: "Found gains" in at("tune-progress").text)
     until(lambda: "below the start" in at("cost").text)
+
+
+def _found(model: str, start: str | None, values: dict[str, Any], cost: float) -> dict[str, Any]:
+    """The end of a search, as the server tells it to every page."""
+    ended = {"interrupted": False, "ended": "evaluations", "cost": cost, "start_cost": 2.0}
+    return {
+        "event": "searched",
+        "found": {"model": model, "start": start, "values": values, **ended},
+    }
+
+
+@pytest.mark.alone
+def test_gains_wait_until_their_model_and_start_are_open(
+    tuned: Studio, browser: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also while another one is open still, and behind those of another search."""
+    from selenium.webdriver.support.ui import Select
+
+    from sewfast_studio.tuning import Tuning
+
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    def gain() -> float:
+        return float(at("knob-Kp-value").get_attribute("value"))
+
+    folder = tuned.project.folder
+    shutil.copy(folder / "drive.json", folder / "other.json")
+    tuning = tuned.project.tuning("drive.json")
+    tuned.project.save_controller(tuning, {}, "saved.json")
+    values = {knob.name: knob.value for knob in tuning.knobs}
+    begin = values["Kp"]
+    found = {name: {**values, "Kp": k * begin} for k, name in enumerate(("one", "two", "three"), 2)}
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    tuned._tell(_found("other.json", None, found["one"], 1.0))
+    until(lambda: "A search for other.json has ended" in at("tune-progress").text)
+    tuned._tell(_found("drive.json", "saved.json", found["two"], 1.0))
+    until(lambda: "Choose the start “saved.json”" in at("tune-progress").text)
+    tuned._tell(_found("drive.json", None, found["three"], 1.5))
+    until(lambda: "Found gains with cost 1.5" in at("tune-progress").text)
+    assert gain() == pytest.approx(4 * begin, rel=1e-4)
+
+    # a state comes, and a search ends, while its model is being opened
+    go, opened = threading.Event(), Tuning.opened
+
+    def slowly(tuning: Tuning) -> dict[str, Any]:
+        assert go.wait(60.0)
+        return opened(tuning)
+
+    monkeypatch.setattr(Tuning, "opened", slowly)
+    Select(at("tune-model")).select_by_value("other.json")
+    assert "Found gains" not in at("tune-progress").text
+    tuned._tell(_found("other.json", None, found["two"], 0.5))
+    tuned._tell_all()
+    assert not at("search").is_enabled()
+    go.set()
+    until(lambda: "Found gains with cost 0.5" in at("tune-progress").text)
+    until(lambda: "above" in at("cost").text or "below" in at("cost").text)
+    assert gain() == pytest.approx(3 * begin, rel=1e-4)
+    assert not at("tune-error").is_displayed()
+    # another start waits still
+    Select(at("tune-model")).select_by_value("drive.json")
+    until(lambda: "Choose the start “saved.json”" in at("tune-progress").text)
+    Select(at("tune-start")).select_by_value("saved.json")
+    until(lambda: "Found gains with cost 1" in at("tune-progress").text)
+    assert gain() == pytest.approx(3 * begin, rel=1e-4)
+    assert browser.get_log("browser") == []
+
+
+@pytest.mark.alone
+def test_a_model_that_is_gone_is_said_and_leaves_nothing(tuned: Studio, browser: Any) -> None:
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    drive = tuned.project.folder / "drive.json"
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    at("knob-Kp").send_keys("\ue014")  # arrow right
+    until(lambda: "start" in browser.execute_script(TITLES))
+    drive.rename(drive.with_name("renamed.json"))
+    tuned._tell_all()
+    until(lambda: "drive.json is no longer in the folder" in at("tune-error").text)
+    until(lambda: "that of the start" in at("cost").text)
+    assert at("tune-model").get_attribute("value") == "renamed.json"
+    # a model that cannot be opened shows nothing of the one before
+    drive.write_text('{"format": "sewfast.model", "version": 1}')
+    tuned._tell_all()
+    until(lambda: len(at("tune-model").find_elements("tag name", "option")) == 2)
+    at("tune-model").send_keys("drive")
+    until(lambda: at("tune-error").text and "no longer" not in at("tune-error").text)
+    assert not at("lights").text
+    assert not at("step-plot").is_displayed()
+    drive.unlink()
+    tuned._tell_all()
+    until(lambda: "that of the start" in at("cost").text)
+    assert at("step-plot").is_displayed()
+    drive.with_name("renamed.json").unlink()
+    tuned._tell_all()
+    until(lambda: at("no-model").is_displayed())
+    assert not at("search").is_enabled()
+    assert not at("lights").text
+    assert browser.get_log("browser") == []
+
+
+@pytest.mark.alone
+def test_a_model_without_loops_to_limit_shows_the_sensitivity_of_the_table(
+    tuned: Studio, browser: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The judgement of some networks has an Ms of 0, which is none and no good one."""
+    from sewfast_studio.tuning import Tuning
+
+    judged = Tuning.judged
+    monkeypatch.setattr(Tuning, "judged", lambda *given: {**judged(*given), "Ms": 0.0})
+    browser.get(tuned.address)
+    until(lambda: "at most 10 %" in browser.find_element("id", "lights").text)
+    until(lambda: browser.find_element("id", "cost").text.startswith("cost"))
+    Ms = browser.execute_script(NUMBER, "Ms")
+    assert f"Ms {Ms}, at most 1.8" in browser.find_element("id", "lights").text
