@@ -59,6 +59,21 @@ def test_the_rest_of_a_record_is_kept_in_its_model() -> None:
     assert model.rest.y == pytest.approx(24.5 + 2.0 * model.rest.u[0], abs=0.5)
 
 
+def test_a_fast_record_about_a_level_rests_at_its_mean_command() -> None:
+    """A network is known at no end of it: the record was never long enough at either."""
+    rng, n = np.random.default_rng(2), 3000
+    u = 2.0 + np.repeat(rng.choice([-1.0, 1.0], n // 10), 10) * rng.uniform(0.5, 1.0, n)
+    y, x = np.zeros(n), 24.5
+    for k in range(n):
+        y[k] = x
+        x += 0.01 * (21.0 + np.sqrt(6.0 * u[k]) - x)
+    record = Dataset.from_arrays(u, y + 0.005 * rng.standard_normal(n), 0.002)
+    model = identify(record, model="neural_oe", starts=1, threads=1, seed=0)
+    assert model.rest.source == "equilibrium"
+    assert model.rest.u[0] == pytest.approx(u.mean())
+    assert model.rest.y == pytest.approx(21.0 + np.sqrt(12.0), abs=0.2)
+
+
 def test_only_outputs_that_stand_still_are_a_rest() -> None:
     u = np.repeat([0.0, 1.0], [50, 150])
     noise = 0.01 * np.random.default_rng(1).standard_normal(200)

@@ -173,6 +173,18 @@ def test_a_controller_is_no_better_than_its_model() -> None:
     assert tune(weak, [SHORT], start=QUIET, **FIXED).verdict.grade == "poor"
 
 
+def test_gains_of_whose_ms_nothing_is_known_are_fair() -> None:
+    model = model_of("neural_oe")
+    gains = Gains.standard(1e-3, 0.2, u_unit="V", y_unit=model.output_unit)
+    start = Controller(gains, Ts=model.Ts, u_min=-20, u_max=20)
+    # no command holds the network there
+    found = tune(model, [np.full(300, 1e4)], start=start, evaluations=5, threads=1)
+    assert found.verdict.grade in ("fair", "poor", "unfit")
+    (text,) = [o for o in found.verdict.objections if "Ms is not known" in o.text]
+    assert text.grade == "fair"
+    assert "it reaches" in text.text
+
+
 def test_gains_that_destabilise_the_model_are_unfit() -> None:
     wild = replace(QUIET, gains=replace(QUIET.gains, Kp=30.0 * QUIET.gains.Kp))
     found = tune(drive(), [1.0 * SHORT], start=wild, **FIXED)

@@ -59,18 +59,20 @@ def _standing(data: Dataset) -> Rest | None:
 
 def _equilibrium(model: Model, data: Dataset) -> Rest | None:
     """The model's equilibrium without a command, or with the least recorded one.
-    The record has been at rest or not, so the level is kept within the recorded outputs. It is zero
-    if the model's own error does not tell it from zero.
+    If the model is known at neither, as the record is too fast to have stayed there, it is that
+    with their mean. The record has been at rest or not, so the level is kept within the recorded
+    outputs. It is zero if the model's own error does not tell it from zero.
     """
+    held = _held(data)
     if doubling(model) is not None:
-        return _held(data)
+        return held
     low, high = np.array(data.input_range, dtype=np.float64).T
     zero = np.zeros(len(low))
-    off = _level(model, zero)
-    if off is None:
-        u, off = np.clip(zero, low, high), _level(model, np.clip(zero, low, high))
-    else:
-        u = zero
+    known = ((u, _level(model, u)) for u in (zero, np.clip(zero, low, high)))
+    u, off = next((pair for pair in known if pair[1] is not None), (zero, None))
+    if off is None and held is not None:
+        u = np.array(held.u)
+        off = _level(model, u, anywhere=True)
     if off is None:
         return None
     y = float(np.clip(off, *data.output_range))
@@ -91,10 +93,10 @@ def _held(data: Dataset) -> Rest | None:
     return Rest(tuple(float(v) for v in mean), level, "equilibrium")
 
 
-def _level(model: Model, u: FloatArray) -> float | None:
+def _level(model: Model, u: FloatArray, *, anywhere: bool = False) -> float | None:
     """The steady output at constant inputs, if there is one where the model is known."""
     found = linearise(representative(model).core, u)
-    region = stored_region(model)
+    region = None if anywhere else stored_region(model)
     if not (found.settled and math.isfinite(found.y)):
         return None
     return found.y if region is None or region.holds(u, found.y) else None

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import in_unit
-from ..control.controller import SampledController
+from ..control.controller import Controller, SampledController
 from ..control.defaults import (
     drive_step,
     growth_rate,
@@ -162,12 +162,19 @@ def verdict_of(
 
 
 def _of_loops(task: TuningTask, controller: SampledController, remedy: str) -> Iterator[Objection]:
-    """An Ms above the default limit."""
-    Ms, level = task.loops.worst(controller)
+    """An Ms above the default limit, or of which nothing is known."""
+    loops = task.loops
+    if isinstance(controller, Controller) and not loops.looked_at and _models(task):
+        why = "" if loops.reason is None else f" ({loops.reason})"
+        yield Objection(
+            "fair", "Ms is not known: no model has a stable linear loop about the levels of the "
+            f"references{why}", "give references that the model reaches, or identify it again",
+        )  # fmt: skip
+    Ms, level = loops.worst(controller)
     if Ms <= HAIR * LARGEST_MS:
         return
     place = ""
-    if level is not None and task.loops.depends:
+    if level is not None and loops.depends:
         place = f" about {in_unit(f'{level:.4g}', controller.y_unit)}"
     if math.isinf(Ms):
         yield Objection(
@@ -196,12 +203,16 @@ def _calmer(limit: float | None, searched: bool) -> str:
     )
 
 
+def _models(task: TuningTask) -> list[Model]:
+    return [p for p in task.plants if isinstance(p, Model)]
+
+
 # --- Runs -----------------------------------------------------------------------------------------
 
 
 def _of_runs(task: TuningTask, controller: SampledController) -> list[Objection]:
     """What the references show on the models as they are, each share in the mean of the models."""
-    models = [p for p in task.plants if isinstance(p, Model)]
+    models = _models(task)
     at_limit, outside, missed = 0.0, 0.0, ""
     for r in task.references if models else ():
         try:
