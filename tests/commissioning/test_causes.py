@@ -140,6 +140,23 @@ def test_a_machine_that_was_never_as_thought_is_named_from_one_run() -> None:
     assert named(Motor(0.0, stuck=3.0)) == "turns at rest"
 
 
+@pytest.mark.parametrize("lag", [0.1, 0.4, 1.5])
+@pytest.mark.parametrize("friction", [1.0, 0.0])
+def test_a_strong_machine_that_a_guard_ended_early_is_not_said_to_integrate(
+    lag: float, friction: float
+) -> None:
+    """Ended at a fifth of its own speed, it has not settled, but its speed falls behind a line."""
+    speed, counts = 0.0, [0.0]
+    while speed < 2100.0:
+        speed += TS / lag * (2500.0 * 4.0 - friction * speed)
+        counts.append(counts[-1] + PER_TURN * TS * speed / 60.0)
+    u = np.full(len(counts), 4.0)
+    ended = Recording.of_counts(u, np.floor(counts), Ts=TS, counts_per_rev=PER_TURN)
+    found = cause_of(ended, volt=12.0, speed=2000.0)
+    assert found is not None
+    assert found.name == ("gain too large" if friction else "integrates")
+
+
 def test_a_machine_that_did_what_it_always_did_has_no_cause() -> None:
     before = [record(rig(Motor()), np.repeat([0.0, 3.0, 6.0, 2.0], 500), name="steps")]
     assert cause_of(looped(Motor()), before, volt=10.0) is None
