@@ -140,6 +140,43 @@ def test_a_machine_that_was_never_as_thought_is_named_from_one_run() -> None:
     assert named(Motor(0.0, stuck=3.0)) == "turns at rest"
 
 
+@pytest.mark.parametrize(("brakes", "named"), [(False, "turns at rest"), (True, "sign")])
+def test_a_load_that_hangs_is_not_a_turned_sign(brakes: bool, named: str) -> None:
+    """Behind a brake that opens with the command nothing tells them apart: both are said."""
+
+    class Hoist(Motor):
+        def step(self, u: float) -> None:
+            self.at = math.inf if brakes and not u else 0.0
+            super().step(u)
+
+    with pytest.raises(Refusal) as refused:
+        commission(rig(Hoist(load=-1.5)), speed=1100.0)
+    assert refused.value.stage == "first motion"
+    assert refused.value.cause.name == named
+    assert "load" in refused.value.cause.text
+
+
+def test_no_longer_step_follows_one_that_nothing_was_seen_of() -> None:
+    class Slips(Motor):
+        """The coupling is lost after the first motion."""
+
+        runs = 0
+
+        def reset(self) -> None:
+            super().reset()
+            self.runs += 1
+
+        @property
+        def counts(self) -> float:
+            return super().counts if self.runs <= 6 else 0.0
+
+    motor = Slips()
+    with pytest.raises(Refusal, match="counted nothing in 2 s") as refused:
+        commission(rig(motor), speed=1100.0)
+    assert refused.value.cause.name == "encoder lost"
+    assert motor.t < 2.1
+
+
 @pytest.mark.parametrize("lag", [0.1, 0.4, 1.5])
 @pytest.mark.parametrize("friction", [1.0, 0.0])
 def test_a_strong_machine_that_a_guard_ended_early_is_not_said_to_integrate(
