@@ -341,7 +341,8 @@ class _Look:
         )
         if change == "stuck" and abs(value * motor["gain"]) < LOST * self.found["size"]:
             change, value = "gain", 0.0
-        name, text = _NAMED[change](value, when)
+        words = partial(_jump, per_turn=r.counts_per_rev) if change == "jump" else _NAMED[change]
+        name, text = words(value, when)
         return Cause(name, text, self.name, None if early else at, value)
 
     def always(self) -> Cause | None:
@@ -449,11 +450,13 @@ def _counts(value: float, when: str) -> tuple[str, str]:
     )
 
 
-def _jump(value: float, when: str) -> tuple[str, str]:
-    wraps = next((n for n in (8, 12, 16, 24, 32) if abs(abs(value) / 2.0**n - 1.0) < 0.02), None)
+def _jump(value: float, when: str, per_turn: float = math.inf) -> tuple[str, str]:
+    counters = {2.0**n: f"a counter of {n} bits that wraps" for n in range(8, 33)}
+    wraps = counters | {per_turn: "an angle that begins anew at every turn"}
+    seen = next((what for size, what in wraps.items() if abs(abs(value) / size - 1.0) < 0.02), None)
     what = (
-        f"as a counter of {wraps} bits that wraps; unwrap it where it is read"
-        if wraps
+        f"as {seen}; unwrap it where it is read"
+        if seen
         else "more than the machine can turn; check for disturbed lines and torn transfers"
     )
     return "counts jumped", f"{when} the counts jump by {value:.6g}: {what}"

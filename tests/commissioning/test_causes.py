@@ -140,6 +140,28 @@ def test_a_machine_that_was_never_as_thought_is_named_from_one_run() -> None:
     assert named(Motor(0.0, stuck=3.0)) == "turns at rest"
 
 
+@pytest.mark.parametrize(
+    ("wraps", "per_turn", "said"),
+    [
+        (2000, 2000.0, "an angle that begins anew at every turn"),
+        (4096, 4096.0, "an angle that begins anew at every turn"),
+        (16384, 2000.0, "a counter of 14 bits that wraps"),
+        (3000, 2000.0, "more than the machine can turn"),
+    ],
+)
+def test_counts_that_wrap_are_said_to(wraps: int, per_turn: float, said: str) -> None:
+    class Absolute(Motor):
+        @property
+        def counts(self) -> float:
+            return math.floor(per_turn * self.counted) % wraps
+
+    bench = SteppedBench(Absolute(), Ts=TS, counts_per_rev=per_turn, volt=10.0, speed=3000.0)
+    with pytest.raises(LinkError) as stop:
+        record(bench, np.full(3000, 1.0))
+    assert stop.value.cause.name == "counts jumped"
+    assert said in stop.value.cause.text
+
+
 @pytest.mark.parametrize(("brakes", "named"), [(False, "turns at rest"), (True, "sign")])
 def test_a_load_that_hangs_is_not_a_turned_sign(brakes: bool, named: str) -> None:
     """Behind a brake that opens with the command nothing tells them apart: both are said."""
