@@ -152,7 +152,52 @@ def test_a_stage_that_does_not_obey_is_switched_off() -> None:
     assert not obedient.is_off
 
 
-@pytest.mark.parametrize("missing", [math.nan, None])
+def test_a_load_that_falls_after_the_command_of_rest_is_switched_off() -> None:
+    class Hoist(Motor):
+        """Rest slows it; then gravity turns it the other way. The brake is its `off`."""
+
+        def step(self, u: float) -> None:
+            pull = 0.0 if self.is_off else 8.0 * (self.t > 0.3)
+            super().step(u - pull)
+
+        def off(self) -> None:
+            self.is_off = True
+
+    motor = Hoist(command=1.0)
+    with pytest.raises(LinkError, match=r"at most 2000 RPM.*it stands now"):
+        record(stepped(motor), np.full(1500, 9.0))
+    assert motor.is_off
+    assert motor.top < 1.25 * 2000.0
+
+
+def test_an_off_that_fails_does_not_hide_what_ended_the_run() -> None:
+    class Welded(Motor):
+        def off(self) -> None:
+            raise OSError("the contactor does not answer")
+
+    with (
+        pytest.warns(RuntimeWarning, match="rig: off.. failed: OSError"),
+        pytest.raises(LinkError, match=r"at most 2000 RPM.*it still turns 5 s after that"),
+    ):
+        run(PID, stepped(Welded(stuck=10.0)), LEVEL)
+
+
+@pytest.mark.parametrize("kind", [stepped, Watched, Own])
+def test_a_reference_beyond_the_stated_speed_accuses_no_machine(kind: Any) -> None:
+    motor = Motor()
+    with pytest.raises(SettingError, match=r"rig, reference: expected within its \+-2000 RPM"):
+        run(PID, kind(motor), np.repeat([500.0, 2500.0], 500))
+    assert motor.t == 0.0
+
+
+def test_a_run_has_the_commands_that_acted() -> None:
+    weak = SteppedBench(Motor(), Ts=1e-3, counts_per_rev=4096, volt=2.0, speed=2000.0)
+    found = run(PID, weak, LEVEL)
+    assert found.u.max() == 2.0
+    np.testing.assert_array_equal(found.u, found.recording.u)
+
+
+@pytest.mark.parametrize("missing", [math.nan, None, 10**400])
 @pytest.mark.parametrize("play", [lambda on: run(PID, on, LEVEL), lambda on: record(on, STEADY)])
 def test_counts_that_are_no_numbers_end_a_run(play: Any, missing: Any) -> None:
     class Blind(Motor):

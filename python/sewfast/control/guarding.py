@@ -201,6 +201,7 @@ class GuardedMachine(MachineWrapper):
         self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
         require_fit(controller, r, self.Ts)
+        require_reference(self, controller, r)
         low, high = controller.u_min, controller.u_max
         require_within(self, "limits of the controller", np.array([low, high]))
         with self._guarded(name, self.volt) as guard:
@@ -279,6 +280,16 @@ def require_within(machine: Machine, name: str, u: FloatArray) -> None:
         raise SettingError(
             name=f"{machine.name}, {name}", expected=f"within its +-{machine.volt:g} V",
             received=f"{largest:g} V", remedy="limit them to what the machine bears",
+        )  # fmt: skip
+
+
+def require_reference(machine: Machine, controller: SampledController, r: FloatArray) -> None:
+    """Refuse a reference beyond the speed that a machine must not pass, as a device does."""
+    fastest = float(np.max(np.abs(r), initial=0.0)) if controller.LOOP == "speed" else 0.0
+    if fastest > machine.speed * (1.0 + 1e-6):
+        raise SettingError(
+            name=f"{machine.name}, reference", expected=f"within its +-{machine.speed:g} RPM",
+            received=f"{fastest:g} RPM", remedy="scale it",
         )  # fmt: skip
 
 
