@@ -25,6 +25,7 @@ from .guarding import (
     TAIL,
     GuardedMachine,
     MachineWrapper,
+    limited,
     require_numbers,
     require_reference,
 )
@@ -191,6 +192,7 @@ class SteppedBench:
     ) -> RecordedRun:
         require_fit(controller, r, self.Ts)
         require_reference(self, controller, r)
+        controller = limited(controller, self.volt)
         core, early = controller.core(), controller.early(r)
         per_count = 60.0 / (self.counts_per_rev * self.Ts)
         u, feedback, before = np.zeros(len(r)), np.zeros(len(r)), [0.0]
@@ -209,11 +211,9 @@ class SteppedBench:
         truth = recording.speed_true
         t = np.arange(len(r), dtype=np.float64) * self.Ts
         y = recording.y if truth is None else truth
-        # the commands that acted, which are clipped at the machine's limit
         return RecordedRun(
-            t, np.array(r), recording.u, y, feedback, controller, self.name, name,
-            recording=recording,
-        )  # fmt: skip
+            t, np.array(r), u, y, feedback, controller, self.name, name, recording=recording
+        )
 
     def _played(
         self, decide: Callable[[int, float], float], samples: int, name: str, volt: float
