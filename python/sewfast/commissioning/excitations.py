@@ -127,7 +127,7 @@ def _judged(recording: Recording, u: float, *, may_stall: bool) -> float | None:
         not stopped,
         f"expected the machine to keep turning at {u:g} V, it stood still after "
         f"{abs(turns[-1]):.3g} turns: too little travel; free the shaft, take the end stop away, "
-        "or see whether the encoder loses counts",
+        "or see whether the encoder loses counts, or the command is a position",
     )
     return float(speed) if speed > 0.0 and turns[-1] >= MOVED else None
 
