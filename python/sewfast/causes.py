@@ -27,7 +27,7 @@ ALIKE, UNSURE = 0.05, 0.1
 """Shares of the speed by which a motor of its own errs at most on a run that can be an earlier one,
 and on one that shows what the machine always was."""
 LOST = 0.1
-"""Shares of motion, and of the largest command, that count as none."""
+"""Shares of motion, of a speed, and of the largest command that count as none."""
 
 
 @dataclass(frozen=True)
@@ -341,7 +341,8 @@ class _Look:
         )
         if change == "stuck" and abs(value * motor["gain"]) < LOST * self.found["size"]:
             change, value = "gain", 0.0
-        name, text = _NAMED[change](value, when)
+        words = partial(_jump, per_turn=r.counts_per_rev) if change == "jump" else _NAMED[change]
+        name, text = words(value, when)
         return Cause(name, text, self.name, None if early else at, value)
 
     def always(self) -> Cause | None:
@@ -365,10 +366,8 @@ class _Look:
             text = f"a positive command turns the machine backwards; {_SIGN}"
         elif unlike > UNSURE:
             return None
-        elif self.is_unsettled():
-            return self.integrates()
         # gain is too large if the largest command reaches this many times the machine's own limit
-        elif self.is_too_fast() and gain * self.volt > 3.0 * self.speed:
+        elif self.is_too_fast() and gain * self.volt > 3.0 * self.speed and self.bends():
             value = gain * self.volt / self.speed
             name = "gain too large"
             text = (
@@ -376,9 +375,19 @@ class _Look:
                 f"{self.volt:g} take it to its {self.speed:g} RPM; check counts_per_rev, the unit "
                 "of the command, its scale in the drive"
             )
+        elif self.is_unsettled():
+            return self.integrates()
         else:
             return None
         return Cause(name, text, self.name, None, float(value))
+
+    def bends(self) -> bool:
+        """Whether a run that was ended early shows that its speed would have settled: an answer of
+        first order falls behind a straight line by half the run's length over its time constant.
+        """
+        return bool(
+            0.5 * len(self.recording) * self.recording.Ts > LOST * self.found["motor"]["lag"]
+        )
 
     def is_unsettled(self, lags: float = 0.5) -> bool:
         """Whether the run is shorter than this many time constants of its motor."""
@@ -441,11 +450,13 @@ def _counts(value: float, when: str) -> tuple[str, str]:
     )
 
 
-def _jump(value: float, when: str) -> tuple[str, str]:
-    wraps = next((n for n in (8, 12, 16, 24, 32) if abs(abs(value) / 2.0**n - 1.0) < 0.02), None)
+def _jump(value: float, when: str, per_turn: float = math.inf) -> tuple[str, str]:
+    counters = {2.0**n: f"a counter of {n} bits that wraps" for n in range(8, 33)}
+    wraps = counters | {per_turn: "an angle that begins anew at every turn"}
+    seen = next((what for size, what in wraps.items() if abs(abs(value) / size - 1.0) < 0.02), None)
     what = (
-        f"as a counter of {wraps} bits that wraps; unwrap it where it is read"
-        if wraps
+        f"as {seen}; unwrap it where it is read"
+        if seen
         else "more than the machine can turn; check for disturbed lines and torn transfers"
     )
     return "counts jumped", f"{when} the counts jump by {value:.6g}: {what}"

@@ -20,6 +20,7 @@ import numpy as np
 
 from sewfast.arrays import FloatArray
 from sewfast.control.controller import SampledController
+from sewfast.control.guarding import TOO_FAST
 from sewfast.control.machine import WATCHED, RecordedRun, Watch
 from sewfast.errors import Interrupted, LinkError, SettingError
 from sewfast.gains import real
@@ -295,7 +296,7 @@ class PolledBoard(Unique, ABC):
             raise LinkError(
                 name=self.name, expected=f"at most {self.speed:g} RPM",
                 received=f"{speed:.0f} RPM at sample {k}",
-                remedy="excite it less, or raise `speed` if the machine tolerates it",
+                remedy=TOO_FAST,
             )  # fmt: skip
 
     def _recording(self, run: _Samples, name: str) -> Recording | None:

@@ -140,6 +140,82 @@ def test_a_machine_that_was_never_as_thought_is_named_from_one_run() -> None:
     assert named(Motor(0.0, stuck=3.0)) == "turns at rest"
 
 
+@pytest.mark.parametrize(
+    ("wraps", "per_turn", "said"),
+    [
+        (2000, 2000.0, "an angle that begins anew at every turn"),
+        (4096, 4096.0, "an angle that begins anew at every turn"),
+        (16384, 2000.0, "a counter of 14 bits that wraps"),
+        (3000, 2000.0, "more than the machine can turn"),
+    ],
+)
+def test_counts_that_wrap_are_said_to(wraps: int, per_turn: float, said: str) -> None:
+    class Absolute(Motor):
+        @property
+        def counts(self) -> float:
+            return math.floor(per_turn * self.counted) % wraps
+
+    bench = SteppedBench(Absolute(), Ts=TS, counts_per_rev=per_turn, volt=10.0, speed=3000.0)
+    with pytest.raises(LinkError) as stop:
+        record(bench, np.full(3000, 1.0))
+    assert stop.value.cause.name == "counts jumped"
+    assert said in stop.value.cause.text
+
+
+@pytest.mark.parametrize(("brakes", "named"), [(False, "turns at rest"), (True, "sign")])
+def test_a_load_that_hangs_is_not_a_turned_sign(brakes: bool, named: str) -> None:
+    """Behind a brake that opens with the command nothing tells them apart: both are said."""
+
+    class Hoist(Motor):
+        def step(self, u: float) -> None:
+            self.at = math.inf if brakes and not u else 0.0
+            super().step(u)
+
+    with pytest.raises(Refusal) as refused:
+        commission(rig(Hoist(load=-1.5)), speed=1100.0)
+    assert refused.value.stage == "first motion"
+    assert refused.value.cause.name == named
+    assert "load" in refused.value.cause.text
+
+
+def test_no_longer_step_follows_one_that_nothing_was_seen_of() -> None:
+    class Slips(Motor):
+        """The coupling is lost after the first motion."""
+
+        runs = 0
+
+        def reset(self) -> None:
+            super().reset()
+            self.runs += 1
+
+        @property
+        def counts(self) -> float:
+            return super().counts if self.runs <= 6 else 0.0
+
+    motor = Slips()
+    with pytest.raises(Refusal, match="counted nothing in 2 s") as refused:
+        commission(rig(motor), speed=1100.0)
+    assert refused.value.cause.name == "encoder lost"
+    assert motor.t < 2.1
+
+
+@pytest.mark.parametrize("lag", [0.1, 0.4, 1.5])
+@pytest.mark.parametrize("friction", [1.0, 0.0])
+def test_a_strong_machine_that_a_guard_ended_early_is_not_said_to_integrate(
+    lag: float, friction: float
+) -> None:
+    """Ended at a fifth of its own speed, it has not settled, but its speed falls behind a line."""
+    speed, counts = 0.0, [0.0]
+    while speed < 2100.0:
+        speed += TS / lag * (2500.0 * 4.0 - friction * speed)
+        counts.append(counts[-1] + PER_TURN * TS * speed / 60.0)
+    u = np.full(len(counts), 4.0)
+    ended = Recording.of_counts(u, np.floor(counts), Ts=TS, counts_per_rev=PER_TURN)
+    found = cause_of(ended, volt=12.0, speed=2000.0)
+    assert found is not None
+    assert found.name == ("gain too large" if friction else "integrates")
+
+
 def test_a_machine_that_did_what_it_always_did_has_no_cause() -> None:
     before = [record(rig(Motor()), np.repeat([0.0, 3.0, 6.0, 2.0], 500), name="steps")]
     assert cause_of(looped(Motor()), before, volt=10.0) is None

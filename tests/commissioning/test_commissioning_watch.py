@@ -253,9 +253,9 @@ def test_a_command_that_does_not_swing_ends_no_run(u: FloatArray) -> None:
 def test_a_motor_that_stands_under_a_small_command_ends_no_run() -> None:
     guard = Guard(QUIET, "hold", 1572.0)
     guard(0, np.full(5000, 9.9), np.zeros(5000))
-    guard(0, np.full(245, 20.0), np.zeros(245))
+    guard(5000, np.full(245, 20.0), np.zeros(245))
     with pytest.raises(Aborted, match=r"not a count for \.25 s at 20 V") as stop:
-        guard(0, np.full(20, 20.0), np.zeros(20))
+        guard(5245, np.full(20, 20.0), np.zeros(20))
     assert len(stop.value.recording) == 5251
 
 

@@ -95,7 +95,7 @@ def test_no_command_is_beyond_the_limit(case: Case) -> None:
     emulated = case.emulated()
     board, _ = case.board(emulated, volt=0.5 * case.volt)
     record(board, 10.0 * case.step)
-    run(case.controller, board, np.full(60, 1e6))
+    run(case.controller, board, np.full(60, board.speed))
     assert 0.0 < emulated.motor.most <= 0.5 * case.volt
 
 

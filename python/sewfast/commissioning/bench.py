@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
@@ -17,7 +17,7 @@ from .. import _core
 from ..causes import ABORTED
 from ..control.benches import MachineBench, Stepped, SteppedBench, machine_of
 from ..control.controller import SampledController
-from ..control.guarding import SEEN, MachineWrapper, RunGuard, require_made
+from ..control.guarding import SEEN, MachineWrapper, RunGuard, require_record, require_run
 from ..control.loop import ClosedLoopRun
 from ..control.machine import (
     Followed,
@@ -30,10 +30,10 @@ from ..control.machine import (
     watching,
 )
 from ..dataset import FloatArray
-from ..errors import DataError, LinkError
+from ..errors import LinkError
 from ..link import Drive
 from ..link.record import conditions_of, device_of
-from ..recording import Recording, require_finite
+from ..recording import Recording
 from ..speed import speed_or_nan
 from .demands import Refusal
 
@@ -65,7 +65,7 @@ class Aborted(Refusal):
         frequency: float | None = None,
     ) -> Aborted:
         """The error for a run of this name, from its commands [V] and counts until then."""
-        counts, u = counts - counts[0], u.copy()
+        counts, u = counts - counts[:1], u.copy()
         y = speed_or_nan(counts, like.Ts, counts_per_rev, "kalman")
         return cls(
             f"{name!r}, ended after {len(u) * like.Ts:.3g} s: {reason}",
@@ -85,11 +85,12 @@ class Guard(RunGuard):
         name: str,
         counts_per_rev: float,
         speed: float = math.inf,
+        lossy: bool = False,
     ) -> None:
         low, high = controller.u_min, controller.u_max
         super().__init__(
             name, controller.Ts, counts_per_rev, volt=max(-low, high), speed=speed,
-            between=(low, high),
+            between=(low, high), lossy=lossy,
         )  # fmt: skip
         self._controller = controller
 
@@ -178,7 +179,9 @@ class RecordedBench(MachineWrapper):
         recording = self.kept(name, key)
         if recording is None:
             with self._keeping_what_failed():
-                guard = RunGuard(name, self.Ts, self.counts_per_rev, speed=self._stated)
+                guard = RunGuard(
+                    name, self.Ts, self.counts_per_rev, speed=self._stated, lossy=self._is_lossy
+                )
                 recording = self.inner.excite(u, name, **watching(self.inner.excite, guard))
                 require_record(self.inner, name, len(u), recording)
                 self._require_speed(name, key, recording)
@@ -202,7 +205,7 @@ class RecordedBench(MachineWrapper):
         key = key_of(r, controller)
         found = self.kept_run(name, key, controller)
         if found is None:
-            guard = Guard(controller, name, self.counts_per_rev, self._stated)
+            guard = Guard(controller, name, self.counts_per_rev, self._stated, self._is_lossy)
 
             def both(first: int, u: FloatArray, counts: FloatArray) -> None:
                 guard(first, u, counts)
@@ -218,7 +221,7 @@ class RecordedBench(MachineWrapper):
                     if isinstance(ended, Recording):
                         self.note(f"{name}{ABORTED}", key, ended, None)
                     raise
-                _require_run(self.inner, name, len(r), found)
+                require_run(self.inner, name, len(r), found)
                 # nobody has watched a machine without a watch, nor the last samples of another
                 self._require_speed(name, key, found.recording)
         self.runs.append(found.recording)
@@ -226,9 +229,13 @@ class RecordedBench(MachineWrapper):
         return found
 
     @property
+    def _is_lossy(self) -> bool:
+        return isinstance(self.inner, DriveBench)
+
+    @property
     def _stated(self) -> float:
         """The speed that the machine must not pass [RPM]; a drive's device watches its own."""
-        if isinstance(self.inner, DriveBench):
+        if self._is_lossy:
             return math.inf
         return self.most if math.isinf(self.inner.speed) else self.inner.speed
 
@@ -247,41 +254,6 @@ class RecordedBench(MachineWrapper):
             f"{name!r}, {k * self.Ts:.3g} s after its start: " + seen(reason, value, self._stated),
             aborted,
         )
-
-
-def require_record(machine: Machine, name: str, samples: int, found: object) -> None:
-    """Refuse an unusable recording of a user's own machine."""
-    made = require_made(machine, name, found, Recording)
-    columns = {"u": made.u, "counts": made.counts, "y": made.y}
-    _require_columns(f"{machine.name}, {name}", columns, samples, "command")
-    for member in ("Ts", "counts_per_rev"):
-        own, its = getattr(machine, member), getattr(made, member)
-        if not math.isclose(own, its, rel_tol=1e-6):
-            raise DataError(
-                name=f"{machine.name}, {name}", expected=f"the machine's {member} of {own:g}",
-                received=f"{its:g}", remedy="state the same in both",
-            )  # fmt: skip
-
-
-def _require_run(machine: Machine, name: str, samples: int, found: object) -> None:
-    """The same for a closed loop."""
-    made = require_made(machine, name, found, RecordedRun)
-    require_record(machine, name, samples, made.recording)
-    columns = {"r": made.r, "u": made.u, "y": made.y}
-    _require_columns(f"{machine.name}, {name}", columns, samples, "sample of the reference")
-
-
-def _require_columns(
-    where: str, columns: Mapping[str, FloatArray], samples: int, each: str
-) -> None:
-    """Refuse a column with a missing sample or a value that is not finite."""
-    for column, values in columns.items():
-        if np.shape(values) != (samples,):
-            raise DataError(
-                name=where, expected=f"{column} of shape ({samples},), one for each {each}",
-                received=f"shape {np.shape(values)}", remedy="log every sample of the run",
-            )  # fmt: skip
-        require_finite(f"{where}: {column}", values)
 
 
 def key_of(signal: FloatArray, controller: SampledController | None = None) -> str:

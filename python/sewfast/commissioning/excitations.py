@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import _core
-from ..causes import LOST, Cause, dead_zone, unsettled
+from ..causes import LOST, Cause, dead_zone, turns_at_rest, unsettled
 from ..control.machine import Machine
 from ..dataset import FloatArray
 from ..errors import DataError, FitError
@@ -107,11 +107,12 @@ def _judged(recording: Recording, u: float, *, may_stall: bool) -> float | None:
         turns[-1] > -MOVED,
         f"expected a positive command to turn the machine forward, at {u:g} V it went "
         f"{turns[-1]:.3g} turns",
-        Cause(
+        # a load that hangs falls before it is commanded; behind a brake it falls with the command
+        turns_at_rest(recording) or Cause(
             "sign",
             "a positive command turns the machine backwards, and a controller would run away; swap "
             "two motor leads or the encoder's A and B, or change the sign of the command in the "
-            "drive", recording.name, None, -1.0,
+            "drive; or take away the load if it drives the shaft", recording.name, None, -1.0,
         ),
     )  # fmt: skip
     tail = max(2, round(0.1 / recording.Ts))
@@ -126,7 +127,7 @@ def _judged(recording: Recording, u: float, *, may_stall: bool) -> float | None:
         not stopped,
         f"expected the machine to keep turning at {u:g} V, it stood still after "
         f"{abs(turns[-1]):.3g} turns: too little travel; free the shaft, take the end stop away, "
-        "or see whether the encoder loses counts",
+        "or see whether the encoder loses counts, or the command is a position",
     )
     return float(speed) if speed > 0.0 and turns[-1] >= MOVED else None
 
@@ -157,6 +158,12 @@ def step_response(machine: Machine, demands: Demands, motion: Motion) -> Fopdt:
     reason: Exception | None = None
     for k, seconds in enumerate(durations):
         recording = machine.excite(step(u, seconds, machine.Ts), "step")
+        # a longer step would turn it unseen for longer
+        require(
+            bool(np.ptp(recording.counts) > 0.0),
+            f"expected the encoder to count at {u:.3g} V as in the first motion, it counted "
+            f"nothing in {seconds:g} s",
+        )
         try:
             fopdt = fit_fopdt(recording.u, recording.y, Ts=recording.Ts)
         except (DataError, FitError) as error:
@@ -168,9 +175,10 @@ def step_response(machine: Machine, demands: Demands, motion: Motion) -> Fopdt:
             continue
         _checked(fopdt, demands, motion, machine.volt)
         return fopdt
+    said, _, _ = str(reason).partition("; ")
     raise Refusal(
         f"expected a speed that settles within {durations[-1]:g} s at {u:.3g} V, it did not "
-        f"({reason}); see what varies: a changing load, a controller inside the drive, a "
+        f"({said}); see what varies: a changing load, a controller inside the drive, a "
         "machine that integrates", cause=unsettled(recording),
     ) from reason  # fmt: skip
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, cast
@@ -19,7 +20,15 @@ from ..machine import VirtualMachine
 from ..recording import Recording, require_finite
 from ..speed import Method, speed_or_nan
 from .controller import SampledController
-from .guarding import SEEN, TAIL, GuardedMachine, MachineWrapper, require_numbers
+from .guarding import (
+    SEEN,
+    TAIL,
+    GuardedMachine,
+    MachineWrapper,
+    limited,
+    require_numbers,
+    require_reference,
+)
 from .loop import run
 from .machine import (
     MEMBERS,
@@ -114,7 +123,7 @@ def _number(value: Any) -> float:
     """The value as a float, NaN if it is none."""
     try:
         return float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return math.nan
 
 
@@ -182,6 +191,8 @@ class SteppedBench:
         self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
         require_fit(controller, r, self.Ts)
+        require_reference(self, controller, r)
+        controller = limited(controller, self.volt)
         core, early = controller.core(), controller.early(r)
         per_count = 60.0 / (self.counts_per_rev * self.Ts)
         u, feedback, before = np.zeros(len(r)), np.zeros(len(r)), [0.0]
@@ -261,9 +272,11 @@ class SteppedBench:
         half = obeys // 2
         pace = abs(counts[-1] - counts[-1 - half]) if len(counts) > half else math.inf
         while len(coast) * self.Ts < COAST and not guard.at_rest:
-            turned = abs(coast[-1][0] - coast[-1 - half][0]) if len(coast) == obeys else 0.0
+            turned = abs(coast[-1][0] - coast[-1 - half][0]) if len(coast) >= obeys else 0.0
+            # at any time: a load that hangs is slowed first, and then falls
             if off is not None and turned >= pace > 0.0:
-                off()
+                self._switched_off(off)
+                off = None
             self.machine.step(0.0)
             now = _number(self.machine.counts) - first
             if not math.isfinite(now):
@@ -277,6 +290,13 @@ class SteppedBench:
         y = speed_or_nan(counts, self.Ts, self.counts_per_rev, "kalman")
         true = speed if hasattr(self.machine, "speed_rpm") else None
         return Recording(u, counts, y, true, self.Ts, self.counts_per_rev, name)
+
+    def _switched_off(self, off: Callable[[], object]) -> None:
+        """Take the power from the machine; why it failed must not hide what ended the run."""
+        try:
+            off()
+        except Exception as failed:
+            warnings.warn(f"{self.name}: off() failed: {failed!r}", RuntimeWarning, stacklevel=2)
 
     def _explain(self, error: Any, recording: Recording) -> None:
         """Tell an error what was recorded, and its cause if that shows one."""
@@ -345,7 +365,12 @@ def machine_of(
 
 def guarded(machine: Machine) -> Machine:
     """A machine whose runs are watched: those of a device or of a bench of this package are."""
-    if is_streaming(machine) or isinstance(machine, (SteppedBench, MachineBench, MachineWrapper)):
+    if is_streaming(machine) or isinstance(machine, MachineWrapper):
         return machine
+    kind = type(machine)
+    # a subclass of one's own may play in its own way
+    for known in (SteppedBench, MachineBench):
+        if kind.excite is known.excite and kind.follow is known.follow:
+            return machine
     require_numbers(machine)
     return GuardedMachine(machine)

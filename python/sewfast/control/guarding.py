@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -13,12 +13,12 @@ import numpy as np
 from .. import _core
 from ..arrays import FloatArray
 from ..causes import Cause, loss
-from ..errors import LinkError, SettingError, SewfastError
-from ..gains import real
-from ..recording import Recording
+from ..errors import DataError, LinkError, SettingError, SewfastError
+from ..gains import real, vector
+from ..recording import Recording, require_finite
 from ..speed import speed_or_nan
 from .controller import SampledController
-from .machine import Machine, RecordedRun, Watch, cause_in, recording_of, watching
+from .machine import Machine, RecordedRun, Watch, cause_in, recording_of, require_fit, watching
 
 TOO_FAST = (
     "look for a load that drives it, a turned sign of command or encoder, a gain larger than "
@@ -59,6 +59,8 @@ class RunGuard:
     """A device's own guard (docs/PROTOCOL.md, 9 and 12) for one run of a machine that has no
     device: a `Watch` that ends it if it is faster than `speed` [RPM], if its motor or encoder has
     failed under a command of up to `volt` [V], or if its command swings `between` two limits.
+    Counts that are no numbers end it, too, unless the machine is `lossy`: over a link that loses
+    samples.
     """
 
     def __init__(
@@ -70,8 +72,10 @@ class RunGuard:
         volt: float = math.inf,
         speed: float = math.inf,
         between: tuple[float, float] | None = None,
+        lossy: bool = False,
     ) -> None:
         self.name, self.Ts, self.counts_per_rev, self.speed = name, Ts, counts_per_rev, speed
+        self.lossy, self.samples, self.has_ended = lossy, 0, False
         self._guard = _core.Guard(
             Ts=Ts, counts_per_rev=counts_per_rev, volt=volt, speed=speed, between=between
         )
@@ -80,19 +84,35 @@ class RunGuard:
 
     def __call__(self, first: int, u: FloatArray, counts: FloatArray) -> None:
         """Check samples `first`, `first + 1`, ...; raises what `ended` makes."""
-        self._u.append(u.copy())
-        self._counts.append(counts.copy())
-        found = self._guard.watch(u, counts)
-        if found is None:
+        # from a user's own machine: integers, single precision, lists, columns of a table
+        u, counts = vector("u", u).copy(), vector("counts", counts).copy()
+        before, self.samples = self.samples, self.samples + len(u)
+        # a link tells where samples are missing
+        if len(u) != len(counts) or (first != before and not self.lossy):
+            raise SettingError(
+                name=f"{self.name}, watch", expected=f"the samples from {before} on, each once",
+                received=f"{len(u)} commands and {len(counts)} counts from {first} on",
+                remedy="call watch(first, u[first:k], counts[first:k]), then first = k",
+            )  # fmt: skip
+        self._u.append(u)
+        self._counts.append(counts)
+        known = len(u) if self.lossy else _numbers(u, counts)
+        found = self._guard.watch(u[:known], counts[:known])
+        end = before + known
+        if found is not None:
+            after, (reason, value) = found
+            end = before + after + 1
+        elif known < len(u):
+            reason, value = "NoNumber", float(u[known])
+        else:
             return
-        after, (reason, value) = found
-        end = sum(map(len, self._u[:-1])) + after + 1
+        self.has_ended = True
         all_u, all_counts = (np.concatenate(x)[:end] for x in (self._u, self._counts))
         raise self.ended(reason, value, all_u, all_counts)
 
     def ended(self, reason: str, value: float, u: FloatArray, counts: FloatArray) -> SewfastError:
         """The error of a run that was ended, from its commands [V] and counts until then."""
-        counts = counts - counts[0]
+        counts = counts - counts[:1]
         y = speed_or_nan(counts, self.Ts, self.counts_per_rev, "kalman")
         recording = Recording(u, counts, y, None, self.Ts, self.counts_per_rev, self.name)
         return self.error(reason, value, recording, len(u), "the run was ended")
@@ -116,6 +136,12 @@ class RunGuard:
         """What became of an encoder that was seen to be lost after so many samples."""
         concluded = cause_in(recording, volt=math.inf, speed=self.speed)
         return loss(recording, samples - 1, concluded)
+
+
+def _numbers(u: FloatArray, counts: FloatArray) -> int:
+    """How many samples come before the first that is no number."""
+    known = np.isfinite(u) & np.isfinite(counts)
+    return len(known) if known.all() else int(np.argmin(known))
 
 
 @dataclass
@@ -161,16 +187,22 @@ class GuardedMachine(MachineWrapper):
     """A user's own machine: its runs are watched if they can be, and looked at afterwards."""
 
     def excite(self, u: FloatArray, name: str) -> Recording:
+        require_finite("command", u)
+        u = np.clip(u, -self.volt, self.volt)
         # in an open loop a machine may stand under any command
         with self._guarded(name, math.inf) as guard:
-            found = self.inner.excite(u, name, **watching(self.inner.excite, guard))
-            require_made(self, name, found, Recording)
-            self._look_at(guard, found)
+            watched = watching(self.inner.excite, guard)
+            found = self.inner.excite(u, name, **watched)
+            self._look_at(guard, require_made(self, name, found, Recording), bool(watched))
+            require_record(self, name, len(u), found, lossy=True)
             return found
 
     def follow(
         self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
+        require_fit(controller, r, self.Ts)
+        require_reference(self, controller, r)
+        controller = limited(controller, self.volt)
         with self._guarded(name, self.volt) as guard:
 
             def both(first: int, u: FloatArray, counts: FloatArray) -> None:
@@ -178,9 +210,11 @@ class GuardedMachine(MachineWrapper):
                 if watch is not None:
                     watch(first, u, counts)
 
-            found = super().follow(controller, r, name, watch=both)
-            require_made(self, name, found, RecordedRun)
-            self._look_at(guard, found.recording)
+            watched = watching(self.inner.follow, both)
+            found = self.inner.follow(controller, r, name, **watched)
+            made = require_made(self, name, found, RecordedRun)
+            self._look_at(guard, made.recording, bool(watched))
+            require_run(self, name, len(r), found, lossy=True)
             return found
 
     @contextlib.contextmanager
@@ -199,7 +233,7 @@ class GuardedMachine(MachineWrapper):
         if cause := cause_in(recording, volt=self.volt, speed=self.speed):
             error.explain(cause)
 
-    def _look_at(self, guard: RunGuard, recording: Recording) -> None:
+    def _look_at(self, guard: RunGuard, recording: Recording, is_watched: bool) -> None:
         """Refuse a run whose recording shows that it was too fast."""
         if math.isfinite(self.speed):
             whole = _core.Guard(
@@ -208,8 +242,7 @@ class GuardedMachine(MachineWrapper):
             seen = whole.watch(recording.u, recording.counts)
             if seen is not None:
                 k, (reason, value) = seen
-                then = "it was seen after the run, which nobody could end: let it take a `watch`"
-                error = guard.error(reason, value, recording, k + 1, then)
+                error = guard.error(reason, value, recording, k + 1, _late(guard, is_watched))
                 # what a run does long after a fault hides it
                 end = k + 1 + round(TAIL / self.Ts)
                 u, counts, y = recording.u[:end], recording.counts[:end], recording.y[:end]
@@ -217,6 +250,15 @@ class GuardedMachine(MachineWrapper):
                     short = replace(recording, u=u, counts=counts, y=y, speed_true=None)
                     self._explain(error, short)
                 raise error
+
+
+def _late(guard: RunGuard, is_watched: bool) -> str:
+    """Why a run that was too fast was not ended in time."""
+    if guard.has_ended:
+        return "the run went on after its `watch` had ended it: let that exception pass"
+    if is_watched:
+        return f"it was seen after the run, whose `watch` was shown {guard.samples} samples"
+    return "it was seen after the run, which nobody could end: let it take a `watch`"
 
 
 def require_numbers(machine: object) -> None:
@@ -230,6 +272,27 @@ def require_numbers(machine: object) -> None:
             )  # fmt: skip
 
 
+def limited(controller: SampledController, volt: float) -> SampledController:
+    """The controller with commands of at most `volt`: its integral knows of that limit, too."""
+    low, high = max(controller.u_min, -volt), min(controller.u_max, volt)
+    if (low, high) == (controller.u_min, controller.u_max):
+        return controller
+    inner = getattr(controller, "speed", None)
+    if isinstance(inner, SampledController):  # a position loop over a speed loop
+        return replace(controller, speed=limited(inner, volt))  # type: ignore[type-var]
+    return replace(controller, u_min=low, u_max=high)  # type: ignore[type-var]
+
+
+def require_reference(machine: Machine, controller: SampledController, r: FloatArray) -> None:
+    """Refuse a reference beyond the speed that a machine must not pass, as a device does."""
+    fastest = float(np.max(np.abs(r), initial=0.0)) if controller.LOOP == "speed" else 0.0
+    if fastest > machine.speed * (1.0 + 1e-6):
+        raise SettingError(
+            name=f"{machine.name}, reference", expected=f"within its +-{machine.speed:g} RPM",
+            received=f"{fastest:g} RPM", remedy="scale it",
+        )  # fmt: skip
+
+
 def require_made(machine: Machine, name: str, found: object, kind: type[Made]) -> Made:
     """What a user's own machine returned, if it is a recording, or a run."""
     if isinstance(found, kind):
@@ -239,3 +302,45 @@ def require_made(machine: Machine, name: str, found: object, kind: type[Made]) -
         name=f"{machine.name}, {name}", expected=f"a {kind.__name__}",
         received=type(found).__name__, remedy=f"make it by {kind.__name__}.{maker}",
     )  # fmt: skip
+
+
+def require_record(
+    machine: Machine, name: str, samples: int, found: object, *, lossy: bool = False
+) -> None:
+    """Refuse an unusable recording of a user's own machine; a link may have lost samples."""
+    made = require_made(machine, name, found, Recording)
+    columns = {"u": made.u, "counts": made.counts, "y": made.y}
+    _require_columns(f"{machine.name}, {name}", columns, samples, "command", lossy=lossy)
+    for member in ("Ts", "counts_per_rev"):
+        own, its = getattr(machine, member), getattr(made, member)
+        if not math.isclose(own, its, rel_tol=1e-6):
+            raise DataError(
+                name=f"{machine.name}, {name}", expected=f"the machine's {member} of {own:g}",
+                received=f"{its:g}", remedy="state the same in both",
+            )  # fmt: skip
+
+
+def require_run(
+    machine: Machine, name: str, samples: int, found: object, *, lossy: bool = False
+) -> None:
+    """The same for a closed loop."""
+    made = require_made(machine, name, found, RecordedRun)
+    require_record(machine, name, samples, made.recording, lossy=lossy)
+    columns = {"r": made.r, "u": made.u, "y": made.y}
+    _require_columns(
+        f"{machine.name}, {name}", columns, samples, "sample of the reference", lossy=lossy
+    )
+
+
+def _require_columns(
+    where: str, columns: Mapping[str, FloatArray], samples: int, each: str, *, lossy: bool
+) -> None:
+    """Refuse a column with a missing sample or, unless `lossy`, one that is not finite."""
+    for column, values in columns.items():
+        if np.shape(values) != (samples,):
+            raise DataError(
+                name=where, expected=f"{column} of shape ({samples},), one for each {each}",
+                received=f"shape {np.shape(values)}", remedy="log every sample of the run",
+            )  # fmt: skip
+        if not lossy:
+            require_finite(f"{where}: {column}", values)
