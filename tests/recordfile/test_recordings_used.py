@@ -10,9 +10,11 @@ import pytest
 import sewfast as api
 from cli import call_refused as refused
 from cli import called as sewfast
+from kinds import model_of
 from recordings_made import header
 from refusals import refuses
 from sewfast.cli import main
+from sewfast.control import paper_controller
 from sewfast.control.record import record
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, SettingError
@@ -164,6 +166,17 @@ def test_show_says_what_is_there(folder: Path) -> None:
     assert told["gaps"] == [[1500, 40], [2000, 10], [2040, 10]]
     assert (told["received"], told["complete"], told["damage"]) == (3940, False, [])
     assert sewfast(folder, "show", "whole.mcap", "--json").json()["complete"]
+
+
+def test_show_prints_models_and_controllers_too(folder: Path, tmp_path: Path) -> None:
+    model = model_of("oe")
+    model.save(tmp_path / "drive.json")
+    assert sewfast(tmp_path, "show", "drive.json").out == f"{model}\n"
+    assert sewfast(tmp_path, "show", "drive.json", "--json").json()["kind"] == "oe"
+    paper_controller().save(tmp_path / "controller.json")
+    assert "2-DOF PID" in sewfast(tmp_path, "show", "controller.json").out
+    (tmp_path / "results.json").write_text('{"format": "sewfast.results"}')
+    assert "sewfast look" in refused(tmp_path, "show", "results.json")
 
 
 def test_export_writes_what_other_programs_read(folder: Path, tmp_path: Path) -> None:

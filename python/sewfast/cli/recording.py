@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .. import storage
 from ..errors import SettingError
 from .arguments import (
     RECORDINGS,
@@ -220,8 +221,19 @@ def signals_command(args: argparse.Namespace) -> None:
 
 SHOW = """\
 Show the content of a recording (.mcap): its length, gaps, events, damage, the device and its
-settings. A recording whose recorder was killed is readable up to that moment ("torn").
+settings. A recording whose recorder was killed is readable up to that moment ("torn"). Models,
+controllers, tables, motors and frequency responses (.json) are shown as Python prints them.
 """
+
+STORED = {
+    "sewfast.model": "load_model",
+    "sewfast.controller": "load_controller",
+    "sewfast.table": "load_table",
+    "sewfast-motor": "load_motor",
+    "sewfast-frequency-response": "load_response",
+    "sewfast-frequency-responses": "load_responses",
+}
+"""What reads a file of each format."""
 
 EXPORT = """\
 Write the columns of a recording (.mcap) with their time t to a file for other programs. Rows in
@@ -233,9 +245,10 @@ sample, so that PlotJuggler and Foxglove draw curves.
 def add_files(commands: Commands) -> None:
     parser = add_command(
         commands, "show", show_command,
-        summary="content of a recording", text=SHOW, examples="example:\n  sewfast show run.mcap",
+        summary="content of a recording, model or controller", text=SHOW,
+        examples="examples:\n  sewfast show run.mcap\n  sewfast show drive.json",
     )  # fmt: skip
-    parser.add_argument("recording", metavar="RECORDING.mcap", help="recording")
+    parser.add_argument("recording", metavar="FILE", help="recording (.mcap) or .json file")
     parser = add_command(
         commands, "export", export_command,
         summary="a recording in another format", text=EXPORT,
@@ -251,8 +264,18 @@ def add_files(commands: Commands) -> None:
 
 
 def show_command(args: argparse.Namespace) -> None:
+    import sewfast
+
     from ..recordfile import read_recording
 
+    is_json = Path(args.recording).suffix.lower() == ".json"
+    if is_json and (stored := storage.format_of(args.recording)) in STORED:
+        shown = getattr(sewfast, STORED[stored])(args.recording)
+        if args.json:
+            print_json(shown.to_dict())
+        else:
+            print(shown)
+        return
     found = read_recording(args.recording)
     if args.json:
         print_json(_content(found))

@@ -426,6 +426,7 @@ def _headless(path: Path, raw: bytes, damage: list[str]) -> DataError:
         return DataError(
             name=str(path), expected="a recording (MCAP)",
             received="a file of another kind or one damaged from its first bytes on",
+            remedy="sewfast look reads columns in other formats",
         )  # fmt: skip
     reason = next((text for text in damage if Topic.HEADER.path in text), "none is whole")
     return DataError(
