@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sewfast.cli.arguments import Commands, add_command
 from sewfast.cli.drive import is_port
+from sewfast.cli.interrupts import patient
 from sewfast.cli.output import print_json
 from sewfast.errors import SettingError
 
@@ -60,7 +61,8 @@ def command(args: argparse.Namespace) -> None:
 
     if args.demo and args.place is not None:
         raise SettingError(f"--demo: expected no folder, received {args.place}; leave one out")
-    with contextlib.ExitStack() as left, contextlib.suppress(KeyboardInterrupt):
+    # at its end the motor stops, what runs is cancelled, and the demo's folder goes
+    with patient(), contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as left:
         port = args.place if args.place is not None and is_port(args.place) else None
         place = "." if port is not None else args.place or "."
         if args.demo:

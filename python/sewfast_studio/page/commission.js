@@ -10,18 +10,19 @@ let writes = false, busy = false, stages = [];
 
 const tell = teller(document, "commission-error");
 function enable() { $("commission-start").disabled = busy || !writes; $("commission-cancel").disabled = $("commission-cancel").hidden = !busy || !writes; $("commission-bar").hidden = !busy; }
+function enter(stage) { stages.push(stage); const row = document.createElement("li"); row.textContent = stage; $("stages").append(row); }
 /** Once something is verified, the way on is the step's action. */
 function next(on) { $("commission-start").classList.toggle("primary", !on); $("verified").hidden = !on; }
 
 $("commission-start").onclick = async () => {
-  tell(null); stages = []; $("stages").replaceChildren(); $("commission-verdict").textContent = ""; $("loops").replaceChildren(); $("no-commission").hidden = true; $("commission-fold").hidden = true; $("commission-bar").removeAttribute("value"); next(false);
+  tell(null); stages = []; $("stages").replaceChildren(); enter("starting"); $("commission-verdict").textContent = ""; $("loops").replaceChildren(); $("no-commission").hidden = true; $("commission-fold").hidden = true; $("commission-bar").removeAttribute("value"); next(false);
   const seed = $("machine-seed").value;
   try {
     const effort = { seed: 0, members: $("networks").valueAsNumber, evaluations: $("commission-tries").valueAsNumber };
     if ($("commission-on").value === "drive") await ask("drive_commission", { ...effort, go_on: $("go-on").checked });
     else await ask("commission", { machine: seed ? `virtual:${seed}` : "virtual", ...effort });
     busy = true; mark("commission", "under way");
-  } catch (error) { tell(error); }
+  } catch (error) { $("stages").replaceChildren(); tell(error); }
   enable();
 };
 $("commission-cancel").onclick = () => ask($("commission-on").value === "drive" ? "stop" : "cancel").catch(tell);
@@ -47,7 +48,7 @@ on("progress", p => {
   if (!["commissioned", "driven"].includes(p.of)) return;
   busy = true; enable(); $("commission-bar").value = p.done / Math.max(p.total, 1);
   const [, name, share] = p.best.match(/^(.*?)(?: (\d+\/\d+))?$/);
-  if (stages.at(-1) !== name) { stages.push(name); $("stages").append(document.createElement("li")); }
+  if (stages.at(-1) !== name) enter(name);
   $("stages").lastChild.textContent = share ? `${name}, ${share}` : name;
 });
 function ended(m) {

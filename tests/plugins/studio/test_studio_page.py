@@ -312,7 +312,7 @@ def test_the_whole_way_by_keyboard(studio: Studio, browser: Any) -> None:
     keys.write("commission-tries", "100")
     keys.press("commission-start")
     until(lambda: "Verified" in text("commission-verdict"), 300.0)
-    assert text("stages").startswith("first motion")
+    assert text("stages").startswith("starting\nfirst motion")
     assert "verification" in text("stages")
     assert len(browser.find_elements("css selector", "#loops canvas")) == 4
     if "STUDIO_PICTURES" in os.environ:
