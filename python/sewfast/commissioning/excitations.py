@@ -199,20 +199,19 @@ def lost_motion(fopdt: Fopdt, demands: Demands, motion: Motion) -> Cause | None:
 def _checked(fopdt: Fopdt, demands: Demands, motion: Motion, volt: float) -> None:
     # least fit [%]; below it the machine is not of first order with dead time
     least_fit = 80.0
-    lost = lost_motion(fopdt, demands, motion)
+    # a dead zone takes a constant from the command, and leaves the shape of the response
     require(
         fopdt.K > 0.0 and fopdt.fit_percent >= least_fit,
         f"expected a step response of first order with dead time (fit of {least_fit:g} % or more, "
         f"gain above 0), got {fopdt}; see the recording: the load must not change, nor a limit "
         "be reached",
-        lost,
     )
     needed = (demands.top - fopdt.offset) / fopdt.K
     require(
         needed <= demands.u_max,
         f"expected the top speed and a quarter more, {demands.top:.4g} RPM, to need less than "
         f"u_max = {demands.u_max:g} V, the step response says {needed:.3g} V",
-        lost or Cause(
+        lost_motion(fopdt, demands, motion) or Cause(
             "out of reach",
             f"{demands.u_max:g} V reach {fopdt.K * demands.u_max + fopdt.offset:.4g} RPM; lower "
             f"speed, or {more_command(demands.u_max, volt)}",
