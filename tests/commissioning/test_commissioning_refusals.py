@@ -349,3 +349,16 @@ def test_a_current_limit_is_not_taken_for_a_swing() -> None:
     hurried = np.minimum(r * 6.0, r[-1])
     reached = int(np.argmax(hurried >= r[-1]))
     assert swing_of(run(controller, machine, hurried), reached + 200) is not None
+
+
+@pytest.mark.parametrize(
+    ("counts", "named"), [(40.0, "encoder: one count is 188 RPM"), (1e3, "elastic")]
+)
+def test_a_swing_that_one_count_makes_is_the_encoder_and_no_shaft(
+    counts: float, named: str
+) -> None:
+    asked = Gains.standard(0.02, 0.1, 0.005, u_unit="V", y_unit="RPM")
+    loop = Controller(
+        asked, Ts=0.001, u_min=-20.0, u_max=20.0, filter_samples=8, counts_per_rev=counts
+    )
+    assert named in gains.cause(gains.Swing(0.25, 400.0, 5.0, 0.0), None, loop)

@@ -492,7 +492,8 @@ def cautious(
         if kept < shares[0]:
             raise Refusal(
                 f"expected a quiet loop at {r[-1]:.4g} RPM under a quarter of the gains, it swings "
-                f"at {swing.frequency:.3g} Hz ({swing.command:.3g} V rms): {cause(swing, small)}"
+                f"at {swing.frequency:.3g} Hz ({swing.command:.3g} V rms): "
+                f"{cause(swing, small, tried)}"
             )
         return scaled(controller, kept), swing
     return controller, None
@@ -508,8 +509,27 @@ def _chatter(
     return 0.0
 
 
-def cause(swing: Swing, small: SmallSignal | None) -> str:
-    """The likely cause of an oscillation, and its remedy."""
+def _count(controller: Controller) -> tuple[float, float]:
+    """What a single count is in the filtered feedback [RPM], and how far it moves the command [V]:
+    from its least to its largest value over the mean that the count passes.
+    """
+    if controller.counts_per_rev is None:
+        return 0.0, 0.0
+    core, n = controller.core(), controller.filter_samples
+    count = 60.0 / (controller.counts_per_rev * controller.Ts)
+    u = [core.step(0.0, count * (k == 0)) for k in range(n + 2)]
+    return count / n, max(u) - min(u)
+
+
+def cause(swing: Swing, small: SmallSignal | None, controller: Controller) -> str:
+    """The likely cause of an oscillation under a controller, and its remedy."""
+    count, moved = _count(controller)
+    # the deviation of a command that goes from one of the two values to the other
+    if swing.command <= 0.5 * moved:
+        return (
+            f"the steps of the encoder: one count is {count:.3g} RPM in the feedback, and moves "
+            f"the command by {moved:.3g} V; take an encoder with more counts, or a longer mean"
+        )
     remedy = "stiffen the shaft or the coupling, remove its play, or demand less speed"
     if small is not None and small.resonance is not None:
         return f"the machine has {small.resonance}; {remedy}"

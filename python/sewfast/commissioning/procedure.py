@@ -395,15 +395,17 @@ def _carry_out(
         ensemble, controller = _tuned(trained, plan, journal)
 
     journal.enter("verification")
-    controller, swing = cautious(
+    calm, swing = cautious(
         machine, controller, asked, fastest, "hold_tuned", small, ensemble, thinning
     )
     if swing is not None:
+        why = cause(swing, small, scaled(controller, swing.share))
         note = (
             f"gains lowered, as the machine swung at {swing.frequency:.3g} Hz "
-            f"under {100 * swing.share:g} % of them: {cause(swing, small)}"
+            f"under {100 * swing.share:g} % of them: {why}"
         )
-        controller = _noted(controller, note, journal)
+        calm = _noted(calm, note, journal)
+    controller = calm
     controller = _compared(machine, controller, ensemble, verify, load, plan, journal)
     if small is not None and small.resonance is not None:
         speed = SHAKEN_AT * asked.speed
@@ -469,7 +471,7 @@ def _compared(
             return tried
         swings = (
             f"swings at {swing.frequency:.3g} Hz where it should stand or hold a speed "
-            f"({swing.command:.3g} V rms): {cause(swing, plan.small)}"
+            f"({swing.command:.3g} V rms): {cause(swing, plan.small, tried)}"
         )
     raise Refusal(f"expected a quiet loop under half of the gains, the machine {swings}")
 
