@@ -348,7 +348,7 @@ def test_the_command_line_tunes_stops_and_moves(
     for refused, words in (
         (["--on", "virtual", "--stop-at", "90"], "with a unit"),
         (["--on", "virtual", "--stop-at", "90deg", "--speed", "9000"], "the rates of the drive"),
-        (["--on", "/dev/ttyS77", "--stop-at", "90deg"], "no device has positions"),
+        (["--on", "/dev/ttyS77", "--stop-at", "90deg"], "expected -o FILE"),
         (["--on", "virtual", "--stop-at", "90deg", "--table", "a.json"], "two"),
         (["--on", "virtual", "--reference", "trapezoid"], "stop_at"),
         (["--on", "virtual", "--speed", "900"], "--speed: expected --stop-at or --positions"),

@@ -16,6 +16,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..control.controller import SampledController
 from ..control.machine import RecordedRun, Watch, cancelled_by, cause_in, recording_of
+from ..control.position import Playing, PositionController
 from ..errors import Interrupted, LinkError, SettingError, SewfastError
 from ..live import Feed, ViewKind, open_view
 from ..recordfile import Header, RecordWriter, read_recording
@@ -216,7 +217,8 @@ def follow(
     def convert(run: RunResult) -> RecordedRun:
         return _run(run.columns, drive, controller, r, name)
 
-    plan = Plan("controller", controller.early(r), controller)
+    goals = isinstance(controller, PositionController) and Playing.of(controller).stop is None
+    plan = Plan("positions" if goals else "controller", controller.early(r), controller)
     return _converted(drive, plan, convert, name=name, **options)
 
 
@@ -260,6 +262,10 @@ def _run(
     """The run as the drive streamed it; a column that is missing is computed, or NaN."""
     recording = _recording(columns, drive, name, "kalman")
     n, true = len(recording), recording.speed_true
+    place = goal = None
+    if isinstance(controller, PositionController):
+        playing = Playing.of(controller)
+        place, goal = playing.on_device(r, recording.counts, drive.limits().volt)
     return RecordedRun(
         t=np.arange(n, dtype=np.float64) * recording.Ts,
         r=r[:n],
@@ -270,6 +276,8 @@ def _run(
         plant=drive.identity.name,
         reference=name,
         recording=recording,
+        place=place,
+        goal=goal,
     )
 
 

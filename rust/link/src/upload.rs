@@ -48,6 +48,13 @@ impl Upload {
         Self::new(1, values.iter().map(single))
     }
 
+    /// Goals in single precision \[counts\].
+    #[must_use]
+    pub fn goals(values: &[f64]) -> Self {
+        let single = |&value: &f64| (value as f32).to_le_bytes();
+        Self::new(2, values.iter().map(single))
+    }
+
     fn new<const N: usize>(table: u8, values: impl Iterator<Item = [u8; N]>) -> Self {
         Self {
             table,
