@@ -206,8 +206,8 @@ def test_what_cannot_be_is_refused_by_name() -> None:
         stop_at(PI, machine, "90deg")  # type: ignore[arg-type]
     with refuses(SettingError, name="controller"):
         run(LAW, machine, RAMP)
-    with refuses(SettingError, name="controller"):
-        LAW.sent()
+    with refuses(SettingError, name="file"):
+        stop_at(LAW, machine, "90deg", file="stop.mcap")
     with refuses(SettingError, name="controller"):
         tune(drive(), controller="position")
     with refuses(SettingError, name="counts_per_rev"):

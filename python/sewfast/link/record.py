@@ -7,7 +7,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -214,10 +214,18 @@ def follow(
 ) -> RecordedRun:
     """A controller on a drive along a reference; see `Drive.follow`."""
 
-    def convert(run: RunResult) -> RecordedRun:
-        return _run(run.columns, drive, controller, r, name)
+    playing = Playing.of(controller) if isinstance(controller, PositionController) else None
+    # asked for before the run: afterwards the drive may have gone
+    volt = math.inf if playing is None else drive.limits().volt
 
-    goals = isinstance(controller, PositionController) and Playing.of(controller).stop is None
+    def convert(run: RunResult) -> RecordedRun:
+        found = _run(run.columns, drive, controller, r, name)
+        if playing is None:
+            return found
+        place, goal = playing.on_device(r, found.recording.counts, volt)
+        return replace(found, place=place, goal=goal)
+
+    goals = playing is not None and playing.stop is None
     plan = Plan("positions" if goals else "controller", controller.early(r), controller)
     return _converted(drive, plan, convert, name=name, **options)
 
@@ -262,10 +270,6 @@ def _run(
     """The run as the drive streamed it; a column that is missing is computed, or NaN."""
     recording = _recording(columns, drive, name, "kalman")
     n, true = len(recording), recording.speed_true
-    place = goal = None
-    if isinstance(controller, PositionController):
-        playing = Playing.of(controller)
-        place, goal = playing.on_device(r, recording.counts, drive.limits().volt)
     return RecordedRun(
         t=np.arange(n, dtype=np.float64) * recording.Ts,
         r=r[:n],
@@ -276,8 +280,6 @@ def _run(
         plant=drive.identity.name,
         reference=name,
         recording=recording,
-        place=place,
-        goal=goal,
     )
 
 

@@ -160,6 +160,15 @@ mod tests {
     }
 
     #[test]
+    fn goals_have_a_table_of_their_own() {
+        let upload = Upload::goals(&[393.0, -0.5]);
+        let body = upload.piece(2).unwrap();
+        let mut fields = Fields::new(body.bytes().unwrap());
+        assert_eq!((fields.u8(), fields.u32()), (Some(2), Some(0)));
+        assert_eq!((fields.f32(), fields.f32()), (Some(393.0), Some(-0.5)));
+    }
+
+    #[test]
     fn steps_are_rounded_to_even_and_end_at_the_limit() {
         let upload = Upload::commands(&[0.0005, 0.0015, -0.0025, 9.0, -9.0], 1000, 8.9996);
         let body = upload.piece(5).unwrap();

@@ -4,8 +4,8 @@ use super::rig::*;
 use crate::link::identity::capability as can;
 use crate::link::{Fields, Identity, Reason, State, Travel};
 use crate::{
-    Controller, Design, Feedforward, Level, PidController, PositionDesign, PositionLoop, Rate,
-    Rates, Settings, Standard, Turning,
+    Controller, Design, FARTHEST, Feedforward, Level, PidController, PositionDesign, PositionLoop,
+    Rate, Rates, Settings, Standard, Turning,
 };
 use proptest::prelude::*;
 use std::vec;
@@ -504,4 +504,31 @@ proptest! {
 fn limits_of_the_command_are_those_of_the_speed_loop() {
     assert_eq!(law().limits(), (-10.0, 10.0));
     assert_eq!(law().law().speed().limits(), (-10.0, 10.0));
+}
+
+/// Single precision has half counts at the farthest goal: a move there ends at its goal and stands.
+#[test]
+fn a_move_far_away_ends_at_its_goal() {
+    let (mut law, mut motor) = (law(), Motor::new());
+    law.follow();
+    let (mut counts, mut commands) = (0, Vec::new());
+    for (goal, samples) in [
+        (0, 10),
+        (FARTHEST as i32, 62_000),
+        (FARTHEST as i32 - 777, 1500),
+    ] {
+        commands.clear();
+        for k in 0..samples {
+            let moved = motor.moved();
+            counts += moved;
+            let u = law.step(goal as f32, moved);
+            assert!(u.is_finite() && u.abs() <= 10.0);
+            motor.advance(u);
+            if k + 500 > samples {
+                commands.push(counts);
+            }
+        }
+        assert!(law.law().stands(), "{goal}: {}", law.law().place());
+        assert!(commands.iter().all(|at| (at - goal).abs() <= 1), "{goal}");
+    }
 }
