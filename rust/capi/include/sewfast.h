@@ -139,7 +139,7 @@ typedef struct sewfast_device sewfast_device;
 
 /* Enough bytes on any target; sewfast_device_init refuses less than sewfast_device_size(). As static storage:
  *     static union { uint64_t align; unsigned char bytes[SEWFAST_DEVICE_SIZE]; } storage; */
-#define SEWFAST_DEVICE_SIZE 14336
+#define SEWFAST_DEVICE_SIZE 15360
 
 /* Why there is no device. */
 enum sewfast_refusal {
