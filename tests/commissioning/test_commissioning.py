@@ -383,6 +383,15 @@ def test_positions_are_commissioned() -> None:
     assert len(found.stops) == 3
 
 
+@pytest.mark.nightly("a commissioning of its own")
+def test_positions_are_commissioned_on_a_device() -> None:
+    with VirtualDevice(fast=True) as device, connect(device.port) as drive:
+        drive.set_limits(volt=20.0, speed_rpm=8000.0)
+        found = commission(drive, loop="position", **SMALL)
+    assert found.is_verified
+    assert len(found.stops) == 3
+
+
 def test_a_run_of_which_the_link_lost_samples_is_made_once_more() -> None:
     made: list[int] = []
     with (
