@@ -121,7 +121,8 @@ void board_identity(sewfast_identity *identity) {
     identity->counts_per_rev = COUNTS_PER_REV;
     identity->capabilities =
         SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN | SEWFAST_CAN_BIQUADS |
-        SEWFAST_CAN_FEEDFORWARD;
+        SEWFAST_CAN_FEEDFORWARD |
+        SEWFAST_CAN_POSITIONS;
     identity->ceilings = (sewfast_limits){20.0f, 4000.0f, 60000.0f, INFINITY}; /* what the machine can withstand */
     identity->channels = channels;
     identity->channel_count = sizeof channels / sizeof channels[0];

@@ -839,6 +839,9 @@ class PositionController:
     def goal(self) -> float: ...
     def early(self, reference: _F) -> _F:
         """References as the steps take them; the last value stays."""
+    def single(self, early: _F, counts: _F) -> list[_F]:
+        """Commands, places and goals [counts] of a device, which computes in single precision, from early references and the
+        counts that it had: NaN before a stop, and from missing counts on."""
 
 def position_run(
     plant: Any, controller: PositionController, reference: _F, *, counts_per_unit: float,
@@ -1113,6 +1116,18 @@ class LinkBodies:
     ) -> bytes:
         """Levels of output and command."""
     @staticmethod
+    def position(
+        numbers: Sequence[float], smoothing: int, releases: bool,
+        rows: Sequence[tuple[float, float, float]],
+    ) -> bytes:
+        """Gain, fastest, landing and creep; samples of smoothing; rows of speed and rates away from and towards rest."""
+    @staticmethod
+    def angle(at: int, counts: float, onward: bool) -> bytes:
+        """A stop at an angle [counts] from a sample of the run on, 0 for its next one."""
+    @staticmethod
+    def travel(low: int, high: int) -> bytes:
+        """Least and greatest count; both 0 ask only."""
+    @staticmethod
     def biquads(sections: Sequence[Sequence[float]]) -> bytes:
         """Sections of c0, c1, a1, a2."""
     @staticmethod
@@ -1153,6 +1168,9 @@ class LinkBodies:
         body: bytes,
     ) -> list[float] | None:
         """Volt, speed, acceleration, current in force, then their ceilings."""
+    @staticmethod
+    def travel_of(body: bytes) -> list[int] | None:
+        """Least and greatest count in force, then the device's own."""
     @staticmethod
     def started(body: bytes) -> tuple[int, int] | None: ...
     @staticmethod
@@ -1264,6 +1282,9 @@ class LinkUpload:
     @staticmethod
     def references(values: _F, limit: float) -> LinkUpload:
         """In single precision, limited to ``limit``."""
+    @staticmethod
+    def goals(values: _F) -> LinkUpload:
+        """In single precision [counts]."""
     @property
     def end(self) -> int:
         """Number of values on the device."""

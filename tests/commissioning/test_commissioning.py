@@ -23,6 +23,7 @@ import pytest
 from cli import called as sewfast
 from commissioned import SMALL, short
 from fitted import fitted, made
+from link_device import ScriptedDevice
 from moments import once_on
 from sewfast import (
     Commissioning,
@@ -365,12 +366,12 @@ class Sticks:
         self.machine.step(self.u)
 
 
-def test_positions_are_asked_for_by_name_and_not_of_a_device() -> None:
+def test_positions_are_asked_for_by_name_and_not_of_a_device_without(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="loop"):
         commission(VirtualMachine(), loop="angle")  # type: ignore[arg-type]
-    with VirtualDevice(fast=True) as device, connect(device.port) as drive:
+    with ScriptedDevice(tmp_path) as device, connect(device.url) as drive:
         drive.set_limits()
-        with pytest.raises(SettingError, match="no device has positions"):
+        with pytest.raises(SettingError, match="SEWFAST_CAN_POSITIONS"):
             commission(drive, loop="position")
         assert drive.outcome is None
 
@@ -378,6 +379,15 @@ def test_positions_are_asked_for_by_name_and_not_of_a_device() -> None:
 @pytest.mark.nightly("a commissioning of its own")
 def test_positions_are_commissioned() -> None:
     found = commission(VirtualMachine(), loop="position", **SMALL)
+    assert found.is_verified
+    assert len(found.stops) == 3
+
+
+@pytest.mark.nightly("a commissioning of its own")
+def test_positions_are_commissioned_on_a_device() -> None:
+    with VirtualDevice(fast=True) as device, connect(device.port) as drive:
+        drive.set_limits(volt=20.0, speed_rpm=8000.0)
+        found = commission(drive, loop="position", **SMALL)
     assert found.is_verified
     assert len(found.stops) == 3
 

@@ -206,8 +206,8 @@ def test_what_cannot_be_is_refused_by_name() -> None:
         stop_at(PI, machine, "90deg")  # type: ignore[arg-type]
     with refuses(SettingError, name="controller"):
         run(LAW, machine, RAMP)
-    with refuses(SettingError, name="controller"):
-        LAW.sent()
+    with refuses(SettingError, name="file"):
+        stop_at(LAW, machine, "90deg", file="stop.mcap")
     with refuses(SettingError, name="controller"):
         tune(drive(), controller="position")
     with refuses(SettingError, name="counts_per_rev"):
@@ -348,7 +348,7 @@ def test_the_command_line_tunes_stops_and_moves(
     for refused, words in (
         (["--on", "virtual", "--stop-at", "90"], "with a unit"),
         (["--on", "virtual", "--stop-at", "90deg", "--speed", "9000"], "the rates of the drive"),
-        (["--on", "/dev/ttyS77", "--stop-at", "90deg"], "no device has positions"),
+        (["--on", "/dev/ttyS77", "--stop-at", "90deg"], "expected -o FILE"),
         (["--on", "virtual", "--stop-at", "90deg", "--table", "a.json"], "two"),
         (["--on", "virtual", "--reference", "trapezoid"], "stop_at"),
         (["--on", "virtual", "--speed", "900"], "--speed: expected --stop-at or --positions"),

@@ -117,6 +117,15 @@ def feedforward(preview: int, late: float, levels: int, taps: int) -> bytes:
     return body + struct.pack(f"<B{taps}f", taps, *(0.5**j for j in range(taps)))
 
 
+def position(smoothing: int, releases: int, rows: int) -> bytes:
+    """Body of POSITION: gain 30, up to 3000 RPM, the last 12 counts at 60 RPM, rates by speed."""
+    body = struct.pack("<4f3B", 30.0, 3000.0, 12.0, 60.0, smoothing, releases, rows)
+    rates = (
+        struct.pack("<3f", 500.0 * k, 9000.0 - 250.0 * k, 1e4 + 250.0 * k) for k in range(rows)
+    )
+    return body + b"".join(rates)
+
+
 def catalogue() -> list[tuple[str, Frame]]:
     """Frames that reach every edge of the layout."""
     dice = random.Random(7)
@@ -139,6 +148,26 @@ def catalogue() -> list[tuple[str, Frame]]:
         ("FEEDFORWARD of two levels", (0x0E, boot, 8, at(1_070_000), feedforward(8, 0.5, 2, 3))),
         ("FEEDFORWARD in full", (0x0E, boot, 9, at(1_080_000), feedforward(30, 1.0, 8, 16))),
         ("FEEDFORWARD of none", (0x0E, boot, 10, at(1_090_000), feedforward(0, 0.0, 0, 0))),
+        ("HELLO of two versions", (0x01, 0, 0, 1_100_000, struct.pack("<BBI", 3, 4, 0x12345678))),
+        (
+            "UPLOAD of goals",
+            (0x08, boot, 11, at(1_110_000), struct.pack("<BI2f", 2, 7, 393.0, -0.5)),
+        ),
+        ("POSITION of a row", (0x0F, boot, 12, at(1_120_000), position(1, 0, 1))),
+        ("POSITION in full", (0x0F, boot, 13, at(1_130_000), position(31, 1, 8))),
+        (
+            "ANGLE of the next sample",
+            (0x10, boot, 14, at(1_140_000), struct.pack("<IfB", 0, 393.0, 0)),
+        ),
+        (
+            "ANGLE the shorter way",
+            (0x10, boot, 15, at(1_150_000), struct.pack("<IfB", 777, -0.5, 1)),
+        ),
+        ("TRAVEL", (0x11, boot, 16, at(1_160_000), struct.pack("<ii", -(2**31), 2**31 - 1))),
+        (
+            "START of goals",
+            (0x0A, boot, 17, at(1_170_000), struct.pack("<BIQIHB", 3, 50_000, 0, 9, 3, 10)),
+        ),
         (
             "the longest without a zero",
             (0x0B, 0x0101, 0x01010101, 2**64 // 255, b"\x01" * MAX_BODY),

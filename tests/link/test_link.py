@@ -229,7 +229,13 @@ TEXT = st.text(max_size=10)
 @given(U8, U16, U32, U32, U64, SINGLE, st.binary(max_size=200))
 def test_a_commands_body_is_its_fields_one_after_the_other(byte, short, a, b, long, u, values):
     bodies = _core.LinkBodies
-    assert bodies.hello(a) == struct.pack("<BBI", 3, 3, a)
+    assert bodies.hello(a) == struct.pack("<BBI", 3, 4, a)
+    moves = golden.position(31, 1, 8)
+    rows = [struct.unpack_from("<3f", moves, 19 + 12 * k) for k in range(8)]
+    assert bodies.position((30.0, 3000.0, 12.0, 60.0), 31, True, rows) == moves
+    assert bodies.angle(a, u, False) == struct.pack("<IfB", a, u, 1)
+    assert bodies.travel(-short, short) == struct.pack("<ii", -short, short)
+    assert bodies.travel_of(struct.pack("<4i", -short, short, -7, 7)) == [-short, short, -7, 7]
     assert bodies.arm(a, b) == struct.pack("<II", a, b)
     assert bodies.keep(a) == struct.pack("<I", a)
     assert bodies.drive(a, u) == struct.pack("<If", a, u)

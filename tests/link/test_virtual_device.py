@@ -57,7 +57,7 @@ class TestRun:
             name = reply[28 : 28 + reply[27]].decode()
             assert (reply[0], reply[10], name) == (3, 6, "virtual")
             capabilities, capacity = struct.unpack_from("<II", reply, 15)
-            assert (capabilities, capacity) == (0b11_1111_0111, 8192)
+            assert (capabilities, capacity) == (0b111_1111_0111, 8192)
             names = [host.command(raw.DESCRIBE, bytes([k])) for k in range(6)]
             names = [row[7 : 7 + row[6]].decode() for row in names]
             assert names == ["counts", "u", "current", "r", "feedback", "speed_true"]

@@ -233,7 +233,8 @@ void board_identity(sewfast_identity *identity) {
     identity->counts_per_rev = COUNTS_PER_REV;
     identity->capabilities =
         SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN | SEWFAST_CAN_BIQUADS |
-        SEWFAST_CAN_FEEDFORWARD;
+        SEWFAST_CAN_FEEDFORWARD |
+        SEWFAST_CAN_POSITIONS;
     if (!shared.real_time) identity->capabilities |= SEWFAST_CAN_CREDIT;
     identity->ceilings = (sewfast_limits){20.0f, 8000.0f, 90000.0f, INFINITY};
     identity->channels = channels;

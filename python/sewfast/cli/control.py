@@ -37,6 +37,8 @@ from .output import note, print_json, write_columns
 if TYPE_CHECKING:
     from ..control.controller import Controller, SampledController
     from ..control.loop import ClosedLoopRun, Plant
+    from ..control.position import PositionController
+    from ..control.stops import PositionRun
     from ..dataset import FloatArray
     from ..link import HostLoopRun
 
@@ -48,7 +50,7 @@ counts), feedback (y after encoder and filter).
 
 With a controller of positions (sewfast tune --loop position), --stop-at brings a running drive to
 an angle, and --positions goes from goal to goal; there are further columns counts, position, place
-(of the profile) and goal. Angles count from where the run begins. No device has positions yet.
+(of the profile) and goal. Angles count from where the run begins.
 
 On a drive the controller runs on the device; the run is written as MCAP while it runs, and
 a file with another ending is made from it afterwards. Ctrl-C stops the motor and keeps the file.
@@ -63,6 +65,8 @@ examples:
   sewfast run controller.json --on virtual --table seam.json -o measured.csv
   sewfast run position.json --on virtual --stop-at 90deg --speed 2000 -o stop.csv
   sewfast run position.json --on virtual --positions moves.csv -o measured.csv
+  sewfast run position.json --on /dev/ttyUSB0 --stop-at 90deg --speed 2000 -o stop.csv \\
+      --limits volt=10,speed=3500,acceleration=60000,current=15
   sewfast run controller.json --on /dev/ttyUSB0 --reference trapezoid -o measured.mcap \\
       --limits volt=10,speed=3500,acceleration=30000,current=15
   sewfast run controller.json --on /dev/ttyUSB0 --reference cycle.csv -o measured.csv \\
@@ -159,7 +163,7 @@ POSITIONS_OPTIONS = """\
 
 def _add_positions(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
-        "positions", "With a controller of positions, on a model, a virtual machine or an FMU."
+        "positions", "With a controller of positions, on a model, a machine or a drive."
     )
     add_options(group, POSITIONS_OPTIONS)
 
@@ -167,15 +171,27 @@ def _add_positions(parser: argparse.ArgumentParser) -> None:
 def _run_positions(args: argparse.Namespace, controller: SampledController) -> None:
     from ..commissioning.fmu import is_fmu
     from ..control.position import require_position
-    from ..control.stops import follow_positions, stop_at
 
     position = require_position(controller, "run --stop-at")
-    if is_port(args.on):
-        position.sent()
-    require_no_drive_options(args)
     if args.share is not None:
         position = replace(position, share=args.share)
+    if is_port(args.on):
+        place = recording_place(args.out, overwrite=args.overwrite)
+        kept = {"file": place, "live": args.live, "overwrite": args.overwrite}
+        with opened(args) as drive:
+            _show_positions(args, _positions_run(args, position, drive, **kept), place)
+        return
+    require_no_drive_options(args)
     on: Any = machine_of(args.on) if is_fmu(args.on) else plant_of(args.on)
+    _show_positions(args, _positions_run(args, position, on), None)
+
+
+def _positions_run(
+    args: argparse.Namespace, position: PositionController, on: Any, **kept: Any
+) -> PositionRun:
+    """The stop or the moves that are asked for."""
+    from ..control.stops import follow_positions, stop_at
+
     if args.stop_at is not None:
         reference = _wanted(args, position.speed)
         if isinstance(reference, str):
@@ -183,19 +199,22 @@ def _run_positions(args: argparse.Namespace, controller: SampledController) -> N
                 name="--reference", expected="a file of speeds before the stop",
                 received=reference, remedy="or give --speed",
             )  # fmt: skip
-        found = stop_at(
+        return stop_at(
             position, on, args.stop_at, speed=args.speed, reference=reference, way=args.way,
-            zero=args.zero, after=args.after, release=args.release,
+            zero=args.zero, after=args.after, release=args.release, **kept,
         )  # fmt: skip
-    else:
-        if beside := _of_stops(args):
-            raise SettingError(
-                name=beside[0], expected="--stop-at", received="--positions",
-                remedy="leave it out: goals are counted from where the run begins",
-            )  # fmt: skip
-        goals, unit = _goals(args.positions, position.Ts)
-        name = Path(args.positions).stem
-        found = follow_positions(position, on, goals, unit=unit, release=args.release, name=name)
+    if beside := _of_stops(args):
+        raise SettingError(
+            name=beside[0], expected="--stop-at", received="--positions",
+            remedy="leave it out: goals are counted from where the run begins",
+        )  # fmt: skip
+    goals, unit = _goals(args.positions, position.Ts)
+    name = Path(args.positions).stem
+    return follow_positions(position, on, goals, unit=unit, release=args.release, name=name, **kept)
+
+
+def _show_positions(args: argparse.Namespace, found: PositionRun, place: Path | None) -> None:
+    """Write the columns, beside a drive's recording in `place`, and print a summary."""
     summary: dict[str, Any] = {"plant": found.plant, "asked": found.name, "unit": found.unit}
     summary |= {"n": len(found.t), "Ts": found.Ts, **found.metrics()}
     summary["warnings"] = warnings = found.warnings
@@ -206,7 +225,9 @@ def _run_positions(args: argparse.Namespace, controller: SampledController) -> N
         found.plot(file=args.plot)
         summary["plot"] = str(args.plot)
         lines.append(f"written to {args.plot}")
-    write_columns(args.out, found.columns(), found.units, summary, lines, as_json=args.json)
+    write_columns(
+        args.out, found.columns(), found.units, summary, lines, as_json=args.json, written=place
+    )
 
 
 def _of_stops(args: argparse.Namespace) -> list[str]:

@@ -14,7 +14,7 @@ from ..control.machine import Machine
 from ..control.position import PositionController
 from ..control.stops import AFTER, PositionRun, stop_at
 from ..dataset import FloatArray
-from ..errors import FitError
+from ..errors import FitError, SettingError
 from ..models import Ensemble, Model
 from ..recording import Recording
 from ..tuning.objective import Constraints, Cost
@@ -109,7 +109,11 @@ def verified_stops(
     ]
     keep(tuple(stops))
     for k, (angle, begun) in enumerate(asked):
-        stops[k] = replace(stops[k], measured=run(machine, angle, begun))
+        try:
+            measured = run(machine, angle, begun)
+        except SettingError as error:  # moves beyond the limits of a device
+            raise Unsuited(f"{error}; the speed loop is verified and kept") from error
+        stops[k] = replace(stops[k], measured=measured)
         keep(tuple(stops))
         if unmet(stops):
             break

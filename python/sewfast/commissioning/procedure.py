@@ -184,11 +184,7 @@ def commission(
     _require_kinds(cost, progress, cancel, between)
     with bench_of(on, u_max, cancel) as machine:
         if loop == "position" and isinstance(machine, DriveBench):
-            raise SettingError(
-                name="loop", expected="'speed', as no device has positions", received="'position'",
-                remedy="commission the speed loop; positions run on virtual machines, FMUs and "
-                "your own Machine",
-            )  # fmt: skip
+            machine.drive.require_positions()
         asked = demands(
             machine,
             u_max=u_max,

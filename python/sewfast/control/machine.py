@@ -11,7 +11,7 @@ import inspect
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Protocol, TypeAlias, TypeGuard
 
 import numpy as np
@@ -32,9 +32,13 @@ class RecordedRun(ClosedLoopRun):
     ----------
     recording : Recording
         The run as measured by the encoder, for identification.
+    place, goal : array, shape (N,), or None
+        Of a position loop on a device: the profile's position, and where it goes [counts].
     """
 
     recording: Recording
+    place: FloatArray | None = field(default=None, kw_only=True)
+    goal: FloatArray | None = field(default=None, kw_only=True)
 
     @classmethod
     def of(cls, run: ClosedLoopRun, recording: Recording) -> RecordedRun:

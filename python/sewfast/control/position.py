@@ -1,12 +1,12 @@
 """`PositionController`: a position loop over a PID.
 
-The arithmetic is that of `sewfast_control::position`, on models, virtual machines and every
-`Machine` of this process. It works in counts: they are 0 where a run begins.
+The arithmetic is that of `sewfast_control::position`, on models, on every `Machine` of this process
+and, in single precision, on devices. It works in counts: they are 0 where a run begins.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from numpy.typing import ArrayLike
@@ -189,21 +189,6 @@ class PositionController(SampledController):
         early: FloatArray = self.core().early(vector("reference", reference))
         return early
 
-    def sent(self) -> tuple[int, list[float]]:
-        """No device has a position loop.
-
-        Raises
-        ------
-        SettingError
-            Always.
-        """
-        raise SettingError(
-            name="controller", expected="a speed loop, as no device has positions",
-            received="a position loop",
-            remedy="run it on a model, a virtual machine or your own Machine, or give the device "
-            "its speed loop (controller.speed)",
-        )  # fmt: skip
-
     @classmethod
     def first(cls, plant: Any, **settings: Any) -> PositionController:
         """A search needs its speed loop first.
@@ -259,6 +244,39 @@ class PositionController(SampledController):
         ]
         notes = [f"  notes     {self.notes}"] if self.notes else []
         return "\n".join([*lines, *notes, f"over a {self.speed}"])
+
+
+@dataclass(frozen=True)
+class Playing(PositionController):
+    """A position controller for one run, as the `follow` of a machine takes it. With `stop`, the
+    samples before it, the angle and the turn [counts] and whether it goes onward, references are
+    speeds until then; otherwise they are goals [counts].
+    """
+
+    stop: tuple[int, float, float, bool] | None = None
+    releases: bool = False
+
+    @classmethod
+    def of(cls, controller: PositionController, **run: Any) -> Playing:
+        """The controller with what it does in a run; one that is playing already stays as it is."""
+        if isinstance(controller, Playing) and not run:
+            return controller
+        own = {one.name: getattr(controller, one.name) for one in fields(PositionController)}
+        return cls(**own, **run)
+
+    def core(self) -> Any:
+        return self._loop(self.stop, releases=self.releases)
+
+    def on_device(
+        self, r: FloatArray, counts: FloatArray, volt: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Places and goals of a device, which steps the same law in single precision and within
+        its limit of the command, from the references and the counts of the run; NaN before a stop.
+        """
+        low, high = max(self.u_min, -volt), min(self.u_max, volt)
+        core = replace(self, speed=replace(self.speed, u_min=low, u_max=high)).core()
+        _, place, goal = core.single(self.early(r)[: len(counts)], counts)
+        return place, goal
 
 
 def _speed_in(fields: Fields) -> Controller:

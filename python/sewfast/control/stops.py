@@ -1,14 +1,14 @@
 """Runs of a position loop: `stop_at` and `follow_positions`, and their `PositionRun`.
 
-On models, virtual machines and every `Machine` of this process.
+On models, virtual machines, every `Machine` of this process and devices.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -26,7 +26,7 @@ from ..units import counts_of, duration, position_unit
 from .benches import MachineBench, guarded, machine_of
 from .loop import check_fits, common_rest, plant_name, require_units, single_core
 from .machine import is_streaming
-from .position import PositionController, require_position
+from .position import Playing, PositionController, require_position
 
 if TYPE_CHECKING:
     from .machine import Machine
@@ -46,17 +46,6 @@ def _within(name: str, counts: FloatArray | float) -> None:
             name=name, expected=f"a place within {FARTHEST:.3g} counts",
             received=f"{float(np.max(np.abs(counts))):.3g} counts", remedy="give it in its turn",
         )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Playing(PositionController):
-    """A position controller for one run, as the `follow` of a machine takes it."""
-
-    stop: tuple[int, float, float, bool] | None = None
-    releases: bool = False
-
-    def core(self) -> Any:
-        return self._loop(self.stop, releases=self.releases)
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,6 +269,7 @@ def stop_at(
     after: float = AFTER,
     release: bool = False,
     disturbance: ArrayLike | None = None,
+    **drive: Any,
 ) -> PositionRun:
     """Run a drive at a speed, and stop it at an angle of its turn.
 
@@ -288,7 +278,7 @@ def stop_at(
     controller : PositionController
     on : Model, VirtualMachine or Machine
         The plant, from rest. A `Machine` is run by its `follow`, with the position loop computed
-        there: in this process, not on a device.
+        there: for a drive on its device, in single precision.
     angle : str
         With its unit, such as ``90deg``, ``1.57rad``, ``.25turns`` or ``393counts``.
     speed : float, optional
@@ -308,12 +298,15 @@ def stop_at(
         Whether the command goes to 0 once the shaft has come to rest; by default the loop holds it.
     disturbance : array, shape (N,), optional
         For a model: a command added after the limiter, unknown to the controller [u].
+    **drive
+        For a drive: `file`, `live`, `overwrite` and `cancel` as for `run`.
 
     Raises
     ------
     SettingError
         For a controller without a position loop, a speed beyond its `fastest`, an angle without a
-        unit, a machine without counts, a device behind a port, sample times or units that disagree.
+        unit, a machine without counts, a device without positions, sample times or units that
+        disagree.
     FitError
         If the loop diverges.
     LinkError
@@ -359,7 +352,7 @@ def stop_at(
     counts = real("zero", zero) + counts_of(value, unit, per_rev)
     _within("angle", counts)
     stop = (start, counts, per_rev, way == "onward")
-    found = _played(position, on, r, name, stop, release, disturbance)
+    found = _played(position, on, r, name, stop, release, disturbance, drive)
     return replace(found, unit=unit)
 
 
@@ -372,6 +365,7 @@ def follow_positions(
     release: bool = False,
     disturbance: ArrayLike | None = None,
     name: str = "positions",
+    **drive: Any,
 ) -> PositionRun:
     """Go from goal to goal, from rest.
 
@@ -394,6 +388,8 @@ def follow_positions(
         As for `stop_at`.
     name : str
         In texts.
+    **drive
+        As for `stop_at`.
 
     Raises
     ------
@@ -413,7 +409,7 @@ def follow_positions(
         )  # fmt: skip
     require_finite("goals", r)
     _within("goals", r)
-    found = _played(position, on, r, name, None, release, disturbance)
+    found = _played(position, on, r, name, None, release, disturbance, drive)
     return replace(found, unit=known)
 
 
@@ -430,6 +426,7 @@ def _require_reach(controller: PositionController, speeds: Sequence[float] | Flo
 def _played(
     controller: PositionController, on: Any, r: FloatArray, name: str,
     stop: tuple[int, float, float, bool] | None, release: bool, disturbance: ArrayLike | None,
+    drive: Mapping[str, Any],
 ) -> PositionRun:  # fmt: skip
     """The run on a plant of any kind."""
     start = 0 if stop is None else stop[0]
@@ -439,10 +436,12 @@ def _played(
     if stop is not None:
         shown[start:] = np.nan
     t = np.arange(len(r), dtype=np.float64) * controller.Ts
-    own: dict[str, Any] = {
-        one.name: getattr(controller, one.name) for one in fields(PositionController)
-    }
-    playing = _Playing(**own, stop=stop, releases=release)
+    playing = Playing.of(controller, stop=stop, releases=release)
+    if drive and not is_streaming(on):
+        raise SettingError(
+            name=", ".join(drive), expected="a drive", received=type(on).__name__,
+            remedy="leave it out",
+        )  # fmt: skip
     common: dict[str, Any] = {
         "t": t,
         "r": shown,
@@ -478,13 +477,16 @@ def _played(
             remedy="run it on a model",
         )  # fmt: skip
     machine = machine_of(on)
-    if is_streaming(machine):
-        controller.sent()
     _require_counts(controller, machine)
     require_units(controller, ("", "RPM"))
-    run = guarded(machine).follow(playing, r, name)
-    counts = run.recording.counts
-    place, goal = _replayed(playing, counts, r, start)
+    run = (
+        machine.follow(playing, r, name, **drive)
+        if is_streaming(machine)
+        else guarded(machine).follow(playing, r, name)
+    )
+    counts, place, goal = run.recording.counts, run.place, run.goal
+    if place is None or goal is None:
+        place, goal = _replayed(playing, counts, r, start)
     return PositionRun(
         **common, u=run.u, y=run.y, feedback=run.feedback, counts=counts, position=counts.copy(),
         place=place, goal=goal, plant=machine.name, is_stop=stop is not None,
@@ -492,7 +494,7 @@ def _played(
 
 
 def _replayed(
-    controller: _Playing, counts: FloatArray, r: FloatArray, start: int
+    controller: Playing, counts: FloatArray, r: FloatArray, start: int
 ) -> tuple[FloatArray, FloatArray]:
     """Where the profile was and went [counts], NaN before `start`: the loop again, on the counts
     that it got.

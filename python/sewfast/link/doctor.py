@@ -201,6 +201,7 @@ _TRIPS = {
     "no motion": "the motor did not move; check motor cable, drive supply and encoder",
     "stop input": "the stop input is active; release it",
     "late": "a control period came late; see the counters below",
+    "travel": "the counter, or the goal of a stop, was beyond the limits of the position",
     "swinging": "the loop oscillated between its limits; lower the gains or look for a resonance",
 }
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from .. import _core
 from ..control.controller import Controller, SampledController
 from ..control.machine import RecordedRun, Watch
+from ..control.position import Playing, PositionController
 from ..errors import LinkError, SettingError
 from ..gains import real
 from ..live import ViewKind
@@ -35,8 +36,10 @@ from .plan import (
     gains,
     layout,
     limit,
+    moves,
     other_kind,
     require_capable,
+    require_positions,
 )
 from .ports import Unique, open_port
 from .record import excite, follow
@@ -229,14 +232,49 @@ class Drive(Unique):
         ]
         return wire.limits(self._link.ask(Kind.LIMITS, wire.set_limits(values)))
 
+    def require_positions(self) -> None:
+        """Raise `SettingError` for a device that has no positions; the message says how to update
+        it.
+        """
+        require_positions(self.identity)
+
+    def travel(self) -> tuple[int, int]:
+        """Least and greatest count that the device allows during a run."""
+        self.require_positions()
+        low, high, *_ = wire.travel(self._link.ask(Kind.TRAVEL, wire.set_travel(0, 0)))
+        return low, high
+
+    def set_travel(self, low: int, high: int) -> None:
+        """Set the least and the greatest count that the device allows during a run, until a reset
+        or a new session. They are those of its counter (`status().counts`), which goes on from run
+        to run: beyond them it trips, and refuses goals.
+
+        Raises
+        ------
+        SettingError
+            For a device without positions.
+        LinkError
+            For limits beyond the device's own.
+        """
+        self.require_positions()
+        self._link.ask(Kind.TRAVEL, wire.set_travel(low, high))
+
     def set_controller(self, controller: SampledController) -> None:
         """Load a controller into the device; its encoder is the device's own.
 
         Raises
         ------
         SettingError
-            Where sample time or units are not the device's.
+            Where sample time or units are not the device's, or the moves of a position loop are
+            beyond its limits.
         """
+        if isinstance(controller, PositionController):
+            self.require_positions()
+            playing = Playing.of(controller)
+            body = moves(playing, self.identity, self.limits())
+            self.set_controller(playing.speed)
+            self._link.ask(Kind.POSITION, body)
+            return
         if not isinstance(controller, Controller):
             self._link.ask(Kind.CONTROLLER, other_kind(controller, self.channels, self.identity))
             return
@@ -410,9 +448,10 @@ class Drive(Unique):
 
         Parameters
         ----------
-        controller : Controller or StateFeedback
+        controller : Controller, StateFeedback or PositionController
         r : array, shape (N,)
-            Reference at the device's sample time [y].
+            Reference at the device's sample time [y]; for positions goals [counts], from where the
+            run begins (`stop_at` and `follow_positions` are the way to it).
         name : str
             Of the reference, in messages and reports.
         file, live, overwrite, cancel
@@ -491,7 +530,8 @@ class Drive(Unique):
         return self._link.watchdog
 
     def _profile_of(self, plan: Plan) -> _core.LinkUpload | None:
-        profile = self._profile("references" if plan.mode == "controller" else "commands", plan)
+        tables = {"controller": "references", "positions": "goals"}
+        profile = self._profile(tables.get(plan.mode, "commands"), plan)
         return None if plan.mode == "direct" else profile
 
     def _profile(self, what: str, plan: Plan) -> _core.LinkUpload:
@@ -505,6 +545,8 @@ class Drive(Unique):
             )
         if what == "references":
             return profiles.references(plan.values, limits)
+        if what == "goals":
+            return profiles.goals(plan.values)
         return profiles.commands(plan.values, self.channels[1], limits)
 
     def _require_idle(self) -> None:

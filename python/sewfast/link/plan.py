@@ -11,23 +11,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..control.controller import Controller, SampledController
+from ..control.position import Playing, PositionController
 from ..errors import LinkError, SettingError
 from ..gains import Gains, real, vector
 from ..units import counts_per_unit, spelled
 from . import wire
 from .connection import ClockBounds, Connection
-from .wire import Channel, Identity, Kind
+from .wire import Channel, Identity, Kind, Limits
 
-Mode: TypeAlias = Literal["commands", "controller", "direct"]
+Mode: TypeAlias = Literal["commands", "controller", "direct", "positions"]
 Columns: TypeAlias = Mapping[str, NDArray[np.float64]]
 
 DEFAULTS: dict[str, tuple[str, ...]] = {
     "commands": ("speed_true",),
     "controller": ("speed_true", "feedback", "r"),
     "direct": ("speed_true",),
+    "positions": ("speed_true", "feedback", "r"),
 }
 """Streamed besides `counts` and `u` if the device has them; a low baud rate drops the last."""
 _CAPABILITIES = {"commands": wire.PROFILE, "controller": wire.PID, "direct": wire.DIRECT}
+_CAPABILITIES["positions"] = wire.POSITIONS
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,14 @@ class Plan:
 
     Parameters
     ----------
-    mode : "commands", "controller" or "direct"
-        Upload `values` as commands; run `controller` on the device with them as references; or send
-        each as a command at its time, which suits only slow plants.
+    mode : "commands", "controller", "direct" or "positions"
+        Upload `values` as commands; run `controller` on the device with them as references; send
+        each as a command at its time, which suits only slow plants; or go from goal to goal.
     values : array, shape (N,)
-        Commands in the unit of channel `u`, or references in the unit of the controller's output.
-    controller : Controller, StateFeedback or None
-        For mode "controller".
+        Commands in the unit of channel `u`, references in the unit of the controller's output, or
+        goals [counts].
+    controller : Controller, StateFeedback, PositionController or None
+        For mode "controller" and, one of positions, for mode "positions".
     columns : sequence of str or None
         Channels to stream besides `counts` and `u`; None for as many of the mode's usual ones as
         the baud rate carries.
@@ -77,9 +81,10 @@ class Plan:
             )  # fmt: skip
         values.setflags(write=False)
         object.__setattr__(self, "values", values)
-        if (self.controller is None) == (self.mode == "controller"):
+        if (self.controller is None) == (self.mode in ("controller", "positions")):
             raise SettingError(
-                name="controller", expected="one in mode 'controller' and none elsewhere",
+                name="controller",
+                expected="one in the modes 'controller' and 'positions' and none elsewhere",
                 received=f"{'none' if self.controller is None else 'one'} in mode {self.mode!r}",
             )  # fmt: skip
 
@@ -167,6 +172,8 @@ class Layout:
 
 def require_capable(plan: Plan, identity: Identity) -> None:
     """Refuse a mode that the device does not offer, or a controller with another sample time."""
+    if isinstance(plan.controller, PositionController):
+        require_positions(identity)
     if not identity.capabilities & _CAPABILITIES[plan.mode]:
         raise SettingError(
             name="mode", expected="one that the device offers",
@@ -179,6 +186,18 @@ def require_capable(plan: Plan, identity: Identity) -> None:
             name="controller", expected=f"one for the device's period of {identity.Ts:g} s",
             received=f"one for {controller.Ts:g} s", remedy="tune it at that sample time",
         )  # fmt: skip
+
+
+def require_positions(identity: Identity) -> None:
+    """Refuse positions on a device that has none; the message says how to update it."""
+    if identity.capabilities & wire.POSITIONS:
+        return
+    raise SettingError(
+        name="controller", expected="a speed loop for this device", received="a position loop, "
+        f"which its firmware does not support (protocol version {identity.version})",
+        remedy="build the firmware with this sewfast and set SEWFAST_CAN_POSITIONS, or give it "
+        "the speed loop (controller.speed)",
+    )  # fmt: skip
 
 
 def layout(plan: Plan, channels: Sequence[Channel], identity: Identity, baud: float) -> Layout:
@@ -331,6 +350,24 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
     )  # fmt: skip
     design = (c.observer_time, c.r_rate, c.schedule_rows()) if further else None
     return wire.gains(values, c.filter_samples, design)
+
+
+def moves(playing: Playing, identity: Identity, limits: Limits) -> bytes:
+    """Body of POSITION for a position loop, whose moves must keep within the device's limits."""
+    rows, unit = playing.rows(), playing.counts_per_unit
+    rpm = 60.0 * unit / identity.counts_per_rev  # of one unit of speed
+    steepest = max(max(up, down) for _, up, down in rows)
+    for what, wanted, limit, name, remedy in (
+        ("speeds", playing.fastest, limits.speed_rpm, "RPM", "or use less of it (fastest)"),
+        ("rates", steepest, limits.acceleration, "RPM/s", "or use less of them (share)"),
+    ):
+        if wanted * rpm > limit * (1.0 + 1e-6):
+            raise SettingError(
+                name="controller", expected=f"{what} of at most {limit:g} {name}, the limit",
+                received=f"{wanted * rpm:g}", remedy=f"raise the limit (set_limits), {remedy}",
+            )  # fmt: skip
+    numbers = (playing.gain, playing.fastest, playing.landing, playing.creep)
+    return wire.position(numbers, playing.smoothing, playing.releases, rows)
 
 
 def _require_units(given: str, device: str, what: str) -> None:

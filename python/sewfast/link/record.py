@@ -7,7 +7,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -16,6 +16,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..control.controller import SampledController
 from ..control.machine import RecordedRun, Watch, cancelled_by, cause_in, recording_of
+from ..control.position import Playing, PositionController
 from ..errors import Interrupted, LinkError, SettingError, SewfastError
 from ..live import Feed, ViewKind, open_view
 from ..recordfile import Header, RecordWriter, read_recording
@@ -213,10 +214,19 @@ def follow(
 ) -> RecordedRun:
     """A controller on a drive along a reference; see `Drive.follow`."""
 
-    def convert(run: RunResult) -> RecordedRun:
-        return _run(run.columns, drive, controller, r, name)
+    playing = Playing.of(controller) if isinstance(controller, PositionController) else None
+    # asked for before the run: afterwards the drive may have gone
+    volt = math.inf if playing is None else drive.limits().volt
 
-    plan = Plan("controller", controller.early(r), controller)
+    def convert(run: RunResult) -> RecordedRun:
+        found = _run(run.columns, drive, controller, r, name)
+        if playing is None:
+            return found
+        place, goal = playing.on_device(r, found.recording.counts, volt)
+        return replace(found, place=place, goal=goal)
+
+    goals = playing is not None and playing.stop is None
+    plan = Plan("positions" if goals else "controller", controller.early(r), controller)
     return _converted(drive, plan, convert, name=name, **options)
 
 

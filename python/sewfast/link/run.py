@@ -34,6 +34,12 @@ def references(values: NDArray[np.float64], limits: Limits) -> LinkUpload:
     return LinkUpload.references(values, limit)
 
 
+def goals(values: NDArray[np.float64]) -> LinkUpload:
+    """Goals as the device stores them. Raises `SettingError` beyond what single precision holds."""
+    _require_within("goals", values, 2.0**22, "counts")
+    return LinkUpload.goals(values)
+
+
 def _require_within(name: str, values: NDArray[np.float64], limit: float, unit: str) -> None:
     beyond = np.flatnonzero(np.abs(values) > limit * (1.0 + 1e-6))
     if len(beyond):
@@ -191,6 +197,10 @@ class Run:
         link.resumable = True
         link.each_turn = self._each_turn
         arm_at_rest(link)
+        stop = getattr(self.plan.controller, "stop", None)
+        if stop is not None:
+            at, angle, _, onward = stop
+            link.ask(Kind.ANGLE, wire.angle(at, angle, onward))
         mode = wire.MODES[self.plan.mode]
         body = wire.start(mode, link.watchdog_us, 0, self.length, layout.mask, layout.batch)
         self.run, start_us = wire.started(link.ask(Kind.START, body))

@@ -38,6 +38,9 @@ class Kind(IntEnum):
     BIQUADS = 0x0C
     CONTROLLER = 0x0D
     FEEDFORWARD = 0x0E
+    POSITION = 0x0F
+    ANGLE = 0x10
+    TRAVEL = 0x11
     KEEP = 0x20
     DRIVE = 0x21
     CREDIT = 0x22
@@ -46,14 +49,14 @@ class Kind(IntEnum):
 STATES = ("boot", "idle", "armed", "running", "tripped")
 REASONS = (
     "none", "watchdog", "speed", "acceleration", "current", "underrun", "bad command",
-    "host changed", "measurement", "no motion", "stop input", "late", "swinging",
+    "host changed", "measurement", "no motion", "stop input", "late", "swinging", "travel",
 )  # fmt: skip
 EVENTS = ("", "boot", "armed", "started", "finished", "stopped", "tripped", "cleared")
-MODES = {"commands": 0, "controller": 1, "direct": 2}
+MODES = {"commands": 0, "controller": 1, "direct": 2, "positions": 3}
 
-PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN, BIQUADS, KINDS, FEEDFORWARD = (
-    1 << b for b in range(10)
-)
+(
+    PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN, BIQUADS, KINDS, FEEDFORWARD, POSITIONS
+) = (1 << b for b in range(11))  # fmt: skip
 """Capabilities of a device."""
 
 
@@ -277,6 +280,12 @@ def limits(body: bytes) -> Limits:
     return Limits(volt, speed, acceleration, current, (a, b, c, d))
 
 
+def travel(body: bytes) -> tuple[int, int, int, int]:
+    """The reply to TRAVEL: least and greatest count in force, then the device's own."""
+    low, high, least, greatest = _whole(LinkBodies.travel_of(body), body, "TRAVEL")
+    return low, high, least, greatest
+
+
 def event(
     code: int, state: int, reason: int, run: int, samples: int, value: float, time_us: int
 ) -> Event:
@@ -317,6 +326,7 @@ def _shown(name: str) -> str:
 
 arm, set_limits, gains = LinkBodies.arm, LinkBodies.limits, LinkBodies.gains
 biquads, feedforward = LinkBodies.biquads, LinkBodies.feedforward
+position, angle, set_travel = LinkBodies.position, LinkBodies.angle, LinkBodies.travel
 controller, start = LinkBodies.controller, LinkBodies.start
 
 
@@ -347,6 +357,9 @@ _FIELDS: dict[int, tuple[str, ...]] = {
     Kind.BIQUADS: ("the number of biquads",),
     Kind.FEEDFORWARD: ("its preview, levels or taps",),
     Kind.CONTROLLER: ("kind", "counts per unit"),
+    Kind.POSITION: ("its gain, speeds, landing, smoothing or rates",),
+    Kind.ANGLE: ("the sample of the stop", "angle", "way"),
+    Kind.TRAVEL: ("the least count", "the greatest count"),
     Kind.START: ("mode", "watchdog", "at", "length", "mask", "batch"),
 }  # fmt: skip
 

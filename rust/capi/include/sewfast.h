@@ -41,6 +41,7 @@ extern "C" {
 #define SEWFAST_CAN_BIQUADS 128u /* its PID has biquads */
 #define SEWFAST_CAN_KINDS 256u /* runs controllers of other kinds (CONTROLLER) */
 #define SEWFAST_CAN_FEEDFORWARD 512u /* its PID has feedforward */
+#define SEWFAST_CAN_POSITIONS 1024u /* runs a position loop over its PID, and keeps to limits of the position */
 
 /* How a channel's samples are written. */
 enum sewfast_encoding {
@@ -87,6 +88,7 @@ typedef struct sewfast_identity {
     sewfast_limits ceilings;         /* what no host can go beyond */
     const sewfast_channel *channels; /* [0]: counts of the counter; [1]: steps of the command */
     size_t channel_count;            /* 2 to 16 */
+    int32_t travel_low, travel_high; /* where the counter may be during a run; both 0: anywhere */
 } sewfast_identity;
 
 /* ---- what goes in and out -------------------------------------------------------------------------------------------- */
@@ -124,7 +126,8 @@ enum sewfast_reason {
     SEWFAST_NO_MOTION = 9,
     SEWFAST_STOP_INPUT = 10,
     SEWFAST_LATE = 11,
-    SEWFAST_SWINGING = 12
+    SEWFAST_SWINGING = 12,
+    SEWFAST_TRAVEL = 13
 };
 
 /* ---- the device ------------------------------------------------------------------------------------------------------ */
@@ -136,7 +139,7 @@ typedef struct sewfast_device sewfast_device;
 
 /* Enough bytes on any target; sewfast_device_init refuses less than sewfast_device_size(). As static storage:
  *     static union { uint64_t align; unsigned char bytes[SEWFAST_DEVICE_SIZE]; } storage; */
-#define SEWFAST_DEVICE_SIZE 14336
+#define SEWFAST_DEVICE_SIZE 15360
 
 /* Why there is no device. */
 enum sewfast_refusal {
@@ -148,7 +151,8 @@ enum sewfast_refusal {
     SEWFAST_REFUSED_PERIOD = 5,
     SEWFAST_REFUSED_COUNTS_PER_REV = 6,
     SEWFAST_REFUSED_CEILINGS = 7,
-    SEWFAST_REFUSED_CHANNELS = 8
+    SEWFAST_REFUSED_CHANNELS = 8,
+    SEWFAST_REFUSED_TRAVEL = 9
 };
 
 size_t sewfast_device_size(void);

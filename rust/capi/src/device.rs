@@ -6,7 +6,7 @@ use core::slice;
 use sewfast_control::Refused;
 use sewfast_control::link::identity::MAX_CHANNELS;
 use sewfast_control::link::{
-    Channel, Device, Encoding, Identity, Limits, Measurement, Output, Reason, Source,
+    Channel, Device, Encoding, Identity, Limits, Measurement, Output, Reason, Source, Travel,
 };
 
 /// Number of values of a profile that the device holds.
@@ -75,6 +75,10 @@ pub struct CIdentity {
     pub channels: *const CChannel,
     /// 2 to 16.
     pub channel_count: usize,
+    /// Least count of a run; both 0 for anywhere.
+    pub travel_low: i32,
+    /// Greatest count of a run.
+    pub travel_high: i32,
 }
 
 /// `sewfast_measurement`.
@@ -120,6 +124,7 @@ enum Refusal {
     CountsPerRev = 6,
     Ceilings = 7,
     Channels = 8,
+    Travel = 9,
 }
 
 impl From<Refused> for Refusal {
@@ -129,6 +134,7 @@ impl From<Refused> for Refusal {
             "firmware" => Self::Firmware,
             "period" => Self::Period,
             "counts_per_rev" => Self::CountsPerRev,
+            "travel" => Self::Travel,
             "volt" | "speed" | "acceleration" | "current" => Self::Ceilings,
             _ => Self::Channels,
         }
@@ -213,6 +219,10 @@ unsafe fn init(storage: *mut Storage, identity: &CIdentity) -> Result<(), Refusa
             speed,
             acceleration,
             current,
+        },
+        travel: match (identity.travel_low, identity.travel_high) {
+            (0, 0) => Travel::ANY,
+            (low, high) => Travel { low, high },
         },
         // SAFETY: written above and never again, and the caller does not move the storage.
         channels: unsafe { slice::from_raw_parts(channels, count) },
@@ -384,6 +394,7 @@ pub unsafe extern "C" fn sewfast_device_trip(device: *mut Storage, now: u64, rea
         9 => Reason::NoMotion,
         11 => Reason::Late,
         12 => Reason::Swinging,
+        13 => Reason::Travel,
         _ => Reason::StopInput,
     };
     // SAFETY: by contract.

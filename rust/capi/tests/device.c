@@ -113,7 +113,8 @@ void board_identity(sewfast_identity *identity) {
     identity->counts_per_rev = 1572.0f;
     identity->capabilities =
         SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN | SEWFAST_CAN_BIQUADS |
-        SEWFAST_CAN_FEEDFORWARD;
+        SEWFAST_CAN_FEEDFORWARD |
+        SEWFAST_CAN_POSITIONS;
     identity->ceilings = (sewfast_limits){20.0f, 4000.0f, 60000.0f, INFINITY};
     identity->channels = channels;
     identity->channel_count = sizeof channels / sizeof channels[0];
@@ -221,7 +222,7 @@ static void storage_is_checked(void) {
         {SEWFAST_COUNTS, SEWFAST_FROM_COUNTS, 0, 1, "counts", "1"},
         {SEWFAST_STEPS, SEWFAST_FROM_COMMAND, 0, 1000, "u", "V"},
     };
-    sewfast_identity identity = {1, 0, "x", "1", 1000, 1572.0f, SEWFAST_CAN_DRIVE, {20, 4000, INFINITY, INFINITY}, channels, 2};
+    sewfast_identity identity = {1, 0, "x", "1", 1000, 1572.0f, SEWFAST_CAN_DRIVE, {20, 4000, INFINITY, INFINITY}, channels, 2, 0, 0};
     int32_t refusal = -1;
     CHECK(sewfast_device_size() <= SEWFAST_DEVICE_SIZE && sewfast_device_alignment() <= 8);
     CHECK(sewfast_device_init(&place, SEWFAST_DEVICE_SIZE, &identity, &refusal) != NULL && refusal == SEWFAST_DONE);
@@ -244,6 +245,12 @@ static void storage_is_checked(void) {
     CHECK(sewfast_device_init(&place, SEWFAST_DEVICE_SIZE, &identity, &refusal) == NULL);
     CHECK(refusal == SEWFAST_REFUSED_CEILINGS);
     identity.ceilings.volt = 20;
+    identity.travel_low = 5;
+    identity.travel_high = 5;
+    CHECK(sewfast_device_init(&place, SEWFAST_DEVICE_SIZE, &identity, &refusal) == NULL);
+    CHECK(refusal == SEWFAST_REFUSED_TRAVEL);
+    identity.travel_low = -5;
+    CHECK(sewfast_device_init(&place, SEWFAST_DEVICE_SIZE, &identity, &refusal) != NULL);
     identity.channel_count = 17;
     CHECK(sewfast_device_init(&place, SEWFAST_DEVICE_SIZE, &identity, &refusal) == NULL);
     CHECK(refusal == SEWFAST_REFUSED_CHANNELS);

@@ -68,7 +68,9 @@ fn assertions() -> String {
             capabilities,
             ceilings,
             channels,
-            channel_count
+            channel_count,
+            travel_low,
+            travel_high
         }
     );
     layout!(

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use sewfast_control::link::{
     Body, Channel, Deframer, Device, Encoding, Header, Identity, Limits, MAX_WIRE, Measurement,
-    Source, State, capability, encode,
+    Source, State, Travel, capability, encode,
 };
 
 const SAMPLES: u32 = 2_000_000;
@@ -54,13 +54,15 @@ impl Host {
                 | capability::CURRENT
                 | capability::DESIGN
                 | capability::BIQUADS
-                | capability::FEEDFORWARD,
+                | capability::FEEDFORWARD
+                | capability::POSITIONS,
             ceilings: Limits {
                 volt: 20.0,
                 speed: 4000.0,
                 acceleration: f32::INFINITY,
                 current: 30.0,
             },
+            travel: Travel::ANY,
             channels: &CHANNELS,
         };
         Self {

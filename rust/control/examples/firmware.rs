@@ -3,7 +3,8 @@
 //! `cargo run --package sewfast-control --example firmware`
 
 use sewfast_control::link::{
-    Channel, Device, Encoding, Identity, Limits, Measurement, Output, Source, State, capability,
+    Channel, Device, Encoding, Identity, Limits, Measurement, Output, Source, State, Travel,
+    capability,
 };
 
 static CHANNELS: [Channel; 3] = [
@@ -68,13 +69,15 @@ impl<B: Board> Firmware<B> {
                 | capability::DRIVE
                 | capability::DESIGN
                 | capability::BIQUADS
-                | capability::FEEDFORWARD,
+                | capability::FEEDFORWARD
+                | capability::POSITIONS,
             ceilings: Limits {
                 volt: 20.0,
                 speed: 4000.0,
                 acceleration: 60_000.0,
                 current: f32::INFINITY,
             },
+            travel: Travel::ANY,
             channels: &CHANNELS,
         })?;
         Ok(Self {

@@ -25,7 +25,7 @@ pub use filter::{CAPACITY, Feedback, Observer, Ramp};
 pub use gains::{Parallel, PerSample, Standard};
 pub use pid::{Pid, Settings, Terms};
 pub use pid_controller::{Correction, Design, Numbers, PidController};
-pub use position::{PositionDesign, PositionLoop, RATES, Rate, Rates, SMOOTHED};
+pub use position::{FARTHEST, PositionDesign, PositionLoop, RATES, Rate, Rates, SMOOTHED, Turning};
 pub use real::Real;
 pub use schedule::{POINTS, Point, Row, Schedule};
 pub use tracker::{Listening, TRACKED, Tracker};

@@ -17,12 +17,14 @@
 
 mod rates;
 mod stop;
+mod turning;
 
 use crate::pid_controller::Correction;
 use crate::{Controller, PidController, Real, Refused};
 use stop::Angle;
 
 pub use rates::{RATES, Rate, Rates};
+pub use turning::{FARTHEST, Turning};
 
 /// The longest mean over the samples of a profile.
 pub const SMOOTHED: usize = 31;
@@ -52,6 +54,36 @@ pub struct PositionDesign<T> {
 }
 
 impl<T: Real> PositionDesign<T> {
+    /// The refusal that [`PositionLoop::new`] would give, without making the loop.
+    ///
+    /// # Errors
+    /// The first setting that is outside its range.
+    pub fn check(&self) -> Result<(), Refused> {
+        let finite = "a finite number above 0";
+        for (name, value) in [
+            ("position gain", self.gain),
+            ("counts_per_unit", self.counts_per_unit),
+            ("speed", self.speed),
+            ("creep", self.creep),
+        ] {
+            let above = value > T::ZERO && value.is_finite();
+            Refused::unless(above, name, finite, value.to_f64())?;
+        }
+        let landing = self.landing >= T::ZERO && self.landing.is_finite();
+        Refused::unless(
+            landing,
+            "landing",
+            "a finite distance of 0 or more",
+            self.landing.to_f64(),
+        )?;
+        Refused::unless(
+            (1..=SMOOTHED).contains(&self.smoothing),
+            "smoothing",
+            "1 to 31 samples",
+            self.smoothing as f64,
+        )
+    }
+
     /// By how much the landing makes a way at these rates longer \[y s\].
     fn crept(&self, rates: &Rates<T>) -> T {
         let more = self.landing / self.counts_per_unit - rates.way(self.creep);
@@ -162,29 +194,7 @@ impl<T: Real> PositionLoop<T> {
     /// The first setting that is outside its range.
     pub fn new(design: PositionDesign<T>, speed: PidController<T>) -> Result<Self, Refused> {
         let ts = speed.settings().ts;
-        let above = |value: T| value > T::ZERO && value.is_finite();
-        let finite = "a finite number above 0";
-        for (name, value) in [
-            ("position gain", design.gain),
-            ("counts_per_unit", design.counts_per_unit),
-            ("speed", design.speed),
-            ("creep", design.creep),
-        ] {
-            Refused::unless(above(value), name, finite, value.to_f64())?;
-        }
-        let landing = design.landing >= T::ZERO && design.landing.is_finite();
-        Refused::unless(
-            landing,
-            "landing",
-            "a finite distance of 0 or more",
-            design.landing.to_f64(),
-        )?;
-        Refused::unless(
-            (1..=SMOOTHED).contains(&design.smoothing),
-            "smoothing",
-            "1 to 31 samples",
-            design.smoothing as f64,
-        )?;
+        design.check()?;
         Ok(Self {
             mode: Mode::Speed,
             per_sample: ts * design.counts_per_unit,
@@ -303,6 +313,12 @@ impl<T: Real> PositionLoop<T> {
         self.move_by(self.counts - self.place());
     }
 
+    /// The origin of positions moves on by so many counts. It must not do so while there is a goal, which it would leave behind.
+    pub(crate) fn move_origin(&mut self, counts: T) {
+        self.counts = self.counts - counts;
+        self.move_by(-counts);
+    }
+
     fn move_by(&mut self, shift: T) {
         for place in self.path.kept.iter_mut().chain(&mut self.places.kept) {
             *place += shift;
@@ -397,6 +413,11 @@ impl<T: Real> PositionLoop<T> {
     pub fn stands(&self) -> bool {
         let goal = |place: &T| *place == self.goal;
         self.mode != Mode::Speed && self.places.kept.iter().all(goal)
+    }
+
+    /// Whether it is the speed loop alone, as it begins.
+    pub fn is_speed_loop(&self) -> bool {
+        self.mode == Mode::Speed
     }
 
     /// The goal \[counts\]; of a speed loop 0.

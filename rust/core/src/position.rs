@@ -90,6 +90,11 @@ impl Scripted {
         Ok(self.law.step(reference, moved))
     }
 
+    /// The stop that it makes.
+    pub fn stop(&self) -> Option<Stop> {
+        self.stop
+    }
+
     /// The loop itself.
     pub fn law(&self) -> &PositionLoop<f64> {
         &self.law

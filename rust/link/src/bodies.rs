@@ -4,7 +4,7 @@
 //! sequence and result; `None` means that the body is too short.
 
 use sewfast_control::link::crc::Crc;
-use sewfast_control::link::identity::VERSION;
+use sewfast_control::link::identity::{OLDEST, VERSION};
 use sewfast_control::link::{Body, Fields};
 
 fn written(write: impl FnOnce(&mut Body)) -> Body {
@@ -13,10 +13,10 @@ fn written(write: impl FnOnce(&mut Body)) -> Body {
     body
 }
 
-/// HELLO of a host that supports one version.
+/// HELLO of a host that also speaks the version before.
 #[must_use]
 pub fn hello(session: u32) -> Body {
-    written(|b| _ = b.u8(VERSION).u8(VERSION).u32(session))
+    written(|b| _ = b.u8(OLDEST).u8(VERSION).u32(session))
 }
 
 /// ARM, with the key from the reply to HELLO.
@@ -99,6 +99,32 @@ pub fn feedforward(preview: u8, late: f64, levels: &[[f64; 2]], taps: &[f64]) ->
     })
 }
 
+/// POSITION: gain, fastest, landing and creep, samples of smoothing, whether it releases, rows of speed and rates away from and towards
+/// rest.
+#[must_use]
+pub fn position(numbers: [f64; 4], smoothing: u8, releases: bool, rows: &[[f64; 3]]) -> Body {
+    written(|b| {
+        self::numbers(b, &numbers);
+        b.u8(smoothing).u8(releases.into());
+        b.u8(u8::try_from(rows.len()).unwrap_or(u8::MAX));
+        for row in rows {
+            self::numbers(b, row);
+        }
+    })
+}
+
+/// ANGLE: a stop at it \[counts\] from a sample of the run on, 0 for its next one.
+#[must_use]
+pub fn angle(at: u32, counts: f64, onward: bool) -> Body {
+    written(|b| _ = b.u32(at).f32(counts as f32).u8((!onward).into()))
+}
+
+/// TRAVEL: least and greatest count; both 0 ask for the limits in force.
+#[must_use]
+pub fn travel(low: i32, high: i32) -> Body {
+    written(|b| _ = b.i32(low).i32(high))
+}
+
 /// CONTROLLER: the number of a kind, counts per unit, then the numbers of the kind.
 #[must_use]
 pub fn controller(kind: u8, counts_per_unit: f64, values: &[f64]) -> Body {
@@ -119,7 +145,7 @@ fn numbers(body: &mut Body, values: &[f64]) {
 /// START of a run: its mode, its start (0 for the next sample), its length and the streamed channels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Start {
-    /// 0 commands, 1 controller, 2 direct.
+    /// 0 commands, 1 controller, 2 direct, 3 positions.
     pub mode: u8,
     /// Time of the watchdog \[us\].
     pub watchdog: u32,
@@ -317,6 +343,15 @@ pub fn limits_of(fields: &mut Fields<'_>) -> Option<[f32; 8]> {
     Some(found)
 }
 
+/// The reply to TRAVEL: least and greatest count in force, then the device's own.
+pub fn travel_of(fields: &mut Fields<'_>) -> Option<[i32; 4]> {
+    let mut found = [0; 4];
+    for value in &mut found {
+        *value = fields.i32()?;
+    }
+    Some(found)
+}
+
 /// The reply to START: the run's number and its first sample \[us\].
 pub fn started(fields: &mut Fields<'_>) -> Option<(u32, u64)> {
     Some((fields.u32()?, fields.u64()?))
@@ -392,6 +427,7 @@ mod tests {
             prop_assert_eq!(Status::of(&mut fields()).is_some(), body.len() >= 61);
             prop_assert_eq!(Event::of(&mut fields()).is_some(), body.len() >= 15);
             prop_assert_eq!(limits_of(&mut fields()).is_some(), body.len() >= 32);
+            prop_assert_eq!(travel_of(&mut fields()).is_some(), body.len() >= 16);
             prop_assert_eq!(started(&mut fields()).is_some(), body.len() >= 12);
             prop_assert_eq!(uploaded(&mut fields()).is_some(), body.len() >= 8);
             prop_assert_eq!(reply(&mut fields()).is_some(), body.len() >= 5);
@@ -403,7 +439,15 @@ mod tests {
     #[test]
     fn commands_are_as_the_protocol_says() {
         let bytes = |body: &Body| body.bytes().unwrap().to_vec();
-        assert_eq!(bytes(&hello(0x0403_0201)), [3, 3, 1, 2, 3, 4]);
+        assert_eq!(bytes(&hello(0x0403_0201)), [3, 4, 1, 2, 3, 4]);
+        let moves = position([1.0; 4], 8, true, &[[0.0; 3]; 8]);
+        assert_eq!(bytes(&moves).len(), 16 + 3 + 96);
+        assert_eq!(bytes(&moves)[16..19], [8, 1, 8]);
+        assert_eq!(
+            bytes(&angle(2, 1.0, true)),
+            [2, 0, 0, 0, 0, 0, 0x80, 0x3F, 0]
+        );
+        assert_eq!(bytes(&travel(-1, 1)), [255, 255, 255, 255, 1, 0, 0, 0]);
         assert_eq!(bytes(&arm(1, 2)), [1, 0, 0, 0, 2, 0, 0, 0]);
         assert_eq!(bytes(&keep(256)), [0, 1, 0, 0]);
         assert_eq!(bytes(&drive(1, 1.0)), [1, 0, 0, 0, 0, 0, 0x80, 0x3F]);

@@ -22,7 +22,7 @@ pub use upload::Upload;
 /// A device for tests of the host's end: two channels, a period of a millisecond.
 #[cfg(test)]
 mod bench {
-    use sewfast_control::link::{Channel, Encoding, Identity, Limits, Source, capability};
+    use sewfast_control::link::{Channel, Encoding, Identity, Limits, Source, Travel, capability};
 
     pub static CHANNELS: [Channel; 2] = [
         Channel {
@@ -56,6 +56,7 @@ mod bench {
                 acceleration: f32::INFINITY,
                 current: f32::INFINITY,
             },
+            travel: Travel::ANY,
             channels: &CHANNELS,
         }
     }

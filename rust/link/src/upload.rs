@@ -48,6 +48,13 @@ impl Upload {
         Self::new(1, values.iter().map(single))
     }
 
+    /// Goals in single precision \[counts\].
+    #[must_use]
+    pub fn goals(values: &[f64]) -> Self {
+        let single = |&value: &f64| (value as f32).to_le_bytes();
+        Self::new(2, values.iter().map(single))
+    }
+
     fn new<const N: usize>(table: u8, values: impl Iterator<Item = [u8; N]>) -> Self {
         Self {
             table,
@@ -150,6 +157,15 @@ mod tests {
         assert_eq!((upload.end(), upload.len()), (0, 4));
         assert!(upload.answered(0, 0, Some(u32::MAX)));
         assert!(upload.is_whole() && upload.piece(9).is_none());
+    }
+
+    #[test]
+    fn goals_have_a_table_of_their_own() {
+        let upload = Upload::goals(&[393.0, -0.5]);
+        let body = upload.piece(2).unwrap();
+        let mut fields = Fields::new(body.bytes().unwrap());
+        assert_eq!((fields.u8(), fields.u32()), (Some(2), Some(0)));
+        assert_eq!((fields.f32(), fields.f32()), (Some(393.0), Some(-0.5)));
     }
 
     #[test]

@@ -134,6 +134,32 @@ impl LinkBodies {
     }
 
     #[staticmethod]
+    fn position(
+        py: Python<'_>,
+        numbers: [f64; 4],
+        smoothing: u8,
+        releases: bool,
+        rows: Vec<[f64; 3]>,
+    ) -> Wire<'_> {
+        wire(py, &bodies::position(numbers, smoothing, releases, &rows))
+    }
+
+    #[staticmethod]
+    fn angle(py: Python<'_>, at: u32, counts: f64, onward: bool) -> Wire<'_> {
+        wire(py, &bodies::angle(at, counts, onward))
+    }
+
+    #[staticmethod]
+    fn travel(py: Python<'_>, low: i32, high: i32) -> Wire<'_> {
+        wire(py, &bodies::travel(low, high))
+    }
+
+    #[staticmethod]
+    fn travel_of(body: &[u8]) -> Option<[i32; 4]> {
+        bodies::travel_of(&mut Fields::new(body))
+    }
+
+    #[staticmethod]
     fn biquads(py: Python<'_>, sections: Vec<[f64; 4]>) -> Wire<'_> {
         wire(py, &bodies::biquads(&sections))
     }
@@ -497,6 +523,12 @@ impl LinkUpload {
     #[staticmethod]
     fn references(values: Values<'_>, limit: f64) -> PyResult<Self> {
         let core = Upload::references(slice(&values, "values")?, limit);
+        Ok(Self { core })
+    }
+
+    #[staticmethod]
+    fn goals(values: Values<'_>) -> PyResult<Self> {
+        let core = Upload::goals(slice(&values, "values")?);
         Ok(Self { core })
     }
 

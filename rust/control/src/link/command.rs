@@ -2,10 +2,11 @@
 
 use super::Fields;
 use super::device::State;
-use super::identity::Limits;
+use super::identity::{Limits, Travel};
+use super::positions::{self, Asked};
 use crate::{
     AnyController, AnyDesign, BIQUADS, Biquad, Cascade, Design, Feedforward, LEVELS, Level, POINTS,
-    Point, Refused, Schedule, Settings, Standard, TAPS,
+    Point, PositionDesign, Refused, Schedule, Settings, Standard, TAPS,
 };
 
 /// Shortest and longest time of a watchdog \[us\].
@@ -90,6 +91,8 @@ pub(super) struct Gains {
     pub(super) long: bool,
     /// Counts per second of one unit of feedback.
     pub(super) counts_per_unit: f32,
+    /// A position loop over the PID.
+    pub(super) position: Option<PositionDesign<f32>>,
 }
 
 impl Gains {
@@ -213,6 +216,10 @@ pub(super) enum Command<'a> {
     Biquads(Result<Cascade<f32>, Refusal>),
     /// The feedforward if it is valid.
     Feedforward(Result<Feedforward<f32>, Refusal>),
+    /// The position loop if it is valid, but without its counts per unit.
+    Position(Result<PositionDesign<f32>, Refusal>),
+    Angle(Result<Asked, Refusal>),
+    Travel(Travel),
 }
 
 impl<'a> Command<'a> {
@@ -235,6 +242,9 @@ impl<'a> Command<'a> {
             0x0C => biquads(&mut fields).map(Self::Biquads),
             0x0D => controller(&mut fields)?,
             0x0E => feedforward(&mut fields).map(Self::Feedforward),
+            0x0F => positions::design(&mut fields).map(Self::Position),
+            0x10 => positions::angle(&mut fields).map(Self::Angle),
+            0x11 => positions::travel(&mut fields).map(Self::Travel),
             _ => return Err(Refusal::unknown(kind)),
         };
         let whole = command.filter(|_| fields.is_empty());
@@ -312,6 +322,7 @@ fn gains<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
         garbled,
         long,
         counts_per_unit,
+        position: None,
     }))
 }
 
@@ -338,6 +349,7 @@ fn controller<'a>(fields: &mut Fields<'a>) -> Result<Option<Command<'a>>, Refusa
             garbled: false,
             long: false,
             counts_per_unit,
+            position: None,
         })
     }))
 }

@@ -1,7 +1,7 @@
 //! A device without its hardware: bytes and time in, bytes and command out (docs/PROTOCOL.md). Begin reading at [`Device`].
 //!
 //! ```
-//! use sewfast_control::link::{Channel, Device, Encoding, Identity, Limits, Measurement, Source, State, capability};
+//! use sewfast_control::link::{Channel, Device, Encoding, Identity, Limits, Measurement, Source, State, Travel, capability};
 //!
 //! static CHANNELS: [Channel; 2] = [
 //!     Channel { encoding: Encoding::Counts, steps_per_unit: 1, name: "counts", unit: "1", source: Source::Counts },
@@ -17,6 +17,7 @@
 //!     capabilities: capability::PROFILE | capability::PID | capability::DRIVE | capability::DESIGN
 //!         | capability::BIQUADS,
 //!     ceilings: Limits { volt: 20.0, speed: 4000.0, acceleration: f32::INFINITY, current: f32::INFINITY },
+//!     travel: Travel::ANY,
 //!     channels: &CHANNELS,
 //! })?;
 //! for k in 1..=10 {
@@ -34,12 +35,13 @@ use core::num::NonZeroU64;
 
 use super::command::{Gains, Start};
 use super::guard::Guard;
-use super::identity::{Identity, Limits, capability};
+use super::identity::{Identity, Limits, Travel, capability};
+use super::positions::{Asked, Law};
 use super::profile::Profile;
 use super::session::{Session, Watchdog};
 use super::stream::{Stream, Transmit, Weight};
 use super::{Body, Deframer};
-use crate::{AnyController, Refused};
+use crate::Refused;
 
 /// Period of BEAT while not running \[us\].
 const BEAT: u64 = 200_000;
@@ -83,7 +85,10 @@ struct Run {
     samples: u32,
     /// The command of mode 2.
     drive: f32,
-    controller: Option<AnyController<f32>>,
+    /// What it steps.
+    law: Option<Law>,
+    /// The counter where positions are 0.
+    from: i32,
     /// Largest delay of a sample \[us\].
     latest: u32,
     late_before: bool,
@@ -104,7 +109,8 @@ impl Run {
         began: 0,
         samples: 0,
         drive: 0.0,
-        controller: None,
+        law: None,
+        from: 0,
         latest: 0,
         late_before: false,
     };
@@ -239,7 +245,6 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Device<CAPACITY, TRANSMIT> {
 #[derive(Clone, Debug)]
 struct Core<const CAPACITY: usize, const TRANSMIT: usize> {
     identity: Identity,
-    schema: u32,
     period: NonZeroU64,
     /// Period \[s\].
     ts: f32,
@@ -248,11 +253,14 @@ struct Core<const CAPACITY: usize, const TRANSMIT: usize> {
     credit: Option<u64>,
     watchdog: Watchdog,
     limits: Option<Limits>,
+    travel: Option<Travel>,
     guard: Guard,
     gains: Option<Gains>,
     profile: Profile<CAPACITY>,
     stream: Stream,
     run: Run,
+    /// A stop that has not begun, of the run in progress or of the next one.
+    asked: Option<Asked>,
     state: State,
     reason: Reason,
     output: Output,
@@ -274,7 +282,6 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
     const fn off() -> Self {
         Self {
             identity: Identity::NONE,
-            schema: 0,
             period: NonZeroU64::MIN,
             ts: 1.0,
             transmit: Transmit::new(),
@@ -282,11 +289,13 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             credit: None,
             watchdog: Watchdog::new(1),
             limits: None,
+            travel: None,
             guard: Guard::new(1, 1.0, 1.0),
             gains: None,
             profile: Profile::new(),
             stream: Stream::new(&[]),
             run: Run::NONE,
+            asked: None,
             state: State::Boot,
             reason: Reason::None,
             output: Output::SAFE,
@@ -304,7 +313,6 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
     /// Boots from off, with an identity that has been checked.
     fn boot(&mut self, identity: Identity) {
         self.identity = identity;
-        self.schema = identity.schema();
         self.period = NonZeroU64::new(identity.period.into()).unwrap_or(NonZeroU64::MIN);
         self.ts = (f64::from(identity.period) / 1e6) as f32;
         self.transmit.boot(identity.tag());
@@ -360,6 +368,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         self.output = Output::SAFE;
         self.state = state;
         self.run.planned = None;
+        self.asked = None;
         self.flush();
         self.profile.rewind();
     }
@@ -411,6 +420,11 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         self.limits.unwrap_or(self.identity.ceilings)
     }
 
+    /// Where the counter may be: the device's own, until others are set.
+    fn travel(&self) -> Travel {
+        self.travel.unwrap_or(self.identity.travel)
+    }
+
     fn on_credit(&self) -> bool {
         self.can(capability::CREDIT)
     }
@@ -460,6 +474,8 @@ pub enum Reason {
     Late = 11,
     /// The command of a loop swings between its limits.
     Swinging = 12,
+    /// The counter, or the goal of a stop, is beyond its limits.
+    Travel = 13,
 }
 
 /// An event that is sent in its own frame; values as in the protocol.
@@ -480,6 +496,7 @@ mod tests {
     mod laws;
     mod limits;
     mod playback;
+    mod positions;
     mod rig;
     mod safety;
     mod words;

@@ -5,7 +5,9 @@ use super::crc::Crc;
 use crate::Refused;
 
 /// The version of the protocol implemented here.
-pub const VERSION: u8 = 3;
+pub const VERSION: u8 = 4;
+/// The oldest version that is spoken with a peer that has no later one.
+pub const OLDEST: u8 = 3;
 /// The number of channels is limited by the bits of START's mask.
 pub const MAX_CHANNELS: usize = 16;
 
@@ -34,6 +36,8 @@ pub mod capability {
     pub const KINDS: u32 = 1 << 8;
     /// Its PID has feedforward.
     pub const FEEDFORWARD: u32 = 1 << 9;
+    /// Runs a position loop over its PID, and keeps to limits of the position.
+    pub const POSITIONS: u32 = 1 << 10;
 }
 
 /// How a channel's samples are encoded.
@@ -118,6 +122,28 @@ impl Limits {
     }
 }
 
+/// Where the counter may be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Travel {
+    /// The least count.
+    pub low: i32,
+    /// The greatest count, above the least.
+    pub high: i32,
+}
+
+impl Travel {
+    /// Anywhere.
+    pub const ANY: Self = Self {
+        low: i32::MIN,
+        high: i32::MAX,
+    };
+
+    /// Whether a count is within; a counter that may be anywhere may also wrap.
+    pub(super) fn holds(&self, counts: i64) -> bool {
+        *self == Self::ANY || (i64::from(self.low)..=i64::from(self.high)).contains(&counts)
+    }
+}
+
 /// The identity of a device.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Identity {
@@ -138,6 +164,8 @@ pub struct Identity {
     pub capabilities: u32,
     /// Upper bounds of the limits; infinite for none.
     pub ceilings: Limits,
+    /// Where the counter may be during a run.
+    pub travel: Travel,
     /// The counter, the command, then any others.
     pub channels: &'static [Channel],
 }
@@ -153,6 +181,7 @@ impl Identity {
         counts_per_rev: 1.0,
         capabilities: 0,
         ceilings: Limits::NONE,
+        travel: Travel::ANY,
         channels: &[],
     };
 
@@ -184,6 +213,13 @@ impl Identity {
         let holds = COUNTS_PER_REV.contains(&counts);
         let expected = "1 to 1e9";
         unless(holds, "counts_per_rev", expected, counts.into())?;
+        let Travel { low, high } = self.travel;
+        unless(
+            low < high,
+            "travel",
+            "a greatest count above the least",
+            high.into(),
+        )?;
         self.check_ceilings()?;
         self.check_channels()
     }
@@ -225,9 +261,9 @@ impl Identity {
     }
 
     /// CRC-32 of version, period and the descriptions of all channels.
-    pub(super) fn schema(&self) -> u32 {
+    pub(super) fn schema(&self, version: u8) -> u32 {
         let mut crc = Crc::new()
-            .update(&[VERSION])
+            .update(&[version])
             .update(&self.period.to_le_bytes());
         let mut body = Body::new();
         for index in 0..self.channels.len() as u8 {

@@ -7,6 +7,7 @@ use super::command::Refusal;
 pub(super) enum Table {
     Commands = 0,
     References = 1,
+    Goals = 2,
 }
 
 /// Values `end - CAPACITY .. end` of a profile, numbered from its beginning.
@@ -16,8 +17,9 @@ pub(super) struct Profile<const CAPACITY: usize> {
     table: Table,
     end: u32,
     played: u32,
-    /// Largest magnitude, as limits may change after the upload.
-    peak: f32,
+    /// Least and greatest value or 0, as limits may change after the upload.
+    low: f32,
+    high: f32,
 }
 
 impl<const CAPACITY: usize> Profile<CAPACITY> {
@@ -32,7 +34,8 @@ impl<const CAPACITY: usize> Profile<CAPACITY> {
             table: Table::Commands,
             end: 0,
             played: 0,
-            peak: 0.0,
+            low: 0.0,
+            high: 0.0,
         }
     }
 
@@ -48,7 +51,12 @@ impl<const CAPACITY: usize> Profile<CAPACITY> {
 
     /// Largest magnitude.
     pub(super) fn peak(&self) -> f32 {
-        self.peak
+        self.high.max(-self.low)
+    }
+
+    /// Least and greatest value, or 0.
+    pub(super) fn range(&self) -> (f32, f32) {
+        (self.low, self.high)
     }
 
     /// Whether a run can start: there are values of this kind, including the first.
@@ -61,7 +69,7 @@ impl<const CAPACITY: usize> Profile<CAPACITY> {
         self.table = table;
         self.end = 0;
         self.played = 0;
-        self.peak = 0.0;
+        (self.low, self.high) = (0.0, 0.0);
     }
 
     /// How many of `count` values from `offset` on are already there.
@@ -92,7 +100,7 @@ impl<const CAPACITY: usize> Profile<CAPACITY> {
         if let Some(slot) = self.values.get_mut(slot) {
             *slot = value;
             self.end = self.end.saturating_add(1);
-            self.peak = self.peak.max(value.abs());
+            (self.low, self.high) = (self.low.min(value), self.high.max(value));
         }
     }
 

@@ -3,7 +3,8 @@
 use std::time::{Duration, Instant};
 
 use sewfast_control::link::{
-    Channel, Device, Encoding, Identity, Limits, Measurement, Output, Source, State, capability,
+    Channel, Device, Encoding, Identity, Limits, Measurement, Output, Source, State, Travel,
+    capability,
 };
 use sewfast_core::machine::Machine;
 use sewfast_core::{Error, Result};
@@ -22,7 +23,8 @@ const CAPABILITIES: u32 = capability::PROFILE
     | capability::DESIGN
     | capability::BIQUADS
     | capability::KINDS
-    | capability::FEEDFORWARD;
+    | capability::FEEDFORWARD
+    | capability::POSITIONS;
 
 const CHANNELS: [Channel; 6] = [
     channel("counts", "1", Encoding::Counts, 1, Source::Counts),
@@ -80,6 +82,7 @@ impl Rig {
                 acceleration: f32::INFINITY,
                 current: f32::INFINITY,
             },
+            travel: Travel::ANY,
             channels: &CHANNELS,
         };
         Ok(Self {

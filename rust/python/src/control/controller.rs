@@ -122,7 +122,7 @@ fn schedule(rows: &[Given]) -> Result<Schedule<f64>, Refused> {
 }
 
 /// A design rounded to single precision.
-fn single(design: &Design<f64>) -> Result<Design<f32>, Refused> {
+pub(super) fn single(design: &Design<f64>) -> Result<Design<f32>, Refused> {
     let gains = |g: Standard<f64>| Standard {
         kp: g.kp as f32,
         ti: g.ti as f32,

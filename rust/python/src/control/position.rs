@@ -2,16 +2,18 @@
 
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sewfast_control::{AnyDesign, PositionDesign, Rate, Rates};
+use sewfast_control::{
+    AnyDesign, PidController, PositionDesign, PositionLoop, Rate, Rates, Turning,
+};
 use sewfast_core::closed_loop::{self as looped, Varied};
 use sewfast_core::model::ClonePlant;
 use sewfast_core::position::{self, Scripted, Stop, Stops};
 use sewfast_core::{Error, Result};
 
 use super::Model;
-use super::controller::AnyGiven;
+use super::controller::{AnyGiven, single};
 use super::moves::{Reached, reached};
-use crate::seam::{Values, array1, raise, slice, watched, watched_over};
+use crate::seam::{Values, Vector, array1, raise, slice, watched, watched_over};
 
 /// Speed, rates away from rest and towards it.
 type Row = (f64, f64, f64);
@@ -117,6 +119,82 @@ impl PositionController {
         let early = position::early(&self.core, slice(&reference, "reference")?);
         Ok(array1(py, early))
     }
+
+    /// What a device computes in single precision from early references and the counts that it had: commands, and places and goals, NaN
+    /// while it is a speed loop. Where counts are missing it ends.
+    fn single<'py>(
+        &self,
+        py: Python<'py>,
+        early: Values<'py>,
+        counts: Values<'py>,
+    ) -> PyResult<[Vector<'py>; 3]> {
+        let (early, counts) = (slice(&early, "early")?, slice(&counts, "counts")?);
+        let made = self.on_device().map_err(|e| raise(py, e))?;
+        let found = replayed(made, self.core.stop(), early, counts);
+        let found = found.map_err(|e| raise(py, e))?;
+        Ok(found.map(|column| array1(py, column)))
+    }
+}
+
+impl PositionController {
+    /// The loop of a device at rest.
+    fn on_device(&self) -> Result<Turning> {
+        let (law, design) = (self.core.law(), self.core.law().design());
+        let row = |r: &Rate<f64>| Rate {
+            speed: r.speed as f32,
+            up: r.up as f32,
+            down: r.down as f32,
+        };
+        let rows: Vec<_> = design.rates.rows().iter().map(row).collect();
+        let design = PositionDesign {
+            gain: design.gain as f32,
+            counts_per_unit: design.counts_per_unit as f32,
+            speed: design.speed as f32,
+            rates: Rates::new(&rows)?,
+            smoothing: design.smoothing,
+            landing: design.landing as f32,
+            creep: design.creep as f32,
+            releases: design.releases,
+        };
+        let speed = PidController::new(single(law.speed().design())?)?;
+        Ok(Turning::new(PositionLoop::new(design, speed)?))
+    }
+}
+
+/// Commands, places and goals of a device's loop.
+fn replayed(
+    mut law: Turning,
+    stop: Option<Stop>,
+    early: &[f64],
+    counts: &[f64],
+) -> Result<[Vec<f64>; 3]> {
+    if stop.is_none() {
+        law.follow();
+    }
+    let mut found = [(); 3].map(|()| vec![f64::NAN; counts.len()]);
+    let mut before = counts.first().copied().unwrap_or(0.0);
+    for (k, (&r, &now)) in early.iter().zip(counts).enumerate() {
+        if let Some(stop) = stop
+            && stop.after == k
+        {
+            law.stop(stop.angle as f32, stop.turn as f32, stop.onward)?;
+        }
+        let moved = now - before;
+        if !moved.is_finite() {
+            break;
+        }
+        before = now;
+        let u = law.step(r as f32, moved as i32);
+        let shown = |counts: f32| match law.goal() {
+            Some(_) => law.origin() as f64 + f64::from(counts),
+            None => f64::NAN,
+        };
+        let values = [u.into(), shown(law.law().place()), shown(law.law().goal())];
+        for (column, value) in found.iter_mut().zip(values) {
+            column[k] = value;
+        }
+    }
+    Ok(found)
 }
 
 /// A run of a position loop on a model or a virtual machine.

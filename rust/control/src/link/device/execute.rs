@@ -4,11 +4,12 @@ use super::{Core, Event, Reason, Run, State, Weight};
 use crate::link::command::{
     Beat, Command, Gains, HELLO, Heartbeat, Refusal, STOP, Start, Upload, check_watchdog,
 };
-use crate::link::identity::{Limits, VERSION, capability};
+use crate::link::identity::{Limits, OLDEST, Travel, VERSION, capability};
+use crate::link::positions::Asked;
 use crate::link::profile::Table;
 use crate::link::session::{Order, Reply, Session, key};
 use crate::link::{Body, Fields, Frame};
-use crate::{Cascade, Feedforward};
+use crate::{Cascade, FARTHEST, Feedforward, PositionDesign};
 
 /// How far ahead a run can be planned \[us\].
 const AHEAD: u64 = 10_000_000;
@@ -129,6 +130,9 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             Command::Gains(gains) => self.set_gains(gains),
             Command::Biquads(biquads) => self.set_biquads(biquads),
             Command::Feedforward(feedforward) => self.set_feedforward(feedforward),
+            Command::Position(design) => self.set_position(design),
+            Command::Angle(asked) => self.set_angle(asked),
+            Command::Travel(travel) => self.set_travel(travel, body),
             Command::Start(start) => self.start(start, body),
             Command::Echo(bytes) => {
                 body.add(bytes);
@@ -139,7 +143,8 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
 
     #[inline(never)]
     fn hello(&mut self, from: u8, to: u8, number: u32, body: &mut Body) -> Done {
-        Refusal::version(VERSION).unless((from..=to).contains(&VERSION))?;
+        let version = VERSION.min(to);
+        Refusal::version(VERSION).unless(version >= OLDEST && from <= version)?;
         Refusal::value(2).unless(number != 0)?;
         if self.session.as_ref().map(|session| session.number) != Some(number) {
             self.change_host(number);
@@ -147,7 +152,8 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         if self.on_credit() && self.credit.is_none() {
             self.credit = Some(self.now);
         }
-        body.u8(VERSION).u32(self.identity.boot_id).u32(self.schema);
+        body.u8(version).u32(self.identity.boot_id);
+        body.u32(self.identity.schema(version));
         body.u8(self.state as u8);
         body.u8(self.identity.channels.len() as u8);
         body.u32(self.identity.period);
@@ -172,6 +178,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         self.session = Some(Session::new(number, key, foreign));
         self.credit = None;
         self.limits = None;
+        self.travel = None;
         self.gains = None;
         self.profile.clear(Table::Commands);
     }
@@ -256,6 +263,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         let (table, needed) = match upload.table {
             0 => (Table::Commands, capability::PROFILE),
             1 => (Table::References, capability::PID),
+            2 => (Table::Goals, capability::POSITIONS),
             _ => return Err(Refusal::unsupported(0)),
         };
         Refusal::unsupported(0).unless(self.can(needed))?;
@@ -272,6 +280,8 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         let limit = self.profile_limit(table);
         for (index, value) in (0..).zip(values(table, upload.values, steps)) {
             Refusal::limit(index).unless(value.abs() <= limit)?;
+            let goes = table == Table::Goals && self.state == State::Running;
+            Refusal::limit(index).unless(!goes || self.holds_goal(self.run.from, value))?;
         }
         if anew {
             self.profile.clear(table);
@@ -288,6 +298,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         let limits = self.bounds();
         match (table, &self.gains) {
             (Table::Commands, _) => limits.volt,
+            (Table::Goals, _) => FARTHEST,
             (Table::References, None) => limits.speed.min(f32::MAX),
             (Table::References, Some(gains)) => {
                 let counts = limits.speed * (self.identity.counts_per_rev / 60.0);
@@ -340,6 +351,55 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
     }
 
     #[inline(never)]
+    fn set_position(&mut self, design: Result<PositionDesign<f32>, Refusal>) -> Done {
+        let (limits, turn) = (self.bounds(), self.identity.counts_per_rev);
+        let within = |design: &_| {
+            let gains = self.gains.as_ref();
+            gains.is_none_or(|gains| gains.moves_within(design, &limits, turn))
+        };
+        let design =
+            design.and_then(|design| Refusal::limit(0).unless(within(&design)).map(|()| design));
+        let (needed, set) = (capability::POSITIONS, Gains::set_position);
+        self.set_part(needed, design, |_| false, set)
+    }
+
+    fn set_angle(&mut self, asked: Result<Asked, Refusal>) -> Done {
+        self.allow(&[State::Armed, State::Running])?;
+        Refusal::state(self.state).unless(self.run.planned.is_none())?;
+        Refusal::unsupported(0).unless(self.can(capability::POSITIONS))?;
+        let asked = asked?;
+        let (ready, from) = if self.state == State::Running {
+            let law = self.run.law.as_mut();
+            let turns = law.and_then(|law| law.position()).is_some();
+            (turns, self.run.samples)
+        } else {
+            let gains = self.gains.as_ref();
+            (gains.is_some_and(|gains| gains.position.is_some()), 0)
+        };
+        Refusal::value(0).unless(ready && (asked.at == 0 || asked.at >= from))?;
+        self.asked = Some(asked);
+        Ok(())
+    }
+
+    fn set_travel(&mut self, travel: Travel, body: &mut Body) -> Done {
+        Refusal::unsupported(0).unless(self.can(capability::POSITIONS))?;
+        if travel != Travel::ASK {
+            self.allow(&[State::Idle])?;
+            travel.check(&self.identity.travel)?;
+            self.travel = Some(travel);
+        }
+        for Travel { low, high } in [self.travel(), self.identity.travel] {
+            body.i32(low).i32(high);
+        }
+        Ok(())
+    }
+
+    /// Whether a goal of a run from this count on is within the limits of the position.
+    fn holds_goal(&self, from: i32, goal: f32) -> bool {
+        self.travel().holds(i64::from(from) + goal as i64)
+    }
+
+    #[inline(never)]
     fn start(&mut self, start: Start, body: &mut Body) -> Done {
         self.allow(&[State::Armed])?;
         self.check_mode(start.mode)?;
@@ -367,6 +427,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             0 => (capability::PROFILE, Some(Table::Commands)),
             1 => (capability::PID, Some(Table::References)),
             2 => (capability::DRIVE, None),
+            3 => (capability::POSITIONS, Some(Table::Goals)),
             _ => return Err(Refusal::value(0)),
         };
         Refusal::unsupported(0).unless(self.can(needed))?;
@@ -375,12 +436,21 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             let within = self.profile.peak() <= self.profile_limit(table);
             Refusal::limit(0).unless(within)?;
         }
-        if mode == 1 {
+        let (mut turns, limits) = (false, self.bounds());
+        if mode == 1 || mode == 3 {
             let gains = self.gains.as_ref().ok_or(Refusal::value(0))?;
-            let refused = gains.refused(self.bounds().volt, self.ts);
+            let refused = gains.refused(limits.volt, self.ts);
             Refusal::limit(0).unless(refused.is_none())?;
+            if let Some(design) = &gains.position {
+                let turn = self.identity.counts_per_rev;
+                Refusal::limit(0).unless(gains.moves_within(design, &limits, turn))?;
+                turns = true;
+            }
         }
-        Ok(())
+        Refusal::value(0).unless(turns || mode != 3 && self.asked.is_none())?;
+        let ((low, high), from) = (self.profile.range(), self.guard.counts());
+        let reached = self.holds_goal(from, low) && self.holds_goal(from, high);
+        Refusal::limit(0).unless(mode != 3 || reached)
     }
 
     /// Due time of the first sample at `at` or later, but not before the next one.
@@ -396,7 +466,7 @@ fn values(table: Table, bytes: &[u8], steps: f32) -> impl Iterator<Item = f32> {
     let mut fields = Fields::new(bytes);
     core::iter::from_fn(move || match table {
         Table::Commands => fields.i16().map(|value| f32::from(value) / steps),
-        Table::References => fields.f32(),
+        Table::References | Table::Goals => fields.f32(),
     })
 }
 

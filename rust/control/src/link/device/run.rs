@@ -1,9 +1,9 @@
 //! A control period: measure, limits, filter, control, limit, apply.
 
 use super::{Core, Event, Measurement, Output, Reason, State, capability};
-use crate::Controller;
 use crate::link::guard::Trip;
 use crate::link::identity::{Limits, Source};
+use crate::link::positions::Law;
 use crate::link::stream::to_steps;
 
 /// Good samples in a row that end the boot.
@@ -75,10 +75,11 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         let (start, limits) = (self.run.start, self.bounds());
         self.run.planned = None;
         self.run.began = self.due;
-        self.run.controller = match (start.mode, &self.gains) {
-            (1, Some(gains)) => gains.controller(limits.volt, self.ts).ok(),
+        self.run.law = match (start.mode, &self.gains) {
+            (1 | 3, Some(gains)) => gains.law(limits.volt, self.ts, start.mode).ok(),
             _ => None,
         };
+        self.run.from = self.guard.counts().wrapping_sub(self.guard.change());
         self.guard.begin();
         self.stream.begin(start.mask, start.batch);
         self.state = State::Running;
@@ -109,6 +110,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         let measured = self.can(capability::CURRENT);
         let current = if measured { measurement.current } else { 0.0 };
         self.guard.check(&limits, current)?;
+        self.check_travel(self.guard.counts().into())?;
         let (wanted, reference) = self.wanted()?;
         if !wanted.is_finite() {
             return Err((Reason::Measurement, wanted));
@@ -121,13 +123,13 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             self.guard.expect_calm(low, high, u)?;
         }
         let bound = limits.volt - 1.0 / self.identity.steps_per_volt();
-        let limited = self.run.controller.is_some() && u.abs() > bound;
+        let limited = self.run.law.is_some() && u.abs() > bound;
         Ok((u, reference, wanted.abs() > limits.volt || limited))
     }
 
     /// The limits of the loop's command: the controller's own, which lie within the volt limit, if there is a controller.
     fn range(&self, volt: f32) -> (f32, f32) {
-        let own = self.run.controller.as_ref().map(Controller::limits);
+        let own = self.run.law.as_ref().map(Law::limits);
         own.unwrap_or((-volt, volt))
     }
 
@@ -152,24 +154,49 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         if self.run.start.mode == 0 {
             return Ok((value, f32::NAN));
         }
-        let (Some(controller), Some(gains)) = (&mut self.run.controller, &self.gains) else {
+        self.stop_if_asked()?;
+        let (Some(law), Some(gains)) = (&mut self.run.law, &self.gains) else {
             return Err((Reason::BadCommand, 0.0));
         };
-        let feedback = self.guard.change() as f32 / (self.ts * gains.counts_per_unit);
-        Ok((controller.step(value, feedback), value))
+        let unit = self.ts * gains.counts_per_unit;
+        let u = law.step(value, self.guard.change(), unit);
+        let goal = law.position().and_then(|turning| turning.goal());
+        let goal = goal.map(|goal| goal.saturating_add(self.run.from.into()));
+        goal.map_or(Ok(()), |goal| self.check_travel(goal))?;
+        Ok((u, value))
+    }
+
+    /// Begins the stop that is due.
+    fn stop_if_asked(&mut self) -> Result<(), Trip> {
+        let due = |at: u32| at <= self.run.samples;
+        let Some(asked) = self.asked.take_if(|asked| due(asked.at)) else {
+            return Ok(());
+        };
+        let turning = self.run.law.as_mut().and_then(Law::position);
+        let turning = turning.ok_or((Reason::BadCommand, 0.0))?;
+        let turn = self.identity.counts_per_rev;
+        let done = turning.stop(asked.angle, turn, asked.onward);
+        done.map_err(|refused| (Reason::BadCommand, refused.received as f32))
+    }
+
+    fn check_travel(&self, counts: i64) -> Result<(), Trip> {
+        if self.travel().holds(counts) {
+            return Ok(());
+        }
+        Err((Reason::Travel, counts as f32))
     }
 
     fn record(&mut self, measurement: &Measurement<'_>, reference: f32, clipped: bool) {
         if !self.stream.accepts(measurement.counts) {
             self.flush();
         }
-        let (output, controller) = (self.output, &self.run.controller);
+        let (output, law) = (self.output, &self.run.law);
         let value = |source| match source {
             Source::Counts => measurement.counts as f32,
             Source::Command => output.u,
             Source::Current => measurement.current,
             Source::Reference => reference,
-            Source::Feedback => controller.as_ref().map_or(f32::NAN, |c| c.filtered()),
+            Source::Feedback => law.as_ref().map_or(f32::NAN, Law::filtered),
             Source::Further(index) => {
                 let further = measurement.further.get(usize::from(index));
                 further.copied().unwrap_or(f32::NAN)

@@ -45,11 +45,35 @@ fn body(dice: &mut Dice, kind: u8, now: u64) -> Vec<u8> {
             .concat(),
         0x05 | 0x20 => watchdog.to_vec(),
         0x08 => {
-            let values = [100i16; 40];
-            upload(dice.below(80) as u32, &values)
+            let mut body = upload(dice.below(80) as u32, &[100i16; 40]);
+            let table = dice.below(9) as u8;
+            if table == 1 || table == 2 {
+                body.clear();
+                body.u8(table).u32(dice.below(80) as u32);
+                (0..40).for_each(|k| _ = body.f32(10.0 * k as f32));
+            }
+            body.bytes().unwrap().to_vec()
+        }
+        0x0F => {
+            let count = dice.below(11);
+            let rows: Vec<_> = (0..count).map(|i| [500.0 * i as f32, 2e4, 1e4]).collect();
+            let (smoothing, releases) = (dice.below(33) as u8, dice.below(2) as u8);
+            position([30.0, 3000.0, 20.0, 60.0], smoothing, releases, &rows)
                 .bytes()
                 .unwrap()
                 .to_vec()
+        }
+        0x10 => {
+            let at = [0, dice.below(300) as u32][dice.below(2)];
+            let turn = (dice.below(4000) as f32) - 2000.0;
+            angle(at, turn, dice.below(2) as u8)
+                .bytes()
+                .unwrap()
+                .to_vec()
+        }
+        0x11 => {
+            let (low, high) = [(0, 0), (-500, 500), (i32::MIN, i32::MAX)][dice.below(3)];
+            travel(low, high).bytes().unwrap().to_vec()
         }
         0x09 => {
             let good = [
@@ -86,7 +110,7 @@ fn body(dice: &mut Dice, kind: u8, now: u64) -> Vec<u8> {
                 now + dice.below(9000) as u64
             };
             let body = start(
-                dice.below(3) as u8,
+                dice.below(4) as u8,
                 at,
                 1 + dice.below(200) as u32,
                 0b1_1011,
@@ -125,9 +149,10 @@ fn body(dice: &mut Dice, kind: u8, now: u64) -> Vec<u8> {
 }
 
 /// Mostly commands that start a run and keep it going.
-const KINDS: [u8; 28] = [
-    0x0E, 0x0C, 0x01, 0x02, 0x03, 0x04, 0x04, 0x05, 0x05, 0x06, 0x07, 0x07, 0x08, 0x09, 0x0A, 0x0A,
-    0x0B, 0x20, 0x20, 0x21, 0x22, 0xC0, 0x05, 0x0A, 0x0A, 0x20, 0x21, 0x22,
+const KINDS: [u8; 33] = [
+    0x05, 0x0A, 0x20, 0x22, 0x0F, 0x0E, 0x0C, 0x01, 0x02, 0x03, 0x04, 0x04, 0x05, 0x05, 0x06, 0x07,
+    0x07, 0x08, 0x09, 0x0A, 0x0A, 0x0B, 0x20, 0x20, 0x21, 0x22, 0xC0, 0x05, 0x0A, 0x0A, 0x20, 0x21,
+    0x22,
 ];
 
 /// A frame, whole or not, with the next number or another.
@@ -135,6 +160,11 @@ fn bytes(dice: &mut Dice, rig: &mut Rig) -> Vec<u8> {
     let kind = match dice.below(64) {
         0 => dice.byte(),
         _ => KINDS[dice.below(KINDS.len())],
+    };
+    let kind = if kind == 0x0F {
+        kind + dice.below(3) as u8
+    } else {
+        kind
     };
     let counter = if kind < 0x20 {
         &mut rig.commands
@@ -186,7 +216,13 @@ fn bytes(dice: &mut Dice, rig: &mut Rig) -> Vec<u8> {
 fn no_bytes_break_the_device() {
     let mut dice = Dice(20);
     let sound = Identity {
-        capabilities: can::PROFILE | can::PID | can::DRIVE | can::CURRENT | can::CREDIT,
+        capabilities: can::PROFILE
+            | can::PID
+            | can::DRIVE
+            | can::CURRENT
+            | can::CREDIT
+            | can::FEEDFORWARD
+            | can::POSITIONS,
         ..identity()
     };
     let mut rig = Rig::with(sound);

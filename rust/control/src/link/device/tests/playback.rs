@@ -306,7 +306,7 @@ fn uploads_are_taken_whole_or_not_at_all() {
         rig.command(0x08, &[0, 0, 0, 0, 0, 1]),
         (2, vec![6, 0, 0, 0])
     );
-    assert_eq!(rig.command(0x08, &[2, 0, 0, 0, 0]), (8, vec![0; 4]));
+    assert_eq!(rig.command(0x08, &[3, 0, 0, 0, 0]), (8, vec![0; 4]));
 }
 
 #[test]
@@ -317,7 +317,8 @@ fn starts_that_make_no_sense_are_refused_by_field() {
         let (result, body) = rig.command(0x0A, body.bytes().unwrap());
         (result, body[0])
     };
-    assert_eq!(refused(start(3, 0, 5, 3, 10)), (3, 0));
+    assert_eq!(refused(start(4, 0, 5, 3, 10)), (3, 0));
+    assert_eq!(refused(start(3, 0, 5, 3, 10)), (3, 3));
     assert_eq!(refused(start(1, 0, 5, 3, 10)), (3, 3));
     assert_eq!(refused(start(0, 0, 0, 3, 10)), (3, 3));
     assert_eq!(refused(start(0, 0, 5, 0x40, 10)), (3, 4));

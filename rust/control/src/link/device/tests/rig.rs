@@ -4,7 +4,7 @@ use crate::Biquad;
 use crate::link::identity::capability as can;
 use crate::link::{
     Body, Channel, Deframer, Device, Encoding, Fields, Header, Identity, Limits, MAX_WIRE,
-    Measurement, Output, Source, State, encode,
+    Measurement, Output, Source, State, Travel, encode,
 };
 use std::vec::Vec;
 
@@ -51,13 +51,15 @@ pub fn identity() -> Identity {
             | can::DESIGN
             | can::BIQUADS
             | can::KINDS
-            | can::FEEDFORWARD,
+            | can::FEEDFORWARD
+            | can::POSITIONS,
         ceilings: Limits {
             volt: 20.0,
             speed: 5000.0,
             acceleration: INF,
             current: 30.0,
         },
+        travel: Travel::ANY,
         channels: &CHANNELS,
     }
 }
@@ -193,7 +195,7 @@ impl Rig {
 
     pub fn hello(&mut self, session: u32) -> Answer {
         let mut body = Body::new();
-        body.u8(1).u8(3).u32(session);
+        body.u8(1).u8(4).u32(session);
         self.session = session;
         self.say(0x01, 0, 0, body.bytes().unwrap());
         self.answer(0x01, 0).unwrap()
@@ -240,8 +242,13 @@ impl Rig {
     }
 
     pub fn references(&mut self, offset: u32, values: &[f32]) -> Answer {
+        self.numbers(1, offset, values)
+    }
+
+    /// UPLOAD of references (table 1) or goals (2).
+    pub fn numbers(&mut self, table: u8, offset: u32, values: &[f32]) -> Answer {
         let mut body = Body::new();
-        body.u8(1).u32(offset);
+        body.u8(table).u32(offset);
         values.iter().for_each(|&value| {
             body.f32(value);
         });
@@ -391,6 +398,33 @@ pub fn feedforward(preview: u8, late: f32, levels: &[[f32; 2]], taps: &[f32]) ->
     taps.iter().for_each(|&value| {
         body.f32(value);
     });
+    body
+}
+
+/// The body of POSITION: gain, fastest, landing, creep, samples of smoothing, rows of rates.
+pub fn position(numbers: [f32; 4], smoothing: u8, releases: u8, rows: &[[f32; 3]]) -> Body {
+    let mut body = Body::new();
+    numbers.iter().for_each(|&value| {
+        body.f32(value);
+    });
+    body.u8(smoothing).u8(releases).u8(rows.len() as u8);
+    rows.iter().flatten().for_each(|&value| {
+        body.f32(value);
+    });
+    body
+}
+
+/// The body of ANGLE.
+pub fn angle(at: u32, angle: f32, way: u8) -> Body {
+    let mut body = Body::new();
+    body.u32(at).f32(angle).u8(way);
+    body
+}
+
+/// The body of TRAVEL.
+pub fn travel(low: i32, high: i32) -> Body {
+    let mut body = Body::new();
+    body.i32(low).i32(high);
     body
 }
 

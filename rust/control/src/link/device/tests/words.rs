@@ -24,14 +24,14 @@ fn hello_tells_the_identity() {
     let mut fields = Fields::new(&body);
     assert_eq!(
         (result, fields.u8(), fields.u32()),
-        (0, Some(3), Some(0x1_2345))
+        (0, Some(4), Some(0x1_2345))
     );
     // zlib.crc32 of the same fields, packed by Python
     assert_eq!(fields.u32(), Some(SCHEMA));
     assert_eq!((fields.u8(), fields.u8()), (Some(0), Some(6)));
     assert_eq!(
         (fields.u32(), fields.u32()),
-        (Some(1000), Some(0b11_1101_0111))
+        (Some(1000), Some(0b111_1101_0111))
     );
     assert_eq!((fields.u32(), fields.f32()), (Some(64), Some(1500.0)));
     assert_eq!(
@@ -69,15 +69,25 @@ fn arm_repeats_the_key_of_the_last_hello() {
     assert_ne!(other.key(), key);
 }
 
-const SCHEMA: u32 = 0x6B97_08E2;
+const SCHEMA: u32 = 0xB2EB_A4A0;
+/// That of version 3.
+const OLDER: u32 = 0x6B97_08E2;
 
 #[test]
 fn hello_needs_a_common_version() {
     let mut rig = Rig::new();
-    for (from, to) in [(0, 0), (1, 2), (4, 9), (4, 1)] {
+    for (from, to) in [(0, 0), (1, 2), (5, 9), (4, 1)] {
         rig.say(0x01, 0, 0, &[from, to, 1, 0, 0, 0]);
         let reply = rig.listen().pop().unwrap();
-        assert_eq!(reply.body, [0, 0, 0, 0, 10, 3, 0, 0, 0]);
+        assert_eq!(reply.body, [0, 0, 0, 0, 10, 4, 0, 0, 0]);
+    }
+    // a host of version 3 is answered as ever
+    for (from, to, version, schema) in [(3, 3, 3, OLDER), (1, 3, 3, OLDER), (4, 9, 4, SCHEMA)] {
+        rig.say(0x01, 0, 0, &[from, to, 1, 0, 0, 0]);
+        let reply = rig.listen().pop().unwrap();
+        let mut fields = Fields::new(&reply.body[4..]);
+        assert_eq!((fields.u8(), fields.u8()), (Some(0), Some(version)));
+        assert_eq!((fields.u32(), fields.u32()), (Some(0x1_2345), Some(schema)));
     }
     rig.say(0x01, 0, 0, &[1]);
     assert_eq!(rig.listen().pop().unwrap().body[4..], [2, 1, 0, 0, 0]);
