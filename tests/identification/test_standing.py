@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from sewfast import Dataset, LinearOE, _core, identify
 from sewfast.arrays import FloatArray
 from sewfast.control import fit_fopdt
 from sewfast.dataset.standing import Standing, standing
+from sewfast.identification.rest import for_loops
 
 
 def two_lags(k: FloatArray, slow: float, fast: float) -> FloatArray:
@@ -72,6 +75,21 @@ def test_a_fast_record_about_a_level_rests_at_its_mean_command() -> None:
     assert model.rest.source == "equilibrium"
     assert model.rest.u[0] == pytest.approx(u.mean())
     assert model.rest.y == pytest.approx(21.0 + np.sqrt(12.0), abs=0.2)
+
+
+def test_a_level_that_no_record_shows_is_no_rest_where_a_budget_lost_the_region() -> None:
+    """A chiller that a loop holds at 7 degC with 54 %: without a command it would be at 19."""
+    rng = np.random.default_rng(3)
+    u = 54.0 + np.repeat(10.0 * rng.choice([-1.0, 1.0], 100), 6)
+    y = np.full(600, 7.0)
+    for k in range(1, 600):
+        y[k] = y[k - 1] + 0.04 * (19.0 - 0.22222 * u[k - 1] - y[k - 1])
+    record = Dataset.from_arrays(u, y + 0.03 * rng.standard_normal(600), 5.0)
+    model = identify(record, model="oe")
+    kept = {k: v for k, v in model.training.items() if k not in ("region", "rest")}
+    for found in (model, for_loops(replace(model, training=kept), record)):
+        assert found.rest.u[0] == pytest.approx(u.mean())
+        assert found.rest.y == pytest.approx(19.0 - 0.22222 * u.mean(), abs=0.2)
 
 
 def test_only_outputs_that_stand_still_are_a_rest() -> None:

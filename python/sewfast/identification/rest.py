@@ -68,11 +68,11 @@ def _equilibrium(model: Model, data: Dataset) -> Rest | None:
         return held
     low, high = np.array(data.input_range, dtype=np.float64).T
     zero = np.zeros(len(low))
-    known = ((u, _level(model, u)) for u in (zero, np.clip(zero, low, high)))
+    known = ((u, _level(model, u, data)) for u in (zero, np.clip(zero, low, high)))
     u, off = next((pair for pair in known if pair[1] is not None), (zero, None))
     if off is None and held is not None:
         u = np.array(held.u)
-        off = _level(model, u, anywhere=True)
+        off = _level(model, u)
     if off is None:
         return None
     y = float(np.clip(off, *data.output_range))
@@ -93,13 +93,19 @@ def _held(data: Dataset) -> Rest | None:
     return Rest(tuple(float(v) for v in mean), level, "equilibrium")
 
 
-def _level(model: Model, u: FloatArray, *, anywhere: bool = False) -> float | None:
-    """The steady output at constant inputs, if there is one where the model is known."""
+def _level(model: Model, u: FloatArray, data: Dataset | None = None) -> float | None:
+    """The steady output at constant inputs, if there is one; with `data`, where these show the
+    model: in its region, or in the ranges of the record where a budget left no time for a region.
+    """
     found = linearise(representative(model).core, u)
-    region = None if anywhere else stored_region(model)
     if not (found.settled and math.isfinite(found.y)):
         return None
-    return found.y if region is None or region.holds(u, found.y) else None
+    region = stored_region(model)
+    if data is None or (region is not None and region.holds(u, found.y)):
+        return found.y
+    ranges, values = (*data.input_range, data.output_range), (*u, found.y)
+    inside = all(low <= v <= high for (low, high), v in zip(ranges, values, strict=True))
+    return found.y if region is None and inside else None
 
 
 def _noisy(model: M, data: Dataset) -> M:
