@@ -77,6 +77,25 @@ def test_a_fast_record_about_a_level_rests_at_its_mean_command() -> None:
     assert model.rest.y == pytest.approx(21.0 + np.sqrt(12.0), abs=0.2)
 
 
+@pytest.mark.parametrize(("held", "u", "y"), [(4, 60.0, 3000.0), (200, 66.0, 3132.0)])
+def test_too_few_standing_samples_to_show_a_response_are_no_rest(
+    held: int, u: float, y: float
+) -> None:
+    """A turbine under load ran with 60 % until the record began with 66."""
+    rng, n = np.random.default_rng(18), 800
+    command = 60.0 + 6.0 * np.repeat([1.0, -1.0, *rng.choice([-1.0, 1.0], n // 4 - 2)], 4)
+    command = np.concatenate([np.full(held - 4, 66.0), command])
+    speed, valve = np.full(len(command), 3000.0 if held == 4 else 3132.0), command[0]
+    valve = 60.0 if held == 4 else 66.0
+    for k in range(1, len(command)):
+        valve += 0.12 * (command[k - 1] - valve)
+        speed[k] = speed[k - 1] + 0.02 * (3000.0 + 22.0 * (valve - 60.0) - speed[k - 1])
+    record = Dataset.from_arrays(command, speed + 2.0 * rng.standard_normal(len(command)), 0.02)
+    rest = identify(record, model="oe").rest
+    assert rest.u[0] == pytest.approx(u, abs=1.0)
+    assert rest.y == pytest.approx(y + 22.0 * (rest.u[0] - u), abs=5.0)
+
+
 def test_a_level_that_no_record_shows_is_no_rest_where_a_budget_lost_the_region() -> None:
     """A chiller that a loop holds at 7 degC with 54 %: without a command it would be at 19."""
     rng = np.random.default_rng(3)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeVar, cast
 
 import numpy as np
 
-from ..dataset import Dataset, FloatArray
+from ..dataset import Dataset, Experiment, FloatArray
+from ..dataset.experiment import without_weightless
 from ..dataset.outliers import quantum
-from ..dataset.standing import Standing, standing
+from ..dataset.standing import SIGMAS, Standing, standing
 from ..equilibrium import linearise
 from ..errors import FitError, SettingError
 from ..evidence.region import stored_region
@@ -37,8 +37,10 @@ def for_loops(model: M, data: Dataset) -> M:
     return cast("M", replace(each(model), alternatives=tuple(map(each, model.alternatives))))
 
 
-def _rested(model: M, data: Dataset, found: Rest | None) -> M:
-    rest = found or _equilibrium(model, data)
+def _rested(model: M, data: Dataset, found: _Found | None) -> M:
+    # what was too short to show a rest is one if the model stands there, too
+    is_rest = found is not None and (found.is_shown or model.standing(found.experiment))
+    rest = found.rest if found is not None and is_rest else _equilibrium(model, data)
     if rest is None or rest.is_zero:
         return model
     try:
@@ -48,13 +50,31 @@ def _rested(model: M, data: Dataset, found: Rest | None) -> M:
     return cast("M", with_provenance(model, {"rest": rest.to_json()}))
 
 
-def _standing(data: Dataset) -> Rest | None:
+@dataclass(frozen=True)
+class _Found:
+    """The level at which an experiment stands at first. `is_shown` says that these samples were
+    long enough to show that it rests there: its inputs' first move shows in the output after fewer.
+    Else the output can be about to answer a move before the record began.
+    """
+
+    rest: Rest
+    experiment: Experiment
+    is_shown: bool
+
+    @classmethod
+    def of(cls, level: Standing, experiment: Experiment) -> _Found:
+        y = without_weightless(experiment).y[level.samples : 2 * level.samples]
+        is_shown = bool((np.abs(y - level.y) > SIGMAS * level.scatter).any())
+        rest = Rest(level.u, level.y, "standing samples", level.near_zero)
+        return cls(rest, experiment, is_shown)
+
+
+def _standing(data: Dataset) -> _Found | None:
     """The level of the experiment that stands with the least command, and of those the longest."""
-    levels: Sequence[Standing] = [s for s in map(standing, data.experiments) if s is not None]
+    levels = [(s, e) for e in data.experiments if (s := standing(e)) is not None]
     if not levels:
         return None
-    best = min(levels, key=lambda s: (math.hypot(*s.u), -s.samples))
-    return Rest(best.u, best.y, "standing samples", best.near_zero)
+    return _Found.of(*min(levels, key=lambda pair: (math.hypot(*pair[0].u), -pair[0].samples)))
 
 
 def _equilibrium(model: Model, data: Dataset) -> Rest | None:
