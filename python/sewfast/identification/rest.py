@@ -13,7 +13,7 @@ from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.experiment import without_weightless
 from ..dataset.outliers import quantum
 from ..dataset.standing import SIGMAS, Standing, standing
-from ..equilibrium import linearise
+from ..equilibrium import Linearised, linearise
 from ..errors import FitError, SettingError
 from ..evidence.region import stored_region
 from ..evidence.residuals import representative
@@ -38,8 +38,7 @@ def for_loops(model: M, data: Dataset) -> M:
 
 
 def _rested(model: M, data: Dataset, found: _Found | None) -> M:
-    # what was too short to show a rest is one if the model stands there, too
-    is_rest = found is not None and (found.is_shown or model.standing(found.experiment))
+    is_rest = found is not None and not _answers_earlier(model, found)
     rest = found.rest if found is not None and is_rest else _equilibrium(model, data)
     if rest is None or rest.is_zero:
         return model
@@ -52,29 +51,52 @@ def _rested(model: M, data: Dataset, found: _Found | None) -> M:
 
 @dataclass(frozen=True)
 class _Found:
-    """The level at which an experiment stands at first. `is_shown` says that these samples were
-    long enough to show that it rests there: its inputs' first move shows in the output after fewer.
-    Else the output can be about to answer a move before the record began.
-    """
+    """The first samples of an experiment, which stand still."""
 
-    rest: Rest
+    level: Standing
     experiment: Experiment
-    is_shown: bool
 
-    @classmethod
-    def of(cls, level: Standing, experiment: Experiment) -> _Found:
-        y = without_weightless(experiment).y[level.samples : 2 * level.samples]
-        is_shown = bool((np.abs(y - level.y) > SIGMAS * level.scatter).any())
-        rest = Rest(level.u, level.y, "standing samples", level.near_zero)
-        return cls(rest, experiment, is_shown)
+    @property
+    def rest(self) -> Rest:
+        """Their level, as that of a model."""
+        return Rest(self.level.u, self.level.y, "standing samples", self.level.near_zero)
 
 
 def _standing(data: Dataset) -> _Found | None:
     """The level of the experiment that stands with the least command, and of those the longest."""
-    levels = [(s, e) for e in data.experiments if (s := standing(e)) is not None]
-    if not levels:
-        return None
-    return _Found.of(*min(levels, key=lambda pair: (math.hypot(*pair[0].u), -pair[0].samples)))
+    levels = [_Found(s, e) for e in data.experiments if (s := standing(e)) is not None]
+    return min(levels, key=lambda f: (math.hypot(*f.level.u), -f.level.samples), default=None)
+
+
+def _answers_earlier(model: Model, found: _Found) -> bool:
+    """Whether a model that does not stand there explains the standing samples, and as many after
+    them, better if the first command came with the first sample, at an equilibrium for another one:
+    too few samples stand still before they answer.
+    """
+    level, e = found.level, without_weightless(found.experiment)
+    if len(level.u) > 1 or doubling(model) is not None:
+        return False
+    small = linearise(representative(model).core, np.array(level.u), level=level.y)
+    if not small.settled or abs(small.y - level.y) <= SIGMAS * level.scatter:
+        return False
+    n = min(2 * level.samples, len(e.y))
+    gain = (small.C @ np.linalg.pinv(np.eye(len(small.A)) - small.A) @ small.B + small.D).item()
+    if gain == 0.0:
+        return False
+    answer = (small.y - level.y) / gain * _response(small, np.ones(n))
+    left = e.y[:n] - level.y - _response(small, e.u[:n, 0] - level.u[0])
+    known = np.isfinite(left)
+    return bool(2.0 * left[known] @ answer[known] > answer[known] @ answer[known])
+
+
+def _response(small: Linearised, u: FloatArray) -> FloatArray:
+    """The response to small signals of one input, shape (N,), from equilibrium."""
+    delayed = np.concatenate([np.zeros(small.delay), u])[: len(u)]
+    x, y = np.zeros(len(small.A)), np.empty(len(u))
+    for k, v in enumerate(delayed):
+        y[k] = (small.C @ x)[0] + small.D[0, 0] * v
+        x = small.A @ x + small.B[:, 0] * v
+    return y
 
 
 def _equilibrium(model: Model, data: Dataset) -> Rest | None:
