@@ -451,8 +451,8 @@ def _show_gains(args: argparse.Namespace, controller: SampledController) -> None
         unit = controller.u_unit or "u"
         print(
             f"limits: {controller.u_min:g} to {controller.u_max:g} {unit}, all that the drive was "
-            "recorded with, and 0 where the record shows no rest; --u-min, --u-max say what else it "
-            "can take"
+            "recorded with, and 0 if it shows no rest; --u-min, --u-max say what else it can "
+            "take"
         )
     if controller.counts_per_rev is None and args.start is None:
         print(

@@ -38,7 +38,7 @@ def for_loops(model: M, data: Dataset) -> M:
 
 
 def _rested(model: M, data: Dataset, found: _Found | None) -> M:
-    is_rest = found is not None and not _answers_earlier(model, found)
+    is_rest = found is not None and not _answers_earlier(model, found, data)
     rest = found.rest if found is not None and is_rest else _equilibrium(model, data)
     if rest is None or rest.is_zero:
         return model
@@ -68,34 +68,34 @@ def _standing(data: Dataset) -> _Found | None:
     return min(levels, key=lambda f: (math.hypot(*f.level.u), -f.level.samples), default=None)
 
 
-def _answers_earlier(model: Model, found: _Found) -> bool:
-    """Whether a model that does not stand there explains the standing samples, and as many after
-    them, better if the first command came with the first sample, at an equilibrium for another one:
-    too few samples stand still before they answer.
+def _answers_earlier(model: Model, found: _Found, data: Dataset) -> bool:
+    """Whether a model that stands elsewhere, which its own error does not explain, leaves it open
+    that the first command came with the first sample: another one of the record has its equilibrium
+    there, and so few samples would hardly answer the change.
     """
     level, e = found.level, without_weightless(found.experiment)
     if len(level.u) > 1 or doubling(model) is not None:
         return False
     small = linearise(representative(model).core, np.array(level.u), level=level.y)
-    if not small.settled or abs(small.y - level.y) <= SIGMAS * level.scatter:
-        return False
-    n = min(2 * level.samples, len(e.y))
     gain = (small.C @ np.linalg.pinv(np.eye(len(small.A)) - small.A) @ small.B + small.D).item()
-    if gain == 0.0:
+    if not small.settled or gain == 0.0:
         return False
-    answer = (small.y - level.y) / gain * _response(small, np.ones(n))
-    left = e.y[:n] - level.y - _response(small, e.u[:n, 0] - level.u[0])
-    known = np.isfinite(left)
-    return bool(2.0 * left[known] @ answer[known] > answer[known] @ answer[known])
+    change = (small.y - level.y) / gain
+    ((low, high),) = data.input_range
+    earlier = low <= level.u[0] - change <= high
+    if not earlier or abs(small.y - level.y) <= SIGMAS * free_run_rmse(model, data):
+        return False
+    left = e.y[: level.samples] - level.y
+    worse = (left - change * _step(small, level.samples)) ** 2 - left**2
+    return bool(np.nansum(worse) <= (SIGMAS * level.scatter) ** 2)
 
 
-def _response(small: Linearised, u: FloatArray) -> FloatArray:
-    """The response to small signals of one input, shape (N,), from equilibrium."""
-    delayed = np.concatenate([np.zeros(small.delay), u])[: len(u)]
-    x, y = np.zeros(len(small.A)), np.empty(len(u))
-    for k, v in enumerate(delayed):
-        y[k] = (small.C @ x)[0] + small.D[0, 0] * v
-        x = small.A @ x + small.B[:, 0] * v
+def _step(small: Linearised, n: int) -> FloatArray:
+    """The response of a small signal to a step of its first input, shape (n,)."""
+    x, y = np.zeros(len(small.A)), np.zeros(n)
+    for k in range(small.delay, n):
+        y[k] = (small.C @ x)[0] + small.D[0, 0]
+        x = small.A @ x + small.B[:, 0]
     return y
 
 
