@@ -96,6 +96,21 @@ def test_too_few_standing_samples_to_show_a_response_are_no_rest(
     assert rest.y == pytest.approx(y + 22.0 * (rest.u[0] - u), abs=5.0)
 
 
+def test_a_motor_that_turns_late_does_not_rest_at_its_first_command() -> None:
+    """It stood at 0 V until the record began with 5 V, for less than its lags show."""
+    rng, n = np.random.default_rng(0), 1500
+    u = 5.0 * np.repeat([1.0, -1.0, *rng.choice([-1.0, 1.0], n // 4 - 2)], 4)
+    current, speed, y = 0.0, 0.0, np.zeros(n)
+    for k in range(1, n):
+        current += 0.1 * (u[k - 1] - current)
+        speed += 0.01 * (90.0 * current - speed)
+        y[k] = speed
+    y += 3.0 * rng.standard_normal(n)
+    record = Dataset.from_arrays(u, y, 0.001, input_units=("V",), output_unit="RPM")
+    assert standing(record.experiments[0]) is not None
+    assert identify(record, model="oe").rest.is_zero
+
+
 def test_a_level_that_no_record_shows_is_no_rest_where_a_budget_lost_the_region() -> None:
     """A chiller that a loop holds at 7 degC with 54 %: without a command it would be at 19."""
     rng = np.random.default_rng(3)
