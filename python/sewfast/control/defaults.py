@@ -388,7 +388,10 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
         top = math.copysign(min(_RECORDED * abs(way), _HELD_UNSTABLE * gain * room), way)
         return _Span(rest, rest, rest + top, rest, 4.0 * pace)
     fopdt, rest = step.fopdt, step.rest
-    reach = [fopdt.K * u + fopdt.offset - rest for u in (u_min, u_max)]
+    levels = [fopdt.K * u + fopdt.offset for u in (u_min, u_max)]
+    if min(*levels, rest) <= model.rest.y <= max(*levels, rest):
+        rest = model.rest.y  # where the plant was seen to rest, whatever offset the model has there
+    reach = [level - rest for level in levels]
     up = max(0.0, min(_RECORDED * (high - rest), reached * max(reach)))
     down = max(0.0, min(_RECORDED * (rest - low), reached * -min(reach)))
     sign, x, other = (1.0, up, down) if up >= down else (-1.0, down, up)
