@@ -180,7 +180,8 @@ _SUFFIX = {
     "rad_s": "rad/s", "degps": "deg/s", "deg_s": "deg/s", "deg": "deg", "rad": "rad", "Nm": "Nm",
     "mm": "mm", "Hz": "Hz", "rad_per_s": "rad/s", "deg_per_s": "deg/s", "m_s": "m/s",
     "mm_s": "mm/s", "m_per_s": "m/s", "mm_per_s": "mm/s", "mps": "m/s", "percent": "%", "pct": "%",
-    "volt": "V", "volts": "V", "degC": "degC", "degc": "degC", "celsius": "degC", "kelvin": "K",
+    "%": "%", "volt": "V", "volts": "V", "degC": "degC", "degc": "degC", "celsius": "degC",
+    "kelvin": "K",
 }  # fmt: skip
 _SUFFIXED = re.compile(rf"(.+)[_ ]({'|'.join(sorted(_SUFFIX, key=len, reverse=True))})")
 _SPEED_SUFFIX = re.compile(rf"(.+?)[_ ]({'|'.join(map(re.escape, sorted(SPEEDS, key=len)))})")
