@@ -47,7 +47,23 @@ _OUTPUTS = (
     _sort(
         "temperature temp temperatur level füllstand fuellstand pressure druck flow durchfluss "
         "thrust schub",
-        "°c degc k °f degf bar mbar pa hpa kpa psi kgf m³/h m3/h l/min".split(),
+        (
+            "°c",
+            "degc",
+            "k",
+            "°f",
+            "degf",
+            "bar",
+            "mbar",
+            "pa",
+            "hpa",
+            "kpa",
+            "psi",
+            "kgf",
+            "m³/h",
+            "m3/h",
+            "l/min",
+        ),
     ),
 )
 """The first sort with a column counts; columns of later sorts were logged beside it."""
