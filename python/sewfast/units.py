@@ -147,6 +147,8 @@ _UNITS = SPEEDS | frozenset(
 """Units that are written behind or below a name, in lower case."""
 _STATISTIC = re.compile(r"(?:^|\s+)(?:rms|avg|mean|max|min|peak|pk|pp)$", re.IGNORECASE)
 """What a number between brackets is of several samples; `[V rms]` is in V."""
+_TIMES = re.compile(r"t|.*(?:time|zeit|elapsed|stamp|temps|tiempo|tempo).*", re.IGNORECASE)
+"""Names of times, whose `[min]` are minutes and no least value."""
 _BEFORE_UNIT = re.compile(r"\s+in\s+|\s*/\s*|\s*,\s+")
 
 
@@ -154,7 +156,9 @@ def split_unit(header: str) -> tuple[str, str]:
     """`u [V]`, `u (V)`, `u, V`, `u in V` or `u / V` -> `("u", "V")`; no unit gives an empty one."""
     match = re.fullmatch(r"\s*(\S.*?)[\s/]*(?:\[([^\]]*)\]|\(([^)]*)\))\s*", header)
     if match is not None:
-        return match[1], _STATISTIC.sub("", match[2] or match[3] or "").strip()
+        unit = (match[2] or match[3] or "").strip()
+        minutes = unit.lower() == "min" and _TIMES.fullmatch(match[1]) is not None
+        return match[1], unit if minutes else _STATISTIC.sub("", unit).strip()
     text = header.strip()
     if is_unit(text):
         return text, ""
@@ -176,7 +180,8 @@ _SUFFIX = {
     "rad_s": "rad/s", "degps": "deg/s", "deg_s": "deg/s", "deg": "deg", "rad": "rad", "Nm": "Nm",
     "mm": "mm", "Hz": "Hz", "rad_per_s": "rad/s", "deg_per_s": "deg/s", "m_s": "m/s",
     "mm_s": "mm/s", "m_per_s": "m/s", "mm_per_s": "mm/s", "mps": "m/s", "percent": "%", "pct": "%",
-    "volt": "V", "volts": "V", "degC": "degC", "degc": "degC", "celsius": "degC", "kelvin": "K",
+    "%": "%", "volt": "V", "volts": "V", "degC": "degC", "degc": "degC", "celsius": "degC",
+    "kelvin": "K",
 }  # fmt: skip
 _SUFFIXED = re.compile(rf"(.+)[_ ]({'|'.join(sorted(_SUFFIX, key=len, reverse=True))})")
 _SPEED_SUFFIX = re.compile(rf"(.+?)[_ ]({'|'.join(map(re.escape, sorted(SPEEDS, key=len)))})")

@@ -127,6 +127,10 @@ def table(tmp_path: Path, *names: str) -> api.readers.Table:
         (("heater_pct", "temp_C", "ambient_C"), ("heater_pct", "temp_C")),
         (("valve [%]", "level [m]", "noise"), ("valve", "level")),
         (("Voltage", "speed_rad/s", "other"), ("Voltage", "speed_rad/s")),
+        (("compressor [%]", "cabinet [°F]"), ("compressor", "cabinet")),
+        (("fan (%)", "duct (Pa)"), ("fan", "duct")),
+        (("Pumpe [%]", "Niveau [cm]"), ("Pumpe", "Niveau")),
+        (("duty_%", "flow in m³/h"), ("duty_%", "flow in m³/h")),
     ],
 )
 def test_columns_are_recognised_or_left_open(

@@ -58,6 +58,19 @@ def test_a_shift_changes_no_run_and_no_reference(u0: float, y0: float) -> None:
     np.testing.assert_allclose(found.feedback - y0, expected.feedback, atol=1e-4)
 
 
+@pytest.mark.parametrize(("offset", "begins"), [(-0.23, 22.0), (0.23, 22.23)])
+def test_references_begin_at_the_level_of_rest_if_the_model_reaches_it(
+    offset: float, begins: float
+) -> None:
+    """A slow plant's model is off by a little at rest, where the plant itself cannot be lower."""
+    plain = heater(0.0, 22.0 + offset)
+    seen = {**plain.training["rest"], "y": 22.0}
+    for r in drive_references(
+        replace(plain, training={**plain.training, "rest": seen}), 0.0, 100.0
+    ).values():
+        assert r.min() == pytest.approx(begins, abs=0.01)
+
+
 @pytest.mark.parametrize(("u0", "y0"), SHIFTS)
 def test_a_shift_changes_no_first_gain_and_no_cost(u0: float, y0: float) -> None:
     plain, moved = heater(), heater(u0, y0)

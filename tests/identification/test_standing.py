@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from sewfast import Dataset, LinearOE, _core, identify
 from sewfast.arrays import FloatArray
 from sewfast.control import fit_fopdt
 from sewfast.dataset.standing import Standing, standing
+from sewfast.identification.rest import for_loops
 
 
 def two_lags(k: FloatArray, slow: float, fast: float) -> FloatArray:
@@ -72,6 +75,55 @@ def test_a_fast_record_about_a_level_rests_at_its_mean_command() -> None:
     assert model.rest.source == "equilibrium"
     assert model.rest.u[0] == pytest.approx(u.mean())
     assert model.rest.y == pytest.approx(21.0 + np.sqrt(12.0), abs=0.2)
+
+
+@pytest.mark.parametrize(("held", "u", "y"), [(4, 60.0, 3000.0), (200, 66.0, 3132.0)])
+def test_too_few_standing_samples_to_show_a_response_are_no_rest(
+    held: int, u: float, y: float
+) -> None:
+    """A turbine under load ran with 60 % until the record began with 66."""
+    rng, n = np.random.default_rng(18), 800
+    command = 60.0 + 6.0 * np.repeat([1.0, -1.0, *rng.choice([-1.0, 1.0], n // 4 - 2)], 4)
+    command = np.concatenate([np.full(held - 4, 66.0), command])
+    speed, valve = np.full(len(command), 3000.0 if held == 4 else 3132.0), command[0]
+    valve = 60.0 if held == 4 else 66.0
+    for k in range(1, len(command)):
+        valve += 0.12 * (command[k - 1] - valve)
+        speed[k] = speed[k - 1] + 0.02 * (3000.0 + 22.0 * (valve - 60.0) - speed[k - 1])
+    record = Dataset.from_arrays(command, speed + 2.0 * rng.standard_normal(len(command)), 0.02)
+    rest = identify(record, model="oe").rest
+    assert rest.u[0] == pytest.approx(u, abs=1.0)
+    assert rest.y == pytest.approx(y + 22.0 * (rest.u[0] - u), abs=5.0)
+
+
+def test_a_motor_that_turns_late_does_not_rest_at_its_first_command() -> None:
+    """It stood at 0 V until the record began with 5 V, for less than its lags show."""
+    rng, n = np.random.default_rng(0), 1500
+    u = 5.0 * np.repeat([1.0, -1.0, *rng.choice([-1.0, 1.0], n // 4 - 2)], 4)
+    current, speed, y = 0.0, 0.0, np.zeros(n)
+    for k in range(1, n):
+        current += 0.1 * (u[k - 1] - current)
+        speed += 0.01 * (90.0 * current - speed)
+        y[k] = speed
+    y += 3.0 * rng.standard_normal(n)
+    record = Dataset.from_arrays(u, y, 0.001, input_units=("V",), output_unit="RPM")
+    assert standing(record.experiments[0]) is not None
+    assert identify(record, model="oe").rest.is_zero
+
+
+def test_a_level_that_no_record_shows_is_no_rest_where_a_budget_lost_the_region() -> None:
+    """A chiller that a loop holds at 7 degC with 54 %: without a command it would be at 19."""
+    rng = np.random.default_rng(3)
+    u = 54.0 + np.repeat(10.0 * rng.choice([-1.0, 1.0], 100), 6)
+    y = np.full(600, 7.0)
+    for k in range(1, 600):
+        y[k] = y[k - 1] + 0.04 * (19.0 - 0.22222 * u[k - 1] - y[k - 1])
+    record = Dataset.from_arrays(u, y + 0.03 * rng.standard_normal(600), 5.0)
+    model = identify(record, model="oe")
+    kept = {k: v for k, v in model.training.items() if k not in ("region", "rest")}
+    for found in (model, for_loops(replace(model, training=kept), record)):
+        assert found.rest.u[0] == pytest.approx(u.mean())
+        assert found.rest.y == pytest.approx(19.0 - 0.22222 * u.mean(), abs=0.2)
 
 
 def test_only_outputs_that_stand_still_are_a_rest() -> None:

@@ -266,6 +266,27 @@ def test_a_linear_model_is_kept_when_the_motor_is_stopped(monkeypatch: pytest.Mo
     assert isinstance(e.value.best, LinearOE)
 
 
+@pytest.mark.parametrize(
+    ("unit", "order"), [("RPM", ["motor", "linear"]), ("mm", ["linear", "motor"])]
+)
+def test_only_a_speed_asks_for_a_motor_before_the_larger_linear_models(
+    monkeypatch: pytest.MonkeyPatch, unit: str, order: list[str]
+) -> None:
+    """A joint takes longer than all of these: a budget would end with the smallest."""
+    done: list[str] = []
+
+    def stopped(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(table.Table, "_try_motor", lambda _: done.append("motor"))
+    monkeypatch.setattr(table.LinearTable, "search", lambda *_: done.append("linear"))
+    monkeypatch.setattr(table.Table, "_screened", stopped)
+    (e,) = bent_data(600, noise=0.02).experiments
+    with pytest.raises(Interrupted):
+        identify(Dataset.from_arrays(e.u, e.y, 0.01, output_unit=unit))
+    assert done == order
+
+
 def test_a_curve_without_memory_gets_a_network() -> None:
     # linear fits without some of the blocks end at a trend, from which no network can start
     rng = np.random.default_rng(0)

@@ -312,13 +312,22 @@ def times(tmp_path: Path, values: object, header: str = "t") -> Path:
 
 @pytest.mark.parametrize(
     ("header", "factor"),
-    [("t", 1), ("time", 1), ("Time [s]", 1), ("t [ms]", 1e-3), ("T (us)", 1e-6)],
-)
+    [
+        ("t", 1), ("time", 1), ("Time [s]", 1), ("t [ms]", 1e-3), ("T (us)", 1e-6),
+        ("t [min]", 60), ("Zeit (min)", 60), ("time_min", 60), ("Time (h)", 3600),
+        ("t_hours", 3600),
+    ],
+)  # fmt: skip
 def test_the_sample_time_comes_from_the_time_column(
     tmp_path: Path, header: str, factor: float
 ) -> None:
     data = read(times(tmp_path, [0, 2, 4, 6], header), inputs="u", output="y")
     assert data.Ts == pytest.approx(2 * factor)
+
+
+def test_min_of_another_column_is_its_least_value(tmp_path: Path) -> None:
+    path = csv(tmp_path, "t,u [V],speed [min]\n0,1,2\n1,2,4\n2,1,3\n")
+    assert read(path, inputs="u", output="speed").output_unit == ""
 
 
 def test_a_time_column_by_another_name(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from sewfast.control.defaults import (
     filter_length,
     recorded_limits,
 )
-from sewfast.errors import SettingError
+from sewfast.errors import FitError, SettingError
 from sewfast.evidence.region import training_region
 from sewfast.models import LinearOE
 from sewfast.trust import judge
@@ -318,6 +318,15 @@ def test_a_drive_is_not_moved_without_a_reference() -> None:
     controller = first_controller(drive(0.01, 0.2, 10.0, (-3.0, 3.0)))
     with refuses(SettingError, name="reference", expected="for a drive"):
         sewfast.run(controller, object())  # type: ignore[arg-type]
+
+
+def test_a_model_that_follows_a_drift_is_refused_with_what_to_do() -> None:
+    """The steps of a lag, and a pole at 1 whose own part of them is nothing but noise."""
+    num = [0.0, 0.0151676, -0.0166623, 0.00154688]
+    plant = LinearOE.from_tf(num, [1.0, -1.941696, 0.941696], 20.0)
+    drifting = replace(plant, training={"input_range": [[0.0, 80.0]], "output_range": [15.0, 33.0]})
+    with refuses(FitError, name="model", received="none up to u = 40", remedy="--detrend 1"):
+        sewfast.tune(drifting, evaluations=10)
 
 
 def test_the_commands_need_nothing_but_the_model(

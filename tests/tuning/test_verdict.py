@@ -20,10 +20,11 @@ from sewfast.errors import FitError, SettingError
 from sewfast.machine import VirtualMachine
 from sewfast.models import Ensemble, LinearOE, Model
 from sewfast.tuning import tune
+from sewfast.tuning import verdict as verdicts
 from sewfast.tuning.objective import LARGEST_MS, Constraints, Cost
 from sewfast.tuning.robustness import _levels
-from sewfast.tuning.task import TuningTask
-from sewfast.tuning.verdict import GRADES, Objection, Verdict, _at_limit, command_for
+from sewfast.tuning.task import Budget, TuningTask
+from sewfast.tuning.verdict import GRADES, Objection, Verdict, _at_limit, command_for, verdict_of
 
 SHORT = signals.reference("trapezoid")[:900]
 FIXED: dict[str, Any] = {"variables": ["alpha"], "evaluations": 10, "seed": 0}
@@ -261,6 +262,35 @@ def test_full_power_on_the_way_to_a_step_is_no_limit_without_need(level: float) 
     found = run(pid, heater, np.full(600, level))
     assert abs(found.y[-1] - level) < 0.1
     assert _at_limit(found, heater) < 0.1
+
+
+def test_the_runs_for_a_verdict_end_with_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between any two models, as one run of a slow plant can take seconds."""
+    ran = []
+    monkeypatch.setattr(verdicts, "run", lambda *given: ran.append(given) or run(*given))
+    task = TuningTask.of(
+        [drive()] * 4, [SHORT, 0.5 * SHORT], start=QUIET, first={}, cost=None,
+        aggregate="mean", constraints=None, variations=None,
+    )  # fmt: skip
+    time = Budget(1.0)
+    monkeypatch.setattr(Budget, "spent", property(lambda _: float(len(ran))))
+    found = verdict_of(task, QUIET, time)
+    assert len(ran) == 2
+    assert found.grade == "fair"
+    assert "left no time" in (found.warning or "")
+    assert time.lost == ["the runs for the verdict"]
+
+
+def test_what_a_reference_needs_is_asked_only_of_a_loop_that_is_at_a_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(verdicts, "command_for", lambda *_: pytest.fail("it takes long"))
+    task = TuningTask.of(
+        [drive()], [SHORT], start=QUIET, first={}, cost=None,
+        aggregate="mean", constraints=None, variations=None,
+    )  # fmt: skip
+    task = task.with_loops(Budget(None))
+    assert verdict_of(task, QUIET, Budget(None)).grade == "good"
 
 
 def test_gains_are_no_better_than_an_ensemble() -> None:

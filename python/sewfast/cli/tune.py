@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import Interrupted, SettingError
 from ..progress import Progress
+from ..units import duration
 from .arguments import (
     TABLES,
     Commands,
@@ -450,7 +451,8 @@ def _show_gains(args: argparse.Namespace, controller: SampledController) -> None
         unit = controller.u_unit or "u"
         print(
             f"limits: {controller.u_min:g} to {controller.u_max:g} {unit}, all that the drive was "
-            "recorded with; --u-min, --u-max say what else it can take"
+            "recorded with, and 0 if it shows no rest; --u-min, --u-max say what else it can "
+            "take"
         )
     if controller.counts_per_rev is None and args.start is None:
         print(
@@ -459,7 +461,7 @@ def _show_gains(args: argparse.Namespace, controller: SampledController) -> None
         )
     lead = controller.feedforward
     if lead is not None and lead.preview:
-        early = f"{lead.preview} samples ({1e3 * lead.preview * controller.Ts:.3g} ms)"
+        early = f"{lead.preview} samples ({duration(lead.preview * controller.Ts, 3)})"
         print(
             f"feedforward: it needs the reference {early} early, or follows it that much later; "
             "--feedforward causal does without, --no-feedforward leaves it out"

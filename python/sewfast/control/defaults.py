@@ -34,6 +34,11 @@ NAMES = ("trapezoid", "trapezoids", "random")
 _STEP_SHARES = (0.25, 0.5, 0.1)
 """Sizes of the step response to try, as shares of the larger limit."""
 _STEP_SAMPLES = (4_000, 16_000)
+_UNSETTLED = (
+    "identify it again with --detrend 1 if the record drifts (detrend(1) in Python), or give a "
+    "controller to start from"
+)
+"""What to do about a model with no step response that settles: a pole at 1 follows a drift."""
 _RECORDED = 0.9
 """Top of the references as a share of the recorded output, beyond which the model extrapolates."""
 _HELD_UNSTABLE = 0.3
@@ -164,8 +169,8 @@ def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
         return DriveStep(_raised(fopdt, about.u[0], about.y), float(y[at - 1]) + about.y, slowest)
     raise FitError(
         name="model", expected="one whose step response settles",
-        received=f"none up to u = {about.u[0] + 0.5 * size:g} ({reason})",
-        remedy="give a controller to start from",
+        received=f"none up to u = {about.u[0] + max(_STEP_SHARES) * size:g} ({reason})",
+        remedy=_UNSETTLED,
     ) from reason  # fmt: skip
 
 
@@ -193,7 +198,8 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
         return DriveStep(fopdt, float(y[0]) + model.rest.y, fopdt.T)
     raise FitError(
         name="model", expected="one that integrates its input and whose rate settles after a step",
-        received=f"{reason}", remedy="give a controller to start from",
+        received=f"none up to u = {model.rest.u[0] + max(_STEP_SHARES) * size:g} ({reason})",
+        remedy=_UNSETTLED,
     ) from reason  # fmt: skip
 
 
@@ -382,7 +388,10 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
         top = math.copysign(min(_RECORDED * abs(way), _HELD_UNSTABLE * gain * room), way)
         return _Span(rest, rest, rest + top, rest, 4.0 * pace)
     fopdt, rest = step.fopdt, step.rest
-    reach = [fopdt.K * u + fopdt.offset - rest for u in (u_min, u_max)]
+    levels = [fopdt.K * u + fopdt.offset for u in (u_min, u_max)]
+    if min(*levels, rest) <= model.rest.y <= max(*levels, rest):
+        rest = model.rest.y  # where the plant was seen to rest, whatever offset the model has there
+    reach = [level - rest for level in levels]
     up = max(0.0, min(_RECORDED * (high - rest), reached * max(reach)))
     down = max(0.0, min(_RECORDED * (rest - low), reached * -min(reach)))
     sign, x, other = (1.0, up, down) if up >= down else (-1.0, down, up)

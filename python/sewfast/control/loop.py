@@ -138,12 +138,14 @@ class ClosedLoopRun:
         return loop_drawing(traces[::-1], self.units["y"], self.units["u"], limits).plot(ax, file)
 
     def _repr_html_(self) -> str:
-        return run_html(self, f"{self.reference} on {self.plant}, {len(self.t) * self.Ts:g} s")
+        return run_html(
+            self, f"{self.reference} on {self.plant}, {duration(len(self.t) * self.Ts)}"
+        )
 
     def __str__(self) -> str:
         unit = self.units | {n: unit or n for n, unit in self.units.items() if n in "uy"}
         metrics = self.metrics()
-        lines = [f"{self.reference} on {self.plant}, {len(self.t) * self.Ts:g} s"]
+        lines = [f"{self.reference} on {self.plant}, {duration(len(self.t) * self.Ts)}"]
         if metrics["rmse"] is None:
             return f"{lines[0]}; no sample came"
         lines.append(

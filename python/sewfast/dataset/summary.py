@@ -14,6 +14,7 @@ import numpy as np
 from ..arrays import FloatArray, labelled, runs
 from ..plotting import Drawing, legend, lettered, thin
 from ..tables import Table
+from ..units import duration
 from .diagnosis import Diagnosis, diagnose
 from .outliers import (
     band,
@@ -163,7 +164,7 @@ class Summary:
         count = len(self.experiments)
         several = f" in {count} experiments" if count > 1 else ""
         rate = f"Ts = {self.Ts:g} s ({1 / self.Ts:.4g} Hz)"
-        return f"{self.n} samples{several}, {self.n * self.Ts:.4g} s at {rate}"
+        return f"{self.n} samples{several}, {duration(self.n * self.Ts)} at {rate}"
 
     def __str__(self) -> str:
         lines = [self._caption()]

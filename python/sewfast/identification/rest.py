@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeVar, cast
 
 import numpy as np
 
-from ..dataset import Dataset, FloatArray
+from ..dataset import Dataset, Experiment, FloatArray
+from ..dataset.experiment import without_weightless
 from ..dataset.outliers import quantum
-from ..dataset.standing import Standing, standing
-from ..equilibrium import linearise
+from ..dataset.standing import SIGMAS, Standing, standing
+from ..equilibrium import Linearised, linearise
 from ..errors import FitError, SettingError
 from ..evidence.region import stored_region
 from ..evidence.residuals import representative
@@ -37,8 +37,9 @@ def for_loops(model: M, data: Dataset) -> M:
     return cast("M", replace(each(model), alternatives=tuple(map(each, model.alternatives))))
 
 
-def _rested(model: M, data: Dataset, found: Rest | None) -> M:
-    rest = found or _equilibrium(model, data)
+def _rested(model: M, data: Dataset, found: _Found | None) -> M:
+    is_rest = found is not None and not _answers_earlier(model, found, data)
+    rest = found.rest if found is not None and is_rest else _equilibrium(model, data)
     if rest is None or rest.is_zero:
         return model
     try:
@@ -48,13 +49,54 @@ def _rested(model: M, data: Dataset, found: Rest | None) -> M:
     return cast("M", with_provenance(model, {"rest": rest.to_json()}))
 
 
-def _standing(data: Dataset) -> Rest | None:
+@dataclass(frozen=True)
+class _Found:
+    """The first samples of an experiment, which stand still."""
+
+    level: Standing
+    experiment: Experiment
+
+    @property
+    def rest(self) -> Rest:
+        """Their level, as that of a model."""
+        return Rest(self.level.u, self.level.y, "standing samples", self.level.near_zero)
+
+
+def _standing(data: Dataset) -> _Found | None:
     """The level of the experiment that stands with the least command, and of those the longest."""
-    levels: Sequence[Standing] = [s for s in map(standing, data.experiments) if s is not None]
-    if not levels:
-        return None
-    best = min(levels, key=lambda s: (math.hypot(*s.u), -s.samples))
-    return Rest(best.u, best.y, "standing samples", best.near_zero)
+    levels = [_Found(s, e) for e in data.experiments if (s := standing(e)) is not None]
+    return min(levels, key=lambda f: (math.hypot(*f.level.u), -f.level.samples), default=None)
+
+
+def _answers_earlier(model: Model, found: _Found, data: Dataset) -> bool:
+    """Whether a model that stands elsewhere, which its own error does not explain, leaves it open
+    that the first command came with the first sample: another one of the record has its equilibrium
+    there, and so few samples would hardly answer the change.
+    """
+    level, e = found.level, without_weightless(found.experiment)
+    if len(level.u) > 1 or doubling(model) is not None:
+        return False
+    small = linearise(representative(model).core, np.array(level.u), level=level.y)
+    gain = (small.C @ np.linalg.pinv(np.eye(len(small.A)) - small.A) @ small.B + small.D).item()
+    if not small.settled or gain == 0.0:
+        return False
+    change = (small.y - level.y) / gain
+    ((low, high),) = data.input_range
+    earlier = low <= level.u[0] - change <= high
+    if not earlier or abs(small.y - level.y) <= SIGMAS * free_run_rmse(model, data):
+        return False
+    left = e.y[: level.samples] - level.y
+    worse = (left - change * _step(small, level.samples)) ** 2 - left**2
+    return bool(np.nansum(worse) <= (SIGMAS * level.scatter) ** 2)
+
+
+def _step(small: Linearised, n: int) -> FloatArray:
+    """The response of a small signal to a step of its first input, shape (n,)."""
+    x, y = np.zeros(len(small.A)), np.zeros(n)
+    for k in range(small.delay, n):
+        y[k] = (small.C @ x)[0] + small.D[0, 0]
+        x = small.A @ x + small.B[:, 0]
+    return y
 
 
 def _equilibrium(model: Model, data: Dataset) -> Rest | None:
@@ -68,11 +110,11 @@ def _equilibrium(model: Model, data: Dataset) -> Rest | None:
         return held
     low, high = np.array(data.input_range, dtype=np.float64).T
     zero = np.zeros(len(low))
-    known = ((u, _level(model, u)) for u in (zero, np.clip(zero, low, high)))
+    known = ((u, _level(model, u, data)) for u in (zero, np.clip(zero, low, high)))
     u, off = next((pair for pair in known if pair[1] is not None), (zero, None))
     if off is None and held is not None:
         u = np.array(held.u)
-        off = _level(model, u, anywhere=True)
+        off = _level(model, u)
     if off is None:
         return None
     y = float(np.clip(off, *data.output_range))
@@ -93,13 +135,19 @@ def _held(data: Dataset) -> Rest | None:
     return Rest(tuple(float(v) for v in mean), level, "equilibrium")
 
 
-def _level(model: Model, u: FloatArray, *, anywhere: bool = False) -> float | None:
-    """The steady output at constant inputs, if there is one where the model is known."""
+def _level(model: Model, u: FloatArray, data: Dataset | None = None) -> float | None:
+    """The steady output at constant inputs, if there is one; with `data`, where these show the
+    model: in its region, or in the ranges of the record where a budget left no time for a region.
+    """
     found = linearise(representative(model).core, u)
-    region = None if anywhere else stored_region(model)
     if not (found.settled and math.isfinite(found.y)):
         return None
-    return found.y if region is None or region.holds(u, found.y) else None
+    region = stored_region(model)
+    if data is None or (region is not None and region.holds(u, found.y)):
+        return found.y
+    ranges, values = (*data.input_range, data.output_range), (*u, found.y)
+    inside = all(low <= v <= high for (low, high), v in zip(ranges, values, strict=True))
+    return found.y if region is None and inside else None
 
 
 def _noisy(model: M, data: Dataset) -> M:

@@ -24,6 +24,7 @@ from .. import _core
 from ..dataset import Diagnosis, diagnose
 from ..dataset.pieces import thinned
 from ..models.base import EnsembleCore
+from ..units import revolutions_per_second
 from . import grey_box, lagged
 from .blocks import Blocks, Mixture, Row, near
 from .folds import TRIAL
@@ -101,12 +102,17 @@ class Table:
         """Linear models and a motor, then networks: the better half of them further, twice, larger
         ones from the best, and those that lead to the end.
         The equations of a motor come after the smallest linear model: where they hold, no other
-        second of the search gains as much, and a time budget must not end before it.
+        second of the search gains as much, and a time budget must not end before it. Those of a
+        joint take longer than all linear models, and many a length (a level) is no joint's.
         """
         self.linear.begin()
-        if not self.is_exact:
+        is_open = not self.is_exact
+        is_motor = revolutions_per_second(self.task.data.output_unit) is not None
+        if is_open and is_motor:
             self._try_motor()
         self.linear.search(self.clock.within(SHARES.linear, SHARES.search))
+        if is_open and not is_motor:
+            self._try_motor()
         self.enter_linear()
         if self.is_exact or self.joints_decide:
             return

@@ -42,12 +42,28 @@ _OUTPUTS = (
     _sort(
         "y out output speed rpm velocity vel omega drehzahl geschwindigkeit vitesse tacho tach "
         "position pos angle theta winkel weg istwert velocidad velocità",
-        (*SPEEDS, "rad", "deg", "°", "rev", "m", "mm"),
+        (*SPEEDS, "rad", "deg", "°", "rev", "m", "cm", "mm"),
     ),
     _sort(
         "temperature temp temperatur level füllstand fuellstand pressure druck flow durchfluss "
         "thrust schub",
-        ("°c", "degc", "k", "bar", "kpa", "kgf"),
+        (
+            "°c",
+            "degc",
+            "k",
+            "°f",
+            "degf",
+            "bar",
+            "mbar",
+            "pa",
+            "hpa",
+            "kpa",
+            "psi",
+            "kgf",
+            "m³/h",
+            "m3/h",
+            "l/min",
+        ),
     ),
 )
 """The first sort with a column counts; columns of later sorts were logged beside it."""

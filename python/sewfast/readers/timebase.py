@@ -23,11 +23,13 @@ GAP = 3.5
 """Steps of more periods than this are gaps, in which nothing is known."""
 _SECONDS = {
     "": 1.0, "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3,
-    "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "usec": 1e-6, "ns": 1e-9, "min": 60.0,
+    "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "usec": 1e-6, "ns": 1e-9,
+    **dict.fromkeys(("min", "mins", "minute", "minutes"), 60.0),
+    **dict.fromkeys(("h", "hr", "hrs", "hour", "hours", "std"), 3600.0),
     "millis": 1e-3, "milliseconds": 1e-3, "micros": 1e-6, "microseconds": 1e-6,
     "nanos": 1e-9, "nanoseconds": 1e-9,
 }  # fmt: skip
-_UNIT = r"s|sec|seconds|ms|msec|millis(?:econds)?|us|µs|usec|micros(?:econds)?|ns|nanos(?:econds)?"
+_UNIT = "|".join(filter(None, _SECONDS))
 _TIME = re.compile(
     r"(?:t|(?:(?:elapsed|relative|rel|unix|epoch|system|sys|log|run)[_ ]?)?time|time[_ ]?stamp|"
     r"stamp|"
@@ -329,7 +331,7 @@ def _unit(table: Table, name: str) -> tuple[float | None, tuple[str, ...]]:
         unit = (match[1] or match[2] or "") if match else ""
     if unit.lower() not in _SECONDS:
         raise DataError(
-            f"{table.path}: time in {unit!r} is not understood; expected s, ms, us or ns"
+            f"{table.path}: time in {unit!r} is not understood; expected ns, us, ms, s, min or h"
         )
     first = table[name][0] if len(table[name]) else 0.0
     for least, scale, epoch in _EPOCH if not unit else ():
