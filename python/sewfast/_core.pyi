@@ -708,6 +708,11 @@ def cost_terms(
 ) -> dict[str, float]:
     """tracking, chatter, effort, overshoot [%], rise [ms], lag [ms], saturation, u_max of a run."""
 
+def run_cost(
+    cost: Mapping[str, float], terms: Mapping[str, float], *, span: float, command: float,
+) -> float:
+    """The cost of a run with these terms, for references and commands of these ranges."""
+
 _Lines: TypeAlias = tuple[_F, NDArray[np.complex128], _F, bool]  # rad/s, responses, radii; counted
 _Variable: TypeAlias = tuple[str, tuple[float, float] | None]
 

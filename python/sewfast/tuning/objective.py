@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, cast
@@ -19,9 +18,6 @@ from ..gains import real
 
 SHARES = ("chatter", "overshoot", "saturation")
 """Weights whose default depends on the references' span."""
-
-ROUNDING = 0.1
-"""The rounding of the penalty of overshoot, as a share of its limit, as in the core."""
 
 
 @dataclass(frozen=True)
@@ -88,15 +84,6 @@ class Cost:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
 
-    def resolved(self, span: float, u_range: float) -> Cost:
-        """The same cost with the default weights for this span of the references and range of u."""
-        shares = {
-            "chatter": 0.5 * span / u_range,
-            "overshoot": span / 100.0,
-            "saturation": 0.02 * span,
-        }
-        return Cost(**(shares | self.named()))
-
     def of(self, runs: ClosedLoopRun | Sequence[ClosedLoopRun]) -> float:
         """The cost of runs: the mean over them, as in `sewfast.tune` over references.
 
@@ -118,21 +105,11 @@ class Cost:
             raise DataError("expected at least one run to take the cost of, got none")
         r = np.concatenate([run.r for run in several])
         limits = several[0].controller
-        cost = self.resolved(float(np.ptp(r)), limits.u_max - limits.u_min)
-        return float(np.mean([cost._of(terms(run)) for run in several]))
-
-    def _beyond_limit(self, overshoot: float) -> float:
-        """The overshoot beyond its limit, with the kink rounded as in the core."""
-        excess, half = overshoot - self.overshoot_limit, ROUNDING * self.overshoot_limit
-        if excess >= half or half < sys.float_info.min:
-            return max(excess, 0.0)
-        above = max(excess + half, 0.0)
-        return above * above / (4.0 * half)
-
-    def _of(self, terms: dict[str, float]) -> float:
-        above = {**terms, "overshoot": self._beyond_limit(terms["overshoot"])}
-        weights = self.named()
-        return sum(weights[name] * value for name, value in above.items() if name in weights)
+        span, command = float(np.ptp(r)), limits.u_max - limits.u_min
+        costs = [
+            _core.run_cost(self.named(), terms(run), span=span, command=command) for run in several
+        ]
+        return float(np.mean(costs))
 
 
 def terms(run: ClosedLoopRun) -> dict[str, float]:

@@ -183,13 +183,13 @@ fn staged<P: Plant + Clone + Send + Sync>(
         Method::Genetic => genetic::search(problem, start, options, monitor),
         Method::CmaEs => cma_es::search(problem, start, options, monitor),
     };
-    let part = on(Extent::Part, bench.clone());
-    let smooth = on(Extent::Part, bench.clone().smoothed());
     let whole = on(Extent::Whole, bench.clone());
     let scouts = (SCOUTS * options.evaluations as f64) as usize;
     if scouts == 0 {
         return search(&whole, Some(start), options);
     }
+    let part = on(Extent::Part, bench.clone());
+    let smooth = on(Extent::Part, bench.clone().smoothed());
     // a stop request must not lose what has been found
     let never = Monitor::default();
     let judge = |design| bench.clone().judge_one(task, &design, &never);

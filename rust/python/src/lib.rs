@@ -43,7 +43,7 @@ mod _core {
         PositionController, approach, judge_stops, position_rates, position_run,
     };
     #[pymodule_export]
-    use crate::control::tuning::{cost_terms, pareto, tune, tuning_costs, tuning_loads};
+    use crate::control::tuning::{cost_terms, pareto, run_cost, tune, tuning_costs, tuning_loads};
     #[pymodule_export]
     use crate::control::{
         amigo, closed_loop, convert_gains, effort, eq_12, eq_12_costs, fit_fopdt, simc,

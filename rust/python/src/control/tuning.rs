@@ -2,18 +2,20 @@
 
 mod task;
 
+use std::collections::BTreeMap;
+
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::AnyDesign;
 use sewfast_core::closed_loop::Run;
 use sewfast_core::search::Options;
-use sewfast_core::tune::{self as tuning, Method, Objective, Tuned, Variable, terms};
+use sewfast_core::tune::{self as tuning, Method, Objective, Terms, Tuned, Variable, terms};
 use sewfast_core::{Error, Result};
 
 use super::controller::AnyGiven;
 use super::named;
 use crate::seam::{Raised, Values, array1, slice, watched};
-use task::{Asked, Given};
+use task::{Asked, Given, cost as named_cost};
 
 /// What a run was like, term by term.
 #[pyfunction]
@@ -47,6 +49,44 @@ pub fn cost_terms<'py>(
             ("u_max", terms.u_max),
         ],
     )
+}
+
+/// The terms of [`cost_terms`] that a cost along a reference has.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub struct Along {
+    tracking: f64,
+    chatter: f64,
+    effort: f64,
+    overshoot: f64,
+    rise: f64,
+    lag: f64,
+    saturation: f64,
+}
+
+/// The cost of a run with these terms, for references of range `span` and commands of range `command`.
+#[pyfunction]
+#[pyo3(signature = (cost, terms, *, span, command))]
+#[expect(clippy::needless_pass_by_value, reason = "extracted from Python")]
+pub fn run_cost(
+    py: Python<'_>,
+    cost: BTreeMap<String, f64>,
+    terms: Along,
+    span: f64,
+    command: f64,
+) -> PyResult<f64> {
+    let weights = named_cost(&cost).and_then(|c| c.weights(span, command));
+    let terms = Terms {
+        tracking: terms.tracking,
+        chatter: terms.chatter,
+        effort: terms.effort,
+        overshoot: terms.overshoot,
+        rise: terms.rise,
+        lag: terms.lag,
+        saturation: terms.saturation,
+        ..Terms::default()
+    };
+    Ok(weights.raised(py)?.of(&terms))
 }
 
 fn method(name: &str) -> Result<Method> {

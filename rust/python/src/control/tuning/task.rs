@@ -328,7 +328,7 @@ fn variables(wanted: &[Wanted], start: &AnyDesign<f64>) -> Result<Vec<Variable>>
 }
 
 /// A cost from its weights by name; others keep their defaults.
-fn cost(changes: &BTreeMap<String, f64>) -> Result<Cost> {
+pub fn cost(changes: &BTreeMap<String, f64>) -> Result<Cost> {
     let mut cost = Cost::default();
     for (name, &value) in changes {
         match name.as_str() {
