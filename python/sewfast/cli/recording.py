@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -225,16 +226,6 @@ settings. A recording whose recorder was killed is readable up to that moment ("
 controllers, tables, motors and frequency responses (.json) are shown as Python prints them.
 """
 
-STORED = {
-    "sewfast.model": "load_model",
-    "sewfast.controller": "load_controller",
-    "sewfast.table": "load_table",
-    "sewfast-motor": "load_motor",
-    "sewfast-frequency-response": "load_response",
-    "sewfast-frequency-responses": "load_responses",
-}
-"""What reads a file of each format."""
-
 EXPORT = """\
 Write the columns of a recording (.mcap) with their time t to a file for other programs. Rows in
 gaps are NaN. Events, settings and the device's identity go only into .mcap, with one message a
@@ -264,13 +255,12 @@ def add_files(commands: Commands) -> None:
 
 
 def show_command(args: argparse.Namespace) -> None:
-    import sewfast
-
     from ..recordfile import read_recording
 
     is_json = Path(args.recording).suffix.lower() == ".json"
-    if is_json and (stored := storage.format_of(args.recording)) in STORED:
-        shown = getattr(sewfast, STORED[stored])(args.recording)
+    read = _reader(storage.format_of(args.recording)) if is_json else None
+    if read is not None:
+        shown = read(args.recording)
         if args.json:
             print_json(shown.to_dict())
         else:
@@ -281,6 +271,24 @@ def show_command(args: argparse.Namespace) -> None:
         print_json(_content(found))
     else:
         print(found)
+
+
+def _reader(stored: str) -> Callable[[str], Any] | None:
+    """What reads a .json file of a format; None for one that is not shown."""
+    from ..control.files import load_controller, load_table
+    from ..frequency import load_response, load_responses
+    from ..greybox import load_motor
+    from ..models import load_model
+
+    known: dict[str, Callable[[str], Any]] = {
+        "sewfast.model": load_model,
+        "sewfast.controller": load_controller,
+        "sewfast.table": load_table,
+        "sewfast-motor": load_motor,
+        "sewfast-frequency-response": load_response,
+        "sewfast-frequency-responses": load_responses,
+    }
+    return known.get(stored)
 
 
 def export_command(args: argparse.Namespace) -> None:

@@ -395,10 +395,10 @@ def _carry_out(
         machine, controller, asked, fastest, "hold_tuned", small, ensemble, thinning
     )
     if swing is not None:
-        why = cause(swing, small, scaled(controller, swing.share))
+        reason = cause(swing, small, scaled(controller, swing.share))
         note = (
             f"gains lowered, as the machine swung at {swing.frequency:.3g} Hz "
-            f"under {100 * swing.share:g} % of them: {why}"
+            f"under {100 * swing.share:g} % of them: {reason}"
         )
         calm = _noted(calm, note, journal)
     controller = calm
