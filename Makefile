@@ -172,7 +172,7 @@ ifeq ($(shell uname),Linux)
 endif
 
 c-test: ## tests the C library and the example firmware, with board, motor and host in memory; no path panics
-	cargo rustc --package sewfast-capi --profile firmware --crate-type staticlib --quiet
+	cargo rustc --package sewfast-capi --features positions --profile firmware --crate-type staticlib --quiet
 	mkdir -p target/bare
 	$(CC) -std=c99 -Wall -Wextra -Werror -pedantic -O1 -I rust/capi/include -I examples/firmware \
 	  -o target/bare/device_test rust/capi/tests/device.c examples/firmware/firmware.c \

@@ -41,7 +41,7 @@ extern "C" {
 #define SEWFAST_CAN_BIQUADS 128u /* its PID has biquads */
 #define SEWFAST_CAN_KINDS 256u /* runs controllers of other kinds (CONTROLLER) */
 #define SEWFAST_CAN_FEEDFORWARD 512u /* its PID has feedforward */
-#define SEWFAST_CAN_POSITIONS 1024u /* runs a position loop over its PID, and keeps to limits of the position */
+#define SEWFAST_CAN_POSITIONS 1024u /* runs a position loop over its PID, and keeps to limits of the position; if the library was built with `--features positions` */
 
 /* How a channel's samples are written. */
 enum sewfast_encoding {

@@ -242,9 +242,9 @@ impl<'a> Command<'a> {
             0x0C => biquads(&mut fields).map(Self::Biquads),
             0x0D => controller(&mut fields)?,
             0x0E => feedforward(&mut fields).map(Self::Feedforward),
-            0x0F => positions::design(&mut fields).map(Self::Position),
-            0x10 => positions::angle(&mut fields).map(Self::Angle),
-            0x11 => positions::travel(&mut fields).map(Self::Travel),
+            0x0F if positions::HAS => positions::design(&mut fields).map(Self::Position),
+            0x10 if positions::HAS => positions::angle(&mut fields).map(Self::Angle),
+            0x11 if positions::HAS => positions::travel(&mut fields).map(Self::Travel),
             _ => return Err(Refusal::unknown(kind)),
         };
         let whole = command.filter(|_| fields.is_empty());

@@ -36,7 +36,7 @@ use core::num::NonZeroU64;
 use super::command::{Gains, Start};
 use super::guard::Guard;
 use super::identity::{Identity, Limits, Travel, capability};
-use super::positions::{Asked, Law};
+use super::positions::{self, Asked, Law};
 use super::profile::Profile;
 use super::session::{Session, Watchdog};
 use super::stream::{Stream, Transmit, Weight};
@@ -313,6 +313,9 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
     /// Boots from off, with an identity that has been checked.
     fn boot(&mut self, identity: Identity) {
         self.identity = identity;
+        if !positions::HAS {
+            self.identity.capabilities &= !capability::POSITIONS;
+        }
         self.period = NonZeroU64::new(identity.period.into()).unwrap_or(NonZeroU64::MIN);
         self.ts = (f64::from(identity.period) / 1e6) as f32;
         self.transmit.boot(identity.tag());

@@ -8,6 +8,9 @@ use crate::{
     Turning,
 };
 
+/// Whether the device can run a position loop: without it none of its code is linked.
+pub(super) const HAS: bool = cfg!(feature = "positions");
+
 /// What a run steps at every sample.
 #[derive(Clone, Debug)]
 #[expect(
@@ -25,7 +28,8 @@ impl Law {
     pub(super) fn step(&mut self, reference: f32, moved: i32, unit: f32) -> f32 {
         match self {
             Self::Speed(controller) => controller.step(reference, moved as f32 / unit),
-            Self::Position(turning) => turning.step(reference, moved),
+            Self::Position(turning) if HAS => turning.step(reference, moved),
+            Self::Position(_) => 0.0,
         }
     }
 
@@ -33,7 +37,8 @@ impl Law {
     pub(super) fn limits(&self) -> (f32, f32) {
         match self {
             Self::Speed(controller) => controller.limits(),
-            Self::Position(turning) => turning.limits(),
+            Self::Position(turning) if HAS => turning.limits(),
+            Self::Position(_) => (0.0, 0.0),
         }
     }
 
@@ -41,15 +46,16 @@ impl Law {
     pub(super) fn filtered(&self) -> f32 {
         match self {
             Self::Speed(controller) => controller.filtered(),
-            Self::Position(turning) => turning.filtered(),
+            Self::Position(turning) if HAS => turning.filtered(),
+            Self::Position(_) => 0.0,
         }
     }
 
     /// The position loop; `None` for a controller without one.
     pub(super) fn position(&mut self) -> Option<&mut Turning> {
         match self {
-            Self::Speed(_) => None,
-            Self::Position(turning) => Some(turning),
+            Self::Position(turning) if HAS => Some(turning),
+            _ => None,
         }
     }
 }
@@ -62,7 +68,7 @@ impl Gains {
     pub(super) fn law(&self, volt: f32, ts: f32, mode: u8) -> Result<Law, Refused> {
         let speed = self.controller(volt, ts)?;
         match (self.position, speed) {
-            (Some(design), AnyController::Pid(speed)) => {
+            (Some(design), AnyController::Pid(speed)) if HAS => {
                 let mut turning = Turning::new(PositionLoop::new(design, speed)?);
                 if mode == 3 {
                     turning.follow();
