@@ -59,6 +59,11 @@ MODES = {"commands": 0, "controller": 1, "direct": 2, "positions": 3}
 ) = (1 << b for b in range(11))  # fmt: skip
 """Capabilities of a device."""
 
+ANYWHERE = (-(2**31), 2**31 - 1)
+"""Limits of the position that are none: the counter may wrap."""
+FARTHEST = 2.0**22
+"""Farthest goal or angle that a device takes, where single precision has half counts [counts]."""
+
 
 def name_of(names: Sequence[str], value: int) -> str:
     """The name of a value; an unknown one, of a later firmware, stays a number."""
