@@ -244,5 +244,8 @@ def test_the_command_line_stops_a_drive_at_an_angle(tmp_path: Path, capsys: Any)
         assert '"off"' in capsys.readouterr().out
     kept = read_recording(out.with_suffix(".mcap"))
     assert kept.header.settings["controller"]["kind"] == "position"
+    stop = kept.header.settings["stop"]
+    assert (stop["angle"], stop["turn"], stop["way"]) == (393.0, 1572.0, "onward")
+    assert kept.header.settings["release"] is False
     assert out.read_text().startswith("t [s]")
     assert {"counts", "u"} <= set(kept.columns)
