@@ -145,7 +145,7 @@ def test_the_counter_keeps_to_its_travel() -> None:
         drive.set_controller(LAW)
         drive._link.ask(Kind.UPLOAD, struct.pack("<BI2f", 2, 0, 0.0, -900.0))
         drive.arm()
-        with pytest.raises(LinkError, match="beyond a limit"):
+        with pytest.raises(LinkError, match=r"its profile, or what .* is beyond a limit"):
             drive._link.ask(Kind.START, wire.start(3, 100_000, 0, 2, 3, 5))
         drive.stop()
         with pytest.raises(LinkError, match="travel") as found:
@@ -179,9 +179,12 @@ def test_what_does_not_go_together_is_refused_before_a_motor_is_armed() -> None:
 def test_a_stop_that_passed_or_a_goal_that_is_torn_ends_in_a_safe_output() -> None:
     with VirtualDevice(fast=True) as device, connect(device.port) as drive:
         drive.set_limits(volt=20.0, speed_rpm=4000.0)
-        drive.set_controller(LAW)
+        drive.set_controller(SPEED)
         drive.wait_for_rest()
         drive.arm()
+        with pytest.raises(LinkError, match="a run without a position loop, is outside"):
+            drive._link.ask(Kind.ANGLE, wire.angle(0, 1.0, True))
+        drive.set_controller(LAW)
         with pytest.raises(LinkError, match="angle"):
             drive._link.ask(Kind.ANGLE, wire.angle(0, float("nan"), True))
         with pytest.raises(LinkError, match="wrong length"):
