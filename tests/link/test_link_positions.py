@@ -229,6 +229,22 @@ def test_a_device_of_version_3_refuses_positions_by_name_and_runs_as_ever(tmp_pa
         np.testing.assert_array_equal(sink.column("u"), 1.0)
 
 
+def test_a_stop_of_which_samples_were_lost_is_not_judged() -> None:
+    lossy = VirtualDevice(fast=True, faults="drop=.03", seed=3)
+    with lossy as device, connect(device.port) as drive:
+        drive.set_limits(volt=20.0, speed_rpm=4000.0)
+        found = stop_at(GENTLE, drive, "90deg", speed=1500.0, after=1.5)
+        assert drive.outcome is not None
+        assert drive.outcome.gaps
+    m = found.metrics()
+    assert np.isnan([m["off"], m["passed"], m["counts_off"]]).all()
+    assert m["time"] is None
+    # it was said to have gone on to a later turn, and to have stopped at once
+    (warning,) = found.warnings
+    assert warning.startswith(f"lost samples from {drive.outcome.gaps[0][0]} on")
+    assert "unknown: samples were lost" in str(found)
+
+
 def test_the_command_line_stops_a_drive_at_an_angle(tmp_path: Path, capsys: Any) -> None:
     law, out = tmp_path / "position.json", tmp_path / "stop.csv"
     LAW.save(law)
