@@ -17,12 +17,14 @@ from sewfast import (
     Feedforward,
     LinkError,
     PositionController,
+    Recording,
     SettingError,
     VirtualMachine,
     follow_positions,
     stop_at,
 )
 from sewfast.cli import main
+from sewfast.commissioning.positions import Stop, telling
 from sewfast.control.position import Playing
 from sewfast.link import Plan, VirtualDevice, connect, wire
 from sewfast.link.wire import Kind
@@ -243,6 +245,11 @@ def test_a_stop_of_which_samples_were_lost_is_not_judged() -> None:
     (warning,) = found.warnings
     assert warning.startswith(f"lost samples from {drive.outcome.gaps[0][0]} on")
     assert "unknown: samples were lost" in str(found)
+    # nor is its recording cut down to nothing where a commissioning looks for the cause
+    stop = Stop("90deg from 1500 RPM", (), found)
+    record = Recording(found.u, found.counts, found.y, None, found.Ts, 1572.0, "stop")
+    (told,) = telling([record], [stop], GENTLE)
+    assert len(told) == len(record)
 
 
 def test_the_command_line_stops_a_drive_at_an_angle(tmp_path: Path, capsys: Any) -> None:
