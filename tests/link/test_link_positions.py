@@ -17,12 +17,14 @@ from sewfast import (
     Feedforward,
     LinkError,
     PositionController,
+    Recording,
     SettingError,
     VirtualMachine,
     follow_positions,
     stop_at,
 )
 from sewfast.cli import main
+from sewfast.commissioning.positions import Stop, telling
 from sewfast.control.position import Playing
 from sewfast.link import Plan, VirtualDevice, connect, wire
 from sewfast.link.wire import Kind
@@ -125,26 +127,66 @@ def test_the_counter_keeps_to_its_travel() -> None:
         assert drive.travel() == (-(2**31), 2**31 - 1)
         drive.set_travel(-400, 1800)
         assert drive.travel() == (-400, 1800)
+        # 0 and 0 on the wire would only ask, and leave the limits as they are
+        for low, high in ((0, 0), (5, 5), (10, -10), (-(2**31) - 1, 5), (0, 2**31)):
+            with pytest.raises(SettingError, match="a least count below the greatest"):
+                drive.set_travel(low, high)
+        for low in (0.5, np.nan, np.inf, True, "0"):
+            with pytest.raises(SettingError, match="low"):
+                drive.set_travel(low, 5)  # type: ignore[arg-type]
+        assert drive.travel() == (-400, 1800)
         with pytest.raises(LinkError, match="the greatest count"):
-            drive.set_travel(5, 5)
+            drive._link.ask(Kind.TRAVEL, wire.set_travel(5, 5))
         # goals within, goals beyond, and a stop that the turn leads beyond
         follow_positions(GENTLE, drive, np.repeat([0.0, 1500.0, 0.0], 900), unit="counts")
-        with pytest.raises(LinkError, match="beyond a limit"):
+        drive.outcome = None
+        with pytest.raises(SettingError, match=r"goals: .* limits of the position \(-400 to 1800"):
             follow_positions(LAW, drive, np.repeat([0.0, -900.0], 600), unit="counts")
+        assert drive.outcome is None  # nothing was armed
+        # what a host did not check, the device refuses
+        drive.set_controller(LAW)
+        drive._link.ask(Kind.UPLOAD, struct.pack("<BI2f", 2, 0, 0.0, -900.0))
+        drive.arm()
+        with pytest.raises(LinkError, match=r"its profile, or what .* is beyond a limit"):
+            drive._link.ask(Kind.START, wire.start(3, 100_000, 0, 2, 3, 5))
         drive.stop()
         with pytest.raises(LinkError, match="travel") as found:
             stop_at(LAW, drive, "90deg", speed=1500.0)
         assert found.value.recording is not None
         assert drive.status().reason == "travel"
         drive.clear()
+        # the shaft coasts on without a command: there is no run from where it is
+        drive.wait_for_rest()
+        assert drive.status().counts > 1800
+        for run in (
+            lambda: drive.excite(np.full(20, -1.0)),
+            lambda: follow_positions(LAW, drive, np.zeros(20), unit="counts"),
+        ):
+            with pytest.raises(SettingError, match="travel: expected a counter within -400 to"):
+                run()
+        drive.set_travel(-400, 2**31 - 1)
+        drive.excite(np.full(20, -1.0))
+
+
+def test_what_does_not_go_together_is_refused_before_a_motor_is_armed() -> None:
+    with pytest.raises(SettingError, match="a PositionController in the mode 'positions'"):
+        Plan("positions", GOALS, SPEED)
+    with VirtualDevice(fast=True) as device, connect(device.port) as drive:
+        drive.set_limits(volt=20.0, speed_rpm=4000.0)
+        with pytest.raises(SettingError, match="angle: expected a place within"):
+            stop_at(LAW, drive, "5e6counts", speed=500.0)
+        assert drive.outcome is None
 
 
 def test_a_stop_that_passed_or_a_goal_that_is_torn_ends_in_a_safe_output() -> None:
     with VirtualDevice(fast=True) as device, connect(device.port) as drive:
         drive.set_limits(volt=20.0, speed_rpm=4000.0)
-        drive.set_controller(LAW)
+        drive.set_controller(SPEED)
         drive.wait_for_rest()
         drive.arm()
+        with pytest.raises(LinkError, match="a run without a position loop, is outside"):
+            drive._link.ask(Kind.ANGLE, wire.angle(0, 1.0, True))
+        drive.set_controller(LAW)
         with pytest.raises(LinkError, match="angle"):
             drive._link.ask(Kind.ANGLE, wire.angle(0, float("nan"), True))
         with pytest.raises(LinkError, match="wrong length"):
@@ -189,6 +231,27 @@ def test_a_device_of_version_3_refuses_positions_by_name_and_runs_as_ever(tmp_pa
         np.testing.assert_array_equal(sink.column("u"), 1.0)
 
 
+def test_a_stop_of_which_samples_were_lost_is_not_judged() -> None:
+    lossy = VirtualDevice(fast=True, faults="drop=.03", seed=3)
+    with lossy as device, connect(device.port) as drive:
+        drive.set_limits(volt=20.0, speed_rpm=4000.0)
+        found = stop_at(GENTLE, drive, "90deg", speed=1500.0, after=1.5)
+        assert drive.outcome is not None
+        assert drive.outcome.gaps
+    m = found.metrics()
+    assert np.isnan([m["off"], m["passed"], m["counts_off"]]).all()
+    assert m["time"] is None
+    # it was said to have gone on to a later turn, and to have stopped at once
+    (warning,) = found.warnings
+    assert warning.startswith(f"lost samples from {drive.outcome.gaps[0][0]} on")
+    assert "unknown: samples were lost" in str(found)
+    # nor is its recording cut down to nothing where a commissioning looks for the cause
+    stop = Stop("90deg from 1500 RPM", (), found)
+    record = Recording(found.u, found.counts, found.y, None, found.Ts, 1572.0, "stop")
+    (told,) = telling([record], [stop], GENTLE)
+    assert len(told) == len(record)
+
+
 def test_the_command_line_stops_a_drive_at_an_angle(tmp_path: Path, capsys: Any) -> None:
     law, out = tmp_path / "position.json", tmp_path / "stop.csv"
     LAW.save(law)
@@ -207,5 +270,8 @@ def test_the_command_line_stops_a_drive_at_an_angle(tmp_path: Path, capsys: Any)
         assert '"off"' in capsys.readouterr().out
     kept = read_recording(out.with_suffix(".mcap"))
     assert kept.header.settings["controller"]["kind"] == "position"
+    stop = kept.header.settings["stop"]
+    assert (stop["angle"], stop["turn"], stop["way"]) == (393.0, 1572.0, "onward")
+    assert kept.header.settings["release"] is False
     assert out.read_text().startswith("t [s]")
     assert {"counts", "u"} <= set(kept.columns)

@@ -136,7 +136,8 @@ def telling(
 
 def _landed(run: PositionRun, law: PositionController) -> int:
     """The sample from which a shaft stays within the landing before its goal; N if it does not."""
-    far = np.abs(run.counts - run.goal[-1]) > law.landing
+    # a goal that is unknown, as the link lost samples, is none to land at
+    far = ~(np.abs(run.counts - run.goal[-1]) <= law.landing)
     return int(np.max(np.flatnonzero(far), initial=-1)) + 1
 
 

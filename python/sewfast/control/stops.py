@@ -127,7 +127,8 @@ class PositionRun(Plotted):
             until it stays within one count [s], None if it never does; `rest_counts`, peak to peak
             of the counts in the later half of the time for which the profile stands, None if it
             never stood; `rms`, error after the
-            profile [unit]; `u_rms`, `du_rms` (change from sample to sample) [u].
+            profile [unit]; `u_rms`, `du_rms` (change from sample to sample) [u]. After samples that
+            a link has lost, `time` and `rest_counts` are None, and the others NaN.
         """
         per_rev = self.controller.counts_per_rev
         assert per_rev is not None
@@ -145,12 +146,13 @@ class PositionRun(Plotted):
         stood = stood[len(stood) // 2 :]
         error = self.place[self.start :] - self.position[self.start :]
         found = _core.effort(self.u, u_min=self.controller.u_min, u_max=self.controller.u_max)
+        passed = max(0.0, float(np.max(way * (position - goal)))) if self._is_known else math.nan
         return {
             "off": self._in_unit(float(np.mean(position[-tail:])) - goal),
-            "passed": self._in_unit(max(0.0, float(np.max(way * (position - goal))))),
+            "passed": self._in_unit(passed),
             "counts_off": float(self.counts[-1]) - goal,
             "turns": float(np.sum(np.abs(np.diff(position)))) / per_rev,
-            "time": settled * self.Ts if settled < len(late) else None,
+            "time": settled * self.Ts if self._is_known and settled < len(late) else None,
             "rest_counts": float(np.ptp(stood)) if len(stood) else None,
             "rms": self._in_unit(float(np.sqrt(np.mean(error**2)))),
             "u_rms": found["u_rms"],
@@ -158,8 +160,19 @@ class PositionRun(Plotted):
         }
 
     @property
+    def _is_known(self) -> bool:
+        """Whether it is known where the profile went: a link that lost samples lost that, too."""
+        return bool(np.isfinite(self.goal[-1]))
+
+    @property
     def warnings(self) -> list[str]:
         """What a stop onward, or the last move, did that its models do not."""
+        if not self._is_known:
+            lost = int(np.argmin(np.isfinite(self.counts)))
+            return [
+                f"lost samples from {lost} on: how it met its goal is unknown; see the line "
+                "(sewfast doctor) and run it again"
+            ]
         m, unit = self.metrics(), self.unit
         count = abs(self._in_unit(1.0))
         found = []
@@ -215,6 +228,8 @@ class PositionRun(Plotted):
 
     def __str__(self) -> str:
         m, unit = self.metrics(), self.unit
+        if not self._is_known:
+            return f"{self.name} on {self.plant}\n  stops     unknown: samples were lost"
         came = "not within a count" if m["time"] is None else f"after {duration(m['time'])}"
         rest = (
             "at rest   the profile has not come to rest: run it for longer"

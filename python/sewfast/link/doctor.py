@@ -195,13 +195,15 @@ _TRIPS = {
     "acceleration": "the acceleration limit was exceeded; check the limits and the encoder",
     "current": "the current limit was exceeded; check the mechanics for a jam",
     "underrun": "the profile ran dry; see the throughput below",
-    "bad command": "a command was refused while running; check host and firmware versions",
+    "bad command": "a command was refused while running (check host and firmware versions), or a "
+    "stop was to begin above the fastest speed of its position loop",
     "host changed": "another host connected while it was running; use one host only",
     "measurement": "a measurement was not finite; check the sensors",
     "no motion": "the motor did not move; check motor cable, drive supply and encoder",
     "stop input": "the stop input is active; release it",
     "late": "a control period came late; see the counters below",
-    "travel": "the counter, or the goal of a stop, was beyond the limits of the position",
+    "travel": "the counter, or the goal of a stop, was beyond the limits of the position; turn the "
+    "shaft back without a command, or widen them (drive.set_travel)",
     "swinging": "the loop oscillated between its limits; lower the gains or look for a resonance",
 }
 

@@ -32,6 +32,7 @@ from .plan import (
     Plan,
     Sink,
     channels,
+    count,
     fitting,
     gains,
     layout,
@@ -252,12 +253,19 @@ class Drive(Unique):
         Raises
         ------
         SettingError
-            For a device without positions.
-        LinkError
-            For limits beyond the device's own.
+            For a device without positions, and for limits that are no counts, that leave no room,
+            or that are beyond the device's own.
         """
         self.require_positions()
-        self._link.ask(Kind.TRAVEL, wire.set_travel(low, high))
+        given = (count("low", low), count("high", high))
+        *_, least, greatest = wire.travel(self._link.ask(Kind.TRAVEL, wire.set_travel(0, 0)))
+        # 0 and 0 would only ask the device
+        if not least <= given[0] < given[1] <= greatest:
+            raise SettingError(
+                name="travel", expected=f"a least count below the greatest, within {least} to "
+                f"{greatest}, the device's own", received=f"{given[0]} to {given[1]}",
+            )  # fmt: skip
+        self._link.ask(Kind.TRAVEL, wire.set_travel(*given))
 
     def set_controller(self, controller: SampledController) -> None:
         """Load a controller into the device; its encoder is the device's own.
@@ -500,6 +508,7 @@ class Drive(Unique):
         if plan.controller is not None:
             self.set_controller(plan.controller)
         self.wait_for_rest()
+        self._require_travel(plan)
         self.outcome = None
         return Run(self._link, plan, streamed, profile, sink)
 
@@ -518,6 +527,7 @@ class Drive(Unique):
         streamed = self.layout(plan)
         self._require_idle()
         self.wait_for_rest()
+        self._require_travel(plan)
         return streamed
 
     def lent(self) -> AbstractContextManager[Loan]:
@@ -559,6 +569,29 @@ class Drive(Unique):
             )  # fmt: skip
         if status.state in ("armed", "running"):
             self.stop()
+
+    def _require_travel(self, plan: Plan) -> None:
+        """Refuse a run that would trip where it begins, and goals beyond the limits."""
+        if not self.identity.capabilities & wire.POSITIONS:
+            return
+        low, high = self.travel()
+        if (low, high) == wire.ANYWHERE:
+            return
+        at = self.status().counts
+        if not low <= at <= high:
+            raise SettingError(
+                name="travel", expected=f"a counter within {low} to {high}, its limits",
+                received=f"one at {at}", remedy="turn the shaft back without a command, or widen "
+                "them (set_travel)",
+            )  # fmt: skip
+        least, most = at + float(plan.values.min()), at + float(plan.values.max())
+        if plan.mode == "positions" and not (low <= least and most <= high):
+            raise SettingError(
+                name="goals", expected=f"within {low - at} to {high - at} counts from here, the "
+                f"limits of the position ({low} to {high}; the counter is at {at})",
+                received=f"{least - at:g} to {most - at:g}",
+                remedy="change the goals, or widen the limits (set_travel)",
+            )  # fmt: skip
 
     def _settle(self) -> None:
         """Wait for rest after a stop, if the device still answers."""

@@ -87,6 +87,12 @@ class Plan:
                 expected="one in the modes 'controller' and 'positions' and none elsewhere",
                 received=f"{'none' if self.controller is None else 'one'} in mode {self.mode!r}",
             )  # fmt: skip
+        if self.mode == "positions" and not isinstance(self.controller, PositionController):
+            raise SettingError(
+                name="controller", expected="a PositionController in the mode 'positions'",
+                received="a controller without a position loop",
+                remedy="tune one with loop='position' (sewfast tune --loop position)",
+            )  # fmt: skip
 
 
 class Sink(Protocol):
@@ -296,6 +302,14 @@ def limit(name: str, value: float | None, present: float, ceiling: float) -> flo
     return min(value, ceiling)
 
 
+def count(name: str, value: float) -> int:
+    """The value as a whole number; fractions, booleans and text are refused by name."""
+    number = math.nan if isinstance(value, bool) else real(name, value)
+    if not number.is_integer():
+        raise SettingError(name=name, expected="a whole number of counts", received=repr(value))
+    return int(number)
+
+
 def require_units(controller: SampledController, streamed: Sequence[Channel]) -> None:
     """Refuse a controller whose command or output has another unit than the device's."""
     units = {c.name: c.unit for c in streamed}
@@ -353,7 +367,14 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
 
 
 def moves(playing: Playing, identity: Identity, limits: Limits) -> bytes:
-    """Body of POSITION for a position loop, whose moves must keep within the device's limits."""
+    """Body of POSITION for a position loop, whose moves must keep within the device's limits, and
+    the angle of a stop within what single precision holds.
+    """
+    if playing.stop is not None and not abs(playing.stop[1]) <= wire.FARTHEST:
+        raise SettingError(
+            name="angle", expected=f"a place within {wire.FARTHEST:g} counts on a device",
+            received=f"{playing.stop[1]:g} counts", remedy="give it in its turn",
+        )  # fmt: skip
     rows, unit = playing.rows(), playing.counts_per_unit
     rpm = 60.0 * unit / identity.counts_per_rev  # of one unit of speed
     steepest = max(max(up, down) for _, up, down in rows)

@@ -298,7 +298,7 @@ def _writer(
     if file is None:
         return None
     identity = drive.identity
-    controller = {} if plan.controller is None else {"controller": plan.controller.to_dict()}
+    asked = {} if plan.controller is None else _asked_of(plan.controller)
     header = Header(
         name=name,
         Ts=identity.Ts,
@@ -306,11 +306,24 @@ def _writer(
         n=len(plan.values),
         counts_per_rev=_counts_per_rev(drive),
         device=device_of(drive),
-        settings={"mode": plan.mode, **conditions_of(drive), **controller, **settings},
+        settings={"mode": plan.mode, **conditions_of(drive), **asked, **settings},
     )
     place = Path(file)
     # whether an existing file may be replaced was checked before
     return RecordWriter(place, header, overwrite=place.exists(), lazy=True)
+
+
+def _asked_of(controller: SampledController) -> dict[str, Any]:
+    """The controller, and what a position loop does in this run."""
+    asked: dict[str, Any] = {"controller": controller.to_dict()}
+    if not isinstance(controller, Playing):
+        return asked
+    asked["release"] = controller.releases
+    if controller.stop is not None:
+        at, angle, turn, onward = controller.stop
+        way = "onward" if onward else "shortest"
+        asked["stop"] = {"sample": at, "angle": angle, "turn": turn, "way": way}
+    return asked
 
 
 def device_of(drive: Drive) -> dict[str, Any]:

@@ -36,7 +36,7 @@ def references(values: NDArray[np.float64], limits: Limits) -> LinkUpload:
 
 def goals(values: NDArray[np.float64]) -> LinkUpload:
     """Goals as the device stores them. Raises `SettingError` beyond what single precision holds."""
-    _require_within("goals", values, 2.0**22, "counts")
+    _require_within("goals", values, wire.FARTHEST, "counts")
     return LinkUpload.goals(values)
 
 

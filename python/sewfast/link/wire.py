@@ -59,6 +59,11 @@ MODES = {"commands": 0, "controller": 1, "direct": 2, "positions": 3}
 ) = (1 << b for b in range(11))  # fmt: skip
 """Capabilities of a device."""
 
+ANYWHERE = (-(2**31), 2**31 - 1)
+"""Limits of the position that are none: the counter may wrap."""
+FARTHEST = 2.0**22
+"""Farthest goal or angle that a device takes, where single precision has half counts [counts]."""
+
 
 def name_of(names: Sequence[str], value: int) -> str:
     """The name of a value; an unknown one, of a later firmware, stays a number."""
@@ -358,7 +363,7 @@ _FIELDS: dict[int, tuple[str, ...]] = {
     Kind.FEEDFORWARD: ("its preview, levels or taps",),
     Kind.CONTROLLER: ("kind", "counts per unit"),
     Kind.POSITION: ("its gain, speeds, landing, smoothing or rates",),
-    Kind.ANGLE: ("the sample of the stop", "angle", "way"),
+    Kind.ANGLE: ("the sample of the stop, or a run without a position loop,", "angle", "way"),
     Kind.TRAVEL: ("the least count", "the greatest count"),
     Kind.START: ("mode", "watchdog", "at", "length", "mask", "batch"),
 }  # fmt: skip
@@ -385,7 +390,7 @@ def _refused(kind: int, result: int, detail: int) -> str:
         3: f"{where} is outside its range; change it",
         4: f"not while {name_of(STATES, detail)}; {_way_out(detail)}",
         5: "it has been reset since; connect again, set the limits and start anew",
-        6: f"{where} is beyond a limit; lower it or raise the limit",
+        6: f"{_field(kind, detail, limit=True)} is beyond a limit; lower it or raise the limit",
         7: f"no room in its profile memory, {detail} values would fit; wait for it to play on",
         8: f"it does not offer {where}; {_without(kind)}",
         9: f"values out of order, it expects number {detail}; upload from there",
@@ -399,7 +404,9 @@ def _refused(kind: int, result: int, detail: int) -> str:
     )
 
 
-def _field(kind: int, index: int) -> str:
+def _field(kind: int, index: int, *, limit: bool = False) -> str:
+    if limit and kind == Kind.START and index == 0:
+        return "its profile, or what its controller does,"
     if kind == Kind.UPLOAD:
         return f"value {index}"
     if kind == Kind.BIQUADS and index:
