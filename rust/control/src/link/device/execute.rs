@@ -396,7 +396,11 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
 
     /// Whether a goal of a run from this count on is within the limits of the position.
     fn holds_goal(&self, from: i32, goal: f32) -> bool {
-        self.travel().holds(i64::from(from) + goal as i64)
+        let (travel, from) = (self.travel(), i64::from(from));
+        let whole = goal as i64;
+        // cut towards 0: the place may be rounded the other way
+        let beyond = whole + i64::from(goal > whole as f32) - i64::from(goal < whole as f32);
+        travel.holds(from + whole) && travel.holds(from + beyond)
     }
 
     #[inline(never)]

@@ -79,7 +79,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             (1 | 3, Some(gains)) => gains.law(limits.volt, self.ts, start.mode).ok(),
             _ => None,
         };
-        self.run.from = self.guard.counts().wrapping_sub(self.guard.change());
+        self.run.from = self.guard.counts();
         self.guard.begin();
         self.stream.begin(start.mask, start.batch);
         self.state = State::Running;
@@ -159,7 +159,10 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             return Err((Reason::BadCommand, 0.0));
         };
         let unit = self.ts * gains.counts_per_unit;
-        let u = law.step(value, self.guard.change(), unit);
+        // positions are 0 at the first sample of a run, also of a shaft that was turned by hand just before it
+        let begins = self.run.samples == 0 && law.position().is_some();
+        let moved = if begins { 0 } else { self.guard.change() };
+        let u = law.step(value, moved, unit);
         let goal = law.position().and_then(|turning| turning.goal());
         let goal = goal.map(|goal| goal.saturating_add(self.run.from.into()));
         goal.map_or(Ok(()), |goal| self.check_travel(goal))?;

@@ -453,6 +453,35 @@ fn the_counter_keeps_to_its_travel_in_every_mode() {
 }
 
 #[test]
+fn positions_count_from_the_first_sample_of_a_run() {
+    let mut rig = Rig::positioned();
+    rig.arm();
+    assert_eq!(rig.numbers(2, 0, &[0.0; 30]).0, 0);
+    rig.start(3, 0, 30);
+    // turned by hand in the sample of the start
+    rig.counts += 3;
+    rig.watched(5);
+    assert_eq!(rig.device.core.run.from, rig.counts);
+    assert!(rig.sent().iter().all(|sample| sample.2 == 0));
+}
+
+#[test]
+fn a_goal_is_rounded_to_no_count_beyond_the_travel() {
+    let mut rig = Rig::positioned();
+    assert_eq!(rig.travel(-1800, 1800).0, 0);
+    rig.arm();
+    for (goal, is_within) in [(1800.0, true), (1800.9, false), (-1800.9, false)] {
+        rig.numbers(2, 0, &[goal; 30]);
+        assert_eq!(rig.start(3, 0, 30).0 == 0, is_within, "{goal}");
+        rig.stop();
+        rig.samples(150);
+        if rig.device.state() == State::Idle {
+            rig.arm();
+        }
+    }
+}
+
+#[test]
 fn a_stop_whose_goal_is_beyond_the_travel_trips_before_it_is_gone_to() {
     let mut rig = Rig::positioned();
     assert_eq!(rig.travel(-10, 40_000).0, 0);
