@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .. import storage
 from ..errors import SettingError
 from .arguments import (
     RECORDINGS,
@@ -255,6 +254,7 @@ def add_files(commands: Commands) -> None:
 
 
 def show_command(args: argparse.Namespace) -> None:
+    from .. import storage
     from ..recordfile import read_recording
 
     is_json = Path(args.recording).suffix.lower() == ".json"
