@@ -113,7 +113,7 @@ def test_a_device_that_boots_slowly_is_waited_for():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"hello_result": b"\x0a\x04\0\0\0"}, r"protocol version 4, sewfast 3; update the older"),
+        ({"hello_result": b"\x0a\x05\0\0\0"}, r"protocol version 5, sewfast 4; update the older"),
         ({"schema": 0x12345678}, r"match the device's schema hash"),
         ({"channels": 1}, r"2 to 16 channels"),
     ],

@@ -4,8 +4,7 @@ use super::command::{Gains, Refusal};
 use super::identity::{Limits, Travel};
 use super::wire::Fields;
 use crate::{
-    AnyController, Controller, FARTHEST, PositionDesign, PositionLoop, RATES, Rate, Rates, Refused,
-    Turning,
+    AnyController, Controller, FARTHEST, PositionDesign, RATES, Rate, Rates, Refused, Turning,
 };
 
 /// Whether the device can run a position loop: without it none of its code is linked.
@@ -13,12 +12,16 @@ pub(super) const HAS: bool = cfg!(feature = "positions");
 
 /// What a run steps at every sample.
 #[derive(Clone, Debug)]
-#[expect(
-    clippy::large_enum_variant,
-    reason = "there is no heap to box it on, and one run lives at a time"
+#[cfg_attr(
+    feature = "positions",
+    expect(
+        clippy::large_enum_variant,
+        reason = "there is no heap to box it on, and one run lives at a time"
+    )
 )]
 pub(super) enum Law {
     Speed(AnyController<f32>),
+    #[cfg(feature = "positions")]
     Position(Turning),
 }
 
@@ -28,8 +31,8 @@ impl Law {
     pub(super) fn step(&mut self, reference: f32, moved: i32, unit: f32) -> f32 {
         match self {
             Self::Speed(controller) => controller.step(reference, moved as f32 / unit),
-            Self::Position(turning) if HAS => turning.step(reference, moved),
-            Self::Position(_) => 0.0,
+            #[cfg(feature = "positions")]
+            Self::Position(turning) => turning.step(reference, moved),
         }
     }
 
@@ -37,8 +40,8 @@ impl Law {
     pub(super) fn limits(&self) -> (f32, f32) {
         match self {
             Self::Speed(controller) => controller.limits(),
-            Self::Position(turning) if HAS => turning.limits(),
-            Self::Position(_) => (0.0, 0.0),
+            #[cfg(feature = "positions")]
+            Self::Position(turning) => turning.limits(),
         }
     }
 
@@ -46,16 +49,17 @@ impl Law {
     pub(super) fn filtered(&self) -> f32 {
         match self {
             Self::Speed(controller) => controller.filtered(),
-            Self::Position(turning) if HAS => turning.filtered(),
-            Self::Position(_) => 0.0,
+            #[cfg(feature = "positions")]
+            Self::Position(turning) => turning.filtered(),
         }
     }
 
     /// The position loop; `None` for a controller without one.
     pub(super) fn position(&mut self) -> Option<&mut Turning> {
         match self {
-            Self::Position(turning) if HAS => Some(turning),
-            _ => None,
+            #[cfg(feature = "positions")]
+            Self::Position(turning) => Some(turning),
+            Self::Speed(_) => None,
         }
     }
 }
@@ -66,10 +70,12 @@ impl Gains {
     /// # Errors
     /// The first setting that is outside its range.
     pub(super) fn law(&self, volt: f32, ts: f32, mode: u8) -> Result<Law, Refused> {
-        let speed = self.controller(volt, ts)?;
-        match (self.position, speed) {
-            (Some(design), AnyController::Pid(speed)) if HAS => {
-                let mut turning = Turning::new(PositionLoop::new(design, speed)?);
+        #[cfg(not(feature = "positions"))]
+        let _ = mode;
+        match (self.position, self.controller(volt, ts)?) {
+            #[cfg(feature = "positions")]
+            (Some(design), AnyController::Pid(speed)) => {
+                let mut turning = Turning::new(crate::PositionLoop::new(design, speed)?);
                 if mode == 3 {
                     turning.follow();
                 }

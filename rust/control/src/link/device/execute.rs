@@ -5,7 +5,7 @@ use crate::link::command::{
     Beat, Command, Gains, HELLO, Heartbeat, Refusal, STOP, Start, Upload, check_watchdog,
 };
 use crate::link::identity::{Limits, OLDEST, Travel, VERSION, capability};
-use crate::link::positions::Asked;
+use crate::link::positions::{self, Asked};
 use crate::link::profile::Table;
 use crate::link::session::{Order, Reply, Session, key};
 use crate::link::{Body, Fields, Frame};
@@ -130,9 +130,12 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             Command::Gains(gains) => self.set_gains(gains),
             Command::Biquads(biquads) => self.set_biquads(biquads),
             Command::Feedforward(feedforward) => self.set_feedforward(feedforward),
-            Command::Position(design) => self.set_position(design),
-            Command::Angle(asked) => self.set_angle(asked),
-            Command::Travel(travel) => self.set_travel(travel, body),
+            Command::Position(design) if positions::HAS => self.set_position(design),
+            Command::Angle(asked) if positions::HAS => self.set_angle(asked),
+            Command::Travel(travel) if positions::HAS => self.set_travel(travel, body),
+            Command::Position(_) | Command::Angle(_) | Command::Travel(_) => {
+                Err(Refusal::unsupported(0))
+            }
             Command::Start(start) => self.start(start, body),
             Command::Echo(bytes) => {
                 body.add(bytes);
@@ -263,7 +266,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         let (table, needed) = match upload.table {
             0 => (Table::Commands, capability::PROFILE),
             1 => (Table::References, capability::PID),
-            2 => (Table::Goals, capability::POSITIONS),
+            2 if positions::HAS => (Table::Goals, capability::POSITIONS),
             _ => return Err(Refusal::unsupported(0)),
         };
         Refusal::unsupported(0).unless(self.can(needed))?;
@@ -280,7 +283,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         let limit = self.profile_limit(table);
         for (index, value) in (0..).zip(values(table, upload.values, steps)) {
             Refusal::limit(index).unless(value.abs() <= limit)?;
-            let goes = table == Table::Goals && self.state == State::Running;
+            let goes = positions::HAS && table == Table::Goals && self.state == State::Running;
             Refusal::limit(index).unless(!goes || self.holds_goal(self.run.from, value))?;
         }
         if anew {
@@ -445,16 +448,18 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             let gains = self.gains.as_ref().ok_or(Refusal::value(0))?;
             let refused = gains.refused(limits.volt, self.ts);
             Refusal::limit(0).unless(refused.is_none())?;
-            if let Some(design) = &gains.position {
+            if let (true, Some(design)) = (positions::HAS, &gains.position) {
                 let turn = self.identity.counts_per_rev;
                 Refusal::limit(0).unless(gains.moves_within(design, &limits, turn))?;
                 turns = true;
             }
         }
         Refusal::value(0).unless(turns || mode != 3 && self.asked.is_none())?;
+        if !positions::HAS || mode != 3 {
+            return Ok(());
+        }
         let ((low, high), from) = (self.profile.range(), self.guard.counts());
-        let reached = self.holds_goal(from, low) && self.holds_goal(from, high);
-        Refusal::limit(0).unless(mode != 3 || reached)
+        Refusal::limit(0).unless(self.holds_goal(from, low) && self.holds_goal(from, high))
     }
 
     /// Due time of the first sample at `at` or later, but not before the next one.
