@@ -147,6 +147,12 @@ def as_inputs(values: ArrayLike, n: int) -> FloatArray:
     return array
 
 
+def known_until(*columns: FloatArray) -> int:
+    """How many entries come before the first that is not finite in one of the columns."""
+    known = np.logical_and.reduce([np.isfinite(column) for column in columns])
+    return len(known) if known.all() else int(np.argmin(known))
+
+
 def range_of(column: FloatArray) -> tuple[float, float]:
     known = column[~np.isnan(column)]
     return (float(known.min()), float(known.max())) if len(known) else (math.nan, math.nan)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from . import _core
-from .arrays import FloatArray
+from .arrays import FloatArray, known_until
 from .errors import DataError
 from .recording import Recording
 
@@ -265,8 +265,7 @@ def turning(rpm: float, run: str) -> Cause:
 
 def _columns(recording: Recording) -> tuple[FloatArray, FloatArray]:
     """Commands and counts, until the first that a link has lost."""
-    known = np.isfinite(recording.u) & np.isfinite(recording.counts)
-    end = len(known) if known.all() else int(np.argmin(known))
+    end = known_until(recording.u, recording.counts)
     u, counts = recording.u[:end], recording.counts[:end]
     return np.ascontiguousarray(u), np.ascontiguousarray(counts, dtype=np.float64)
 

@@ -25,7 +25,6 @@ from .guarding import (
     TAIL,
     GuardedMachine,
     MachineWrapper,
-    limited,
     require_numbers,
     require_reference,
 )
@@ -192,7 +191,7 @@ class SteppedBench:
     ) -> RecordedRun:
         require_fit(controller, r, self.Ts)
         require_reference(self, controller, r)
-        controller = limited(controller, self.volt)
+        controller = controller.limited(self.volt)
         core, early = controller.core(), controller.early(r)
         per_count = 60.0 / (self.counts_per_rev * self.Ts)
         u, feedback, before = np.zeros(len(r)), np.zeros(len(r)), [0.0]

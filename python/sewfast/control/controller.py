@@ -121,6 +121,13 @@ class SampledController(storage.Stored, Shown):
         changes = {} if lead is None else {"feedforward": lead.about(rest)}
         return replace(self, u_min=low, u_max=high, **changes)  # type: ignore[type-var]
 
+    def limited(self: _Kind, volt: float) -> _Kind:
+        """The same controller with commands of at most `volt` [u], as its integral then knows."""
+        low, high = max(self.u_min, -volt), min(self.u_max, volt)
+        if (low, high) == (self.u_min, self.u_max):
+            return self
+        return replace(self, u_min=low, u_max=high)  # type: ignore[type-var]
+
     def early(self, reference: ArrayLike) -> FloatArray:
         """The reference as a step of the compiled controller takes it: with a feedforward `preview`
         samples early, otherwise in time.

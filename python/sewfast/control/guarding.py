@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from .. import _core
-from ..arrays import FloatArray
+from ..arrays import FloatArray, known_until
 from ..causes import Cause, loss
 from ..errors import DataError, LinkError, SettingError, SewfastError
 from ..gains import real, vector
@@ -96,7 +96,7 @@ class RunGuard:
             )  # fmt: skip
         self._u.append(u)
         self._counts.append(counts)
-        known = len(u) if self.lossy else _numbers(u, counts)
+        known = len(u) if self.lossy else known_until(u, counts)
         found = self._guard.watch(u[:known], counts[:known])
         end = before + known
         if found is not None:
@@ -136,12 +136,6 @@ class RunGuard:
         """What became of an encoder that was seen to be lost after so many samples."""
         concluded = cause_in(recording, volt=math.inf, speed=self.speed)
         return loss(recording, samples - 1, concluded)
-
-
-def _numbers(u: FloatArray, counts: FloatArray) -> int:
-    """How many samples come before the first that is no number."""
-    known = np.isfinite(u) & np.isfinite(counts)
-    return len(known) if known.all() else int(np.argmin(known))
 
 
 @dataclass
@@ -202,7 +196,7 @@ class GuardedMachine(MachineWrapper):
     ) -> RecordedRun:
         require_fit(controller, r, self.Ts)
         require_reference(self, controller, r)
-        controller = limited(controller, self.volt)
+        controller = controller.limited(self.volt)
         with self._guarded(name, self.volt) as guard:
 
             def both(first: int, u: FloatArray, counts: FloatArray) -> None:
@@ -270,17 +264,6 @@ def require_numbers(machine: object) -> None:
                 name=name, expected="a finite number above 0", received=f"{value!r}",
                 remedy="math.inf if it states none" if name == "speed" else "see the data sheet",
             )  # fmt: skip
-
-
-def limited(controller: SampledController, volt: float) -> SampledController:
-    """The controller with commands of at most `volt`: its integral knows of that limit, too."""
-    low, high = max(controller.u_min, -volt), min(controller.u_max, volt)
-    if (low, high) == (controller.u_min, controller.u_max):
-        return controller
-    inner = getattr(controller, "speed", None)
-    if isinstance(inner, SampledController):  # a position loop over a speed loop
-        return replace(controller, speed=limited(inner, volt))  # type: ignore[type-var]
-    return replace(controller, u_min=low, u_max=high)  # type: ignore[type-var]
 
 
 def require_reference(machine: Machine, controller: SampledController, r: FloatArray) -> None:

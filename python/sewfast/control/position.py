@@ -184,6 +184,9 @@ class PositionController(SampledController):
         most, part = self.speed.r_rate, self.share
         return [(v, min(part * up, most), min(part * down, most)) for v, up, down in self.rates]
 
+    def limited(self, volt: float) -> PositionController:
+        return replace(self, speed=self.speed.limited(volt))
+
     def early(self, reference: ArrayLike) -> FloatArray:
         """Goals as the compiled loop takes them, early by the preview; the last value stays."""
         early: FloatArray = self.core().early(vector("reference", reference))
@@ -273,8 +276,7 @@ class Playing(PositionController):
         """Places and goals of a device, which steps the same law in single precision and within
         its limit of the command, from the references and the counts of the run; NaN before a stop.
         """
-        low, high = max(self.u_min, -volt), min(self.u_max, volt)
-        core = replace(self, speed=replace(self.speed, u_min=low, u_max=high)).core()
+        core = self.limited(volt).core()
         _, place, goal = core.single(self.early(r)[: len(counts)], counts)
         return place, goal
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import _core
-from ..arrays import FloatArray
+from ..arrays import FloatArray, known_until
 from ..errors import DataError, SettingError
 from ..gains import real, vector
 from ..machine import VirtualMachine
@@ -168,7 +168,7 @@ class PositionRun(Plotted):
     def warnings(self) -> list[str]:
         """What a stop onward, or the last move, did that its models do not."""
         if not self._is_known:
-            lost = int(np.argmin(np.isfinite(self.counts)))
+            lost = known_until(self.counts)
             return [
                 f"lost samples from {lost} on: how it met its goal is unknown; see the line "
                 "(sewfast doctor) and run it again"
@@ -494,11 +494,7 @@ def _played(
     machine = machine_of(on)
     _require_counts(controller, machine)
     require_units(controller, ("", "RPM"))
-    run = (
-        machine.follow(playing, r, name, **drive)
-        if is_streaming(machine)
-        else guarded(machine).follow(playing, r, name)
-    )
+    run = guarded(machine).follow(playing, r, name, **drive)
     counts, place, goal = run.recording.counts, run.place, run.goal
     if place is None or goal is None:
         place, goal = _replayed(playing, counts, r, start)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from .._core import LinkUpload
 from ..causes import turning
+from ..control.position import Playing
 from ..errors import LinkError, SettingError
 from . import wire
 from .connection import SILENCE, Connection, DeviceReset
@@ -197,9 +198,9 @@ class Run:
         link.resumable = True
         link.each_turn = self._each_turn
         arm_at_rest(link)
-        stop = getattr(self.plan.controller, "stop", None)
-        if stop is not None:
-            at, angle, _, onward = stop
+        playing = self.plan.controller
+        if isinstance(playing, Playing) and playing.stop is not None:
+            at, angle, _, onward = playing.stop
             link.ask(Kind.ANGLE, wire.angle(at, angle, onward))
         mode = wire.MODES[self.plan.mode]
         body = wire.start(mode, link.watchdog_us, 0, self.length, layout.mask, layout.batch)

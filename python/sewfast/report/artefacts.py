@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import storage
+from ..arrays import known_until
 from ..errors import DataError, ModelFileError
 from ..readers import read_table
 
@@ -178,8 +179,7 @@ def _columns(folder: Path, name: str, needed: tuple[str, ...] | list[str]) -> Co
     if min(lengths.values()) < 2:
         raise DataError(f"{path}: expected at least 2 samples, received {min(lengths.values())}")
     for n, column in columns.items():
-        if not np.isfinite(column).all():
-            k = int(np.argmin(np.isfinite(column)))
+        if (k := known_until(column)) < len(column):
             raise DataError(
                 f"{path}: expected finite values, received {column[k]} in column {n!r}, sample {k};"
                 " run `sewfast demo` again"
