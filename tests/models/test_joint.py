@@ -97,6 +97,13 @@ def test_a_limit_that_is_reached_is_found() -> None:
     assert "at its limit from an error" in str(gains)
 
 
+def test_damping_is_a_time_whatever_the_unit_of_the_angles() -> None:
+    e = _servo(1500, 2, reach=0.3).experiments[0]
+    turned = np.degrees(e.u[:, 0]), np.degrees(e.y)
+    data = Dataset.from_arrays(*turned, TS, input_units=("deg",), output_unit="deg")
+    assert physics(data, structure="joint").value("damping") == pytest.approx(0.02, rel=0.2)
+
+
 def test_slow_moves_give_a_joint_that_quick_ones_do_not_throw_off() -> None:
     n = 500
     slow = 0.9 * np.sin(2.0 * math.pi * 0.15 * TS * np.arange(n))
@@ -331,6 +338,9 @@ def test_a_command_and_an_output_may_have_other_units_or_spellings(units: tuple[
     assert joint.terms == plain.terms
     for name, scale in {"stiffness": 1.0, "friction": a, "inertia": a / b}.items():
         assert joint.value(name) == pytest.approx(scale * plain.value(name), rel=1e-4), name
+    assert joint.inner_gains(5.0).kp_factor == pytest.approx(
+        plain.inner_gains(5.0).kp_factor, rel=1e-4
+    )
 
 
 def test_a_length_does_not_command_an_angle() -> None:

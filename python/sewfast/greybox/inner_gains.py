@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import SettingError
 from ..gains import real
+from ..motorfit.joint import factor
 from ..tables import significant
 
 if TYPE_CHECKING:
@@ -95,8 +96,10 @@ def inner_gains(joint: Joint, bandwidth: float, damping_ratio: float) -> InnerGa
                 name=name, expected=f"a number from {least:g} to {most:g}", received=f"{value:g}",
                 remedy="bandwidth in Hz, damping_ratio 1 for no overshoot",
             )  # fmt: skip
-    k_a = joint.value("inertia")
-    of = joint.parameters
+    of, model = joint.parameters, joint.model
+    # in position errors per acceleration, and per speed
+    same = factor(model.input_units[0]) / factor(model.output_unit)
+    k_a = same * joint.value("inertia")
 
     def known(name: str) -> float:
         return abs(of[name].value) if name in of else 0.0
@@ -107,7 +110,7 @@ def inner_gains(joint: Joint, bandwidth: float, damping_ratio: float) -> InnerGa
     crossover = w * math.sqrt(2.0 * damping_ratio**2 + math.sqrt(4.0 * damping_ratio**4 + 1.0))
     margin = math.atan2(damping * crossover, kp)
     return InnerGains(
-        bandwidth, kp, damping - known("viscous") - known("damping"), damping_ratio,
+        bandwidth, kp, damping - same * known("viscous") - known("damping"), damping_ratio,
         math.degrees(margin), margin / crossover, (known("gravity") + known("offset")) / kp,
-        known("friction") / kp, known("reach") / kp or None, joint.model.input_units[0],
+        known("friction") / kp, known("reach") / kp or None, model.input_units[0],
     )  # fmt: skip

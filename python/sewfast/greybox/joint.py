@@ -264,7 +264,10 @@ def _quantities(
         "quadratic": [("quadratic_friction", f"1/{u}", lambda p: p["k_mm"])],
         "creep": [("creep", "s", lambda p: p["creep"])],
         "settling": [("settling", "s", lambda p: p["settling"])],
-        "reach": [("reach", u, lambda p: p["reach"]), ("damping", "s", lambda p: p["damping"])],
+        "reach": [
+            ("reach", u, lambda p: p["reach"]),
+            ("damping", "s", lambda p: p["damping"] / p["k_q"]),
+        ],
         "dead_band": [("dead_band", u, lambda p: p["dead_band"])],
         "rate": [("rate", f"{u}/s", lambda p: p["rate"])],
         "backlash": [
