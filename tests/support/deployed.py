@@ -9,6 +9,7 @@ sums are equal results in equal order.
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import subprocess
 import sys
@@ -31,6 +32,7 @@ CORTEX_M4 = [
     "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-std=gnu99", "-O2",
     "-ffp-contract=off",
 ]  # fmt: skip
+M4 = "thumbv7em-none-eabihf"
 HOLD = 16
 """Samples for which an input stays."""
 
@@ -338,11 +340,16 @@ def instructions(what: Model | Controller, folder: Path, precision: str) -> floa
 
 def cortex_m4(folder: Path, name: str, *options: str) -> str:
     """The same on the emulated Cortex-M4."""
-    program = folder / f"{name}.elf"
-    sources = [str(folder / f"{name}.c"), str(folder / "main.c"), str(EMULATED / "start.c")]
+    return emulated(folder, [folder / f"{name}.c", folder / "main.c"], *options)
+
+
+def emulated(folder: Path, parts: list[Path], *options: str) -> str:
+    """What a program of these sources and libraries prints on the emulated Cortex-M4."""
+    program = folder / "program.elf"
     subprocess.run(
-        ["arm-none-eabi-gcc", *CORTEX_M4, "-nostartfiles",
-         "-T", str(EMULATED / "mps2.ld"), *sources, "-o", str(program)],
+        ["arm-none-eabi-gcc", *CORTEX_M4, "-nostartfiles", "-Wl,--gc-sections,-z,noexecstack",
+         "-T", str(EMULATED / "mps2.ld"), str(EMULATED / "start.c"), *map(str, parts),
+         "-o", str(program)],
         check=True,
     )  # fmt: skip
     done = subprocess.run(
@@ -424,8 +431,27 @@ def sizes(folder: Path, kind: str) -> tuple[int, int]:
     return sum(found[0][:2]), sum(found[1])
 
 
+def print_positions() -> None:
+    """Instructions and memory of the position loop, which is deployed as Rust alone."""
+    rust = ["cargo", "build", "--release", "--quiet", "-Zbuild-std=core", "--target", M4]
+    crate = EMULATED / "position"
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        own = {"RUSTC": "/usr/bin/rustc", "RUSTC_BOOTSTRAP": "1", "CARGO_TARGET_DIR": place}
+        subprocess.run(rust, cwd=crate, env={**os.environ, **own}, check=True)
+        library = folder / M4 / "release" / "libposition_steps.a"
+        found = emulated(folder, [library], "-icount", "shift=0")
+    print("\n| position loop, f32 | instructions a step, mean | most |\n|---|---|---|")
+    *phases, memory = found.splitlines()
+    for line in phases:
+        mean, most = (int(number) for number in line[32:].split())
+        print(f"| {line[:32].strip()} | {mean:,} | {most:,} |")
+    beyond, speed = (int(number) for number in memory[32:].split())
+    print(f"{beyond} bytes beyond the {speed:,} of its speed loop", flush=True)
+
+
 def print_costs() -> int:
-    """The table of docs/deploy.md."""
+    """The table of docs/deploy.md, and the figures of docs/positions.md."""
     print("| | instructions a step, f32 | f64 | bytes of code and tables, f32 | of memory, f32 |")
     print("|---|---|---|---|---|")
     for name, what in costs():
@@ -434,6 +460,7 @@ def print_costs() -> int:
             double, single = (instructions(what, folder, p) for p in ("f64", "f32"))
             code, memory = sizes(folder, "pid" if isinstance(what, Controller) else "model")
         print(f"| {name} | {single:.0f} | {double:,.0f} | {code:,} | {memory} |", flush=True)
+    print_positions()
     return 0
 
 
