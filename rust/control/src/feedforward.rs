@@ -12,16 +12,15 @@
 //! measurement that is late by its filter with a reference that is late by the same filter. Otherwise it would fight the
 //! feedforward.
 
+use crate::ring::Ring;
 use crate::{Feedback, Real, Refused};
 
-/// The longest preview, in samples.
+/// The longest preview, in samples: the ring also keeps the newest reference and the one before the delayed one.
 pub const AHEAD: usize = 30;
 /// The most taps.
 pub const TAPS: usize = 16;
 /// The most levels.
 pub const LEVELS: usize = 8;
-/// References kept: the longest preview, the newest and the one before the delayed one.
-const KEPT: usize = 32;
 
 /// An output and the command that holds it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -160,16 +159,14 @@ impl<T: Real> Feedforward<T> {
 
     /// The command that holds the output `y`.
     pub fn held(&self, y: T) -> T {
-        let [first, ..] = self.levels;
+        let [first, ..] = &self.levels;
         let levels = self.levels();
-        let (mut low, mut high) = (first, levels.get(1).copied().unwrap_or(first));
-        for pair in levels.windows(2) {
-            if let [this, next] = pair
-                && y >= this.y
-            {
-                (low, high) = (*this, *next);
-            }
-        }
+        // of those between the first and the last, which grow
+        let inner = levels.get(1..levels.len().saturating_sub(1));
+        let passed = inner.unwrap_or_default().iter();
+        let passed = passed.take_while(|level| y >= level.y).count();
+        let low = levels.get(passed).unwrap_or(first);
+        let high = levels.get(passed + 1).unwrap_or(low);
         // one level alone: any distance, as the command does not change over it
         let apart = if high.y > low.y {
             high.y - low.y
@@ -193,9 +190,7 @@ impl<T: PartialEq> PartialEq for Feedforward<T> {
 /// The last references, and the filter of the expected measurement.
 #[derive(Clone, Debug)]
 pub(crate) struct Ahead<T> {
-    /// A ring, the newest at `newest`, older ones behind it.
-    kept: [T; KEPT],
-    newest: usize,
+    kept: Ring<T>,
     pub(crate) started: bool,
     filter: Feedback<T>,
 }
@@ -204,8 +199,7 @@ impl<T: Real> Ahead<T> {
     /// Without a reference yet; `filter` is the feedback's.
     pub(crate) fn new(filter: Feedback<T>) -> Self {
         Self {
-            kept: [T::ZERO; KEPT],
-            newest: 0,
+            kept: Ring::filled(T::ZERO),
             started: false,
             filter,
         }
@@ -218,13 +212,12 @@ impl<T: Real> Ahead<T> {
 
     /// The reference `age` samples before the newest.
     pub(crate) fn at(&self, age: usize) -> T {
-        let place = (self.newest + KEPT - age % KEPT) % KEPT;
-        self.kept.get(place).copied().unwrap_or(T::ZERO)
+        self.kept.at(age)
     }
 
     /// As if the reference had been `r` for ever.
     pub(crate) fn stand_at(&mut self, r: T) {
-        self.kept = [r; KEPT];
+        self.kept = Ring::filled(r);
         self.started = true;
         self.filter.reset();
     }
@@ -238,18 +231,19 @@ impl<T: Real> Ahead<T> {
             return;
         }
         let r = if r.is_finite() { r } else { self.at(0) };
-        self.newest = (self.newest + 1) % KEPT;
-        if let Some(place) = self.kept.get_mut(self.newest) {
-            *place = r;
-        }
+        self.kept.push(r);
     }
 
     /// The command for the references so far.
     pub(crate) fn command(&self, of: &Feedforward<T>) -> T {
-        let changes = of.taps().iter().enumerate();
-        let sum = changes.fold(T::ZERO, |sum, (age, tap)| {
-            sum + *tap * (self.at(age) - self.at(age + 1))
-        });
+        let (mut sum, mut newer, mut taps) = (T::ZERO, self.at(0), of.taps());
+        for part in self.kept.parts(1) {
+            for (tap, older) in taps.iter().zip(part) {
+                sum += *tap * (newer - *older);
+                newer = *older;
+            }
+            taps = taps.get(part.len()..).unwrap_or_default();
+        }
         if of.levels().is_empty() {
             sum
         } else {

@@ -7,6 +7,11 @@ use crate::{Real, Refused};
 /// The longest moving average, in samples.
 pub const CAPACITY: usize = 64;
 
+fn mean<T: Real>(memory: &[T]) -> T {
+    let sum = memory.iter().fold(T::ZERO, |sum, &x| sum + x);
+    sum / T::from_count(memory.len())
+}
+
 /// Mean of the last `n` samples: a delay of `(n - 1)/2` samples, and an encoder step `n` times smaller.
 #[derive(Clone, Debug)]
 pub struct MovingAverage<T> {
@@ -54,7 +59,7 @@ impl<T: Real> MovingAverage<T> {
         }
         let next = self.next + 1;
         self.next = if next < self.length { next } else { 0 };
-        self.mean()
+        mean(memory)
     }
 
     /// The last sample; `None` before the first one.
@@ -64,9 +69,7 @@ impl<T: Real> MovingAverage<T> {
     }
 
     fn mean(&self) -> T {
-        let memory = self.samples.get(..self.length).unwrap_or_default();
-        let sum = memory.iter().fold(T::ZERO, |sum, &x| sum + x);
-        sum / T::from_count(self.length)
+        mean(self.samples.get(..self.length).unwrap_or_default())
     }
 
     /// This average's length with the memory of `other`: all of it or, if the lengths differ, its mean.

@@ -15,6 +15,7 @@ pub mod pid;
 pub mod pid_controller;
 pub mod position;
 pub mod real;
+mod ring;
 pub mod schedule;
 pub mod tracker;
 

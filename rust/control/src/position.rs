@@ -20,6 +20,7 @@ mod stop;
 mod turning;
 
 use crate::pid_controller::Correction;
+use crate::ring::{KEPT, Ring};
 use crate::{Controller, PidController, Real, Refused};
 use stop::Angle;
 
@@ -28,8 +29,6 @@ pub use turning::{FARTHEST, Turning};
 
 /// The longest mean over the samples of a profile.
 pub const SMOOTHED: usize = 31;
-/// Samples kept: the longest preview or mean, and one more.
-const KEPT: usize = 32;
 
 /// The settings of a position loop.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -84,54 +83,31 @@ impl<T: Real> PositionDesign<T> {
         )
     }
 
-    /// By how much the landing makes a way at these rates longer \[y s\].
-    fn crept(&self, rates: &Rates<T>) -> T {
-        let more = self.landing / self.counts_per_unit - rates.way(self.creep);
+    /// By how much the landing makes a way at this part of the rates longer \[y s\].
+    fn crept(&self, part: T) -> T {
+        let more = self.landing / self.counts_per_unit - self.rates.way_by(self.creep, part);
         if more > T::ZERO { more } else { T::ZERO }
     }
 
-    /// The speed of the next sample towards a goal at a distance of 0 or more, at these rates.
-    fn towards(&self, rates: &Rates<T>, distance: T, ts: T) -> T {
-        let last = rates.from(distance, ts);
-        let more = self.crept(rates);
-        if more == T::ZERO {
-            return last;
+    /// The speed of the next sample towards a goal at a distance of 0 or more, at this part of the rates, by which the landing makes
+    /// the way longer by `crept`.
+    fn towards(&self, distance: T, ts: T, part: T, crept: T) -> T {
+        let from = |distance| self.rates.from(distance, ts, part);
+        if crept == T::ZERO {
+            return from(distance);
         }
-        let first = if distance > more {
-            rates.from(distance - more, ts)
+        let first = if distance > crept {
+            from(distance - crept)
         } else {
             T::ZERO
         };
+        // above its own speed the landing does not matter
+        if first >= self.creep {
+            return first;
+        }
+        let last = from(distance);
         let slow = if last < self.creep { last } else { self.creep };
         if first > slow { first } else { slow }
-    }
-}
-
-/// The last values, newest first.
-#[derive(Clone, Debug)]
-struct Ring<T> {
-    kept: [T; KEPT],
-    newest: usize,
-}
-
-impl<T: Real> Ring<T> {
-    fn filled(value: T) -> Self {
-        Self {
-            kept: [value; KEPT],
-            newest: 0,
-        }
-    }
-
-    fn push(&mut self, value: T) {
-        self.newest = (self.newest + 1) % KEPT;
-        if let Some(place) = self.kept.get_mut(self.newest) {
-            *place = value;
-        }
-    }
-
-    fn at(&self, age: usize) -> T {
-        let place = (self.newest + KEPT - age % KEPT) % KEPT;
-        self.kept.get(place).copied().unwrap_or(T::ZERO)
     }
 }
 
@@ -171,8 +147,9 @@ pub struct PositionLoop<T> {
     /// Goal of the last sample \[counts\], and its own speed \[y\].
     goal: T,
     own: T,
-    /// Rates and largest speed of this move \[y\].
-    rates: Rates<T>,
+    /// Part of the rates that this move uses, by how much its landing makes a way longer \[y s\], and its largest speed \[y\].
+    part: T,
+    crept: T,
     fastest: T,
     /// Largest way of a sample of the profile since this move was planned, and all the way that braking has taken off \[counts\].
     top: T,
@@ -183,6 +160,8 @@ pub struct PositionLoop<T> {
     u: T,
     /// Samples since the last count.
     still: usize,
+    /// How many of the newest `places` are the goal.
+    stood: usize,
     /// Samples that the speed loop has yet to be told of the profile, beyond one at each sample.
     untold: usize,
 }
@@ -204,13 +183,15 @@ impl<T: Real> PositionLoop<T> {
             rate: T::ZERO,
             goal: T::ZERO,
             own: T::ZERO,
-            rates: design.rates,
+            part: T::ONE,
+            crept: design.crept(T::ONE),
             fastest: design.speed,
             top: T::ZERO,
             lost: T::ZERO,
             unplanned: 0,
             u: T::ZERO,
             still: 0,
+            stood: KEPT,
             untold: 0,
             design,
             speed,
@@ -224,7 +205,8 @@ impl<T: Real> PositionLoop<T> {
         (self.counts, self.rate, self.goal) = (T::ZERO, T::ZERO, T::ZERO);
         (self.own, self.u, self.still, self.untold) = (T::ZERO, T::ZERO, 0, 0);
         (self.path, self.places) = (Ring::filled(T::ZERO), Ring::filled(T::ZERO));
-        self.planned(self.design.rates, self.design.speed);
+        self.stood = KEPT;
+        self.planned(T::ONE, self.design.speed);
     }
 
     /// From the reference and the counts `moved` since the last sample to the command. The reference is a speed \[y\], after
@@ -288,9 +270,9 @@ impl<T: Real> PositionLoop<T> {
     /// the bounds; one that moves as the drive can is followed as it is.
     pub fn follow(&mut self) {
         self.take_over();
-        self.goal = self.path.at(0);
+        self.set_goal(self.path.at(0));
         self.own = self.rate;
-        self.planned(self.design.rates, self.design.speed);
+        self.planned(T::ONE, self.design.speed);
         self.mode = Mode::Goals;
     }
 
@@ -319,14 +301,27 @@ impl<T: Real> PositionLoop<T> {
         self.move_by(-counts);
     }
 
+    #[inline(never)]
     fn move_by(&mut self, shift: T) {
-        for place in self.path.kept.iter_mut().chain(&mut self.places.kept) {
+        for place in self.path.values_mut().chain(self.places.values_mut()) {
             *place += shift;
         }
+        self.set_goal(self.goal);
+    }
+
+    #[inline(never)]
+    fn set_goal(&mut self, goal: T) {
+        self.goal = goal;
+        let places = (0..KEPT).map(|age| self.places.at(age));
+        self.stood = places.take_while(|place| *place == goal).count();
     }
 
     /// The profile one sample on towards a goal; its speed \[y\].
     fn profile(&mut self, goal: T) -> T {
+        if self.stood == KEPT && goal == self.goal && self.is_there() {
+            self.own = T::ZERO;
+            return T::ZERO;
+        }
         if self.unplanned > 0 {
             self.path
                 .push(self.path.at(0) + self.rate * self.per_sample);
@@ -337,37 +332,52 @@ impl<T: Real> PositionLoop<T> {
         }
         let samples = self.design.smoothing;
         let (newest, oldest) = (self.path.at(0), self.path.at(samples));
-        self.places.push(self.mean());
+        let place = self.mean();
+        self.places.push(place);
+        self.stood = if place == self.goal {
+            (self.stood + 1).min(KEPT)
+        } else {
+            0
+        };
         (newest - oldest) / (T::from_count(samples) * self.per_sample)
+    }
+
+    /// Whether the path has come to rest at the goal.
+    fn is_there(&self) -> bool {
+        self.unplanned == 0 && self.rate == T::ZERO && self.path.at(0) == self.goal
     }
 
     /// The position before the mean, one sample on towards a goal.
     fn advance(&mut self, goal: T) {
         let goal = if goal.is_finite() { goal } else { self.goal };
         let (ts, rate) = (self.speed.settings().ts, self.rate);
-        let (row, _) = self.rates.at(size(rate));
+        let (row, _) = self.design.rates.at(size(rate), self.part);
         let (up, down) = (row.up * ts, row.down * ts);
         // a goal that moves as the drive can is followed at its own speed, from its second sample on: before, it may be a step
         let (own, last) = ((goal - self.goal) / self.per_sample, self.own);
         let moves = last != T::ZERO && size(own) <= self.fastest;
         let follows = moves && size(own - last) <= up + down;
         let carried = if follows { own } else { T::ZERO };
-        (self.goal, self.own) = (goal, own);
+        if goal != self.goal {
+            self.set_goal(goal);
+        }
+        self.own = own;
         let at = self.path.at(0);
         let left = (goal - at) / self.design.counts_per_unit - carried * ts;
-        let towards = self.design.towards(&self.rates, size(left), ts);
+        let (design, part) = (&self.design, self.part);
+        let towards = design.towards(size(left), ts, part, self.crept);
         let wanted = carried + if left < T::ZERO { -towards } else { towards };
         let wanted = wanted.limit(-self.fastest, self.fastest);
         // on its way to a goal the speed may fall by the rate of the row below, and by an eighth more just before it, where the
         // last samples do not divide the way evenly
         let brakes = size(wanted) <= size(rate) && wanted * rate >= T::ZERO;
-        let (next, _) = self.rates.at(size(wanted));
-        let steeper = if next.down > row.down {
-            next.down * ts
-        } else {
-            down
-        };
         let down = if brakes {
+            let (next, _) = design.rates.at(size(wanted), part);
+            let steeper = if next.down > row.down {
+                next.down * ts
+            } else {
+                down
+            };
             steeper + steeper / T::from_count(8)
         } else {
             down
@@ -392,7 +402,14 @@ impl<T: Real> PositionLoop<T> {
     /// The mean over the newest positions of the path; exactly the goal if all are.
     fn mean(&self) -> T {
         let samples = self.design.smoothing;
-        let off = (0..samples).fold(T::ZERO, |sum, age| sum + (self.path.at(age) - self.goal));
+        let (mut off, mut left) = (T::ZERO, samples);
+        for part in self.path.parts(0) {
+            let used = part.get(..left).unwrap_or(part);
+            for place in used {
+                off += *place - self.goal;
+            }
+            left -= used.len();
+        }
         self.goal + off / T::from_count(samples)
     }
 
@@ -411,8 +428,7 @@ impl<T: Real> PositionLoop<T> {
 
     /// Whether the profile stands at its goal.
     pub fn stands(&self) -> bool {
-        let goal = |place: &T| *place == self.goal;
-        self.mode != Mode::Speed && self.places.kept.iter().all(goal)
+        self.mode != Mode::Speed && self.stood == KEPT
     }
 
     /// Whether it is the speed loop alone, as it begins.

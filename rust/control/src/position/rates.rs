@@ -88,45 +88,48 @@ impl<T: Real> Rates<T> {
         self.rows.get(..self.count.into()).unwrap_or_default()
     }
 
-    /// The same rows with this part of the rates.
-    pub(super) fn scaled(mut self, part: T) -> Self {
-        for (row, way) in self.rows.iter_mut().zip(&mut self.ways) {
-            (row.up, row.down, *way) = (row.up * part, row.down * part, *way / part);
-        }
-        self
+    /// The row at a speed, as a magnitude, with this part of its rates, and the way from its own speed to rest.
+    pub(super) fn at(&self, speed: T, part: T) -> (Rate<T>, T) {
+        self.last(part, |row, _| row.speed <= speed)
     }
 
-    /// The row at a speed, as a magnitude, and the way from its own speed to rest.
-    pub(super) fn at(&self, speed: T) -> (Rate<T>, T) {
-        self.last(|row, _| row.speed <= speed)
-    }
-
-    /// The last row that holds, with its way; the first one if none does.
-    fn last(&self, holds: impl Fn(&Rate<T>, T) -> bool) -> (Rate<T>, T) {
-        let ([first, ..], [none, ..]) = (self.rows, self.ways);
-        let known = self.rows().iter().zip(self.ways);
-        known
-            .filter(|(row, way)| holds(row, *way))
+    /// The last of the rows that hold, which are the first ones, and its way, with this part of the rates; the first row if none holds.
+    fn last(&self, part: T, holds: impl Fn(&Rate<T>, T) -> bool) -> (Rate<T>, T) {
+        let ([first, ..], [none, ..]) = (&self.rows, &self.ways);
+        let known = self.rows().iter().zip(&self.ways);
+        let (row, way) = known
+            .take_while(|(row, way)| holds(row, **way / part))
             .last()
-            .map_or((first, none), |(row, way)| (*row, way))
+            .unwrap_or((first, none));
+        let rate = Rate {
+            speed: row.speed,
+            up: row.up * part,
+            down: row.down * part,
+        };
+        (rate, *way / part)
     }
 
     /// The way from a speed, as a magnitude, to rest \[y s\].
     pub fn way(&self, speed: T) -> T {
-        let (row, way) = self.at(speed);
+        self.way_by(speed, T::ONE)
+    }
+
+    /// The same with this part of the rates.
+    pub(super) fn way_by(&self, speed: T, part: T) -> T {
+        let (row, way) = self.at(speed, part);
         way + (speed * speed - row.speed * row.speed) / (row.down + row.down)
     }
 
     /// The speed of the next sample from which a distance of 0 or more ends at rest, if the speed then falls from sample to sample
-    /// at these rates: it solves `way(v) + v ts/2 = distance`, and is exact for sampled steps of one rate.
-    pub(super) fn from(&self, distance: T, ts: T) -> T {
+    /// at this part of these rates: it solves `way(v) + v ts/2 = distance`, and is exact for sampled steps of one rate.
+    pub(super) fn from(&self, distance: T, ts: T, part: T) -> T {
         let half = T::ONE / (T::ONE + T::ONE);
-        let ([first, ..], last) = (self.rows, distance / ts);
+        let ([first, ..], last) = (&self.rows, distance / ts);
         // the last step of the speed, in which the distance is met in one sample
-        if last <= first.down * ts {
+        if last <= first.down * part * ts {
             return last;
         }
-        let (row, way) = self.last(|row, way| way + half * row.speed * ts <= distance);
+        let (row, way) = self.last(part, |row, way| way + half * row.speed * ts <= distance);
         let (lost, left) = (half * row.down * ts, distance - way);
         let v = (lost * lost + row.speed * row.speed + (row.down + row.down) * left).sqrt() - lost;
         v.limit(T::ZERO, last)

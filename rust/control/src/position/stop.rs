@@ -4,7 +4,7 @@
 //! A shaft that brakes less than planned goes on to a later place at the angle, once, instead of passing it by much and turning
 //! back. The last, slow part of any way ends where the counts meet the goal, so that a shaft which leads does not pass it.
 
-use super::{Mode, PositionLoop, Rates, size};
+use super::{Mode, PositionLoop, size};
 use crate::{Real, Refused};
 
 /// An angle of a stop.
@@ -70,15 +70,16 @@ impl<T: Real> PositionLoop<T> {
         let missed = T::from_count(sooner.unwrap_or(0));
         self.move_by(-(missed * rate * self.per_sample));
         // what the drive loses within a sample is rest: at that speed a turn could take minutes
-        let (row, _) = self.design.rates.at(fast);
+        let (row, _) = self.design.rates.at(fast, T::ONE);
         let moves = fast > row.down * self.speed.settings().ts;
         let fastest = if moves && onward {
             fast
         } else {
             self.design.speed
         };
-        self.planned(self.design.rates, fastest);
-        (self.goal, self.own) = (self.reached(asked), T::ZERO);
+        self.planned(T::ONE, fastest);
+        self.set_goal(self.reached(asked));
+        self.own = T::ZERO;
         self.mode = Mode::Stop(onward.then_some(asked));
         // what the first of two stops had not told yet is told all the same
         self.untold = sooner.unwrap_or(self.untold);
@@ -91,10 +92,11 @@ impl<T: Real> PositionLoop<T> {
         let (rate, fast) = (self.rate, size(self.rate));
         let half = T::ONE / (T::ONE + T::ONE);
         // the speed falls from the next sample on
-        let way = self.rates.way(fast) - half * fast * self.speed.settings().ts;
+        let way =
+            self.design.rates.way_by(fast, self.part) - half * fast * self.speed.settings().ts;
         let braked = if way > T::ZERO { way } else { T::ZERO };
         let creeps = if fast > self.design.creep {
-            self.design.crept(&self.rates)
+            self.crept
         } else {
             T::ZERO
         };
@@ -151,9 +153,10 @@ impl<T: Real> PositionLoop<T> {
         (taps / 2).min(preview)
     }
 
-    /// A move with these rates and this largest speed begins.
-    pub(super) fn planned(&mut self, rates: Rates<T>, fastest: T) {
-        (self.rates, self.fastest, self.unplanned) = (rates, fastest, 0);
+    /// A move with this part of the rates and this largest speed begins.
+    pub(super) fn planned(&mut self, part: T, fastest: T) {
+        (self.part, self.crept) = (part, self.design.crept(part));
+        (self.fastest, self.unplanned) = (fastest, 0);
         (self.top, self.lost) = (T::ZERO, T::ZERO);
     }
 
@@ -206,12 +209,12 @@ impl<T: Real> PositionLoop<T> {
         let top = self.top / self.per_sample;
         let kept = top - (top - size(self.rate)) * has;
         let samples = self.design.smoothing;
-        let (row, _) = self.rates.at(kept);
+        let (row, _) = self.design.rates.at(kept, self.part);
         if kept < row.down * self.speed.settings().ts * T::from_count(samples) {
             return false;
         }
         self.rate = if forwards { kept } else { -kept };
-        self.planned(self.rates.scaled(has * has), kept);
+        self.planned(self.part * (has * has), kept);
         self.unplanned = self.speed.design().feedforward.preview() + samples;
         true
     }
