@@ -172,9 +172,16 @@ impl<T: Real> PositionLoop<T> {
     /// # Errors
     /// The first setting that is outside its range.
     pub fn new(design: PositionDesign<T>, speed: PidController<T>) -> Result<Self, Refused> {
-        let ts = speed.settings().ts;
         design.check()?;
-        Ok(Self {
+        Ok(Self::checked(design, speed))
+    }
+
+    /// The same for settings that have been checked. Inlined, so that it is made in its place: it would fill most of a small
+    /// processor's stack.
+    #[inline(always)]
+    pub(crate) fn checked(design: PositionDesign<T>, speed: PidController<T>) -> Self {
+        let ts = speed.settings().ts;
+        Self {
             mode: Mode::Speed,
             per_sample: ts * design.counts_per_unit,
             counts: T::ZERO,
@@ -195,7 +202,7 @@ impl<T: Real> PositionLoop<T> {
             untold: 0,
             design,
             speed,
-        })
+        }
     }
 
     /// Back to the state before the first sample, as the speed loop alone, with the counts at 0.

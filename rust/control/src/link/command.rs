@@ -101,7 +101,9 @@ impl Gains {
     /// # Errors
     /// The first setting that is outside its range.
     pub(super) fn controller(&self, volt: f32, ts: f32) -> Result<AnyController<f32>, Refused> {
-        self.design.bounded(volt, ts).controller()
+        let mut design = self.design;
+        design.bound(volt, ts);
+        design.controller()
     }
 
     /// Biquads from the next start on; GAINS has none.
@@ -146,7 +148,9 @@ impl Gains {
     /// The reason why no controller can be made; a separate function, as the controller's parts fill much of a stack.
     #[inline(never)]
     pub(super) fn refused(&self, volt: f32, ts: f32) -> Option<Refused> {
-        self.design.bounded(volt, ts).check().err()
+        let mut design = self.design;
+        design.bound(volt, ts);
+        design.check().err()
     }
 }
 

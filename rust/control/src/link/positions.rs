@@ -3,9 +3,7 @@
 use super::command::{Gains, Refusal};
 use super::identity::{Limits, Travel};
 use super::wire::Fields;
-use crate::{
-    AnyController, Controller, FARTHEST, PositionDesign, RATES, Rate, Rates, Refused, Turning,
-};
+use crate::{AnyController, Controller, FARTHEST, PositionDesign, RATES, Rate, Rates, Turning};
 
 /// Whether the device can run a position loop: without it none of its code is linked.
 pub(super) const HAS: bool = cfg!(feature = "positions");
@@ -65,23 +63,26 @@ impl Law {
 }
 
 impl Gains {
-    /// What a run steps: goals follow in mode 3, elsewhere references are speeds.
-    ///
-    /// # Errors
-    /// The first setting that is outside its range.
-    pub(super) fn law(&self, volt: f32, ts: f32, mode: u8) -> Result<Law, Refused> {
+    /// Makes what a run steps, in its place, if all settings are within their ranges: goals follow in mode 3, elsewhere references
+    /// are speeds.
+    pub(super) fn begin(&self, law: &mut Option<Law>, volt: f32, ts: f32, mode: u8) {
         #[cfg(not(feature = "positions"))]
         let _ = mode;
-        match (self.position, self.controller(volt, ts)?) {
+        *law = match (self.position, self.controller(volt, ts)) {
             #[cfg(feature = "positions")]
-            (Some(design), AnyController::Pid(speed)) => {
-                let mut turning = Turning::new(crate::PositionLoop::new(design, speed)?);
-                if mode == 3 {
-                    turning.follow();
+            (Some(design), Ok(AnyController::Pid(speed))) => {
+                if design.check().is_err() {
+                    return;
                 }
-                Ok(Law::Position(turning))
+                let law = crate::PositionLoop::checked(design, speed);
+                Some(Law::Position(Turning::new(law)))
             }
-            (_, speed) => Ok(Law::Speed(speed)),
+            (_, Ok(speed)) => Some(Law::Speed(speed)),
+            _ => None,
+        };
+        #[cfg(feature = "positions")]
+        if let (3, Some(Law::Position(turning))) = (mode, law) {
+            turning.follow();
         }
     }
 

@@ -25,6 +25,7 @@ pub struct Turning {
 
 impl Turning {
     /// A loop at rest.
+    #[inline]
     pub fn new(law: PositionLoop<f32>) -> Self {
         Self { law, origin: 0 }
     }

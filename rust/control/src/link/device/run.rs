@@ -75,10 +75,10 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         let (start, limits) = (self.run.start, self.bounds());
         self.run.planned = None;
         self.run.began = self.due;
-        self.run.law = match (start.mode, &self.gains) {
-            (1 | 3, Some(gains)) => gains.law(limits.volt, self.ts, start.mode).ok(),
-            _ => None,
-        };
+        self.run.law = None;
+        if let (1 | 3, Some(gains)) = (start.mode, &self.gains) {
+            gains.begin(&mut self.run.law, limits.volt, self.ts, start.mode);
+        }
         self.run.from = self.guard.counts();
         self.guard.begin();
         self.stream.begin(start.mask, start.batch);
