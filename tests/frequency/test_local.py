@@ -185,6 +185,9 @@ def test_a_record_is_taken_by_either_method(tmp_path: Any) -> None:
     segments = bode(data, method="segments")
     np.testing.assert_array_equal(segments.value, bode(data).value)
     assert np.ndim(segments.blocks) == 0
+    # overlapping segments are worth a fraction of a block each; a count is printed whole
+    assert segments.blocks % 1.0
+    assert f" {segments.blocks:.0f} blocks" in str(segments)
     found.save(tmp_path / "response.json")
     again = load_response(tmp_path / "response.json")
     np.testing.assert_array_equal(again.radius(), found.radius())

@@ -297,7 +297,7 @@ class FrequencyResponse(storage.Stored, Shown):
         db = 20.0 * np.log10(1.0 + self.radius() / np.maximum(np.abs(self.value), 1e-300))
         lines = [
             f"frequency response, {len(self.hertz)} lines from {self.hertz[0]:.4g} to "
-            f"{self.hertz[-1]:.4g} Hz, {np.median(self.blocks):.4g} blocks",
+            f"{self.hertz[-1]:.4g} Hz, {np.median(self.blocks):.0f} blocks",
             f"  coherence  above .95 at {100 * known.mean():.0f} % of them, {span}",
             f"  band       95 %: {np.median(db):.2g} dB in the median, {db.max():.2g} dB at most",
         ]
