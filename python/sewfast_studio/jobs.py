@@ -26,7 +26,7 @@ import numpy as np
 from sewfast.errors import Interrupted, SettingError
 
 from .loops import shown_loop, shown_response
-from .project import Project, checked_name
+from .project import CONTROLLER_FORMAT, MODEL_FORMAT, Project, checked_name
 from .requests import COMMISSIONED, Commission, Step, carry_out
 from .tuning import Found, Search, Tuning
 from .words import error_text
@@ -390,16 +390,28 @@ class Steps:
         search = Search(**{k: fields[k] for k in names if fields.get(k) is not None})
         tuning.check(search)
         tuning.controller(values)
-        task = (
-            fields["model"], fields.get("controller"), _notches(fields.get("notches", [])), values,
-            search,
-        )  # fmt: skip
-        # a page takes it where the same model and start are open
-        of = {"model": fields["model"], "start": fields.get("controller")}
+        model, start = fields["model"], fields.get("controller")
+        notches = _notches(fields.get("notches", []))
+        project, task = self.project, (model, start, notches, values, search)
+        follow = (
+            project.follow(model, MODEL_FORMAT),
+            (lambda: None) if start is None else project.follow(start, CONTROLLER_FORMAT),
+        )
+
+        def of() -> dict[str, Any]:
+            """Where a page takes it: the same model and start, by their names at the end."""
+            return dict(zip(("model", "start"), (now() for now in follow), strict=True))
+
+        def found(result: Found) -> dict[str, Any]:
+            names, here = of(), tuning
+            if names != {"model": model, "start": start}:
+                here = project.tuning(names["model"], names["start"], notches)
+            return {**here.keep(result), **names}
+
         if name == "tune_search":
-            self.jobs.start("searched", "tune", *task, finish=lambda f: {**tuning.keep(f), **of})
+            self.jobs.start("searched", "tune", *task, finish=found)
         else:
-            self.jobs.start("traded", "front", *task, finish=lambda found: {**found, **of})
+            self.jobs.start("traded", "front", *task, finish=lambda front: {**front, **of()})
 
     def _copies(self, step: Step, name: str) -> dict[str, str]:
         return {

@@ -173,6 +173,22 @@ class Project:
             )
         return self.folder / str(name)
 
+    def follow(self, name: str, format: str) -> Callable[[], str]:
+        """What one of `documents` is called by then: a person may rename it during a long step."""
+        content = self.document(name, format).read_bytes()
+
+        def now() -> str:
+            names = self.documents(format)
+            with suppress(OSError):  # one that goes meanwhile
+                if name not in names:
+                    return next(n for n in [*names, name] if n == name or self._is(n, content))
+            return name
+
+        return now
+
+    def _is(self, name: str, content: bytes) -> bool:
+        return (self.folder / name).read_bytes() == content
+
     def path_of(self, name: str) -> Path:
         """The path of one of `recordings`.
 

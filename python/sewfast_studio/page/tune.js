@@ -378,7 +378,8 @@ export function mount(root, { ask, on, mark = () => {} }) {
     const seconds = $("tune-seconds").valueAsNumber, effort = { evaluations: $("evaluations").valueAsNumber, seed: $("tune-seed").valueAsNumber, seconds: seconds > 0 ? seconds : null };
     try { await ask(what, question({ ...effort, weights: weights(), constraints })); busy = true; enable(); } catch (error) { tell(error); }
   }
-  const untaken = new Map();
+  const untaken = new Map(), listed = (id, name) => [...$(id).options].some(o => o.value === name);
+  let waiting = "";
   /** Takes what a search found if it is of the model and start that are open; else once they are: another page, or this one before, can have asked. */
   function takeIt(found, values, take) {
     const of = place(found.model, found.start), same = of === shown && opened;
@@ -391,7 +392,8 @@ export function mount(root, { ask, on, mark = () => {} }) {
   function waits() {
     if (busy) return;
     const [found] = [...untaken].filter(([of]) => of !== chosen()).at(-1)?.[1] ?? [], start = found?.start ? titleOf(found.start) : "computed from the model";
-    $("tune-progress").textContent = !found ? "" : found.model !== $("tune-model").value ? `A search for ${titleOf(found.model)} has ended. Choose this model to see what was found.` : `A search from another start has ended. Choose the start “${start}” to see what was found.`;
+    const gone = !found ? "" : !listed("tune-model", found.model) ? found.model : found.start && !listed("tune-start", found.start) ? found.start : "";
+    $("tune-progress").textContent = waiting = !found ? "" : gone ? `A search has ended, but ${titleOf(gone)} is no longer in the folder. Put it back to see what was found.` : found.model !== $("tune-model").value ? `A search for ${titleOf(found.model)} has ended. Choose this model to see what was found.` : `A search from another start has ended. Choose the start “${start}” to see what was found.`;
   }
   $("tune-cancel").onclick = () => ask("cancel").catch(tell);
   $("save").onclick = async () => {
@@ -445,6 +447,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
     const [model, start] = shown === null ? [] : JSON.parse(shown), gone = shown !== null && shown !== chosen();
     if (gone) { missed = model ? `${titleOf(model !== $("tune-model").value ? model : start)} is no longer in the folder.` : ""; notches = []; opened = null; turn++; }
     if (gone || !s.models.length) blank();
+    if (waiting && $("tune-progress").textContent === waiting) waits();  // what waits may have come or gone
     if (!opened) mark("tune", s.models.length ? "ready" : "needs a model");
     if (!$("tune").hidden && !saving) opened ? move() : opening && !gone || open();
   });
@@ -457,6 +460,6 @@ export function mount(root, { ask, on, mark = () => {} }) {
 
   enable();
   /** Takes a model of the folder, as one that was just identified. */
-  function choose(name) { if ([...$("tune-model").options].some(o => o.value === name) && $("tune-model").value !== name) { $("tune-model").value = name; notches = []; open(); } }
+  function choose(name) { if (listed("tune-model", name) && $("tune-model").value !== name) { $("tune-model").value = name; notches = []; open(); } }
   return { choose, show: async () => { await (opened ? move() : opening || open()); }, question, addNotch, unit: () => opened ? opened.y_unit : "" };
 }

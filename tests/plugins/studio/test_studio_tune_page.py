@@ -259,6 +259,29 @@ def test_gains_of_another_model_are_not_taken(tuned: Studio, browser: Any) -> No
     until(lambda: "below the start" in at("cost").text)
 
 
+@pytest.mark.nightly("a search from a browser")
+@pytest.mark.alone
+def test_gains_follow_a_model_that_is_renamed(tuned: Studio, browser: Any) -> None:
+    drive = tuned.project.folder / "drive.json"
+    other = sewfast.load_model(drive).members[0]
+    at = _searching(browser, tuned, "300", "search")
+    until(lambda: " of 300" in at("tune-progress").text)
+    drive.rename(drive.with_name("renamed.json"))
+    other.save(drive.with_name("an other.json"))
+    until(lambda: "A search for renamed.json has ended" in at("tune-progress").text)
+    assert at("tune-model").get_attribute("value") == "an other.json"
+    drive.with_name("renamed.json").rename(drive)
+    tuned._tell_all()
+    until(lambda: "renamed.json is no longer in the folder" in at("tune-progress").text)
+    drive.rename(drive.with_name("renamed.json"))
+    tuned._tell_all()
+    until(lambda: "Choose this model" in at("tune-progress").text)
+    at("tune-model").send_keys("renamed")
+    until(lambda: "Found gains" in at("tune-progress").text)
+    until(lambda: "below the start" in at("cost").text)
+    assert browser.get_log("browser") == []
+
+
 def _found(model: str, start: str | None, values: dict[str, Any], cost: float) -> dict[str, Any]:
     """The end of a search, as the server tells it to every page."""
     ended = {"interrupted": False, "ended": "evaluations", "cost": cost, "start_cost": 2.0}
