@@ -91,9 +91,9 @@ export function mount(root, { ask, on, mark = () => {} }) {
       label.textContent = (KNOBS[k.name] ?? k.name.replaceAll("_", " ")) + (k.unit ? ` [${k.unit}]` : ""); label.htmlFor = `knob-${k.name}`;
       const to = v => k.log ? Math.log(v / k.low) / Math.log(k.high / k.low) : (v - k.low) / (k.high - k.low);
       const from = p => k.log ? k.low * (k.high / k.low) ** p : k.low + p * (k.high - k.low);
-      // a browser that keeps fields over a reload gives these values to the next ones of the page: they are made later
-      Object.assign(slider, { type: "range", autocomplete: "off", id: label.htmlFor, min: 0, max: 1, step: k.whole ? 1 / (k.high - k.low) : .005 });
-      Object.assign(field, { type: "number", autocomplete: "off", id: `${label.htmlFor}-value`, step: "any" }); field.setAttribute("aria-label", label.textContent);
+      // a browser that keeps fields over a reload gives values of those without a name to the next ones of the page: these are made later
+      Object.assign(slider, { type: "range", id: label.htmlFor, name: label.htmlFor, min: 0, max: 1, step: k.whole ? 1 / (k.high - k.low) : .005 });
+      Object.assign(field, { type: "number", id: `${label.htmlFor}-value`, name: `${label.htmlFor}-value`, step: "any" }); field.setAttribute("aria-label", label.textContent);
       const show = () => {
         slider.value = to(values[k.name]); field.value = Number(values[k.name].toPrecision(5));
         slider.setAttribute("aria-valuetext", `${field.value} ${k.unit}`);
@@ -346,7 +346,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
   for (const id of ["tune-model", "tune-start"]) $(id).onchange = () => { notches = []; open(); };
   $("weights").replaceChildren(...WEIGHTS.map(([name, per]) => {
     const label = document.createElement("label"), field = document.createElement("input");
-    label.textContent = `${name}, ${per} `; Object.assign(field, { type: "number", autocomplete: "off", min: 0, step: "any", id: `weight-${name}`, placeholder: "usual" });
+    label.textContent = `${name}, ${per} `; Object.assign(field, { type: "number", min: 0, step: "any", id: `weight-${name}`, name: `weight-${name}`, placeholder: "usual" });
     field.onchange = () => { if (opened) { $("cost").classList.add("old"); judge(); } };
     label.append(field); return label;
   }));
