@@ -365,8 +365,12 @@ def test_a_recording_is_added_by_a_file_picker_and_by_a_drop(studio: Studio, bro
     assert "empty.csv: expected 1 byte to 512 MB, received an empty file. more.csv: " in said
     assert browser.find_element("id", "upload").get_attribute("aria-invalid") == "true"
     # of two drops the second waits for the first; a drop without files adds none
-    browser.execute_script(DROP, "third.csv", "t,u,y\n" + "0,1,2\n" * 30_000)
-    browser.execute_script(DROP, "fourth.csv", "t,u,y\n0,1,2\n0.1,1,2\n0.2,1,2\n")
+    second = DROP.replace("const ", "var ").replace("[1]", "[3]").replace("[0]", "[2]")
+    rows = "0,1,2\n0.1,1,2\n0.2,1,2\n"
+    browser.execute_script(
+        DROP.replace("const ", "var ") + second,
+        *("third.csv", "t,u,y\n" + "0,1,2\n" * 30_000, "fourth.csv", f"t,u,y\n{rows}"),
+    )
     until(lambda: "third.csv, fourth.csv are in" in browser.find_element("id", "uploaded").text)
     browser.find_element("id", "view-tune").click()
     browser.execute_script(
