@@ -240,7 +240,7 @@ def main() -> None:
 
 
 def identify(folder: Path, report: Report, step: Step) -> dict[str, Any]:
-    """A model from a recording, written to `model.json`."""
+    """A model from a recording, written to the step's file."""
     return Project(folder).identify(step, report, report.writing)
 
 
@@ -336,7 +336,9 @@ class Steps:
         if name == "bode":
             return self._bode(step, fields.get("reference") or None, fields.get("segment"))
         if name == "identify":
-            copies = self._copies(step, name)  # refuses wrong columns before the work starts
+            # both refuse before the work starts
+            self.project.place_for(step.model_file, MODEL_FORMAT, replace=step.replace)
+            copies = self._copies(step, name)
             return self.jobs.start(
                 "identified", name, step, finish=lambda found: {**found, **copies}
             )
@@ -380,7 +382,8 @@ class Steps:
             return self._search(tuning, name, values, fields)
         file = checked_name(fields.get("file"))
         if name == "tune_save":
-            self.project.save_controller(tuning, values, file)
+            replace = fields.get("replace", False)
+            self.project.save_controller(tuning, values, file, replace=replace)
         return {"python": tuning.python(values, file), "commands": tuning.commands(values, file)}
 
     def _search(

@@ -19,7 +19,6 @@ from sewfast.errors import SettingError, SewfastError, unwritable
 
 from .requests import (
     COMMISSIONED,
-    MODEL,
     Step,
     commands,
     envelope,
@@ -270,8 +269,8 @@ class Project:
             if models and (self.demo or self.first in models):
                 self.tuning(self.first if self.first in models else models[0])
 
-    def save_controller(self, tuning: Tuning, values: dict[str, Any], file: str) -> None:
-        """Write a controller into the folder; it replaces only another controller.
+    def place_for(self, file: str, format: str, *, replace: bool = False) -> Path:
+        """The path of a model or controller to write, a new file; with `replace` also that of one.
 
         Raises
         ------
@@ -279,9 +278,17 @@ class Project:
             For the name of another file.
         """
         path = self.folder / checked_name(file)
-        if path.is_symlink() or (path.exists() and file not in self.documents(CONTROLLER_FORMAT)):
-            raise SettingError(f"{file}: expected a new name or that of a controller; choose one")
-        tuning.controller(values).save(path)
+        taken = path.is_symlink() or path.exists()
+        if taken and not (replace and file in self.documents(format) and not path.is_symlink()):
+            raise SettingError(f"file: expected a new name, {file} is there already; choose one")
+        return path
+
+    def save_controller(
+        self, tuning: Tuning, values: dict[str, Any], file: str, *, replace: bool = False
+    ) -> None:
+        """Write a controller into the folder; see `place_for`."""
+        place = self.place_for(file, CONTROLLER_FORMAT, replace=replace)
+        tuning.controller(values).save(place)
 
     # --- Steps ------------------------------------------------------------------------------------
 
@@ -315,17 +322,19 @@ class Project:
         progress: Progress | None = None,
         writing: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> dict[str, Any]:
-        """A model from the recording, written to `model.json`."""
+        """A model from the recording, written to the step's file."""
         from sewfast.identification import identify
 
         require_writable(self.folder)
+        place = self.place_for(step.model_file, MODEL_FORMAT, replace=step.replace)
         data = self._read(step)
         model = identify(data, model=step.model, seed=step.seed, progress=progress)
         with writing():
-            model.save(self.folder / MODEL)
+            model.save(place)
         choice = model.training.get("choice", {})
         return {
             "text": str(model),
+            "file": step.model_file,
             "candidates": choice.get("candidates", []),
             "chosen": choice.get("chosen", model.kind),
             **self.validate(step),
@@ -337,9 +346,10 @@ class Project:
         from sewfast.models import load_model
         from sewfast.validation import validate
 
-        if not (self.folder / MODEL).is_file():
-            raise SettingError(f"expected {MODEL} in the project folder; identify a model first")
-        model, data = load_model(self.folder / MODEL), self._read(step)
+        if not self.documents(MODEL_FORMAT):
+            raise SettingError("expected a model in the project folder; identify one first")
+        model = load_model(self.document(step.model_file, MODEL_FORMAT))
+        data = self._read(step)
         found, card = validate(model, data), check(model, data)
         errors = found.experiments[0]
         pairs = (("measured", errors.y), ("free run", errors.simulated))

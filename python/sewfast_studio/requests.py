@@ -55,6 +55,10 @@ class Step:
         Samples by which the inputs were logged late.
     hold : bool
         Whether a missing input is the last known one.
+    model_file : str
+        The file that `identify` writes and `validate` reads.
+    replace : bool
+        Whether `identify` may replace a model of that name.
     """
 
     file: str
@@ -69,6 +73,8 @@ class Step:
     mask: tuple[str, ...] = ()
     shift: int = 0
     hold: bool = False
+    model_file: str = MODEL
+    replace: bool = False
 
     @classmethod
     def parse(cls, asked: dict[str, Any]) -> Step:
@@ -101,6 +107,7 @@ class Step:
             asked["file"], tuple(inputs), output or None, resample, model, seed, counts or None,
             asked.get("counts_per_rev"), asked.get("Ts"), tuple(re.split(r"[\s,;]+", mask.strip()))
             if mask.strip() else (), asked.get("shift") or 0, bool(asked.get("hold")),
+            asked.get("model_file") or MODEL, bool(asked.get("replace")),
         )  # fmt: skip
 
     def changed(self, data: Dataset) -> Dataset:
@@ -170,9 +177,9 @@ def script(
         lines += [f"response = {call}", f"response.save({RESPONSE!r})", "print(response)"]
     elif name == "identify":
         call = f"sewfast.identify(data, model={step.model!r}, seed={step.seed})"
-        lines += [f"model = {call}", f"model.save({MODEL!r})", "print(model)"]
+        lines += [f"model = {call}", f"model.save({step.model_file!r})", "print(model)"]
     else:
-        lines.append(f"model = sewfast.load_model({MODEL!r})")
+        lines.append(f"model = sewfast.load_model({step.model_file!r})")
         lines += ["print(sewfast.validate(model, data))", "print(sewfast.check(model, data))"]
     return "\n".join(lines) + "\n"
 
@@ -191,7 +198,9 @@ def commands(
     step: Step, name: str, columns: dict[str, Any], reference: str | None, segment: int | None
 ) -> str:
     """The same for a shell in the project folder."""
-    file = f"./{step.file}" if step.file.startswith("-") else step.file
+    file, model = (
+        f"./{name}" if name.startswith("-") else name for name in (step.file, step.model_file)
+    )
     options = [f"--input={c}" for c in columns["inputs"]]
     if "counts" in columns:
         options.append(f"--counts={columns['counts']}")
@@ -204,14 +213,14 @@ def commands(
     options += [f"--mask={span}" for span in step.mask] + ["--hold-inputs"] * step.hold
     if step.resample is not None:
         options.append(f"--resample={step.resample!r}")
-    kind = [f"--model={step.model.replace('_', '-')}", f"--seed={step.seed}", "-o", MODEL]
+    kind = [f"--model={step.model.replace('_', '-')}", f"--seed={step.seed}", "-o", model]
     more = [] if reference is None else [f"--reference={reference}"]
     more += [] if segment is None else [f"--segment={segment}"]
     rows = {
         "bode": [["bode", file, *options, *more, "-o", RESPONSE]],
         "look": [["look", file, *options]],
         "identify": [["identify", file, *options, *kind]],
-        "validate": [[c, MODEL, file, *options] for c in ("validate", "check")],
+        "validate": [[c, model, file, *options] for c in ("validate", "check")],
     }[name]
     return "".join(shlex.join(["sewfast", *row]) + "\n" for row in rows)
 

@@ -165,6 +165,8 @@ _STEP = {
     "hold": {"type": "boolean"},
     "model": NAME,
     "seed": {**SEED, "type": ["integer", "null"]},
+    "model_file": NAME,
+    "replace": {"type": "boolean"},
 }
 NUMBERS = {"type": "array", "items": {"type": "number"}, "maxItems": 3}
 WEIGHTS = (
@@ -230,7 +232,10 @@ _MESSAGES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "report": ({}, ()),
     "upload": ({"file": NAME, "size": {"type": "integer", "minimum": 0}}, ("file", "size")),
     "upload_end": ({}, ()),
-    "tune_save": ({**_TUNE, "file": NAME}, ("model", "values", "file")),
+    "tune_save": (
+        {**_TUNE, "file": NAME, "replace": {"type": "boolean"}},
+        ("model", "values", "file"),
+    ),
     "tune_copy": ({**_TUNE, "file": NAME}, ("model", "values", "file")),
     "ports": ({}, ()),
     "drive_connect": (

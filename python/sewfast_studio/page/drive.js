@@ -3,7 +3,7 @@ import { ask, on, mark } from "/server.js";
 import { teller } from "/tell.js";
 import { Chart } from "/curves.js";
 import { copies } from "/copies.js";
-import { titleOf } from "/tune.js";
+import { free, titleOf } from "/tune.js";
 
 const $ = id => document.getElementById(id);
 const LIMITS = ["volt", "speed_rpm", "acceleration", "current"], SAID = ["command", "V", "speed", "RPM", "acceleration", "RPM/s", "current", "A"], MOST_COLUMNS = 1200, PROMPT = 10;
@@ -33,7 +33,7 @@ on("stopped", m => {
 on("state", s => {
   writes = s.writes;
   fill($("run-controller"), s.controllers); fill($("signal"), s.excitations); fill($("reference"), s.references);
-  for (const [field, word] of [["record-file", "record"], ["run-file", "run"]]) if (s.recordings.includes($(field).value)) $(field).value = free(s.recordings, word);
+  for (const field of ["record-file", "run-file"]) free($(field), s.recordings);
   enable();
 });
 on("drive", m => {
@@ -158,7 +158,6 @@ document.addEventListener("keydown", event => {
   event.preventDefault(); pause();
 });
 
-function free(names, word) { let k = 1; while (names.includes(`${word}-${k}.mcap`)) k++; return `${word}-${k}.mcap`; }
 function fill(select, names) {
   const kept = select.value;
   select.replaceChildren(...names.map(name => new Option(titleOf(name), name)));

@@ -4,9 +4,10 @@ import { sentences, teller } from "/tell.js";
 import { copies } from "/copies.js";
 import { panels } from "/look.js";
 import { chosen, fill, open } from "/data.js";
+import { free, titleOf } from "/tune.js";
 
 const $ = id => document.getElementById(id);
-let writes = false, busy = false, tune = null, view = null, turn = 0;
+let writes = false, busy = false, tune = null, view = null, turn = 0, latest = "", identified = "";
 
 /** The step Tune, and the way to a step. */
 export function connect(tuning, viewing) { tune = tuning; view = viewing; }
@@ -15,10 +16,12 @@ function enable() {
   $("identify").disabled = busy || !writes; $("cancel").disabled = $("cancel").hidden = !busy || !writes; $("bar").hidden = !busy;
   $("model-what").textContent = $("file").value || "no recording";
 }
-const step = file => ({ ...chosen(), file, model: $("kind").value, seed: parseInt($("seed").value) || 0 });
+const step = (file, model_file) => ({ ...chosen(), file, model: $("kind").value, seed: parseInt($("seed").value) || 0, model_file });
 
 on("state", s => {
-  writes = s.writes; enable();
+  writes = s.writes; enable(); free($("model-file"), [...s.models, ...s.controllers, ...s.recordings]);
+  const of = s.models.includes(latest) ? latest : $("model-of").value;
+  fill($("model-of"), s.models.map(n => [n, titleOf(n)]), [of]); latest = "";
   if (!busy && !$("headline").textContent) mark("model", s.models.length ? `${s.models.length} in folder` : "none yet", s.models.length ? "good" : "");
 });
 document.addEventListener("recordings", ({ detail: names }) => {
@@ -26,14 +29,14 @@ document.addEventListener("recordings", ({ detail: names }) => {
   fill($("against"), names.map(n => [n, n]), [names.includes(kept) ? kept : other ?? names[0]]);
 });
 document.addEventListener("columns", () => { clear(); enable(); });
-$("against").onchange = clear;
+$("against").onchange = $("model-of").onchange = clear;
 
 /** A verdict on another recording, or of the model before, would pass for this one's. */
 function clear() { turn++; $("validated").hidden = true; for (const id of ["verdict", "free", "card", "validate-copy"]) $(id).replaceChildren(); }
 
 async function identify() {
   tell(null); $("identify").disabled = true;
-  try { await open(); await ask("identify", step($("file").value)); busy = true; $("progress").textContent = "starting"; } catch (error) { tell(error); }
+  try { await open(); await ask("identify", { ...step($("file").value, $("model-file").value), replace: "chosen" in $("model-file").dataset }); busy = true; $("progress").textContent = "starting"; } catch (error) { tell(error); }
   enable();
 }
 on("progress", p => {
@@ -45,7 +48,7 @@ on("identified", m => {
   busy = false; $("progress").textContent = ""; enable();
   if (m.error) { mark("model", "failed", "bad"); return tell(new Error(m.error)); }
   const f = m.found;
-  clear();
+  clear(); latest = identified = f.file;
   $("headline").textContent = `The free run explains ${f.fit.toFixed(1)} % of the training data (rms error ${`${f.rmse.toPrecision(4)} ${f.unit}`.trim()}).`;
   $("no-model-yet").hidden = true; $("identify").classList.remove("primary"); $("to-tune").hidden = false;
   panels($("fit"), shown(f)); candidates(f.candidates); $("modeltext").textContent = f.text; $("modeltext-fold").hidden = false; copies($("identify-copy"), f);
@@ -77,7 +80,7 @@ async function validate() {
   tell(null); $("validate").disabled = true;
   const mine = turn, file = $("against").value;
   try {
-    const f = await ask("validate", step(file));
+    const f = await ask("validate", step(file, $("model-of").value));
     if (mine !== turn) return;
     $("verdict").textContent = sentences(f.verdict); $("verdict").className = `chip ${f.grade}`; panels($("free"), shown(f));
     const lines = table(["question", "found", "limit", "verdict", "what it means"], f.lines.map(l => [l.name, l.shown, l.limit, chip(l.verdict, GRADES[l.verdict]), l.meaning]));
@@ -91,5 +94,5 @@ async function validate() {
 $("identify").onclick = identify; $("validate").onclick = validate;
 $("cancel").onclick = () => ask("cancel").catch(tell);
 $("to-model").onclick = () => { view("model"); if (!$("identify").disabled) identify(); };
-$("to-tune").onclick = () => { tune.choose("model.json"); view("tune"); };
+$("to-tune").onclick = () => { tune.choose(identified); view("tune"); };
 enable();

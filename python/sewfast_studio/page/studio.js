@@ -55,7 +55,7 @@ $("take").onclick = async () => {
   $("take").textContent = "Take over";
 };
 for (const v of VIEWS) $(`view-${v}`).onclick = () => view(v);
-$("to-deploy").onclick = () => { choose($("save-name").value); view("deploy"); };
+$("to-deploy").onclick = () => { choose(tune.saved()); view("deploy"); };
 $("verified").onclick = () => { choose("commissioned/controllers/tuned.json"); view("deploy"); };
 // a file that is dropped anywhere goes to the step Look
 addEventListener("drop", event => { if ($("data").hidden && event.dataTransfer.files.length) view("data"); }, { capture: true });

@@ -15,6 +15,14 @@ const NUMBERS = [ // name, title, unit
 /** A file of a commissioning by a name that fits into a field. */
 export const titleOf = name => name.replace(/^commissioned\/\w+\//, "commissioned: ");
 
+/** A name that no file has: the one of a field, or, where a person did not choose it, with the next number. */
+export function free(field, files) {
+  field.oninput = () => { field.dataset.chosen = "yes"; };
+  if (field.dataset.chosen) return;
+  const [, word, number, ending] = /^(.*?)(?:-(\d+))?(\.\w+)?$/.exec(field.value);
+  for (let k = Number(number ?? 1); files.includes(field.value);) field.value = `${word}-${++k}${ending}`;
+}
+
 /**
  * Brings the view to life: `root` holds its elements, `ask` and `on` reach the steps (server.js).
  * Returns how it is opened, its controller as a question has it, and how a notch is put in.
@@ -29,7 +37,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
     upset: new Chart($("upset-plot"), {}),
     sensitivity: new Chart($("sens-plot"), { x: "frequency [Hz]", y: "|S|, |T| [dB]", log: true, marks: [0], floor: -60 }),
   };
-  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, saving = false, notches = [], failed = "", front = [], before = null, judged = null, verdict = null, weighing = 0, sought = null, stored = null;
+  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, saving = false, notches = [], failed = "", front = [], before = null, judged = null, verdict = null, weighing = 0, sought = null, stored = null, storedAs = "";
 
   const question = more => ({ model: $("tune-model").value, controller: $("tune-start").value || null, values, notches, ...more });
   const given = pairs => Object.fromEntries(pairs.map(([name, id]) => [name, $(id).valueAsNumber]).filter(([, v]) => Number.isFinite(v)));
@@ -401,8 +409,8 @@ export function mount(root, { ask, on, mark = () => {} }) {
     const file = $("save-name").value, written = values;
     saving = true;
     try {
-      await ask("tune_save", question({ file })); $("saved").textContent = `Written: ${file}`;
-      stored = written;
+      await ask("tune_save", question({ file, replace: "chosen" in $("save-name").dataset })); $("saved").textContent = `Written: ${file}`;
+      stored = written; storedAs = file;
       // the start is this controller now, and has the notches that were put into it
       if (file === $("tune-start").value) { const same = values === written; notches = []; if (await open(values) && same) stored = values; }
       enable();
@@ -441,7 +449,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
     });
   });
   on("state", s => {
-    writes = s.writes; enable();
+    writes = s.writes; enable(); free($("save-name"), [...s.controllers, ...s.models, ...s.recordings]);
     fill($("tune-model"), s.models.map(n => [n, titleOf(n)]), s.first); fill($("tune-start"), [["", "computed from the model"], ...s.controllers.map(n => [n, titleOf(n)])], s.start ?? "");
     $("no-model").hidden = s.models.length > 0;
     const [model, start] = shown === null ? [] : JSON.parse(shown), gone = shown !== null && shown !== chosen();
@@ -461,5 +469,5 @@ export function mount(root, { ask, on, mark = () => {} }) {
   enable();
   /** Takes a model of the folder, as one that was just identified. */
   function choose(name) { if (listed("tune-model", name) && $("tune-model").value !== name) { $("tune-model").value = name; notches = []; open(); } }
-  return { choose, show: async () => { await (opened ? move() : opening || open()); }, question, addNotch, unit: () => opened ? opened.y_unit : "" };
+  return { choose, show: async () => { await (opened ? move() : opening || open()); }, question, addNotch, saved: () => storedAs, unit: () => opened ? opened.y_unit : "" };
 }

@@ -332,6 +332,27 @@ def test_a_cancelled_search_gives_its_best_so_far(tuned: Studio) -> None:
         assert "sewfast.tune(" not in page.ask("tune_copy", **asked)["found"]["python"]
 
 
+def test_a_file_is_replaced_only_where_a_page_asks_for_it(folder: Path, page: Page) -> None:
+    asked = {**STEP, "model": "oe"}
+    page.ask("identify", **asked)
+    assert page.event("identified")["found"]["file"] == "model.json"
+    page.hear(lambda m: m.get("event") == "state" and m["models"] == ["model.json"])
+    first = (folder / "model.json").read_bytes()
+    for more in ({}, {"replace": True, "model_file": "run.csv"}):
+        assert "error" in page.ask("identify", **asked, **more)
+    page.ask("identify", **asked, model_file="second.json")
+    assert "model='oe'" in page.event("identified")["found"]["python"]
+    said = page.ask("validate", **asked, model_file="second.json")["found"]
+    assert "load_model('second.json')" in said["python"]
+    assert "check second.json" in said["commands"]
+    assert (folder / "model.json").read_bytes() == first
+    tune = {"model": "second.json", "values": {}, "file": "controller.json"}
+    assert "found" in page.ask("tune_save", **tune)
+    assert "is there already" in page.ask("tune_save", **tune)["error"]
+    assert "found" in page.ask("tune_save", **tune, replace=True)
+    assert "error" in page.ask("tune_save", **{**tune, "file": "model.json"}, replace=True)
+
+
 def test_a_controller_file_is_a_start(tuned: Studio) -> None:
     with Page(tuned) as page:
         page.ask("tune_save", file="mine.json", **MOVE)

@@ -210,6 +210,9 @@ def test_what_is_shown_follows_its_files(tuned: Studio, browser: Any) -> None:
     at("tune-start").send_keys("controller.json")
     until(lambda: "start" in at("cost").text and not at("cost").get_attribute("class").count("old"))
     browser.execute_script(FOLDS)
+    assert at("save-name").get_attribute("value") == "controller-2.json"
+    at("save-name").clear()
+    at("save-name").send_keys("controller.json")  # only what a person has named is replaced
     at("notch-hz").send_keys("60")
     at("add-notch").click()
     until(lambda: len(notches()) == 1)
