@@ -54,6 +54,9 @@ RESULTS = (
 )  # fmt: skip
 """Events at the end of a step."""
 
+LONG = ("identify", "bode", "commission", "report", "tune_search", "tune_front")
+"""Messages that start a step whose end is an event; why it failed is told to their page alone."""
+
 BEAT = 0.1
 """Time between two heartbeats to the page in control [s]."""
 
@@ -136,6 +139,7 @@ class Studio:
         self._pages: set[Session] = set()
         self._connections: WeakSet[ServerConnection] = WeakSet()
         self._writer: Session | None = None
+        self._asker: Session | None = None
         self._since = 0.0
         self._uploads: dict[Session, Upload] = {}
         self._line = Line(project.folder, self._tell)
@@ -361,6 +365,8 @@ class Studio:
         if name.startswith("drive_"):
             return self._drive(page, name.removeprefix("drive_"), fields)
         found = self._steps.do(name, fields)
+        if name in LONG:
+            self._asker = page
         if name == "tune_save":
             self._tell_all()
         return found
@@ -451,14 +457,19 @@ class Studio:
             page.send(to_text({"event": "state", **state, **own}))
 
     def _tell(self, event: dict[str, Any]) -> None:
-        """Send an event to every page; after the result of a long step, also the state."""
+        """Send an event to every page; after the result of a long step, also the state.
+        The others than the page that asked for a step hear of a failure only that it has ended; if
+        that page is closed, or was loaded anew, all are told.
+        """
         with self._lock:
             pages = list(self._pages)
+        asker = self._asker if self._asker in pages and event["event"] != "driven" else None
+        others = to_text({"event": event["event"]}) if asker and "error" in event else None
         if event["event"] == "reported" and "found" in event:
             event["found"]["address"] = self._report
         text = to_text(event)
         for page in pages:
-            page.send(text)
+            page.send(text if others is None or page is asker else others)
         if event["event"] in RESULTS:
             self._tell_all()
 

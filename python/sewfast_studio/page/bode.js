@@ -39,7 +39,7 @@ on("state", s => { writes = s.writes; enable(); });
 on("progress", p => { if (p.of === "responded") { running(true); $("bode-state").textContent = p.best; } });
 on("responded", m => {
   running(false);
-  if (m.error) return tell(new Error(m.error));
+  if (!m.found) return m.error && tell(new Error(m.error));
   const f = m.found, c = Object.fromEntries(Object.entries(f.curves).map(([name, values]) => [name, values.map(v => v ?? NaN)]));
   response = f.response; notch = f.notch; $("bode-charts").hidden = false;
   charts.gain.axes.y = `gain [dB re 1 ${f.unit}]`;

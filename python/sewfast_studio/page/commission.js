@@ -6,7 +6,7 @@ import { copies } from "/copies.js";
 
 const $ = id => document.getElementById(id);
 const NAMES = { chirp_hi_lo: "chirp, fast to slow", chirp_lo_hi: "chirp, slow to fast" };
-let writes = false, busy = false, stages = [];
+let writes = false, busy = false, stages = [], grade = ["not yet"];
 
 const tell = teller(document, "commission-error");
 function enable() { $("commission-start").disabled = busy || !writes; $("commission-cancel").disabled = $("commission-cancel").hidden = !busy || !writes; $("commission-bar").hidden = !busy; }
@@ -43,7 +43,7 @@ function loops(references) {
   }
 }
 
-on("state", s => { writes = s.writes; enable(); if (!busy && !$("commission-verdict").textContent) mark("commission", "not yet"); });
+on("state", s => { writes = s.writes; enable(); if (!busy) mark("commission", ...grade); });
 on("progress", p => {
   if (!["commissioned", "driven"].includes(p.of)) return;
   busy = true; enable(); $("commission-bar").value = p.done / Math.max(p.total, 1);
@@ -53,11 +53,12 @@ on("progress", p => {
 });
 function ended(m) {
   busy = false; $("go").hidden = true; $("commission-start").hidden = false; enable();
-  if (m.error) { mark("commission", "not verified", "bad"); return tell(new Error(m.error)); }
+  if (m.error) { grade = ["not verified", "bad"]; tell(new Error(m.error)); }
+  if (!m.found) return mark("commission", ...grade);
   const f = m.found, cost = v => v === null ? "none" : v.toPrecision(4);
   const is = f.verdict.startsWith("verified"), unit = f.references[0]?.curves[0]?.unit ?? "";
   $("commission-verdict").textContent = `${sentences(upper(f.verdict))} Cost predicted ${cost(f.predicted_cost)} ${unit}, measured ${cost(f.measured_cost)} ${unit}`;
-  mark("commission", ...is ? ["verified", "good"] : ["not verified", "bad"]); next(is);
+  grade = is ? ["verified", "good"] : ["not verified", "bad"]; mark("commission", ...grade); next(is);
   loops(f.references);
   $("commission-text").textContent = f.text; $("commission-fold").hidden = false;
   copies($("commission-copy"), { ...f, ...(m.python ? m : {}) });

@@ -33,7 +33,7 @@ $("report").onclick = async () => {
   try { await ask("report"); $("report-state").textContent = "under way"; } catch (error) { failed(error); }
 };
 on("reported", m => {
-  if (m.error) return failed(new Error(m.error));
+  if (!m.found) return m.error && failed(new Error(m.error));
   $("report-state").textContent = `Written: ${m.found.file}`; $("report-link").href = m.found.address; next(true);
   copies($("report-copy"), m.found);
 });

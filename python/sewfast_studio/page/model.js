@@ -7,7 +7,7 @@ import { chosen, fill, open } from "/data.js";
 import { free, titleOf } from "/tune.js";
 
 const $ = id => document.getElementById(id);
-let writes = false, busy = false, tune = null, view = null, turn = 0, latest = "", identified = "";
+let writes = false, busy = false, tune = null, view = null, turn = 0, latest = "", identified = "", grade = null;
 
 /** The step Tune, and the way to a step. */
 export function connect(tuning, viewing) { tune = tuning; view = viewing; }
@@ -22,7 +22,7 @@ on("state", s => {
   writes = s.writes; enable(); free($("model-file"), [...s.models, ...s.controllers, ...s.recordings]);
   const of = s.models.includes(latest) ? latest : $("model-of").value;
   fill($("model-of"), s.models.map(n => [n, titleOf(n)]), [of]); latest = "";
-  if (!busy && !$("headline").textContent) mark("model", s.models.length ? `${s.models.length} in folder` : "none yet", s.models.length ? "good" : "");
+  if (!busy) mark("model", ...grade ?? [s.models.length ? `${s.models.length} in folder` : "none yet", s.models.length ? "good" : ""]);
 });
 document.addEventListener("recordings", ({ detail: names }) => {
   const kept = $("against").value, other = names.find(n => n !== $("file").value);
@@ -33,6 +33,9 @@ $("against").onchange = $("model-of").onchange = clear;
 
 /** A verdict on another recording, or of the model before, would pass for this one's. */
 function clear() { turn++; $("validated").hidden = true; for (const id of ["verdict", "free", "card", "validate-copy"]) $(id).replaceChildren(); }
+
+/** The mark of the step, until there is another one. */
+function graded(...said) { grade = said; mark("model", ...said); }
 
 async function identify() {
   tell(null); $("identify").disabled = true;
@@ -46,13 +49,14 @@ on("progress", p => {
 });
 on("identified", m => {
   busy = false; $("progress").textContent = ""; enable();
-  if (m.error) { mark("model", "failed", "bad"); return tell(new Error(m.error)); }
+  if (m.error) { graded("failed", "bad"); tell(new Error(m.error)); }
+  if (!m.found) return;  // another page asked, and is told why
   const f = m.found;
   clear(); latest = identified = f.file;
   $("headline").textContent = `The free run explains ${f.fit.toFixed(1)} % of the training data (rms error ${`${f.rmse.toPrecision(4)} ${f.unit}`.trim()}).`;
   $("no-model-yet").hidden = true; $("identify").classList.remove("primary"); $("to-tune").hidden = false;
   panels($("fit"), shown(f)); candidates(f.candidates); $("modeltext").textContent = f.text; $("modeltext-fold").hidden = false; copies($("identify-copy"), f);
-  mark("model", `fit ${f.fit.toFixed(1)} %`, f.grade);
+  graded(`fit ${f.fit.toFixed(1)} %`, f.grade);
 });
 
 /** The two curves, and below them what is left between them: a good model's lie on each other. */
@@ -86,7 +90,7 @@ async function validate() {
     const lines = table(["question", "found", "limit", "verdict", "what it means"], f.lines.map(l => [l.name, l.shown, l.limit, chip(l.verdict, GRADES[l.verdict]), l.meaning]));
     lines.className = "blocks"; lines.createCaption().textContent = `Report card on ${file}`;
     $("card").replaceChildren(lines); copies($("validate-copy"), f); $("validated").hidden = false;
-    mark("model", `fit ${f.fit.toFixed(1)} %`, f.grade);
+    graded(`fit ${f.fit.toFixed(1)} %`, f.grade);
   } catch (error) { if (mine === turn) tell(error); }
   finally { $("validate").disabled = false; }
 }

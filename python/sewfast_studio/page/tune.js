@@ -429,7 +429,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
   });
   on("searched", m => {
     busy = false; $("tune-progress").textContent = ""; enable();
-    if (m.error) return tell(new Error(m.error));
+    if (!m.found) return m.error && tell(new Error(m.error));  // another page is told why
     takeIt(m.found, m.found.values, () => {
       $("tune-progress").textContent = m.found.interrupted ? "Cancelled. These are the best gains so far." : `${m.found.ended === "time" ? "Time is up. " : ""}Found gains with cost ${m.found.cost.toPrecision(4)} ${opened.y_unit}, from ${m.found.start_cost.toPrecision(4)}.`;
       set(m.found.values); sought = values; enable();
@@ -437,7 +437,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
   });
   on("traded", m => {
     busy = false; $("tune-progress").textContent = ""; enable();
-    if (m.error) return tell(new Error(m.error));
+    if (!m.found) return m.error && tell(new Error(m.error));
     if (m.found.front.length) takeIt(m.found, m.found.front[0].values, () => {
       front = m.found.front; const most = front.length - 1;
       for (const id of ["front-response", "front-robust"]) $(id).max = most;

@@ -320,6 +320,19 @@ def test_copies_of_a_search_give_the_same_file(tuned: Studio, lead: int) -> None
     assert _run_copies(folder, said["python"], said["commands"]) == [written, written]
 
 
+def test_why_a_search_failed_is_told_to_the_page_that_asked(tuned: Studio) -> None:
+    impossible = {"evaluations": 10, "seed": 0, "constraints": {"u": 1e-6, "Ms": 1.01}}
+    with Page(tuned) as other, Page(tuned) as page:
+        page.ask("take")
+        page.ask("tune_search", **impossible, **MOVE)
+        assert page.event("searched")["error"]
+        assert other.hear(lambda m: m.get("event") == "searched") == {"event": "searched"}
+        # its page is gone by the end: then the others are told
+        page.ask("tune_search", **impossible, **MOVE)
+        page.socket.close()
+        assert other.hear(lambda m: m.get("event") == "searched")["error"]
+
+
 def test_a_cancelled_search_gives_its_best_so_far(tuned: Studio) -> None:
     with Page(tuned) as page:
         page.ask("tune_search", evaluations=20_000, seed=0, **MOVE)
