@@ -51,6 +51,9 @@ KEPT = 4
 GRADES = {"ok": "good", "info": "good", "warn": "warn", "fail": "bad"}
 """Chips of the page for the verdicts of a report card."""
 
+WARNS = "warning: "
+"""Before a note on what was left out or assumed, which a person has to see."""
+
 _ARTEFACTS = ("controllers", "models")
 """Subfolders of a commissioning with documents."""
 
@@ -436,7 +439,8 @@ def looked_at(data: Dataset) -> dict[str, Any]:
             (data.output_name, data.output_unit, experiment.y),
         ]
     ]
-    return {"text": str(summary), "advice": list(summary.advice), "curves": curves}
+    notes = [note.removeprefix(WARNS) for note in data.notes if note.startswith(WARNS)]
+    return {"text": str(summary), "advice": [*notes, *summary.advice], "curves": curves}
 
 
 def _files(place: Path) -> list[Path]:

@@ -39,7 +39,7 @@ on("state", s => {
     fill($("file"), s.recordings.map(n => [n, n]), [s.recordings.includes(before) ? before : s.first]);
     // a recording may be large, so it is opened only where its columns are asked for
     if ($("file").value !== before) { stale = true; if (!$("data").hidden) open(); }
-    $("what-to-look-at").textContent = s.recordings.length ? "Drop a file here, or choose one in the list. Then press Look." : "There is no recording in this folder. Drop a CSV, log, JSON, .mat, .npz, Parquet or MCAP file here.";
+    if (!s.recordings.length) asks("There is no recording in this folder. Drop a CSV, log, JSON, .mat, .npz, Parquet or MCAP file here.");
     mark("data", s.recordings.length === 1 ? "1 file" : `${s.recordings.length || "no"} files`);
     document.dispatchEvent(new CustomEvent("recordings", { detail: s.recordings }));
   }
@@ -53,7 +53,7 @@ export async function open() {
   const mine = ++turn;
   // what was found on another recording would pass for this one's
   for (const id of ["signals", "advice", "summary", "look-copy", "looked", "rows", "inputs", "output", "counts"]) $(id).replaceChildren();
-  $("summary-fold").hidden = $("rows-fold").hidden = true; $("no-look").hidden = false; next(false); mark("data", "not looked at");
+  $("summary-fold").hidden = $("rows-fold").hidden = true; $("no-look").hidden = false; next(false); mark("data", "not looked at"); asks("Drop a file here, or choose one in the list. Then press Look.");
   $("mask").value = $("shift").value = ""; $("hold").checked = false;
   try {
     const c = await send("columns", chosen()), names = c.names.map(n => [n, n]);
@@ -62,9 +62,12 @@ export async function open() {
     fill($("output"), [["", c.encoder ? "speed from counts" : "speed from the counts below"], ...names], [c.output ?? ""]);
     fill($("counts"), [["", c.encoder ? "counts" : "none"], ...names], [""]);
     rows(c);
+    if (!c.inputs.length) { asks("Its columns are not known by their names. Choose the input and the output, then press Look."); mark("data", "needs columns", "warn"); }
     document.dispatchEvent(new CustomEvent("columns"));
   } catch (error) { if (mine !== turn) return; tell(error); mark("data", "not read", "bad"); }
 }
+
+function asks(text) { $("what-to-look-at").textContent = text; }
 
 /** The first rows of a file, under names and units, so that a person sees which column is which. */
 function rows(c) {

@@ -463,6 +463,14 @@ def test_a_model_is_identified_and_validated(folder: Path, page: Page) -> None:
     assert len(checked["free_run"]) == 2
 
 
+def test_what_was_left_out_of_a_file_is_said(folder: Path, page: Page) -> None:
+    torn = folder / "torn.csv"
+    torn.write_text((folder / "run.csv").read_text(encoding="utf-8")[:-9], encoding="utf-8")
+    found = page.ask("look", **{**STEP, "file": "torn.csv"})["found"]
+    assert found["advice"][0]["text"].startswith("torn.csv: the last line is cut off")
+    assert not found["advice"][0]["idle"]
+
+
 def test_a_cancelled_search_writes_nothing(folder: Path, page: Page) -> None:
     page.ask("identify", **{**STEP, "model": "auto"})
     assert "a job that runs" in page.ask("identify", **STEP)["error"]

@@ -372,6 +372,9 @@ def test_a_recording_is_added_by_a_file_picker_and_by_a_drop(studio: Studio, bro
         *("third.csv", "t,u,y\n" + "0,1,2\n" * 30_000, "fourth.csv", f"t,u,y\n{rows}"),
     )
     until(lambda: "third.csv, fourth.csv are in" in browser.find_element("id", "uploaded").text)
+    # where nothing says which column is which, the page asks
+    browser.execute_script(DROP, "odd.csv", f"a,b,c\n{rows}")
+    until(lambda: "Choose the input" in browser.find_element("id", "what-to-look-at").text)
     browser.find_element("id", "view-tune").click()
     browser.execute_script(
         DROP.replace("data.items.add(new File([arguments[1]], arguments[0]));", "")
