@@ -25,7 +25,9 @@ document.addEventListener("mark", ({ detail: [step, word, kind = ""] }) => {
   chip.className = `chip ${kind}`;
 });
 
+/** Shows a step. A browser's Back and a reload lead to the one that was shown, without a fragment, as that is the token. */
 function view(name) {
+  if (history.state !== name) history[first ? "replaceState" : "pushState"](name, "");
   for (const v of VIEWS) { $(v).hidden = v !== name; $(`view-${v}`).setAttribute("aria-pressed", v === name); }
   scrollTo(0, 0);
   if (name === "data") bode.show();
@@ -41,11 +43,13 @@ on("state", s => {
   const others = s.pages > 1 ? `${s.pages} pages are open.` : "";
   $("control").textContent = s.writes ? "in control" : "looking on";
   notice(s.writes ? "" : `${lost ? "Another page has taken control. This page looks on." : "This page looks on."} ${others}`.trim(), true);
-  if (first && s.port) { $("port").value = s.port; view("drive"); }
+  if (first && VIEWS.includes(history.state)) view(history.state);
+  else if (first && s.port) { $("port").value = s.port; view("drive"); }
   else if (first && s.models.length && (s.demo || s.models.includes(s.first))) view("tune");
   else if (first) view("data");
   first = false;
 });
+addEventListener("popstate", ({ state }) => { if (VIEWS.includes(state)) view(state); });
 on("lost", () => { lost = true; });
 $("take").onclick = async () => {
   const held = await ask("take", { over });

@@ -201,6 +201,17 @@ def test_the_page_finds_its_state_again(tuned: Studio, browser: Any) -> None:
     browser.forward()
     until(lambda: browser.execute_script(NUMBER, "Ms"))
     assert browser.execute_script(fields) == before
+    # Back and a reload lead to the step that was shown
+    for view in ("model", "deploy"):
+        browser.find_element("id", f"view-{view}").click()
+    browser.back()
+    until(lambda: browser.find_element("id", "model").is_displayed())
+    browser.refresh()
+    until(lambda: browser.find_element("id", "model").is_displayed())
+    browser.back()
+    until(lambda: browser.find_element("id", "tune").is_displayed())
+    browser.forward()
+    until(lambda: browser.find_element("id", "model").is_displayed())
 
 
 def _take_pictures(
