@@ -171,7 +171,8 @@ class Project:
         """
         if name not in self.documents(format):
             raise SettingError(
-                f"{str(name)[:80]!r}: expected a file of format {format} in the project folder"
+                f"{str(name)[:80]!r}: expected a {format.removeprefix('sewfast.')} in the project "
+                "folder, it is not there; put it back, or choose another one"
             )
         return self.folder / str(name)
 
@@ -461,7 +462,7 @@ def _files(place: Path) -> list[Path]:
 def checked_name(file: Any) -> str:
     """The plain name of a controller to write, without a folder; others raise `SettingError`."""
     fits = isinstance(file, str) and re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,60}\.json", file)
-    require(bool(fits), "file", "a name such as controller.json", file)
+    require(bool(fits), "file", "a plain name that ends in .json", file)
     return str(file)
 
 

@@ -132,7 +132,7 @@ class Step:
         from sewfast.dataset import is_reference
 
         if not self.inputs:
-            raise SettingError(f"{self.file}: expected an input, received none; choose a column")
+            raise SettingError("inputs: expected a column, received none; choose one")
         columns: dict[str, Any] = {"inputs": list(self.inputs)}
         per_rev = self.counts_per_rev or table.counts_per_rev
         counts = self.counts or "counts"
@@ -145,7 +145,7 @@ class Step:
                 f"{self.file}: expected the encoder counts of one turn, received none; give them"
             )
         else:
-            raise DataError(f"{self.file}: expected an output, received none; choose a column")
+            raise DataError("output: expected a column, received none; choose one")
         if self.Ts is not None:
             columns["Ts"] = self.Ts
         used = {table.resolve(n) for n in (*self.inputs, self.output or counts)}

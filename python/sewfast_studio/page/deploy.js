@@ -1,10 +1,12 @@
 // The step Deploy: the report, and the commands that write a controller as code.
 import { ask, on, mark } from "/server.js";
 import { copies } from "/copies.js";
+import { teller } from "/tell.js";
 import { titleOf } from "/tune.js";
 
 const $ = id => document.getElementById(id);
-function failed(error) { $("report-error").textContent = error ? error.message : ""; $("report-error").hidden = !error; if (error) $("report-state").textContent = ""; }
+const tell = teller(document, "report-error");
+function failed(error) { tell(error); if (error) $("report-state").textContent = ""; }
 
 on("state", s => {
   $("report").disabled = !s.writes;

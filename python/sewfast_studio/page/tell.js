@@ -33,5 +33,6 @@ export function teller(root, id) {
     const label = field && field.closest("label")?.firstChild.textContent.trim();
     toast.textContent = error ? sentences(label && rest !== said ? `${label}: ${rest}` : said) : "";
     toast.hidden = !error || beside !== null;
+    if (!toast.hidden) toast.scrollIntoView({ block: "nearest" });  // the action stays in sight where the toast does not
   };
 }

@@ -384,7 +384,7 @@ export function mount(root, { ask, on, mark = () => {} }) {
     tell(null);
     const constraints = $("tune-within").checked ? given([["Ms", "limit-Ms"], ["overshoot", "limit-overshoot"], ["u", "limit-u"]]) : {};
     const seconds = $("tune-seconds").valueAsNumber, effort = { evaluations: $("evaluations").valueAsNumber, seed: $("tune-seed").valueAsNumber, seconds: seconds > 0 ? seconds : null };
-    try { await ask(what, question({ ...effort, weights: weights(), constraints })); busy = true; enable(); } catch (error) { tell(error); }
+    try { await ask(what, question({ ...effort, weights: weights(), constraints })); busy = true; $("tune-progress").textContent = "starting"; enable(); } catch (error) { tell(error); }
   }
   const untaken = new Map(), listed = (id, name) => [...$(id).options].some(o => o.value === name);
   let waiting = "";

@@ -386,6 +386,8 @@ def test_a_recording_is_added_by_a_file_picker_and_by_a_drop(studio: Studio, bro
     # where nothing says which column is which, the page asks
     browser.execute_script(DROP, "odd.csv", f"a,b,c\n{rows}")
     until(lambda: "Choose the input" in browser.find_element("id", "what-to-look-at").text)
+    browser.find_element("id", "look").click()
+    until(lambda: browser.find_element("id", "inputs").get_attribute("aria-invalid") == "true")
     browser.find_element("id", "view-tune").click()
     browser.execute_script(
         DROP.replace("data.items.add(new File([arguments[1]], arguments[0]));", "")
