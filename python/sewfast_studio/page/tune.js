@@ -345,7 +345,8 @@ export function mount(root, { ask, on, mark = () => {} }) {
 
   async function copied(button, which) {
     try {
-      const said = (await ask("tune_copy", question({ file: $("save-name").value })))[which], label = button.textContent;
+      const file = values === stored ? storedAs : $("save-name").value;  // what was saved is repeated under its name
+      const said = (await ask("tune_copy", question({ file })))[which], label = button.textContent;
       $("tune-copy").textContent = said; $("tune-copy").hidden = false;
       await navigator.clipboard.writeText(said).then(() => { button.textContent = "Copied"; setTimeout(() => { button.textContent = label; }, 1200); }, () => {});
     } catch (error) { tell(error); }
