@@ -181,7 +181,8 @@ _SUFFIX = {
     "mm": "mm", "Hz": "Hz", "rad_per_s": "rad/s", "deg_per_s": "deg/s", "m_s": "m/s",
     "mm_s": "mm/s", "m_per_s": "m/s", "mm_per_s": "mm/s", "mps": "m/s", "percent": "%", "pct": "%",
     "%": "%", "volt": "V", "volts": "V", "degC": "degC", "degc": "degC", "celsius": "degC",
-    "kelvin": "K",
+    "kelvin": "K", "bar": "bar", "mbar": "mbar", "kPa": "kPa", "hPa": "hPa", "psi": "psi",
+    "mNm": "mNm", "kW": "kW", "cm": "cm", "m3h": "m³/h", "m3_h": "m³/h", "l_min": "l/min",
 }  # fmt: skip
 _SUFFIXED = re.compile(rf"(.+)[_ ]({'|'.join(sorted(_SUFFIX, key=len, reverse=True))})")
 _SPEED_SUFFIX = re.compile(rf"(.+?)[_ ]({'|'.join(map(re.escape, sorted(SPEEDS, key=len)))})")

@@ -131,6 +131,9 @@ def table(tmp_path: Path, *names: str) -> api.readers.Table:
         (("fan (%)", "duct (Pa)"), ("fan", "duct")),
         (("Pumpe [%]", "Niveau [cm]"), ("Pumpe", "Niveau")),
         (("duty_%", "flow in m³/h"), ("duty_%", "flow in m³/h")),
+        (("thrust_pct", "altitude_m"), ("thrust_pct", "altitude_m")),
+        (("setpoint_C", "heating_kW", "room_C"), ("heating_kW", "room_C")),
+        (("torque_mNm", "current_A", "speed"), ("current_A", "speed")),
     ],
 )
 def test_columns_are_recognised_or_left_open(
@@ -138,6 +141,28 @@ def test_columns_are_recognised_or_left_open(
 ) -> None:
     found = roles(table(tmp_path, *names))
     assert (None if found is None else (found.input, found.output)) == expected
+
+
+@pytest.mark.parametrize("levels", [2, 1000])
+def test_of_two_columns_in_doubt_the_one_that_steps_is_the_command(
+    tmp_path: Path, levels: int
+) -> None:
+    rng = np.random.default_rng(levels)
+    steps = np.repeat(rng.integers(levels, size=30), 20) / (levels - 1)
+    noisy = np.cumsum(steps - 0.3) + rng.normal(size=600)
+    coarse = np.round(np.cumsum(steps - 0.3))  # a sensor, which keeps its value, too
+    for answer in (noisy, coarse):
+        for names in (("current_A", "voltage_V"), ("feed", "mass"), ("a", "b")):
+            columns = {"t": 0.1 * np.arange(600), names[1]: answer, names[0]: steps}
+            api.write_table(tmp_path / "x.csv", columns)
+            found = roles(read_table(tmp_path / "x.csv"))
+            assert found is not None
+            assert (found.input, found.output) == names
+    # names that are clear count, whatever the values look like
+    api.write_table(tmp_path / "x.csv", {"voltage": noisy, "speed": steps})
+    found = roles(read_table(tmp_path / "x.csv"))
+    assert found is not None
+    assert found.input == "voltage"
 
 
 @pytest.mark.parametrize(
@@ -233,6 +258,7 @@ def test_a_column_that_never_changes_is_neither(tmp_path: Path) -> None:
         ("phase_A", ""), ("rpm", ""), ("i_a", ""), ("pos_m", ""), ("speed", ""), ("", ""),
         ("temp_C", "degC"), ("T_K", "K"), ("speed_rad/s", "rad/s"), ("phase_C", ""),
         ("vel_m_s", "m/s"), ("omega_rad_per_s", "rad/s"), ("pwm_percent", "%"), ("ao_volts", "V"),
+        ("pressure_bar", "bar"), ("heating_kW", "kW"), ("flow_m3h", "m³/h"), ("level_cm", "cm"),
     ],
 )  # fmt: skip
 def test_units_in_names(name: str, unit: str) -> None:
@@ -262,8 +288,8 @@ def test_names_may_hold_a_delimiter_that_the_numbers_do_not(tmp_path: Path) -> N
 
 
 def test_in_doubt_it_asks(tmp_path: Path) -> None:
-    stranger(tmp_path / "bench.csv", "time_ms;a;b")
-    said = refused(tmp_path, "identify", "bench.csv")
+    table(tmp_path, "a", "b")
+    said = refused(tmp_path, "identify", "x.csv")
     assert "expected columns that show which is the input" in said
     assert "--input COL" in said
 
@@ -290,8 +316,8 @@ def test_look_draws_columns_that_need_no_names(tmp_path: Path) -> None:
     stranger(tmp_path / "bench.csv", "time_ms;voltage_V;speed_rpm")
     assert "input voltage" in sewfast(tmp_path, "look", "bench.csv", "--plot", "a.png").err
     assert (tmp_path / "a.png").stat().st_size > 0
-    stranger(tmp_path / "bench.csv", "time_ms;a;b")
-    said = refused(tmp_path, "look", "bench.csv", "--plot", "b.png")
+    table(tmp_path, "a", "b")
+    said = refused(tmp_path, "look", "x.csv", "--plot", "b.png")
     assert "which column is the input" in said
 
 
@@ -352,8 +378,8 @@ def test_init_takes_the_columns_of_a_recording_and_keeps_what_is_there(tmp_path:
 def test_init_refuses_a_file_and_columns_in_doubt(tmp_path: Path) -> None:
     (tmp_path / "f").touch()
     assert "expected a folder" in refused(tmp_path, "init", "f")
-    stranger(tmp_path / "bench.csv", "time_ms;a;b")
-    assert "leave --recording out" in refused(tmp_path, "init", "--recording", "bench.csv")
+    table(tmp_path, "a", "b")
+    assert "leave --recording out" in refused(tmp_path, "init", "--recording", "x.csv")
 
 
 # --- sewfast.toml ---------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..arrays import FloatArray
 from ..dataset import is_reference
 from ..errors import DataError
 from ..units import SPEEDS, unit_in_name
@@ -37,11 +38,16 @@ _INPUTS = (
         ("v", "mv", "volt", "volts"),
     ),
     _sort("i curr current strom amp amps courant", ("a", "ma", "amp", "ampere", "amps")),
+    _sort(
+        "torque moment drehmoment force kraft power leistung heating feed feeder frequency "
+        "frequenz",
+        ("nm", "mnm", "w", "kw", "hz"),
+    ),
 )
 _OUTPUTS = (
     _sort(
         "y out output speed rpm velocity vel omega drehzahl geschwindigkeit vitesse tacho tach "
-        "position pos angle theta winkel weg istwert velocidad velocità",
+        "position pos angle theta winkel weg altitude height höhe hoehe istwert velocidad velocità",
         (*SPEEDS, "rad", "deg", "°", "rev", "m", "cm", "mm"),
     ),
     _sort(
@@ -73,7 +79,7 @@ _QUALIFIERS = frozenset(
     re.split(
         " ",
         "motor shaft actual act ist meas measured measurement gemessen signal value wert cycle "
-        "percent pct raw filt filtered",
+        "percent pct raw filt filtered m n w c k",
     )
 )
 """Words without meaning for the role of a column."""
@@ -102,9 +108,11 @@ def roles(
 ) -> Roles | None:
     """Input and output of a table; None if its names and units leave any doubt.
     Named columns keep their role; time, references, row numbers, supplies and constant columns have
-    none. `u` and `y` come first, then a voltage or command (else a current) as input, a speed or
-    position (else temperature, level, pressure, flow) as output; name and unit together beat one
-    alone. The last column takes the last role. Stated counts per turn make `counts` the output.
+    none. `u` and `y` come first, then a voltage or command (else a current, else a torque or power)
+    as input, a speed or position (else temperature, level, pressure, flow) as output; name and unit
+    together beat one alone. The last column takes the last role. Of two columns that names alone
+    do not tell apart, the one that is held and steps is the input. Stated counts per turn make
+    `counts` the output.
     """
     time = time_column(table) if time is None else table.resolve(time)
     named = [table.resolve(name) for name in (*inputs, output, counts) if name is not None]
@@ -124,6 +132,11 @@ def roles(
     known = None if output is None else table.resolve(output)
     found = known or _only(left, "y") or _first(table, left, _OUTPUTS)
     rest = [name for name in left if name not in (given, found)]
+    if len(left) == 2 and not named and (given is None or found is None or given == found):
+        commands = [name for name in left if is_stepped(table[name])]
+        if len(commands) == 1:
+            left.remove(commands[0])
+            return Roles(commands[0], left[0])
     if len(rest) == 1 and (given is None) != (found is None):
         given, found = given or rest[0], found or rest[0]
     return None if given is None or found is None or given == found else Roles(given, found)
@@ -152,6 +165,16 @@ def recognised(
 def _moves(table: Table, name: str) -> bool:
     known = table[name][np.isfinite(table[name])]
     return len(known) > 0 and bool(known.min() < known.max())
+
+
+def is_stepped(values: FloatArray) -> bool:
+    """Whether a column is held and steps, as a command does: it mostly keeps its value, and moves
+    by more than a coarse sensor would.
+    """
+    known = values[np.isfinite(values)]
+    moves = np.abs(np.diff(known))
+    moves = moves[moves > 0.0]
+    return 0 < 2 * len(moves) < len(known) and bool(np.median(moves) > 0.05 * np.ptp(known))
 
 
 def _stem(name: str) -> str:
