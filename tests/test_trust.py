@@ -70,6 +70,17 @@ def test_a_swing_that_dies_away_is_no_limit_cycle() -> None:
         assert seen.lasts == lasts
 
 
+def test_noise_about_zero_makes_no_limit_cycle_of_a_decay() -> None:
+    t = 0.02 * np.arange(520)
+    r = np.full(len(t), -450.0)
+    noise = np.random.default_rng(0).normal(size=len(t))
+    for decay, lasts in ((2.5, False), (1e9, True)):
+        wave = np.cos(2 * np.pi * (0.3 if decay < 10 else 1.0) * t) * np.exp(-t / decay)
+        seen = oscillation(loop(r + 300 * wave, 12 * wave + 0.5 * noise, r))
+        assert seen is not None
+        assert seen.lasts == lasts
+
+
 def test_what_repeats_with_the_shafts_turn_is_forced() -> None:
     """60 RPM is a turn a second, a load of four a turn 4 Hz."""
     t = 0.001 * np.arange(10_000)

@@ -118,7 +118,7 @@ class Oscillation:
     level : float
         The constant reference [y].
     hertz : float
-        Mean frequency, from crossings of the mean.
+        Mean frequency, from swings beyond half of the rms to either side.
     lasts : bool
         At least `LEAST_PERIODS`, and not dying away.
     """
@@ -168,15 +168,21 @@ def _oscillation_of(run: ClosedLoopRun, part: slice) -> Oscillation:
     command, output = _rms(u), _rms(y)
     swing = command / max(_half_range(run), 1e-300)
     ripple = output / max(float(np.abs(run.r).max()), 1e-300)
-    main = u if swing >= ripple else y
-    periods = 0.5 * np.count_nonzero(np.diff(np.signbit(main)))
+    usual = Limits()
+    # by its usual limit: noise in the command hides that an output settles
+    main = u if swing * usual.ripple >= ripple * usual.swing else y
+    periods = _periods(main)
     half = len(main) // 2
     # least rms of the second half relative to the first for an oscillation that does not decay
     lasts = periods >= LEAST_PERIODS and _rms(main[half:]) >= 0.5 * _rms(main[:half])
     hertz = periods / (len(main) * run.Ts)
-    return Oscillation(
-        command, output, swing, ripple, float(run.r[part][0]), float(hertz), bool(lasts)
-    )
+    return Oscillation(command, output, swing, ripple, float(run.r[part][0]), hertz, lasts)
+
+
+def _periods(values: FloatArray) -> float:
+    """Periods of an oscillation. Only swings of some size count: noise about zero is none."""
+    swings = values[np.abs(values) > 0.5 * _rms(values)]
+    return 0.5 * float(np.count_nonzero(np.diff(np.signbit(swings))))
 
 
 def _forced(run: ClosedLoopRun, part: slice) -> FloatArray:
