@@ -13,7 +13,7 @@ import pytest
 from cli import called as command
 from loops import QUIET, drive
 from sewfast import Ensemble, VirtualMachine, identify, paper_controller, run, signals, tune
-from sewfast.control import Gains
+from sewfast.control import Controller, Gains
 from sewfast.control.loop import ClosedLoopRun
 from sewfast.dataset import Dataset
 from sewfast.errors import FitError, SettingError
@@ -223,3 +223,17 @@ def test_a_run_on_the_command_line_tells_its_warnings(tmp_path: Path) -> None:
     assert "warning" not in command(tmp_path, "run", "quiet.json", *common).out
     told = command(tmp_path, "run", "paper.json", *common, "--json").json()
     assert "limit cycle" in [line["name"] for line in told["warnings"]]
+
+
+def test_a_loop_around_an_unstable_plant_is_located_by_its_output() -> None:
+    """Its command alone takes the model anywhere."""
+    rng = np.random.default_rng(0)
+    u, y, r = np.zeros(2000), np.zeros(2000), np.repeat(rng.uniform(-1.0, 1.0, 40), 50)
+    for k in range(1, 2000):
+        y[k] = 1.03 * y[k - 1] + 0.1 * u[k - 1] + 1e-3 * rng.normal()
+        u[k] = 3.0 * (r[k] - y[k]) + 0.3 * rng.normal()
+    model = identify(Dataset.from_arrays(u, y, 0.01), model="arx", na=1, nb=1)
+    assert abs(model.poles[0]) > 1.02
+    controller = Controller(Gains.standard(3.0, 1.0, u_unit="", y_unit=""), Ts=0.01)
+    found = judge(run(controller, model, 0.8 * r), model).line("training region")
+    assert found.verdict == "ok"

@@ -582,8 +582,9 @@ def _outside(found: ClosedLoopRun, model: Model | None) -> tuple[float, float]:
     if model is None or not len(found.u):
         return math.nan, math.nan
     check_fits(found.controller, model)
+    # the response to the command; of an unstable model as long as it stays with the output
     data = Dataset.from_arrays(
-        bridged(found.u), None, model.Ts,
+        bridged(found.u), bridged(found.y), model.Ts,
         input_names=model.input_names, input_units=model.input_units,
         output_name=model.output_name, output_unit=model.output_unit, name=found.reference,
     )  # fmt: skip

@@ -1,4 +1,6 @@
-"""The training region: the signals of a model's free run on its training data.
+"""The training region: the signals of a model's free run on its training data. The run
+of an unstable model begins anew whenever it has doubled (`scored_runs`): its plant was held in a
+loop.
 
 A model is judged by the input and output of its free run, so that one measure serves every kind,
 including ensembles. A sample lies outside if any of three distances exceeds 1:
@@ -39,6 +41,7 @@ import numpy as np
 
 from ..dataset import Dataset, FloatArray
 from ..dynamic_model import INIT, DynamicModel
+from ..validation import scored_runs
 
 Signals: TypeAlias = tuple[FloatArray, FloatArray]
 """Inputs (N, nu) and output (N,) of one run."""
@@ -272,7 +275,7 @@ def region_runs(
 
 
 def _runs(model: DynamicModel, data: Dataset, init: int) -> list[Signals]:
-    simulated = model.simulate(data, init=init)
+    simulated = scored_runs(model, data, init)
     return [(e.u, yhat) for e, yhat in zip(data.experiments, simulated, strict=True)]
 
 
