@@ -12,7 +12,7 @@ import pytest
 import result_folder
 from cli import called as command
 from loops import QUIET, drive
-from sewfast import Cost, Ensemble, VirtualMachine, _core, identify, run
+from sewfast import Cost, Ensemble, VirtualMachine, _core, identify, run, tune
 from sewfast.analysis import Analysis, analyse, changes, run_under_load
 from sewfast.control import Controller, Gains
 from sewfast.control.systems import LinearLoop, response, simulate
@@ -387,6 +387,22 @@ def test_steps_suit_the_recorded_range(low: float, high: float, level: float, st
     found = analyse(QUIET, recorded(low, high), references=["trapezoid"], threads=1)
     tracked = found.responses[0]
     assert (tracked.level, tracked.size) == (level, pytest.approx(step))
+
+
+def test_a_loop_is_judged_on_what_it_was_tuned_for() -> None:
+    """Not on a jump from rest to the level of the steps; nor where noise alone has been."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 60), 60)
+    y = np.zeros(len(u))
+    for k in range(1, len(u)):
+        y[k] = y[k - 1] + 0.02 / 0.8 * (2.0 * u[k - 1] - y[k - 1])
+    record = Dataset.from_arrays(u, y + 1.0 * rng.normal(size=len(u)), 0.02)
+    model = identify(record, model="oe")
+    found = analyse(tune(model, evaluations=300, threads=1).pid, model, threads=1)
+    assert abs(found.responses[0].level) < 1.1
+    assert found.judgement is not None
+    assert found.judgement.line("saturation").verdict == "ok"
+    assert found.judgement.line("training region").verdict == "ok"
 
 
 @pytest.mark.parametrize(("share", "verdict"), [(1.0, "ok"), (6.0, "warn"), (30.0, "fail")])

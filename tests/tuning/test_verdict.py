@@ -15,7 +15,7 @@ from loops import QUIET
 from sewfast import _core, pareto, signals
 from sewfast.control import Controller, Gains
 from sewfast.control.loop import run
-from sewfast.control.margins import margins, operating_point
+from sewfast.control.margins import levels_over, margins, operating_point
 from sewfast.errors import FitError, SettingError
 from sewfast.machine import VirtualMachine
 from sewfast.models import Ensemble, LinearOE, Model
@@ -98,7 +98,8 @@ def test_gains_above_the_limit_are_kept_and_said_if_there_are_no_others(
         gains = Gains.standard(0.5, 0.2, u_unit="V", y_unit=model.output_unit)
         start = Controller(gains, Ts=model.Ts, u_min=-20, u_max=20)
     r = level * np.repeat([0.0, 1.0, 2.0], 150)
-    worst = {lv: margins(start, model, speed=lv).Ms for lv in (level, 0.5 * level)}
+    levels = levels_over(0.0, 2.0 * level, 0.0)
+    worst = {lv: margins(start, model, speed=lv).Ms for lv in levels}
     at_limit = with_ms_of(LARGEST_MS, model, max(worst, key=lambda lv: worst[lv]), start)
     start = replace(at_limit, gains=replace(at_limit.gains, Kp=share * at_limit.gains.Kp))
     plant = model if not kind.startswith("ensemble") else Ensemble.of([model, model], "mean")
@@ -119,8 +120,8 @@ def test_ms_is_taken_on_both_sides_and_at_every_point() -> None:
     r = 5.0 * np.repeat([0.0, 1.0, 0.0, -1.0], 100)
     gains = Gains.standard(1.0, 0.05, u_unit="V", y_unit=model.output_unit)
     base = Controller(gains, Ts=model.Ts, u_min=-20, u_max=20)
-    lively = with_ms_of(2.4, model, 2.5, base)
-    assert "about 2.5 " in (tune(model, [r], start=lively, **FIXED).warning or "")
+    lively = with_ms_of(2.4, model, 4.5, base)
+    assert "about 4.5 " in (tune(model, [r], start=lively, **FIXED).warning or "")
     # a schedule that is lively only where the references do not stay
     quiet, hot = QUIET.gains, with_ms_of(2.5, drive(), 0.0, QUIET).gains
     scheduled = replace(QUIET, schedule=((100.0, hot), (1000.0, quiet)))
@@ -305,5 +306,5 @@ def test_levels_of_both_directions_leave_out_the_standstill() -> None:
         drive(), [np.array([-1000.0, 1500.0])], start=QUIET, first={}, cost=None,
         aggregate="mean", constraints=None, variations=None,
     )  # fmt: skip
-    assert _levels(task) == [750.0, -500.0]
-    assert _levels(replace(task, references=[np.array([400.0, 1000.0])])) == [700.0, 500.0, 200.0]
+    assert _levels(task) == [-500.0, 750.0, 1350.0]
+    assert _levels(replace(task, references=[np.array([400.0, 1000.0])])) == [460.0, 700.0, 940.0]

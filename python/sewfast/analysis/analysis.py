@@ -15,7 +15,7 @@ import numpy as np
 from .. import storage
 from ..arrays import in_unit
 from ..control.controller import Controller
-from ..control.defaults import catalogue_fits
+from ..control.defaults import default_references
 from ..control.loop import (
     Plants,
     References,
@@ -248,8 +248,8 @@ def analyse(
         Duration of the steps; by default five times the slowest closed-loop pole's time
         constant.
     references : str, array of shape (N,), or sequence of them, optional
-        References for the cost; by default `REFERENCES` if these suit the first plant (RPM
-        at 1 ms, its recorded range), else the reference step.
+        References for the cost and the guards; by default `REFERENCES`, over the first plant's own
+        range if the catalogue does not suit it, as in `tune`.
     cost : Cost, optional
         As for `sewfast.tune`.
     changes : sequence of Change, optional
@@ -332,10 +332,12 @@ def slowest_time(controller: Controller, row: Sequence[PlantPoint]) -> float:
 
 
 def _default_references(controller: Controller, plant: Any, steps: Steps) -> Sequence[Any]:
-    if catalogue_fits(plant, controller.u_min, controller.u_max, controller.gains.y_unit):
-        return REFERENCES
-    n = steps.samples
-    return [np.concatenate([np.full(n, steps.level), np.full(n, steps.level + steps.step)])]
+    """Those of `tune`, so that both judge the same loop; the steps for a plant without any."""
+    try:
+        return default_references(plant, controller, REFERENCES)
+    except (FitError, SettingError):
+        n = steps.samples
+        return [np.concatenate([np.full(n, steps.level), np.full(n, steps.level + steps.step)])]
 
 
 def _responses(

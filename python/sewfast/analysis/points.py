@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..control.controller import Controller
 from ..control.defaults import recorded_outputs
 from ..control.loop import Plant
-from ..control.margins import Margins, loop_response, margins, operating_point
+from ..control.margins import Margins, levels_over, loop_response, margins, operating_point
 from ..dataset import FloatArray
 from ..errors import SettingError
 from ..evidence.operating import OperatingPoint, operating_range
@@ -23,10 +23,6 @@ from ..models.conversion import StateSpace
 from ..models.linear import LinearDifference
 
 # --- PlantPoint: a plant as a linear system at a steady output ------------------------------------
-
-
-SHARES = (0.1, 0.5, 0.9)
-"""Positions within the outputs near the training data at which plants are linearised."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,24 +110,19 @@ def _speeds(plants: Sequence[Plant]) -> list[float]:
     first = next((p for p in plants if isinstance(p, Model)), None)
     if first is None:
         return [300.0, 1000.0, 2000.0]
-    low, high = first.training.get("output_range", (0.0, 0.0))
-    shares: Sequence[float] = SHARES
-    if isinstance(first, LinearDifference) or not first.training.get("input_range"):
-        shares = (0.5,)
-    else:
-        near = operating_range(first).points
-        known = [p.y for p in near if p.known and p.settled and not p.saturated]
-        low, high = (min(known), max(known)) if known else (low, high)
-        shares = SHARES if known else (0.5,)
+    # of the record only what the model holds: its ends may be noise
+    near = operating_range(first).points if first.training.get("input_range") else ()
+    known = [p.y for p in near if p.known and p.settled and not p.saturated]
+    low, high = first.training.get("output_range") or (
+        min(known, default=0.0),
+        max(known, default=0.0),
+    )
+    if known and min(known) < high and max(known) > low:
+        low, high = max(low, min(known)), min(high, max(known))
     rest = first.rest.y
-    ways = sorted((end - rest for end in (low, high)), key=abs)
-    # least way in one direction as a share of that in the other, as of references over both
-    if ways[0] * ways[1] < 0.0 and abs(ways[0]) > 0.25 * abs(ways[1]):
-        # a motor in the middle of both directions stands in its dry friction
-        levels = [rest + share * ways[1] for share in shares[-2:]]
-        levels = [rest + 0.5 * ways[0], *levels] if len(shares) > 1 else levels
-    else:
-        levels = [low + share * (high - low) for share in shares]
+    levels = levels_over(low, high, rest)
+    if not known or isinstance(first, LinearDifference):
+        levels = levels[1:2]
     # two digits of the way from rest are enough for a default
     return [rest + float(f"{level - rest:.2g}") for level in levels]
 

@@ -138,7 +138,7 @@ SEARCH_OPTIONS = """\
 --cost NAME=WEIGHT  text...  weight of a term; may repeat
 --constraint NAME=LIMIT  text...  limit of Ms (1.8; inf: none), overshoot [%%], u, recovery [ms] or
     load; may repeat
---speed Y  float  output about which models are linearised for Ms (half way from rest to the ends of
+--speed Y  float  output about which models are linearised for Ms (a tenth, half and nine tenths of
     the references)
 --load LEVEL:COMMAND  text...  a load step: the level held and the command added after the limiter,
     as in 1500:-2; may repeat

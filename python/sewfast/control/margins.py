@@ -31,6 +31,18 @@ _HALVINGS = 20
 """Bisections of the interval in which it lies."""
 
 
+def levels_over(low: float, high: float, rest: float) -> list[float]:
+    """The outputs about which nonlinear models are linearised over a range: a tenth, half and nine
+    tenths of it. In a range to both sides of rest half way to its nearer end, half and nine tenths
+    of the way to the farther: about rest a motor stands in its dry friction.
+    """
+    near, far = sorted((end - rest for end in (low, high)), key=abs)
+    # least way in one direction as a share of that in the other, as of references over both
+    if near * far < 0.0 and abs(near) > 0.25 * abs(far):
+        return [rest + 0.5 * near, rest + 0.5 * far, rest + 0.9 * far]
+    return [low + share * (high - low) for share in (0.1, 0.5, 0.9)]
+
+
 def sampled(plant: Any, Ts: float, speed: float | None = None) -> tuple[FloatArray, FloatArray]:
     """Numerator and denominator in powers of z^-1, shapes (m,) and (n + 1,). `plant` is an Fopdt, a
     model, an OperatingPoint, or a system of python-control or scipy.signal; a continuous one is

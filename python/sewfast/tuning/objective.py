@@ -163,8 +163,8 @@ class Constraints:
         one of these counts with its bands: Ms is the largest that they allow. By default the models
         used for tuning.
     speed : float, optional
-        Output at which nonlinear models are linearised [y]; by default half way from rest to the
-        ends of the references.
+        Output at which nonlinear models are linearised [y]; by default at a tenth,
+        half and nine tenths of the references.
 
     Raises
     ------

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from ..control.controller import Controller, SampledController
-from ..control.margins import margins, operating_point, sampled
+from ..control.margins import levels_over, margins, operating_point, sampled
 from ..errors import FitError, SettingError
 from ..models import Model
 from .objective import LARGEST_MS
@@ -70,8 +70,8 @@ class LinearLoops:
 
 def linear_loops(task: TuningTask, time: Budget) -> LinearLoops:
     """The linear plants of a task, from the plants of its constraints or else its models. A
-    nonlinear model is linearised half way from rest to the ends of the references; with a gain
-    schedule also at its points; with a speed in the constraints only there. Levels at which a model
+    nonlinear model is linearised at three outputs over the references; with a gain schedule also
+    at its points; with a speed in the constraints only there. Levels at which a model
     has no stable steady state are left out: the plant stands there, one network of many does not.
     """
     controller, given = task.start, task.constraints.plant
@@ -134,14 +134,12 @@ def _of(
 
 
 def _levels(task: TuningTask) -> list[float]:
-    """Half way from rest to the ends of the references [y]; their middle, too, unless rest is among
-    them: about rest a motor stands in its dry friction, and a loop there tells nothing.
+    """As `analyse` has them, over the references: a loop that is calm in their middle may be close
+    to instability at an end, where the gain of a pump or a valve is another.
     """
     low = min(float(r.min()) for r in task.references)
     high = max(float(r.max()) for r in task.references)
-    rest = task.rest.y
-    halves = [rest + 0.5 * (end - rest) for end in (high, low) if end != rest]
-    return halves if low <= rest <= high else list(dict.fromkeys([0.5 * (low + high), *halves]))
+    return list(dict.fromkeys(levels_over(low, high, task.rest.y)))
 
 
 def within_default(task: TuningTask) -> Iterator[TuningTask]:
