@@ -329,3 +329,20 @@ def test_an_axis_at_rest_is_at_home_wherever_it_has_been(seed: int, pole: float)
     assert model.check(data(2.0 * np.repeat(sizes, 30)[5000:])).outside > 0.5
     # farther than it has ever been, however slowly
     assert model.check(data(np.full(4000, 0.3))).outside > 0.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_recorded_level_may_be_held_for_long(seed: int) -> None:
+    """A trapezoid between the ends of what random steps reached."""
+    rng = np.random.default_rng(seed)
+    T = 200.0
+    u = varied_steps(12_000, rng, T) ** 5  # high levels are rare and short
+    u[:200] = 0.0
+    a = float(np.exp(-1.0 / T))
+    y = _filtered([-a], [1.0 - a], u)
+    region = TrainingRegion.of([(u[:, None], y)])
+    levels = [0.0, y.max(), y.max(), y.min(), y.min()]
+    held = np.interp(np.arange(8000), [500, 1500, 4000, 5000, 8000], levels)
+    command = held + T * np.diff(held, prepend=0.0)
+    assert np.mean(region.distances(command[:, None], held) > 1.0) < 0.02
+    assert np.mean(region.distances(2.0 * command[:, None], 2.0 * held) > 1.0) > 0.3

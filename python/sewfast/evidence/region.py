@@ -10,10 +10,11 @@ including ensembles. A sample lies outside if any of three distances exceeds 1:
   time does not make the change vanish. The radius is the distance that a tenth of the training
   record keeps from the other nine tenths, for the worst tenth of ten: a new stretch of the same
   excitation relates to the record as each tenth does to the others.
-- *level*: the rms of each signal about its training mean over a window, over its largest value in
-  the training data. A signal of twice the amplitude still crosses zero, and a Gaussian one is
-  rarely where the training data have never been; its rms over some time reveals it. The window is
-  the shortest one over which most of the training record, doubled in amplitude, would be outside.
+- *level*: the standard deviation of each signal within a window, over its largest value in the
+  training data. A signal of twice the amplitude still crosses zero, and a Gaussian one is rarely
+  where the training data have never been; how far it moves over some time reveals it. A level that
+  is held, however long, is no larger signal. The window is the shortest one over which most of the
+  training record, doubled in amplitude, would be outside.
 - *peak*: the largest deviation within the last few lags, the time over which a sample affects the
   model.
 
@@ -135,8 +136,9 @@ class Region:
 class TrainingRegion:
     """The region of a model's training data. `nearest` is the region of the points (inputs, output,
     change of the output over `lag`), without the output for a model that integrates. `centre`
-    (nu + 1,) holds the means of the inputs and the output; `level` and `peak` (nu + 1,) bound rms
-    and peak about them. `lag` and `window` are in samples.
+    (nu + 1,) holds the means of the inputs and the output; `peak` (nu + 1,) bounds the
+    distance from them, `level` the standard deviation within the window. `lag` and
+    `window` are in samples.
     """
 
     nearest: Region
@@ -356,11 +358,11 @@ def _window(
     window, largest = max(4, 2 * lag), max(4, 2 * lag, n // 6)
     best: tuple[float, int, FloatArray] | None = None
     while True:
-        rms = np.max([_rms(x - centre, window).max(axis=0) for x in signals], axis=0)
+        swing = np.max([_swing(x - centre, window).max(axis=0) for x in signals], axis=0)
         factors = np.full(len(centre), input_level + few_windows * np.sqrt(window / n))
         factors[-1] = _OUTPUT
         # factor on the level of the whole record, if that gives more: half way to the double, in dB
-        level = np.maximum(np.maximum(factors * rms, 1.4 * whole), _SMALLEST * peak)
+        level = np.maximum(np.maximum(factors * swing, 1.4 * whole), _SMALLEST * peak)
         doubled = (
             np.concatenate(
                 [_size(d[:, :-1], level[:-1], peak[:-1], lag, window) > 1.0 for d in bigger]
@@ -382,12 +384,12 @@ def _window(
 def _size(
     signals: FloatArray, level: FloatArray, peak: FloatArray, lag: int, window: int
 ) -> FloatArray:
-    """Largest of rms and peak of the deviations (N, m), relative to their bounds, (N,)."""
+    """Largest of swing and peak of the deviations (N, m), relative to their bounds, (N,)."""
     bound = _FARTHEST * np.minimum(level, peak)
     signals = np.clip(signals, -bound, bound)
-    rms = (_rms(signals, window) / level).max(axis=1)
+    swing = (_swing(signals, window) / level).max(axis=1)
     peaks = _largest((np.abs(signals) / peak).max(axis=1), min(window, max(4, 3 * lag)))
-    size: FloatArray = np.maximum(rms, peaks)
+    size: FloatArray = np.maximum(swing, peaks)
     return size
 
 
@@ -399,6 +401,16 @@ def _rms(signals: FloatArray, window: int) -> FloatArray:
     sums[: window - 1] = sums[window - 1]
     rms: FloatArray = np.sqrt(np.maximum(sums, 0.0) / window)
     return rms
+
+
+def _swing(signals: FloatArray, window: int) -> FloatArray:
+    """Moving standard deviation of each column, as `_rms`."""
+    window = min(window, len(signals))
+    sums = np.cumsum(signals, axis=0)
+    sums[window:] -= sums[:-window].copy()
+    sums[: window - 1] = sums[window - 1]
+    swing: FloatArray = np.sqrt(np.maximum(_rms(signals, window) ** 2 - (sums / window) ** 2, 0.0))
+    return swing
 
 
 def _largest(values: FloatArray, window: int) -> FloatArray:
