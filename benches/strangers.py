@@ -397,11 +397,11 @@ def on_drive(
 ) -> tuple[FloatArray, FloatArray]:
     """Command and output of the drive itself under the controller that was found."""
     controller = load_controller(folder / f"{name}-controller.json")
-    core = controller.core()
+    core, early = controller.core(), controller.early(r)
     u = np.zeros(len(r))
 
     def decide(k: int, y: float) -> float:
-        u[k] = core.step(float(r[k]), y)
+        u[k] = core.step(float(early[k]), y)
         return float(u[k])
 
     _, true = drive.responds(controller.Ts, len(r), decide, seed + 1000)
