@@ -569,3 +569,19 @@ def test_suggested_commands_quote_names_with_spaces(tmp_path: Path) -> None:
 def test_look_counts_the_rows_of_the_longest_variable(tmp_path: Path) -> None:
     np.savez(tmp_path / "x.npz", info=np.arange(6.0), a=np.arange(7200.0), b=np.arange(7200.0) ** 2)
     assert "x.npz: 7200 rows" in sewfast(tmp_path, "look", "x.npz").out
+
+
+def test_a_second_command_is_named_where_it_is_left_out(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    heater, fan = (np.repeat(rng.uniform(0.0, 100.0, 30), 20) for _ in range(2))
+    columns = {
+        "t_s": np.arange(600.0), "heater_pct": heater, "heater_V": 0.24 * heater, "fan_pct": fan,
+        "temp_C": np.cumsum(heater - fan) / 100.0 + rng.normal(size=600),
+    }  # fmt: skip
+    api.write_table(tmp_path / "x.csv", columns)
+    said = sewfast(tmp_path, "look", "x.csv", "--input", "heater_pct").err
+    assert "fan_pct is left out" in said
+    assert "--input heater_pct --input fan_pct" in said
+    assert "heater_V" not in said
+    named = ("--input", "heater_pct", "--input", "fan_pct", "--output", "temp_C")
+    assert "left out" not in sewfast(tmp_path, "look", "x.csv", *named).err

@@ -59,6 +59,7 @@ def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) 
             output, counts = found.output, found.counts
         if table.counts_per_rev is None:
             note(f"{path}: input {', '.join(inputs)}, output {output or counts}")
+            _note_second_inputs(table, inputs, output or counts, args.time)
     return _with_notes(
         read_columns(
             table,
@@ -72,6 +73,20 @@ def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) 
             weights=getattr(args, "weights", None),
         )
     )
+
+
+def _note_second_inputs(
+    table: Table, inputs: Sequence[str], output: str | None, time: str | None
+) -> None:
+    from ..readers.roles import commands_beside
+
+    used = [*inputs, *([output] if output else [])]
+    for name in commands_beside(table, used, time)[:3]:
+        both = " ".join(f"--input {column}" for column in (*inputs, name))
+        note(
+            f"{name} is left out, although it steps as a command does: if it moves {output}, too, "
+            f"hold it while you record what a controller is tuned on, or model both: {both}"
+        )
 
 
 def _how_to_name(table: Table) -> str:

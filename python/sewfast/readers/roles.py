@@ -162,6 +162,25 @@ def recognised(
     return found
 
 
+def commands_beside(table: Table, used: Sequence[str], time: str | None = None) -> list[str]:
+    """Columns that are not `used` and step as a command does, by themselves: a second input."""
+    time = time_column(table) if time is None else table.resolve(time)
+    given = table.resolve(used[0])
+    found = [
+        name for name in table.names
+        if name not in (time, *map(table.resolve, used)) and len(table[name]) == len(table[given])
+        and _moves(table, name) and not is_reference(name) and is_stepped(table[name])
+    ]  # fmt: skip
+    return [name for name in found if not _is_scaled(table[name], table[given])]
+
+
+def _is_scaled(one: FloatArray, other: FloatArray) -> bool:
+    """Whether a column is another one in another unit."""
+    known = np.isfinite(one) & np.isfinite(other)
+    a, b = one[known] - one[known].mean(), other[known] - other[known].mean()
+    return bool(abs(a @ b) > 0.999 * np.sqrt((a @ a) * (b @ b)))
+
+
 def _moves(table: Table, name: str) -> bool:
     known = table[name][np.isfinite(table[name])]
     return len(known) > 0 and bool(known.min() < known.max())
