@@ -134,16 +134,16 @@ def test_a_model_of_speed_is_validated_on_counts(folder: Path, tmp_path: Path) -
     model = tmp_path / "m.json"
     columns = ("--input", "u", "--output", "y")
     sewfast(folder, "identify", "whole.mcap", *columns, "--model", "oe", "-o", model)
-    assert "split-at-gaps" in refused(folder, "validate", model, "holed.mcap")
-    told = sewfast(folder, "validate", model, "holed.mcap", "--split-at-gaps", "--json")
-    assert len(told.json()["experiments"]) == 3
-    assert "2010:2040 between gaps are left out" in told.err
+    for asked in ((), ("--split-at-gaps",)):
+        told = sewfast(folder, "validate", model, "holed.mcap", *asked, "--json")
+        assert len(told.json()["experiments"]) == 3
+        assert "2010:2040 between gaps are left out" in told.err
 
 
-def test_gaps_are_split_on_request_only(folder: Path, tmp_path: Path) -> None:
+def test_pieces_between_missing_rows_are_experiments(folder: Path, tmp_path: Path) -> None:
     out = ("--model", "oe", "-o", tmp_path / "m.json")
-    assert "--split-at-gaps" in refused(folder, "identify", "holed.mcap", *out)
-    told = sewfast(folder, "identify", "holed.mcap", "--split-at-gaps", *out)
+    told = sewfast(folder, "identify", "holed.mcap", *out)
+    assert "rows are missing; the pieces between are separate experiments" in told.err
     assert "2010:2040 between gaps are left out" in told.err
 
 

@@ -289,6 +289,9 @@ def prepared(
     before = len(data.notes)
     if getattr(args, "split_at_gaps", False):
         data = data.split_at_gaps()
+    elif hasattr(args, "split_at_gaps") and _rows_are_missing(data):
+        note(f"{data.source}: rows are missing; the pieces between are separate experiments")
+        data = data.split_at_gaps(of="inputs")
     if args.differentiate:
         data = data.differentiate()
     if args.resample is not None:
@@ -299,6 +302,17 @@ def prepared(
         data = data.detrend("steady" if args.detrend == "steady" else 1)
     _note_new(data, before)
     return data
+
+
+def _rows_are_missing(data: Dataset) -> bool:
+    """Whether inputs are unknown only where outputs are: nothing is lost between the pieces."""
+    import numpy as np
+
+    gaps = [(~e.known_inputs, np.isnan(e.y)) for e in data.experiments]
+    # a sample at either end of a gap has an output, from one row, but no input to its end
+    alone = sum(int(np.sum(u & ~y)) for u, y in gaps)
+    ends = sum(int(np.sum(np.diff(u.astype(int), prepend=0) > 0)) for u, _ in gaps)
+    return ends > 0 and alone <= 2 * ends and any(np.any(u & y) for u, y in gaps)
 
 
 def _note_new(data: Dataset, before: int) -> None:
