@@ -14,7 +14,7 @@ from plants import bent_data, linear_data
 from sewfast import Dataset, Ensemble, Experiment, LinearOE, NeuralSS, _core, identify, validate
 from sewfast.errors import DataError, Interrupted
 from sewfast.identification import table
-from sewfast.identification.blocks import COUNT, Blocks, Row, blocked, combined
+from sewfast.identification.blocks import COUNT, Blocks, Mixture, Row, blocked, combined
 from sewfast.identification.mixture import MOST_MEMBERS
 from sewfast.identification.table import Table
 from sewfast.identification.task import Clock, Pool, Task
@@ -151,6 +151,38 @@ def test_a_model_that_errs_more_has_no_weight(blocks: Blocks) -> None:
     good, noise = drawn(blocks, 1.0, 1.0)
     rows = rows_of(np.array([good + 2.0 * noise, good]), blocks, [2, 9])
     assert combined(rows, blocks).rows == (rows[1],)
+
+
+def test_a_mixture_is_judged_as_the_members_that_it_has(blocks: Blocks) -> None:
+    rows = rows_of(drawn(blocks, 1.0, 1.2, 1.5), blocks, [3, 3, 3])
+    wanted = Mixture.of(rows, blocks)
+    # one network of the scarcest structure must not be all that is left
+    shares, found = wanted.of_members(1, blocks)
+    assert shares.tolist() == [1.0, 1.0, 1.0]
+    thirds = blocks.errors(np.mean([r.residual for r in rows], axis=0))
+    assert found.errors.rmse == pytest.approx(thirds.rmse)
+    shares, found = wanted.of_members(15, blocks)
+    assert found.errors.rmse == pytest.approx(wanted.errors.rmse, rel=0.01)
+    # a third of a model that errs five times as much is worse than none
+    rows = rows_of(drawn(blocks, 1.0, 1.2, 5.0), blocks, [3, 3, 3])
+    shares, found = Mixture.of(rows, blocks).of_members(2, blocks)
+    assert found.rows == tuple(rows[:2])
+
+
+def test_a_motor_is_fitted_to_the_whole_record() -> None:
+    # in blocks of 625 samples, its friction is lost in the limit of current: 28 RPM
+    machine, parts = sewfast.VirtualMachine(5), list[Dataset]()
+    for name in ("chirp_lo_hi", "saturating"):
+        machine.reset()
+        u = sewfast.signals.excitation(name)
+        y = sewfast.speed_from_counts(machine.run(u).counts, 1e-3, machine.counts_per_rev)
+        parts.append(Dataset.from_arrays(u, y, 1e-3, input_units="V", output_unit="RPM"))
+    task = _task(Dataset.concat(parts))
+    asked = Table(task, Blocks(task.data, blocked(task.data)), Pool(2, Clock(None), None))
+    asked._try_motor()
+    (row,) = asked.rows.values()
+    assert row.kind == "grey_box"
+    assert row.rmse < 6.0
 
 
 def test_a_sample_without_weight_does_not_count() -> None:

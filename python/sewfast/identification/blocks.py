@@ -250,6 +250,22 @@ class Mixture:
         residual = residuals @ weights
         return cls(tuple(rows), weights, residual, blocks.errors(residual))
 
+    def of_members(self, most: int, blocks: Blocks) -> tuple[FloatArray, Mixture]:
+        """About `most` members in proportion to the weights, and the mixture that they are.
+        If they are too few for every row, those that get none have one or are left out, whichever
+        leaves less on the blocks.
+        """
+        shares = np.diff(np.round(most * np.cumsum(self.weights)), prepend=0.0)
+        ways = [shares] if shares.min() >= 1.0 else [np.maximum(shares, 1.0), shares]
+        found: list[tuple[FloatArray, Mixture]] = []
+        for way in ways:
+            has = way > 0.0
+            rows = tuple(r for r, own in zip(self.rows, has, strict=True) if own)
+            weights = way[has] / way.sum()
+            residual = np.column_stack([r.residual for r in rows]) @ weights
+            found.append((way[has], Mixture(rows, weights, residual, blocks.errors(residual))))
+        return min(found, key=lambda f: f[1].errors.rmse)
+
     def unseen(self, blocks: Blocks) -> FloatArray:
         """What they leave on each block with weights from the others: errors of rows cancel where
         their weights were found, and not on another recording.

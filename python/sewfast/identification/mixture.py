@@ -83,18 +83,18 @@ class Ending:
             # at rounding, errors say no more
             exact = [r for r in rows if self.table.is_exact and r.rmse <= self.table.rounding]
             simplest = sorted(exact, key=lambda r: r.parameters)[:1]
-            mixture = combined(simplest or rows, self.table.blocks)
+            shares, mixture = self._realised(combined(simplest or rows, self.table.blocks))
             reasons += [*self._missing(rows, is_interrupted), self._reason(mixture, len(rows))]
         else:
             late = self.table.late_row()
             row = late or self._unsound_row()
             mixture = Mixture((row,), np.ones(1), row.residual, row.errors)
+            shares, mixture = self._realised(mixture)
             reasons.append(
                 "there was time for one network only"
                 if late is not None
                 else "no network passed the guard; the best of them is used"
             )
-        shares = self._shares(mixture)
         cores: list[tuple[Any, Provenance]] = []
         # the first member is the plant of a loop: the best of the row with most weight
         for i in np.argsort(-mixture.weights, kind="stable").tolist():
@@ -170,20 +170,20 @@ class Ending:
             return ["the time budget left no time for a network"]
         return ["no network could be trained: too few samples, or none passed the guard"]
 
-    def _shares(self, mixture: Mixture) -> FloatArray:
-        """Members of each row in proportion to its weight, as many as the scarcest row allows."""
+    def _realised(self, mixture: Mixture) -> tuple[FloatArray, Mixture]:
+        """Members of each row, as many as the scarcest row allows, and the mixture they are."""
         if len(mixture.rows) == 1:
             (row,) = mixture.rows
             # a linear model or a motor needs no others beside it
             alone = row.kind in ("oe", "grey_box")
-            return np.array([1 if alone else min(MOST_MEMBERS, self.task.starts or MOST_MEMBERS)])
+            most = 1 if alone else min(MOST_MEMBERS, self.task.starts or MOST_MEMBERS)
+            return np.array([most]), mixture
         pairs = zip(mixture.rows, mixture.weights, strict=True)
         whole = 0 if self.table.folds[0].is_given else 1
         able = min(
             (sum(map(len, r.models)) + whole * (r.kind in ("oe", "grey_box"))) / w for r, w in pairs
         )
-        most = min(MOST_MEMBERS, max(1, int(able)))
-        return np.diff(np.round(most * np.cumsum(mixture.weights)), prepend=0.0)
+        return mixture.of_members(min(MOST_MEMBERS, max(1, int(able))), self.table.blocks)
 
     def _members(self, row: Row, most: int, is_interrupted: bool) -> list[tuple[Any, Provenance]]:
         """At most so many models of the row, each with its provenance.

@@ -177,7 +177,7 @@ class Table:
         if not task.data.output_unit:
             self.motors = replace(self.motors, integrates=self._integrates)
         for part in self.folds:
-            part = part.shortened(grey_box.SEARCHED)
+            part = part.shortened(grey_box.MOST_FITTED)
             one = self.motors.candidate(part, self.pool, until)
             if one is None:
                 return
