@@ -13,7 +13,8 @@ from sewfast import Controller, Gains, VirtualMachine, commission
 from sewfast.commissioning.gains import ruled
 from sewfast.commissioning.slow import HARMONICS, MOST, PER_CONSTANT, SHARPEST, Thinning, TurnLoad
 from sewfast.commissioning.small_signal import Resonance, SmallSignal
-from sewfast.control import Fopdt
+from sewfast.control import Feedforward, Fopdt
+from sewfast.control.feedforward import AHEAD, TAPS
 from sewfast.control.loop import run
 from sewfast.control.margins import margins
 from sewfast.control.record import record
@@ -103,6 +104,34 @@ def test_a_controller_converts_there_and_back() -> None:
     assert replace(back, N=5.0) == softer
     assert thinning.coarse(controller(3)).filter_samples == 1
     assert thinning.fine(replace(coarse, filter_samples=20)).filter_samples == 64
+
+
+@pytest.mark.parametrize("k", [2, 3, 5, 10])
+def test_a_feedforward_is_converted_there_and_back(k: int) -> None:
+    for preview in range(AHEAD // k + 1):
+        taps = tuple(0.1 / (1 + i) for i in range(TAPS // k))
+        coarse = Feedforward(preview, 0.5, ((0.0, 0.0), (2000.0, 12.0)), taps)
+        softer = replace(Thinning(k).coarse(controller()), N=5.0, feedforward=coarse)
+        fine = Thinning(k).fine(softer)
+        assert fine.feedforward is not None
+        assert len(fine.feedforward.taps) == k * (TAPS // k)
+        assert Thinning(k).coarse(fine).feedforward == coarse
+
+
+def test_the_converted_feedforward_commands_the_same() -> None:
+    k, r = 3, np.concatenate([np.zeros(60), np.linspace(0.0, 900.0, 600), np.full(240, 900.0)])
+    lead = Feedforward(4, 0.5, ((0.0, 0.0), (2000.0, 12.0)), (0.05, -0.02, 0.01))
+    without = replace(controller(), gains=Gains.standard(1e-12, 1.0), alpha=0.0, beta=0.0)
+    coarse = replace(Thinning(k).coarse(without), feedforward=lead)
+    fine = replace(without, feedforward=Thinning(k).fine(coarse).feedforward)
+    each = [c.core() for c in (coarse, fine)]
+    thin = [each[0].step(float(x), 0.0) for x in coarse.early(r[::k])]
+    full = [each[1].step(float(x), 0.0) for x in fine.early(r)]
+    # the held command is the mean over its samples wherever the reference does not bend
+    means = np.reshape(full, (-1, k)).mean(axis=1)
+    assert np.abs(means - thin)[40:200].max() < 1e-6
+    # and at a bend less off than one of the machine's samples changes it
+    assert np.abs(means - thin).max() < 0.05 * 1.5
 
 
 def test_the_converted_controller_does_the_same() -> None:

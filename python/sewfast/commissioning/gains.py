@@ -241,14 +241,17 @@ def led(
     cost: Cost,
     disturbances: Sequence[FloatArray] | None,
     threads: int,
+    every: int,
 ) -> TuningResult:
-    """The tuned gains with a feedforward, if no member follows the references worse with it."""
+    """The tuned gains with a feedforward, if no member follows the references worse with it; a
+    sample of the ensemble is `every` so many of the machine's.
+    """
     task = TuningTask.of(
         ensemble, list(references.values()), start=tuning.pid, first={}, cost=cost,
         aggregate="mean", constraints=None, variations=None, disturbances=disturbances,
     )  # fmt: skip
     effort = Effort(threads=threads)
-    controller, found = with_lead(task, tuning.pid, "preview", effort=effort)
+    controller, found = with_lead(task, tuning.pid, "preview", effort=effort, every=every)
     return replace(tuning, controller=controller, lead=found)
 
 

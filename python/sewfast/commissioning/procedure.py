@@ -557,8 +557,8 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
         required, tuning = of(ensemble)
     journal.keep(models=ensemble, rmse=trained.errors_of(ensemble))
     plants = "a linear model" if is_alone else "an ensemble of networks"
-    if plan.thinning.k == 1:
-        tuning = led(tuning, ensemble, practice, cost, plan.pushes, asked.threads)
+    every = plan.thinning.k
+    tuning = led(tuning, ensemble, practice, cost, plan.pushes, asked.threads, every)
     tuned = plan.thinning.fine(tuning.pid)
     controller = replace(tuned, notes=f"commissioned on {plants}")
     if tuning.warning is not None:

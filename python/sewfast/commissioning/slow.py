@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..control.controller import Controller, pid_of
+from ..control.feedforward import Feedforward
 from ..control.loop import ClosedLoopRun
 from ..dataset import FloatArray
 from ..errors import FitError
@@ -280,7 +281,26 @@ class Thinning:
             Ts=self.k * c.Ts,
             filter_samples=max(1, round(c.filter_samples / self.k)),
             N=_derivative_filter(c, (1 - self.k) * c.Ts),
+            feedforward=c.feedforward and self._coarse_lead(c.feedforward),
         )
+
+    def _coarse_lead(self, lead: Feedforward) -> Feedforward:
+        """What `_fine_lead` was made from."""
+        preview = round((lead.preview + self._held) / self.k)
+        return replace(lead, preview=preview, taps=lead.taps[:: self.k])
+
+    def _fine_lead(self, lead: Feedforward) -> Feedforward:
+        """The same command for the same change of the reference over k samples. A command that is
+        held over k samples comes later by half of them, which the preview need not cover here.
+        """
+        preview = max(0, round(lead.preview * self.k - self._held))
+        taps = [tap for tap in lead.taps for _ in range(self.k)]
+        return replace(lead, preview=preview, taps=tuple(taps))
+
+    @property
+    def _held(self) -> float:
+        """By how many samples a command that is held over k of them is later."""
+        return (self.k - 1) / 2.0
 
     def fine(self, c: Controller) -> Controller:
         """The controller for the machine at its own sample time.
@@ -297,6 +317,7 @@ class Thinning:
             # longest moving average of the feedback [samples]
             filter_samples=min(64, self.k * c.filter_samples),
             N=_derivative_filter(c, c.Ts - Ts),
+            feedforward=c.feedforward and self._fine_lead(c.feedforward),
         )
 
     def plant(self, fopdt: Fopdt, Ts: float) -> Fopdt:

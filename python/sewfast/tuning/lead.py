@@ -75,8 +75,10 @@ class Choices:
     reason: str = ""
 
 
-def choices(task: TuningTask, lead: Lead, effort: Effort | None = None) -> Choices:
-    """The feedforwards that the models of a task allow; raises `TimeUp` at a deadline."""
+def choices(task: TuningTask, lead: Lead, effort: Effort | None = None, every: int = 1) -> Choices:
+    """The feedforwards that the models of a task allow, for a device `every` so many of whose
+    samples are one of the task; raises `TimeUp` at a deadline.
+    """
     effort = effort or Effort()
     models = [p for p in task.plants if isinstance(p, Model)]
     if not (isinstance(task.start, Controller) and models):
@@ -93,11 +95,12 @@ def choices(task: TuningTask, lead: Lead, effort: Effort | None = None) -> Choic
     levels = reduced(known, always=rest.y)
     delay = min(p.delay for _, p in local)
     further, smoothings = (FURTHER, SMOOTHINGS) if effort.is_whole else (FEW, SMOOTHINGS[1:2])
-    previews = {min(delay + more, AHEAD) for more in further} if lead == "preview" else {0}
+    ahead = AHEAD // every
+    previews = {min(delay + more, ahead) for more in further} if lead == "preview" else {0}
     pairs = [(preview, smoothing) for preview in sorted(previews) for smoothing in smoothings]
     plants = [_local(p, _slope(levels, level, rest.y)) for level, p in local]
     try:
-        taps = _core.inverse_taps(plants, pairs, count=TAPS)
+        taps = _core.inverse_taps(plants, pairs, count=TAPS // every)
     except SettingError:
         return Choices(reason="a model answers a command within 256 samples with nothing finite")
     late = 0.5 if task.start.counts_per_unit > 0.0 else 0.0
@@ -228,9 +231,11 @@ def with_lead(
     searched: Collection[str] = WEIGHTS,
     others: Sequence[TuningTask] = (),
     effort: Effort | None = None,
+    every: int = 1,
 ) -> tuple[Controller, Led]:
     """A PID with feedforward, if that costs less over all plants of this task and of the others,
-    and no more on any of them in any variation; otherwise the PID alone. The feedforward does the
+    and no more on any of them in any variation; otherwise the PID alone. It has room on a device
+    `every` so many of whose samples are one of the task. The feedforward does the
     work of alpha and beta, which become 0 if they are `searched`. The gains stay: what they owe to
     loads, noise and other plants, margins included, they keep. Raises `TimeUp` at a deadline.
     """
@@ -238,7 +243,7 @@ def with_lead(
     # whose gain is a quarter too large needs less of it
     shares = (1.0, 0.95, 0.9, 0.8)
     effort = effort or Effort()
-    among = choices(task, lead, effort)
+    among = choices(task, lead, effort, every)
     weights: dict[str, Any] = {name: 0.0 for name in WEIGHTS if name in searched}
     tried = [replace(alone, feedforward=one, **weights) for one in among.feedforwards]
     if not tried:
