@@ -114,7 +114,17 @@ class Motor:
         self.held: float | None = None
         if self.has_begun:
             self._change()
+        self.load = self.volt * fault.wrong.get("load", 0.0)
+        while self.has_begun and self.load and not self._turns():
+            self.load *= 1.5
         self.reset()
+
+    def _turns(self) -> bool:
+        """Whether the load alone keeps the motor turning, which friction may hold."""
+        self.plant.reset()
+        for _ in range(round(1.0 / self.Ts)):
+            self.plant.step(self.load)
+        return abs(self.plant.speed_rpm) > 0.01 * self.stated
 
     def _change(self) -> None:
         wrong = self.fault.wrong
@@ -157,9 +167,8 @@ class Motor:
         if self.now("holds", 0.0):
             self.held = u if self.held is None else self.held
             u = self.held
-        self.plant.step(
-            self.volt * self.now("stuck", u / self.volt) + self.volt * self.now("load", 0.0)
-        )
+        load = self.load if self.has_begun else 0.0
+        self.plant.step(self.volt * self.now("stuck", u / self.volt) + load)
         self.counted += self.now("encoder", 1.0) * (self.plant.counts - self.before)
         self.before = self.plant.counts
         self.t += self.Ts
@@ -424,7 +433,7 @@ def cases(args: argparse.Namespace) -> Iterator[tuple[Fault, Machine, int]]:
     faults = IN_STOPS if args.stops else FAULTS
     for i, (machine, seed) in enumerate(machines(args)):
         for fault in faults[i % args.every :: args.every]:
-            # no device has positions
+            # the firmware of the board has no positions
             can_be = machine is not BOARD or (not args.stops and fault.wrong.keys() <= ON_BOARD)
             if args.only in fault.name and can_be:
                 yield fault, machine, seed
