@@ -29,7 +29,7 @@ MARKED := test test-core nightly lint rust-lint rust-test rust-units rust-rest n
   night-bits night-logs night-computing night-waiting night-budgets
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo pictures publishable accuracy assumptions battery strangers commissioning tracking moves positions axes joints drives faults nonsense motors fleet interrupts fuzz-logs mutations screens studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed parting laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help dev demo pictures publishable accuracy assumptions battery strangers commissioning tracking pmsm moves positions axes joints drives faults nonsense motors fleet interrupts fuzz-logs mutations screens studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed parting laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -331,6 +331,9 @@ physics: $(VENV)/bench.stamp ## parameters of motors whose truth is known (docs/
 
 tracking: $(VENV)/bench.stamp ## what a feedforward is worth, beside simple-pid and a linear-quadratic regulator (SEEDS=5 MACHINES=8)
 	$(BIN)/python benches/tracking.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES))
+
+pmsm: $(VENV)/bench.stamp ## commissioning on motulator's synchronous motor with vector control, beside its own speed controller and simple-pid (SEEDS="0 1")
+	$(BIN)/python benches/pmsm.py $(if $(SEEDS),--seeds $(SEEDS))
 
 moves: $(VENV)/bench.stamp ## what a table of a known move brings, and what repetitions add (SEEDS=5 MACHINES=8, MOTORS=20 of MuJoCo, MODEL=grey_box, RUNS=200 on changed machines)
 	$(BIN)/python benches/moves.py $(if $(MOTORS),--motors $(MOTORS)) $(if $(MODEL),--model $(MODEL)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(MACHINES),--machines $(MACHINES)) $(if $(RUNS),--runs $(RUNS))
