@@ -1,4 +1,4 @@
-"""Slow drives: what is simulated runs on every k-th sample, the machine on every one."""
+"""Slow drives (simulated on every k-th sample) and what small signals show of resonances."""
 
 from __future__ import annotations
 
@@ -9,10 +9,16 @@ import numpy as np
 import pytest
 
 from commissioned import SMALL, short
-from sewfast import Controller, Gains, VirtualMachine, commission
+from sewfast import Controller, Gains, VirtualMachine, _core, commission
 from sewfast.commissioning.gains import ruled
 from sewfast.commissioning.slow import HARMONICS, MOST, PER_CONSTANT, SHARPEST, Thinning, TurnLoad
-from sewfast.commissioning.small_signal import Resonance, SmallSignal
+from sewfast.commissioning.small_signal import (
+    Resonance,
+    Shaken,
+    SmallSignal,
+    _is_seen,
+    explained,
+)
 from sewfast.control import Feedforward, Fopdt
 from sewfast.control.feedforward import AHEAD, TAPS
 from sewfast.control.loop import run
@@ -203,3 +209,32 @@ def test_a_commissioning_on_every_third_sample(
     np.testing.assert_array_equal(c.alike.r, c.predicted.r)
     assert c.apart == pytest.approx(np.sqrt(np.mean((c.measured.y[::3] - c.predicted.y) ** 2)))
     assert "mine, measured" in found.save(tmp_path / "out").read_text()
+
+
+def shaken(frequency: float | None, seed: int) -> Shaken:
+    """A drive of .2 s about a speed, its counts and, with a frequency, a shaft [Hz]."""
+    u = 6.0 + _core.prbs(duration=4.0, Ts=1e-3, low=-1.0, high=1.0, hold=2e-3, seed=seed)
+    y, swing, rate = np.full(len(u), 600.0), 0.0, 0.0
+    for k in range(1, len(u)):
+        y[k] = y[k - 1] + 5e-3 * (100.0 * u[k - 1] - y[k - 1])
+        if frequency is not None:
+            omega = 2.0 * np.pi * frequency
+            rate += 1e-3 * (omega**2 * (0.02 * (u[k] - 6.0) - swing) - 0.04 * omega * rate)
+            swing += 1e-3 * rate
+            y[k] += 100.0 * 1e-3 * rate
+    counts = np.round(np.cumsum(y) * 1e-3 / 60.0 * 1572.0)
+    speed = np.diff(counts, prepend=0.0) * 60.0 / (1572.0 * 1e-3)
+    return Shaken(u, speed, counts / 1572.0, 1e-3, "shaken")
+
+
+@pytest.mark.parametrize(("frequency", "seen"), [(60.0, True), (None, False), (90.0, False)])
+def test_a_resonance_shows_in_a_second_record(frequency: float | None, seen: bool) -> None:
+    fopdt = Fopdt(K=100.0, T=0.2, L=0.002)
+    first = explained(shaken(60.0, 0), fopdt)
+    assert first is not None
+    assert first.resonance is not None
+    assert first.resonance.frequency == pytest.approx(60.0, rel=0.02)
+    assert _is_seen(first.resonance, shaken(frequency, 1), fopdt) is seen
+    calm = explained(shaken(60.0, 0), fopdt, swings=False)
+    assert calm is not None
+    assert calm.resonance is None

@@ -36,6 +36,9 @@ SHAKEN_AT = 0.5
 NEAR = 0.1
 """Search range about a frequency, as a share of it. The two speeds lie further apart, so that fixed
 frequencies and those that move with the speed stay separate."""
+SAME = math.log(1.25)
+"""Largest distance of a resonance's frequencies in two records, in logarithms: those of shafts were
+within 1 % of each other, with play within 25 %."""
 TWICE = 2.0
 """Least number of periods in a record: fewer cannot be distinguished from drift."""
 BESIDE = (0.4, 0.8), (1.25, 1.8)
@@ -83,7 +86,7 @@ def small_signal(
     """Excite the machine about half its top speed; None if the record shows no dynamics.
     If a pair of poles is lightly damped, or a line stands out from the residual of a first order,
     the machine is also excited at a higher speed. A frequency that has moved in proportion with the
-    speed is a load over the turn and not a resonance: it is removed.
+    speed is a load over the turn and not a resonance: it is removed. A resonance shows at both.
     """
     u, settled = shaking(demands, motion, fopdt, machine.Ts, SHAKEN_AT)
     slow = Shaken.of(machine.excite(u, "small_signals"), settled)
@@ -104,7 +107,17 @@ def small_signal(
         if again is None:
             break
         found = again
-    return found
+    if found.resonance is None or _is_seen(found.resonance, fast, fopdt):
+        return found
+    return explained(slow, fopdt, swings=False) or replace(found, resonance=None)
+
+
+def _is_seen(resonance: Resonance, shaken: Shaken, fopdt: Fopdt) -> bool:
+    """Whether another record shows it: noise and a delay can pass for one, at any frequency."""
+    other = explained(shaken, fopdt)
+    if other is None or other.resonance is None:
+        return False
+    return abs(math.log(other.resonance.frequency / resonance.frequency)) < SAME
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,14 +186,18 @@ def shaking(
     return np.concatenate([np.full(settle, held), random]), settle
 
 
-def explained(shaken: Shaken, fopdt: Fopdt) -> SmallSignal | None:
-    """The simplest linear model of a record."""
+def explained(shaken: Shaken, fopdt: Fopdt, *, swings: bool = True) -> SmallSignal | None:
+    """The simplest linear model of a record; of those without a resonance unless it `swings`."""
     data = shaken.dataset()
     part, smooth = later_part(data), _smooth(shaken)
     if part is None:
         return None
     tried = {order: fitted(part, order, smooth) for order in ORDERS}
-    found = {order: fit for order, fit in tried.items() if fit is not None}
+    found = {
+        order: fit
+        for order, fit in tried.items()
+        if fit is not None and (swings or _resonance(fit[0], shaken.Ts) is None)
+    }
     if not found or not min(errors.rmse for _, errors in found.values()) < part.spread:
         return None
     order = simplest(found)

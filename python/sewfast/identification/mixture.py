@@ -183,7 +183,9 @@ class Ending:
         able = min(
             (sum(map(len, r.models)) + whole * (r.kind in ("oe", "grey_box"))) / w for r, w in pairs
         )
-        return mixture.of_members(min(MOST_MEMBERS, max(1, int(able))), self.table.blocks)
+        most = min(MOST_MEMBERS, max(1, int(able)))
+        shares, found = mixture.of_members(most, self.table.blocks)
+        return (shares, found) if len(shares) > 1 else self._realised(found)
 
     def _members(self, row: Row, most: int, is_interrupted: bool) -> list[tuple[Any, Provenance]]:
         """At most so many models of the row, each with its provenance.
