@@ -77,6 +77,22 @@ def test_a_fast_record_about_a_level_rests_at_its_mean_command() -> None:
     assert model.rest.y == pytest.approx(21.0 + np.sqrt(12.0), abs=0.2)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_integrates_rests_where_it_stays(seed: int) -> None:
+    """A hover: no command but one holds a level, and all levels are alike to it."""
+    rng, n = np.random.default_rng(seed), 3000
+    u, y, fall = np.zeros(n), np.zeros(n), 0.0
+    height, dither = 3.0, np.repeat(rng.choice([-15.0, 15.0], n // 20), 20)
+    for k in range(n):
+        y[k] = height + 0.005 * rng.standard_normal()
+        u[k] = np.clip(50.0 + 25.0 * (3.0 - y[k]) - 30.0 * fall + dither[k], 20.0, 90.0)
+        fall += 0.02 * (0.196 * (u[k] - 50.0) - 0.4 * fall)
+        height += 0.02 * fall
+    model = identify(Dataset.from_arrays(u, y, 0.02), model="oe", na=2, nb=3, nk=1, threads=1)
+    assert model.rest.u[0] == pytest.approx(50.0, abs=1.0)
+    assert model.rest.y == pytest.approx(y.mean(), abs=0.2 * np.ptp(y))
+
+
 @pytest.mark.parametrize(("held", "u", "y"), [(4, 60.0, 3000.0), (200, 66.0, 3132.0)])
 def test_too_few_standing_samples_to_show_a_response_are_no_rest(
     held: int, u: float, y: float

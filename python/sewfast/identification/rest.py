@@ -115,6 +115,8 @@ def _equilibrium(model: Model, data: Dataset) -> Rest | None:
     if off is None and held is not None:
         u = np.array(held.u)
         off = _level(model, u)
+        if off is not None and not data.output_range[0] <= off <= data.output_range[1]:
+            off = held.y  # what integrates stands at any level
     if off is None:
         return None
     y = float(np.clip(off, *data.output_range))
@@ -137,17 +139,20 @@ def _held(data: Dataset) -> Rest | None:
 
 def _level(model: Model, u: FloatArray, data: Dataset | None = None) -> float | None:
     """The steady output at constant inputs, if there is one; with `data`, where these show the
-    model: in its region, or in the ranges of the record where a budget left no time for a region.
+    model: in its region, or in the ranges of the record where a budget left no time for a region,
+    or where it has no outputs, as they integrate.
     """
     found = linearise(representative(model).core, u)
     if not (found.settled and math.isfinite(found.y)):
         return None
-    region = stored_region(model)
-    if data is None or (region is not None and region.holds(u, found.y)):
+    if data is None:
         return found.y
+    region = stored_region(model)
+    if region is not None and not region.integrates:
+        return found.y if region.holds(u, found.y) else None
     ranges, values = (*data.input_range, data.output_range), (*u, found.y)
     inside = all(low <= v <= high for (low, high), v in zip(ranges, values, strict=True))
-    return found.y if region is None and inside else None
+    return found.y if inside else None
 
 
 def _noisy(model: M, data: Dataset) -> M:
