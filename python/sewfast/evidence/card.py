@@ -174,8 +174,7 @@ _STEPS = (
     ),
     (
         "residual with",
-        "let identify search for the structure (no model named): it tries other orders, delays and "
-        "networks",
+        "let identify search for the structure: it tries other orders, delays and networks",
     ),
     ("squared residual", "allow a network, or check whether the noise grows with the amplitude"),
     ("mean residual", "check whether the zero of a sensor or an amplifier has moved"),

@@ -318,7 +318,8 @@ export function mount(root, { ask, on, mark = () => {} }) {
     if (Number.isFinite(over)) rows.push(row("overshoot", judged?.overshoot, over, " %"));
     if (Number.isFinite(most)) rows.push(row("command", judged?.u, most, ` ${opened.u_unit}`));
     if (limit > 1) $("Ms-means").textContent = `Ms ${limit} leaves a gain margin of at least ${text(limit / (limit - 1))} and a phase margin of at least ${text(2 * Math.asin(.5 / limit) * 180 / Math.PI)} degrees.` +
-      (judged?.Ms > 1.01 * now.Ms ? ` The table holds about ${text(opened.level)} ${opened.y_unit}. The limit counts other levels too: Ms is ${text(judged.Ms)} there.` : "");
+      (judged?.Ms > 1.01 * now.Ms ? ` The table holds about ${text(opened.level)} ${opened.y_unit}. The limit counts other levels too: Ms is ${text(judged.Ms)} there.` : "") +
+      (Number.isFinite(over) && judged?.overshoot < .99 * now.overshoot_percent ? " The limit of overshoot counts the references of a search, not this step." : "");
     const stable = now.stable && !now.diverges;
     const chips = [[verdict ? `gains ${verdict.grade}` : "gains: being judged", verdict ? KINDS[verdict.grade] : ""], [stable ? "stable" : "unstable", stable ? "good" : "bad"],
       ...rows.map(([what, ok, said]) => [`${what}${judged ? "" : ":"}${said}`, !judged ? "" : ok ? "good" : "bad"])];
