@@ -186,21 +186,25 @@ _SUFFIX = {
 }  # fmt: skip
 _SUFFIXED = re.compile(rf"(.+)[_ ]({'|'.join(sorted(_SUFFIX, key=len, reverse=True))})")
 _SPEED_SUFFIX = re.compile(rf"(.+?)[_ ]({'|'.join(map(re.escape, sorted(SPEEDS, key=len)))})")
-_LETTERS = {"A": "A", "C": "degC", "K": "K"}
+_LETTERS = {"A": "A", "C": "degC", "K": "K", "m": "m", "N": "N", "W": "W"}
 _LETTERED = re.compile(
     r"((?i:(?:motor_?)?(?:i|curr(?:ent)?|strom|amps?)|i_?motor))[_ ](A)"
     r"|((?:.*[_ ])?(?i:t|temp|temperature|temperatur))(?:[_ ]?\d+)?[_ ]([CK])"
+    r"|((?:.*[_ ])?(?i:position|weg|stroke|travel|height|altitude|level))[_ ](m)"
+    r"|((?:.*[_ ])?(?i:force|kraft|thrust|schub))[_ ](N)"
+    r"|((?:.*[_ ])?(?i:power|leistung|heat|heater|heating|heizung))[_ ](W)"
 )
 """Units of one letter, each behind a word for what it measures."""
 
 
 def unit_in_name(name: str) -> tuple[str, str]:
     """`speed_rpm` -> `("speed", "RPM")`; a name without a unit at its end gives an empty one.
-    Only unambiguous endings count. A lone `A`, `C` or `K` can also be a phase or a channel, so it
-    is a unit only behind a word for a current or a temperature (`temp_C`, not `phase_C`).
+    Only unambiguous endings count. A lone letter can also be a phase or a channel, so it is a unit
+    only behind a word for what it measures (`temp_C`, not `phase_C`).
     """
     if (match := _LETTERED.fullmatch(name)) is not None:
-        return match[1] or match[3], _LETTERS[match[2] or match[4]]
+        found, letter = filter(None, match.groups())
+        return found, _LETTERS[letter]
     if (match := _SUFFIXED.fullmatch(name)) is not None and match[2] != "A":
         return match[1], _SUFFIX[match[2]]
     if (match := _SPEED_SUFFIX.fullmatch(name.lower())) is not None:

@@ -11,7 +11,7 @@ import pytest
 
 from sewfast import read_joints, read_table
 from sewfast.errors import DataError, SettingError
-from sewfast.readers import joint_columns
+from sewfast.readers import Roles, joint_columns, roles
 
 NAMES, TS, N = ("Rotation", "Elbow"), 0.02, 120
 RNG = np.random.default_rng(5)
@@ -166,6 +166,20 @@ def test_what_is_no_joint_is_none() -> None:
     # two commands of one joint leave doubt
     table = {"a.command": U[:, 0], "a.goal": U[:, 1], "a.position": Q[:, 0]}
     assert joint_columns(read_table(table)) == {}
+
+
+def test_a_joint_alone_needs_no_name() -> None:
+    for command, position in (("goal", "present"), ("goal_position_deg", "present_position_deg")):
+        table = read_table({"timestamp": T, command: U[:, 0], position: Q[:, 0]})
+        assert list(joint_columns(table).values()) == [(command, position)]
+        assert roles(table) == Roles(command, position)
+        # beside further columns, a reference and a position are those of a loop
+        loop = read_table({"t": T, command: U[:, 0], position: Q[:, 0], "u": U[:, 1]})
+        assert joint_columns(loop) == {}
+    stage = read_table({"time_s": T, "force_N": U[:, 0], "position_m": Q[:, 0]})
+    assert roles(stage) == Roles("force_N", "position_m")
+    assert (stage.unit("force_N"), stage.unit("position_m")) == ("N", "m")
+    assert read_table({"phase_m": T}).unit("phase_m") == ""
 
 
 def test_joints_of_several_words_keep_their_columns() -> None:

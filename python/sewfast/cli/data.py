@@ -31,13 +31,25 @@ def shifted(data: Dataset, args: argparse.Namespace) -> Dataset:
 
 
 def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) -> Dataset:
-    from ..readers import left_out, of_joint, parse_source, read_columns, read_table
+    from ..readers import (
+        joint_columns,
+        left_out,
+        of_joint,
+        parse_source,
+        read_columns,
+        read_table,
+    )
 
     path, inputs, output = parse_source(source)
     table = with_units(read_table(path), args)
     inputs, output = inputs or tuple(args.input or ()), output or args.output
     counts = args.counts
-    if (joint := getattr(args, "joint", None)) is not None:
+    joint = getattr(args, "joint", None)
+    if joint is None and getattr(args, "unit", None) and not (inputs or output or counts):
+        # a unit is that of a joint's positions
+        joints = joint_columns(table)
+        joint = next(iter(joints)) if len(joints) == 1 else None
+    if joint is not None:
         if inputs or output or counts:
             raise SettingError(
                 name="--joint", expected="no other names of columns", received=", ".join(

@@ -77,7 +77,7 @@ def rad_per_second(unit: str) -> float:
     if turns is None:
         raise SettingError(
             f"expected a speed in {', '.join(REVOLUTIONS_PER_SECOND)}, received the unit {unit!r}; "
-            "say which it is: speed_unit='rpm'"
+            "say which it is: speed_unit='rpm', or --unit deg for a position"
         )
     return 2.0 * math.pi * turns
 

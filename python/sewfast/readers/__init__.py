@@ -7,9 +7,9 @@ Read in this order: `recording` (`read`, `read_table`, formats that other packag
 """
 
 from .containers import Table
-from .joints import joint_columns, of_joint, read_joints
+from .joints import of_joint, read_joints
 from .recording import parse_source, read, read_columns, read_table
-from .roles import Roles, left_out, roles
+from .roles import Roles, joint_columns, left_out, roles
 
 __all__ = [
     "Roles",

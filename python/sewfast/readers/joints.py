@@ -5,7 +5,6 @@ Readers give a column to each element of an array of joints, `field.JOINT` (`con
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -15,65 +14,9 @@ from ..errors import SettingError
 from ..units import is_position, radians, spelled
 from .containers import Table, freeze
 from .recording import read_columns, read_table
+from .roles import joint_columns
 
-_COMMAND = frozenset(
-    re.split(" ", "action cmd command commanded control desired goal reference setpoint target")
-)
-_POSITION = frozenset(
-    re.split(" ", "actual angle feedback observation pos position positions q state")
-)
-_OTHER = frozenset(
-    re.split(
-        " ",
-        "acceleration accelerations current effort err error load speed temperature torque torques "
-        "vel velocities velocity voltage",
-    )
-)
-"""Words in names of columns; one of the last sort says that it is no position."""
 _EPISODE = "episode_index"
-_WORD = re.compile(r"[A-Za-z]+")
-
-
-def joint_columns(table: Table) -> dict[str, tuple[str, str]]:
-    """Columns of the position command and of the position of each joint, by the joint's name.
-
-    A column belongs to the joint that its last part names (`control.positions.Elbow`), or the words
-    that say neither command nor position (`left_elbow_cmd`). Only joints with one command and one
-    position count.
-    """
-    for parted in (_by_last, _by_words):
-        found: dict[str, dict[str, list[str]]] = {}
-        for name in table.names:
-            joint, rest = parted(name)
-            if joint and not joint.isdigit() and (kind := _kind(rest)):
-                found.setdefault(joint, {}).setdefault(kind, []).append(name)
-        whole = {
-            joint: (of["command"][0], of["position"][0]) for joint, of in found.items()
-            if len(of.get("command", ())) == 1 == len(of.get("position", ()))
-        }  # fmt: skip
-        if whole:
-            return whole
-    return {}
-
-
-def _by_last(name: str) -> tuple[str, Sequence[str]]:
-    *rest, joint = re.split(r"[./]", name)
-    return (joint, rest) if rest else ("", ())
-
-
-def _by_words(name: str) -> tuple[str, Sequence[str]]:
-    words = [w for w in re.split(r"[./_ ]+", name) if w]
-    own = [w for w in words if w.lower() not in _COMMAND | _POSITION]
-    return "_".join(own), words
-
-
-def _kind(parts: Sequence[str]) -> str | None:
-    words = {w.lower() for part in parts for w in _WORD.findall(part)}
-    if words & _OTHER:
-        return None
-    if words & _COMMAND:
-        return "command"
-    return "position" if words & _POSITION else None
 
 
 def columns_of(table: Table, joint: str) -> tuple[str, str]:

@@ -112,7 +112,7 @@ def roles(
     as input, a speed or position (else temperature, level, pressure, flow) as output; name and unit
     together beat one alone. The last column takes the last role. Of two columns that names alone
     do not tell apart, the one that is held and steps is the input. Stated counts per turn make
-    `counts` the output.
+    `counts` the output. Else the position command and the position of a single joint.
     """
     time = time_column(table) if time is None else table.resolve(time)
     named = [table.resolve(name) for name in (*inputs, output, counts) if name is not None]
@@ -139,7 +139,10 @@ def roles(
             return Roles(commands[0], left[0])
     if len(rest) == 1 and (given is None) != (found is None):
         given, found = given or rest[0], found or rest[0]
-    return None if given is None or found is None or given == found else Roles(given, found)
+    if given is not None and found is not None and given != found:
+        return Roles(given, found)
+    joints = joint_columns(table)
+    return Roles(*joints.popitem()[1]) if len(joints) == 1 and not named else None
 
 
 def recognised(
@@ -229,3 +232,69 @@ def _score(table: Table, name: str, sort: _Sort) -> int:
     """2 for a column whose name and unit both match the sort, 1 for one match, else 0."""
     words = {word.lower() for word in _WORD.findall(unit_in_name(name)[0])} - _QUALIFIERS
     return (bool(words) and words <= sort.words) + (table.unit(name).lower() in sort.units)
+
+
+# --- Joints of a robot ---------------------------------------------------------------------------
+
+
+_COMMAND = frozenset(
+    re.split(" ", "action cmd command commanded control desired goal reference setpoint target")
+)
+_POSITION = frozenset(
+    re.split(" ", "actual angle feedback observation pos position positions present q state")
+)
+_OTHER = frozenset(
+    re.split(
+        " ",
+        "acceleration accelerations current effort err error load speed temperature torque torques "
+        "vel velocities velocity voltage",
+    )
+)
+"""Words in names of columns; one of the last sort says that it is no position."""
+_ALONE = "joint"
+"""Name of a joint in a table that names none."""
+
+
+def joint_columns(table: Table) -> dict[str, tuple[str, str]]:
+    """Columns of the position command and of the position of each joint, by the joint's name.
+
+    A column belongs to the joint that its last part names (`control.positions.Elbow`), or the words
+    that say neither command nor position (`left_elbow_cmd`). Only joints with one command and one
+    position count; one without a name (`goal`, `present`) if the table has no further columns.
+    """
+    for parted in (_by_last, _by_words):
+        found: dict[str, dict[str, list[str]]] = {}
+        for name in table.names:
+            joint, rest = parted(name)
+            if joint and not joint.isdigit() and (kind := _kind(rest)):
+                found.setdefault(joint, {}).setdefault(kind, []).append(name)
+        whole = {
+            joint: (of["command"][0], of["position"][0]) for joint, of in found.items()
+            if len(of.get("command", ())) == 1 == len(of.get("position", ()))
+        }  # fmt: skip
+        # at most a time beside command and position
+        if len(table.names) > 3:
+            whole.pop(_ALONE, None)
+        if whole:
+            return whole
+    return {}
+
+
+def _by_last(name: str) -> tuple[str, Sequence[str]]:
+    *rest, joint = re.split(r"[./]", name)
+    return (joint, rest) if rest else ("", ())
+
+
+def _by_words(name: str) -> tuple[str, Sequence[str]]:
+    words = [w for w in re.split(r"[./_ ]+", unit_in_name(name)[0]) if w]
+    own = [w for w in words if w.lower() not in _COMMAND | _POSITION]
+    return "_".join(own) or _ALONE, words
+
+
+def _kind(parts: Sequence[str]) -> str | None:
+    words = {w.lower() for part in parts for w in re.findall("[A-Za-z]+", part)}
+    if words & _OTHER:
+        return None
+    if words & _COMMAND:
+        return "command"
+    return "position" if words & _POSITION else None
