@@ -180,7 +180,7 @@ def test_look_says_what_is_in_recognised_columns_and_lists_those_in_doubt(folder
     assert found["outliers_at"] == [{"experiment": "run.csv", "sample": 700}]
     assert [f["kind"] for f in found["findings"]] == ["spike"]
     assert json.loads(sewfast(folder, "look", "run.csv", "--json").out) == found
-    columns = {"t": T[:2000], "a": excited()[:2000], "b": T[:2000] ** 2}
+    columns = {"t": T[:2000], "a": np.sin(T[:2000]), "b": T[:2000] ** 2}
     api.write_table(folder / "doubt.csv", columns, units={"a": "1", "b": "2"})
     listed = sewfast(folder, "look", "doubt.csv").out
     assert "--input COL --output COL" in listed

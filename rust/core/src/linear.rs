@@ -190,15 +190,18 @@ impl Lagged for LinearModel {
 
 /// Roots of `z^n + a_1 z^(n-1) + .. + a_n`, the eigenvalues of its companion matrix; NaN if they overflow.
 pub(crate) fn poles(a: &[f64]) -> Vec<Complex<f64>> {
-    let n = a.len();
-    if n == 0 {
-        return Vec::new();
+    // the QR iteration may not end at a pole at 0 that is repeated, as that of a delay
+    let n = a.iter().rposition(|x| *x != 0.0).map_or(0, |last| last + 1);
+    let mut found = Vec::with_capacity(a.len());
+    if n > 0 {
+        // without a limit it never ends if squares of the coefficients overflow
+        match companion(&a[..n]).try_schur(f64::EPSILON, 200 * n) {
+            Some(schur) => found.extend(schur.complex_eigenvalues().iter()),
+            None => found.resize(n, Complex::new(f64::NAN, f64::NAN)),
+        }
     }
-    // without a limit the QR iteration never ends if squares of the coefficients overflow
-    companion(a).try_schur(f64::EPSILON, 200 * n).map_or_else(
-        || vec![Complex::new(f64::NAN, f64::NAN); n],
-        |schur| schur.complex_eigenvalues().iter().copied().collect(),
-    )
+    found.resize(a.len(), Complex::new(0.0, 0.0));
+    found
 }
 
 /// The companion matrix of `z^n + a_1 z^(n-1) + .. + a_n`, `-a` in its first row.
@@ -362,6 +365,15 @@ mod tests {
         assert!((y[5] - expected).abs() < 1e-14);
         let first = 1.5 * 0.3 + 0.7 * 0.4 + 0.8 * input(0, 0) - 0.1 * input(0, 1) + 0.05;
         assert!((y[0] - first).abs() < 1e-14);
+    }
+
+    #[test]
+    fn roots_at_zero_are_exact() {
+        // of a motor at a crawl behind a lag and a delay, at which the QR iteration did not end
+        let found = poles(&[-1.2827632894166117, 0.3103589064668176, 0.0, 0.0]);
+        assert!(found.iter().all(|p| p.norm() < 1.0), "{found:?}");
+        assert_eq!(found[2..], [Complex::new(0.0, 0.0); 2]);
+        assert_eq!(poles(&[0.0; 3]), [Complex::new(0.0, 0.0); 3]);
     }
 
     #[test]
