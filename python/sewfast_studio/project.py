@@ -68,11 +68,7 @@ Progress = Callable[[int, int, float], None]
 
 def make_demo(folder: str | os.PathLike[str]) -> None:
     """Fill a folder for the demo: four records of the virtual machine, and an ensemble of models.
-
-    Raises
-    ------
-    ModelFileError
-        If the folder is not writable.
+    Raises `ModelFileError` if the folder is not writable.
     """
     from sewfast import signals
     from sewfast.control.record import record
@@ -162,13 +158,7 @@ class Project:
         return self._formats[path][1]
 
     def document(self, name: Any, format: str) -> Path:
-        """The path of one of `documents`.
-
-        Raises
-        ------
-        SettingError
-            For any other name.
-        """
+        """The path of one of `documents`. Raises `SettingError` for any other name."""
         if name not in self.documents(format):
             raise SettingError(
                 f"{str(name)[:80]!r}: expected a {format.removeprefix('sewfast.')} in the project "
@@ -193,12 +183,8 @@ class Project:
         return (self.folder / name).read_bytes() == content
 
     def path_of(self, name: str) -> Path:
-        """The path of one of `recordings`.
-
-        Raises
-        ------
-        SettingError
-            For any other name, and for a file that is too large.
+        """The path of one of `recordings`. Raises `SettingError` for any other name, and for a file
+        that is too large.
         """
         if name not in self.recordings():
             raise SettingError(
@@ -275,11 +261,7 @@ class Project:
 
     def place_for(self, file: str, format: str, *, replace: bool = False) -> Path:
         """The path of a model or controller to write, a new file; with `replace` also that of one.
-
-        Raises
-        ------
-        SettingError
-            For the name of another file.
+        Raises `SettingError` for the name of another file.
         """
         path = self.folder / checked_name(file)
         taken = path.is_symlink() or path.exists()

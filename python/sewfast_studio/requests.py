@@ -78,13 +78,7 @@ class Step:
 
     @classmethod
     def parse(cls, asked: dict[str, Any]) -> Step:
-        """A step from a message.
-
-        Raises
-        ------
-        SettingError
-            For a value of the wrong type.
-        """
+        """A step from a message. Raises `SettingError` for a value of the wrong type."""
         inputs, output = asked.get("inputs", []), asked.get("output")
         resample, model, seed = asked.get("resample"), asked.get("model", "auto"), asked.get("seed")
         require(isinstance(asked.get("file"), str), "file", "a name", asked.get("file"))
@@ -122,12 +116,8 @@ class Step:
         return data if self.resample is None else data.resample(self.resample)
 
     def columns(self, table: Table, reference: str | None = None) -> dict[str, Any]:
-        """Arguments of `sewfast.read`, with the references, as on the command line.
-
-        Raises
-        ------
-        SettingError, DataError
-            If input or output are missing.
+        """Arguments of `sewfast.read`, with the references, as on the command line. Raises
+        `SettingError` or `DataError` if input or output are missing.
         """
         from sewfast.dataset import is_reference
 
@@ -254,13 +244,7 @@ class Commission:
 
     @classmethod
     def parse(cls, asked: dict[str, Any]) -> Commission:
-        """From a message.
-
-        Raises
-        ------
-        SettingError
-            For a value out of range.
-        """
+        """From a message. Raises `SettingError` for a value out of range."""
         machine = asked.get("machine", "virtual")
         named = isinstance(machine, str) and re.fullmatch(r"virtual(:\d{1,9})?", machine)
         require(bool(named), "machine", "virtual or virtual:SEED", machine)

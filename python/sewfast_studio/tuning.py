@@ -185,12 +185,8 @@ class Tuning:
         }
 
     def controller(self, values: Mapping[str, Any]) -> Controller:
-        """The start with these values; for the values of a search, exactly its controller.
-
-        Raises
-        ------
-        SettingError
-            For an unknown name, or a value that is not a number in its range.
+        """The start with these values; for the values of a search, exactly its controller. Raises
+        `SettingError` for an unknown name, or a value that is not a number in its range.
         """
         found = self._search_of(values)
         if found is not None:
@@ -305,12 +301,7 @@ class Tuning:
         return {"grade": found.grade, "text": spoken(str(found))}
 
     def check(self, search: Search) -> None:
-        """Check the settings of a search.
-
-        Raises
-        ------
-        SettingError
-        """
+        """Check the settings of a search. Raises `SettingError`."""
         search.cost()
         search.limits()
 
