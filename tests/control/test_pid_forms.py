@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sewfast import Controller, Gains, SettingError
@@ -116,6 +116,8 @@ POSITIVE = st.floats(1e-4, 1e4)
 
 
 @pytest.mark.parametrize("as_fraction", [False, True])
+@example(9061.5, math.inf, 0.75, 0.5, 0.0, 0.0)
+@example(1.0, math.inf, 0.79296875, 0.5, 0.0, 0.0)
 @given(
     POSITIVE | POSITIVE.map(lambda x: -x), st.floats(1e-2, 1e3) | st.just(math.inf),
     st.floats(1e-4, 1.0) | st.just(0.0), st.floats(0.5, 50.0) | st.just(math.inf),

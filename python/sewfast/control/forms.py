@@ -162,9 +162,10 @@ def _terms(num: FloatArray, den: FloatArray) -> _Terms:
     kd = 0.0
     if not math.isnan(pole):
         kd = float(at(pole, rising)) / (one**2 if integrates else -one)
-    size = np.abs(num).max(initial=0.0)
-    # share of all gains below which one counts as a rounding error
-    Ki, kd = (0.0 if abs(x) <= 1e-13 * size else x for x in (Ki, kd))
+    # rounding of a sum of the coefficients, which the distance of the poles divides, too
+    rounding = 1e-14 * float(np.abs(num).sum()) / one
+    Ki = 0.0 if abs(Ki) <= rounding else Ki
+    kd = 0.0 if abs(kd) <= rounding / (one if integrates else 1.0) else kd
     return _Terms(float(num[0]) - Ki - kd, Ki, kd, pole if kd else math.nan)
 
 

@@ -81,7 +81,7 @@ def wait_for_rest(link: Connection, timeout: float) -> None:
     since = began = status.time_us
     # the host's clock too: the time of a device that takes no credit stands still
     patience = timeout + (5.0 if link.identity.on_credit else 0.0)
-    start, half = time.monotonic(), math.inf
+    start, marks = time.monotonic(), list[Status]()
     # device time without a count after which a motor counts as at rest; ARM requires 100 ms
     while status.time_us - since < 120_000:
         passed, past = (status.time_us - began) * 1e-6, time.monotonic() - start
@@ -90,18 +90,23 @@ def wait_for_rest(link: Connection, timeout: float) -> None:
                 name=link.port.url, expected=f"the motor at rest within {timeout:g} s",
                 received=f"{status.speed_rpm:.0f} RPM", remedy="brake it or wait longer",
             )  # fmt: skip
-            # a motor that keeps more than this share of its speed over the second half of the wait
-            # for its rest is driven: one that coasts loses speed
-            if abs(status.speed_rpm) > 0.99 * half:
+            # a motor that keeps more than this share of its mean speed from the third to the last
+            # quarter of the wait is driven: one that coasts loses speed
+            if len(marks) == 2 and _pace(marks[1], status) > 0.99 * _pace(*marks):
                 error.remedy = ""  # both are said
                 error.explain(turning(status.speed_rpm, "before a run"))
             raise error
-        if math.isinf(half) and (passed > 0.5 * timeout or past > 0.5 * patience):
-            half = abs(status.speed_rpm)
+        if len(marks) < 2 and max(passed / timeout, past / patience) > (0.5, 0.75)[len(marks)]:
+            marks.append(status)
         link.let_pass(STEP_US)
         before, status = status, link.status()
         if status.counts != before.counts:
             since = status.time_us
+
+
+def _pace(before: Status, after: Status) -> float:
+    """Counts from one status to another, over the device's time between them [1/us]."""
+    return abs(after.counts - before.counts) / max(1, after.time_us - before.time_us)
 
 
 def await_measurement(link: Connection) -> None:
