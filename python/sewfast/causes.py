@@ -91,6 +91,38 @@ def loss(recording: Recording, k: int, concluded: Cause | None) -> Seen:
     return Seen(found.name, found.text, found.run, found.at, found.value)
 
 
+def sudden(recording: Recording, moved: float | None = None) -> Cause | None:
+    """What became of counts whose pace changed in the last samples by far more than in the run
+    before, so that no torque did it; or that have `moved` since in a way in which nothing coasts.
+    A device that trips at once leaves nothing else to look at.
+    """
+    # samples among which the change is; those before it whose pace is its mean; how far it stands
+    # out from the largest change before
+    last, earlier, factor = 3, 5, 3.0
+    paces = np.diff(recording.counts)
+    paces = paces[np.isfinite(paces)]
+    if len(paces) < last + 2 * earlier:
+        return None
+    changes = np.abs(np.diff(paces))
+    k = len(paces) - last + int(np.argmax(changes[-last:]))
+    pace, now = float(paces[k - earlier : k].mean()), float(paces[k])
+    # a motor that only begins to turn has no pace yet to tell it from
+    if abs(pace) < factor:
+        return None
+    if not changes[k - 1] > factor * changes[:-last].max():
+        # it went on until the end: from there a motor coasts by more than a count, and forward
+        if moved is None or moved * pace > abs(pace):
+            return None
+        k, now = len(paces), -pace if moved * pace < -abs(pace) else 0.0
+    at, run = k * recording.Ts, recording.name.removesuffix(ABORTED)
+    when = f"{at:.3g} s after {run!r} began"
+    value = now / pace
+    if abs(value) > factor:
+        return Cause("counts jumped", _jump(now - pace, when)[1], run, at, now - pace)
+    name, text = _counts(value, when)
+    return Cause(name, text, run, at, value)
+
+
 def cause_of(
     recording: Recording,
     before: Sequence[Recording] = (),

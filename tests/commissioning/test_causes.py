@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sewfast import Controller, DataError, Gains, Recording, cause_of, commission, record, run
-from sewfast.causes import cause_among
+from sewfast.causes import cause_among, sudden
 from sewfast.commissioning import Refusal, SteppedBench
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.excitations import first_motion, lost_motion, step_response
@@ -263,6 +263,44 @@ def test_one_motor_that_explains_all_runs_needs_no_change() -> None:
     stiff = Motor(0.0, friction=3.0)
     low, high = (record(rig(stiff), np.repeat([0.0, u], 500), name="step") for u in (5.0, 9.0))
     assert cause_of(high, [low], volt=10.0) is None
+
+
+@pytest.mark.parametrize(
+    ("after", "name", "value"),
+    [(0.0, "encoder lost", 0.0), (-1.0, "encoder sign", -1.0), (0.5, "counts scaled", 0.5),
+     (20.0, "counts jumped", 38.0 * 19.0), (0.9, None, 0.0), (1.5, "counts scaled", 1.5)],
+)  # fmt: skip
+@pytest.mark.parametrize("more", [1, 2])
+def test_a_pace_that_no_torque_changes_has_a_cause(
+    after: float, name: str | None, value: float, more: int
+) -> None:
+    """A device has tripped within a sample or two."""
+    rng = np.random.default_rng(0)
+    paces = np.concatenate([np.linspace(0.0, 38.0, 80), np.full(60, 38.0)])
+    counts = np.floor(np.cumsum([*paces, *[38.0 * after] * more]) + rng.uniform(0.0, 1.0))
+    u = np.full(len(counts), 5.0)
+    seen = sudden(Recording(u, counts, u, None, 1e-3, 1572.0, "loop"))
+    assert (seen and seen.name) == name
+    if seen is not None:
+        assert seen.value == pytest.approx(value, abs=1.5 if name == "counts jumped" else 0.05)
+        assert seen.at == pytest.approx(0.139, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("moved", "name"), [(400.0, None), (0.0, "encoder lost"), (-400.0, "encoder sign")]
+)
+def test_counts_after_a_trip_tell_what_a_run_did_not_show(moved: float, name: str | None) -> None:
+    counts = np.floor(7.4 * np.arange(200.0))
+    run = Recording(np.full(200, 5.0), counts, counts, None, 1e-3, 1572.0, "loop")
+    assert sudden(run) is None
+    seen = sudden(run, moved)
+    assert (seen and seen.name) == name
+
+
+def test_a_motor_that_begins_to_turn_has_not_changed_suddenly() -> None:
+    counts = np.concatenate([np.zeros(60), [3.0, 12.0, 27.0]])
+    u = np.full(len(counts), 20.0)
+    assert sudden(Recording(u, counts, u, None, 1e-3, 1572.0, "loop")) is None
 
 
 def test_too_short_a_run_is_refused() -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from ..arrays import FloatArray
+from ..causes import sudden
 from ..control.controller import SampledController
 from ..control.machine import RecordedRun, Watch, cancelled_by, cause_in, recording_of
 from ..control.position import Playing, PositionController
@@ -240,7 +241,9 @@ def _converted(drive: Drive, plan: Plan, convert: Callable[[RunResult], T], **op
         tripped = outcome.state == "tripped" and outcome.reason in _OF_MACHINE
         if isinstance(error, LinkError) and tripped:
             with contextlib.suppress(LinkError):  # the drive has gone meanwhile
-                cause = cause_in(recording_of(error), volt=drive.volt)
+                found, counts = recording_of(error), stopped.run.columns["counts"]
+                moved = drive.status().counts - counts[np.isfinite(counts)][-1:].sum()
+                cause = cause_in(found, volt=drive.volt) or sudden(found, moved)
                 # a limit that its owner has set low ends a healthy motor before it settles
                 if cause is not None and cause.name != "integrates":
                     error.remedy = ""  # the message keeps how to clear the trip
