@@ -17,7 +17,6 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -25,19 +24,17 @@ from motulator.drive import control, model
 from motulator.drive.control import sm
 from motulator.drive.utils import SynchronousMachinePars
 from scipy.integrate import solve_ivp
-from simple_pid import PID
 
 from sewfast import commission, signals
 from sewfast.commissioning import SteppedBench
-from sewfast.gains import Gains
 from sewfast.rules import simc
+from tracking import TUNED, UNSEEN, Decide, simple_pid, stepped
 
 TORQUE, SPEED, TS, COUNTS = 14.0, 1500.0, 1e-3, 4096.0
 INERTIA = 0.015
 NOMINAL = 2.0 * math.pi * 75.0
 """Electrical angular speed from which the field is weakened [rad/s]."""
 RPM = 30.0 / math.pi
-TUNED, UNSEEN = ("trapezoid", "trapezoids", "random"), ("chirp_hi_lo", "chirp_lo_hi")
 
 
 def friction(speed: float) -> float:
@@ -47,6 +44,8 @@ def friction(speed: float) -> float:
 
 class Pmsm:
     """motulator's motor and vector control as a machine that is advanced by samples."""
+
+    Ts, counts_per_rev = TS, COUNTS
 
     def __init__(self) -> None:
         self.reset()
@@ -90,21 +89,6 @@ class Pmsm:
             self.turned += math.remainder(turned, 2.0 * math.pi)
 
 
-Decide = Callable[[float, float], float]
-
-
-def error(machine: Pmsm, r: np.ndarray, decide: Decide) -> float:
-    """Of a loop that another library decides on: from reference and measured to torque [RPM]."""
-    machine.reset()
-    before, squares = 0.0, 0.0
-    for wanted in r.tolist():
-        counts = machine.counts
-        squares += (machine.speed_rpm - wanted) ** 2
-        machine.step(decide(wanted, (counts - before) * 60.0 / (COUNTS * TS)))
-        before = counts
-    return math.sqrt(squares / len(r))
-
-
 def motulators(bandwidth: float) -> Decide:
     """motulator's speed controller with the true inertia and this bandwidth [rad/s]."""
     loop = control.SpeedController(INERTIA, bandwidth, TORQUE)
@@ -113,19 +97,6 @@ def motulators(bandwidth: float) -> Decide:
         u = float(loop.output(r / RPM, y / RPM))
         loop.update(TS, u)
         return u
-
-    return decide
-
-
-def simple_pid(gains: Gains) -> Decide:
-    """simple-pid behind a mean of 8 samples."""
-    pid = PID(gains.Kp, gains.Ki, gains.Kd, sample_time=None, output_limits=(-TORQUE, TORQUE))
-    kept = [0.0] * 8
-
-    def decide(r: float, y: float) -> float:
-        kept[:] = [*kept[1:], y]
-        pid.setpoint = r
-        return float(pid(sum(kept) / 8, dt=TS))
 
     return decide
 
@@ -143,7 +114,7 @@ def shown(seed: int) -> None:
     )
     assert done.fopdt is not None
     # the mean of 8 samples delays; the ratio of delay to time constant is below those of Eq. 12
-    rule = simc(replace(done.fopdt, L=done.fopdt.L + 3.5 * TS)).gains.to("parallel")
+    rule = simc(replace(done.fopdt, L=done.fopdt.L + 3.5 * TS)).gains
     controller = done.controller
     lead = done.tuning.lead
     print(lead, flush=True)
@@ -154,7 +125,7 @@ def shown(seed: int) -> None:
     references = {n: 0.8 * SPEED / np.max(np.abs(r)) * r for n, r in references.items()}
     best = min(
         (2.0 * math.pi * hz for hz in (20.0, 30.0, 45.0, 65.0, 90.0)),
-        key=lambda b: sum(error(machine, references[n], motulators(b)) for n in TUNED),
+        key=lambda b: sum(stepped(machine, references[n], motulators(b), TORQUE) for n in TUNED),
     )
     print(f"motulator's speed controller is best at {best / (2.0 * math.pi):g} Hz")
     print(f"{'error [RPM rms]':16} feedforward  PID alone  motulator  simple-pid")
@@ -163,7 +134,8 @@ def shown(seed: int) -> None:
             math.sqrt(np.mean((run.recording.speed_true - r) ** 2))
             for run in (bench.follow(c, r, name) for c in (controller, alone))
         ]
-        other = [error(machine, r, loop) for loop in (motulators(best), simple_pid(rule))]
+        rivals = (motulators(best), simple_pid(rule, TS, TORQUE))
+        other = [stepped(machine, r, loop, TORQUE) for loop in rivals]
         print(f"{name:16}" + "".join(f" {e:11.1f}" for e in (*own, *other)), flush=True)
 
 

@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import control
@@ -28,6 +29,7 @@ from sewfast import Controller, VirtualMachine, run, signals
 from sewfast.control.margins import operating_point
 from sewfast.errors import SettingError
 from sewfast.evidence import OperatingPoint
+from sewfast.gains import Gains
 from sewfast.models import Model
 from sewfast.rules import eq_12, fit_fopdt
 
@@ -46,44 +48,45 @@ ALTERED = {
 """Changes of the machine after identification: factors on its parameters."""
 
 
-def stepped(
-    machine: VirtualMachine, r: np.ndarray, decide: Callable[[float, float], float]
-) -> float:
-    """Error of a loop that another library decides on, from reference and measured speed [RPM]."""
+Decide = Callable[[float, float], float]
+"""The command for a reference and a measured speed [RPM]."""
+
+
+def stepped(machine: Any, r: np.ndarray, decide: Decide, limit: float = 20.0) -> float:
+    """Error of a loop that another library decides on [RPM], within a limit of the command."""
     machine.reset()
-    before = counts = machine.counts
-    speed, errors = machine.speed_rpm, []
+    before, errors = machine.counts, []
     for wanted in r.tolist():
+        counts = machine.counts
+        errors.append(machine.speed_rpm - wanted)
         measured = (counts - before) * 60.0 / (machine.counts_per_rev * machine.Ts)
-        errors.append(speed - wanted)
         before = counts
-        counts, speed = machine.step(float(np.clip(decide(wanted, measured), -20.0, 20.0)))
+        machine.step(float(np.clip(decide(wanted, measured), -limit, limit)))
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
-def simple_pid(model: Model) -> Callable[[], Callable[[float, float], float]]:
-    """simple-pid with Eq. 12's gains on the model's step, behind a mean of 8 samples."""
+def simple_pid(gains: Gains, Ts: float, limit: float = 20.0) -> Decide:
+    """simple-pid with these gains, behind a mean of 8 samples."""
+    own = gains.to("parallel")
+    pid = PID(own.Kp, own.Ki, own.Kd, sample_time=None, output_limits=(-limit, limit))
+    kept = [0.0] * 8
+
+    def decide(r: float, y: float) -> float:
+        kept[:] = [*kept[1:], y]
+        pid.setpoint = r
+        return float(pid(sum(kept) / 8, dt=Ts))
+
+    return decide
+
+
+def on_step(model: Model) -> Gains:
+    """Eq. 12's gains on the model's step, with the delay of the mean."""
     u = np.where(np.arange(3000) < 100, 0.0, 6.0)
     fopdt = fit_fopdt(u, model.simulate(u), Ts=model.Ts)
-    gains = eq_12(replace(fopdt, L=fopdt.L + 3.5 * model.Ts), Ms=1.8).gains.to("parallel")
-
-    def loop() -> Callable[[float, float], float]:
-        pid = PID(gains.Kp, gains.Ki, gains.Kd, sample_time=None, output_limits=(-20, 20))
-        kept = [0.0] * 8
-
-        def decide(r: float, y: float) -> float:
-            kept[:] = [*kept[1:], y]
-            pid.setpoint = r
-            return float(pid(sum(kept) / 8, dt=model.Ts))
-
-        return decide
-
-    return loop
+    return eq_12(replace(fopdt, L=fopdt.L + 3.5 * model.Ts), Ms=1.8).gains
 
 
-def regulator(
-    point: OperatingPoint, counts: float
-) -> Callable[[], Callable[[float, float], float]]:
+def regulator(point: OperatingPoint, counts: float) -> Callable[[], Decide]:
     """Linear-quadratic with integral action and a Kalman filter for the encoder's noise."""
     A, B, C, _ = point.delayed()
     n = len(A)
@@ -97,7 +100,7 @@ def regulator(
     K, L = np.asarray(K), np.asarray(L)
     gain, steady = float(point.dc_gain[0]), np.linalg.solve(np.eye(n) - A, B)
 
-    def loop() -> Callable[[float, float], float]:
+    def loop() -> Decide:
         state, total, u = np.zeros((n, 1)), 0.0, 0.0
 
         def decide(r: float, y: float) -> float:
@@ -133,7 +136,9 @@ def row(seed: int, machine: VirtualMachine) -> dict[str, Any]:
         "cpu": time.process_time() - began,
     }
     member = model.members[0] if model.members else model
-    rivals = {"simple-pid": simple_pid(member)}
+    rivals: dict[str, Callable[[], Decide]] = {
+        "simple-pid": partial(simple_pid, on_step(member), member.Ts)
+    }
     with contextlib.suppress(SettingError):  # a member that holds no such speed
         point = operating_point(member, 1500.0)
         rivals["LQI"] = regulator(point, machine.counts_per_rev)

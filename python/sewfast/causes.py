@@ -97,8 +97,8 @@ def sudden(recording: Recording, moved: float | None = None) -> Cause | None:
     A device that trips at once leaves nothing else to look at.
     """
     # samples among which the change is; those before it whose pace is its mean; how far it stands
-    # out from the largest change before
-    last, earlier, factor = 3, 5, 3.0
+    # out from the largest change before; least counts a sample of a motor that turns
+    last, earlier, factor, least = 3, 5, 3.0, 3.0
     paces = np.diff(recording.counts)
     paces = paces[np.isfinite(paces)]
     if len(paces) < last + 2 * earlier:
@@ -107,7 +107,7 @@ def sudden(recording: Recording, moved: float | None = None) -> Cause | None:
     k = len(paces) - last + int(np.argmax(changes[-last:]))
     pace, now = float(paces[k - earlier : k].mean()), float(paces[k])
     # a motor that only begins to turn has no pace yet to tell it from
-    if abs(pace) < factor:
+    if abs(pace) < least:
         return None
     if not changes[k - 1] > factor * changes[:-last].max():
         # it went on until the end: from there a motor coasts by more than a count, and forward

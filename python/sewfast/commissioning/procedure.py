@@ -557,8 +557,7 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
         required, tuning = of(ensemble)
     journal.keep(models=ensemble, rmse=trained.errors_of(ensemble))
     plants = "a linear model" if is_alone else "an ensemble of networks"
-    every = plan.thinning.k
-    tuning = led(tuning, ensemble, practice, cost, plan.pushes, asked.threads, every)
+    tuning = led(tuning, ensemble, practice, cost, plan.pushes, asked.threads, plan.thinning.k)
     tuned = plan.thinning.fine(tuning.pid)
     controller = replace(tuned, notes=f"commissioned on {plants}")
     if tuning.warning is not None:

@@ -1,6 +1,7 @@
-"""Joints of a robot in one record: which columns are the command and the position of each.
+"""Command and position of each joint of a robot, from one record.
 
-Readers give a column to each element of an array of joints, `field.JOINT` (`containers.label`).
+Readers give a column to each element of an array of joints, `field.JOINT` (`containers.label`);
+`roles.joint_columns` knows which are those of a joint.
 """
 
 from __future__ import annotations
