@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from sewfast.commissioning.gains import cautious, first_gains, held, lowered, sc
 from sewfast.commissioning.slow import HARMONICS, TurnLoad, basis, turn_load
 from sewfast.commissioning.small_signal import SmallSignal, small_signal
 from sewfast.control.margins import margins
+from sewfast.dataset import FloatArray
 from sewfast.recording import Recording
 from sewfast.tuning.objective import LARGEST_MS
 
@@ -144,7 +146,26 @@ def test_a_drive_whose_pulses_are_over_at_once_shows_its_acceleration_from_rest(
     assert planned > 4.0 * true
     recording = on.excite(pulses(step, planned, wanted, on.Ts, 0), "pulses")
     assert acceleration_shown(recording, wanted) == np.inf
-    assert acceleration_from_rest(on, planned, wanted) == pytest.approx(true, rel=0.1)
+    assert acceleration_from_rest(on, step, planned, wanted) == pytest.approx(true, rel=0.1)
+
+
+def test_no_longer_pulse_is_tried_where_one_shows_nothing() -> None:
+    on = bench("light")
+    wanted = asked(on)
+    step = step_response(on, wanted, first_motion(on, wanted))
+    tried = []
+
+    class Frozen:
+        Ts = on.Ts
+
+        def excite(self, u: FloatArray, name: str) -> Recording:
+            tried.append(name)
+            found = on.excite(u, name)
+            return replace(found, y=0.0 * found.y, counts=0.0 * found.counts)
+
+    with pytest.raises(Refusal, match="a tenth of what"):
+        acceleration_from_rest(cast(Any, Frozen()), step, acceleration(step, wanted), wanted)
+    assert len(tried) == 1
 
 
 @pytest.mark.parametrize("fastest", [2_500.0, 6_000.0, 1e5])

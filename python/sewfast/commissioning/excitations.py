@@ -297,10 +297,26 @@ def acceleration_shown(recording: Recording, demands: Demands) -> float:
     return float("inf")
 
 
-def acceleration_from_rest(machine: Machine, fastest: float, demands: Demands) -> float:
+def require_acceleration(shown: float, fopdt: Fopdt) -> None:
+    """Refuse a machine that the largest command accelerates by this [RPM/s], far less than the
+    smaller one of its step response did.
+    """
+    # share of the step's acceleration that a larger command must reach
+    slowest = 0.1 * fopdt.K * fopdt.u_high / fopdt.T
+    require(
+        shown > slowest,
+        f"expected the largest command to accelerate the machine by at least {slowest:.3g} RPM/s, "
+        f"a tenth of what {fopdt.u_high:.3g} V did in the step response, it did by {shown:.3g}",
+    )
+
+
+def acceleration_from_rest(
+    machine: Machine, fopdt: Fopdt, fastest: float, demands: Demands
+) -> float:
     """The same from single pulses of the largest command [RPM/s], until one reaches a fair speed.
     Each is twice as long as the one before. Pulses between speeds do not help if they are planned
     with far more acceleration than a drive's current limit allows: they last only milliseconds.
+    Where a pulse shows next to nothing, no longer one is tried: the encoder may be lost.
     """
     # shares of the top speed: aim of the first single pulse, and speed that ends the series
     first_share, fair_share = 0.2, 0.35
@@ -309,10 +325,11 @@ def acceleration_from_rest(machine: Machine, fastest: float, demands: Demands) -
         seconds = samples * machine.Ts
         recording = machine.excite(_single(demands.u_max, samples, machine.Ts), f"limit_{samples}")
         reached = float(np.max(recording.y))
+        require_acceleration(reached / seconds, fopdt)
         # a pulse of twice the length reaches at most about twice the speed
         # longest pulse of the series [s]
         if reached >= fair_share * demands.top or seconds >= 1.0:
-            return max(reached, 1e-3 * demands.top) / seconds
+            return reached / seconds
         samples *= 2
 
 

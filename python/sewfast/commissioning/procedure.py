@@ -27,7 +27,7 @@ from ..tuning.search import Loop, TuningResult
 from . import excitations
 from .bench import DriveBench, RecordedBench, bench_of, description_of
 from .checkpoint import STAGES, Checkpoint
-from .demands import Demands, Refusal, demands, require
+from .demands import Demands, Refusal, demands
 from .excitations import first_motion, lost_motion, step_response
 from .gains import (
     Requirements,
@@ -490,17 +490,11 @@ def _pulses(machine: Machine, fopdt: Fopdt, asked: Demands) -> tuple[float, list
     found = [machine.excite(u, "pulses")]
     shown = excitations.acceleration_shown(found[0], asked)
     if math.isinf(shown):
-        shown = excitations.acceleration_from_rest(machine, fastest, asked)
+        shown = excitations.acceleration_from_rest(machine, fopdt, fastest, asked)
     # share of the planned acceleration; a drive that reaches less limits its current
     if shown > 0.7 * fastest:
         return min(shown, fastest), found
-    # share of the step's acceleration that a larger command must reach
-    slowest = 0.1 * fopdt.K * fopdt.u_high / fopdt.T
-    require(
-        shown > slowest,
-        f"expected the largest command to accelerate the machine by at least {slowest:.3g} RPM/s, "
-        f"a tenth of what {fopdt.u_high:.3g} V did in the step response, it did by {shown:.3g}",
-    )
+    excitations.require_acceleration(shown, fopdt)
     u = excitations.pulses(fopdt, shown, asked, machine.Ts, asked.seed + 1)
     found.append(machine.excite(u, "pulses_limited"))
     again = excitations.acceleration_shown(found[1], asked)
