@@ -327,6 +327,11 @@ class _Look:
         return bool(self.found["error"] <= ALIKE * self.found["size"])
 
     @property
+    def expected(self) -> float:
+        """About the speed that the motor has without a change [RPM, rms]; the run may show none."""
+        return math.hypot(self.found["size"], self.found["error"])
+
+    @property
     def name(self) -> str:
         """The run's name; one that was ended early is saved under another."""
         return self.recording.name.removesuffix(ABORTED)
@@ -351,9 +356,13 @@ class _Look:
         is_alone = math.isnan(found["unsure"])
         least = NOTED if is_alone else max(NOTED, TIMES * found["unsure"])
         least = max(least * found["size"], found["rounding"])
-        if found["error"] > least and found["findings"]:
-            most = min(explained * found["error"], ties * found["findings"][0][3])
-            equal = {f[0]: f for f in found["findings"] if f[3] <= most}
+        findings = found["findings"]
+        if found["size"] < LOST * self.expected:
+            # next to nothing moves: a delay longer than the run explains that as well
+            findings = [f for f in findings if f[0] in ("counts", "gain")]
+        if found["error"] > least and findings:
+            most = min(explained * found["error"], ties * findings[0][3])
+            equal = {f[0]: f for f in findings if f[3] <= most}
             if equal:
                 change = next(name for name in _NAMED if name in equal)
                 _, value, at, error, motor = equal[change]
@@ -370,7 +379,7 @@ class _Look:
         when = (
             f"from the start of {self.name!r}" if early else f"{at:.3g} s after {self.name!r} began"
         )
-        if change == "stuck" and abs(value * motor["gain"]) < LOST * self.found["size"]:
+        if change == "stuck" and abs(value * motor["gain"]) < LOST * self.expected:
             change, value = "gain", 0.0
         words = partial(_jump, per_turn=r.counts_per_rev) if change == "jump" else _NAMED[change]
         name, text = words(value, when)

@@ -20,7 +20,7 @@ TS, PER_TURN = 1e-3, 4096.0
 
 @dataclass
 class Motor:
-    """250 RPM/V, .1 s, .3 V of friction; from `at` on each field that is not None acts."""
+    """250 RPM/V, .3 V of friction; from `at` on each field that is not None acts."""
 
     at: float = math.inf
     command: float = 1.0
@@ -31,6 +31,7 @@ class Motor:
     late: int = 0
     inertia: float = 1.0
     friction: float = 0.3
+    lag: float = 0.1
 
     def __post_init__(self) -> None:
         self.reset()
@@ -56,7 +57,7 @@ class Motor:
             held = math.copysign(friction, self.speed_rpm)
             held = held if self.speed_rpm else min(max(drive, -friction), friction)
             before = self.speed_rpm
-            rise = (250.0 * (drive - held) - before) / (0.1 * (self.inertia if wrong else 1.0))
+            rise = (250.0 * (drive - held) - before) / (self.lag * (self.inertia if wrong else 1.0))
             self.speed_rpm += 0.2 * TS * rise
             if before * self.speed_rpm < 0.0:
                 self.speed_rpm = 0.0
@@ -121,6 +122,15 @@ def test_a_run_alone_is_enough_if_it_was_well_at_first(motor: Motor, name: str) 
     found = cause_of(looped(motor))
     assert found is not None
     assert found.name == name
+
+
+def test_an_encoder_that_freezes_before_anything_moved_fast_is_no_delay() -> None:
+    sound, broken = Motor(lag=0.4), Motor(0.06, encoder=0.0, lag=0.4)
+    before = [record(rig(sound), np.repeat([0.0, 3.0, 0.0], [100, 900, 900]), name="step")]
+    u = np.concatenate([np.zeros(50), np.tile(np.repeat([9.0, -4.0, 6.0, 2.0], 60), 8)])
+    found = cause_among([*before, record(rig(broken), u, name="pulses")], volt=10.0, speed=3000.0)
+    assert found is not None
+    assert found.name in ("encoder lost", "stage off"), str(found)
 
 
 def test_a_machine_that_was_never_as_thought_is_named_from_one_run() -> None:
