@@ -235,11 +235,18 @@ def _looks(runs: Sequence[Recording], volt: float, speed: float) -> list[_Look]:
 def _between(
     runs: Sequence[Recording], known: Sequence[_Look], volt: float, speed: float
 ) -> Cause | None:
-    """What changed in the latest of these runs that differs from those before it."""
+    """What changed in the latest of these runs that differs from those before it, and lasted."""
+
+    def known_among(some: Sequence[Recording]) -> list[Recording]:
+        return [k.recording for k in known if any(k.recording is r for r in some)]
+
     for i in reversed(range(1, len(runs))):
-        before = [k.recording for k in known if any(k.recording is r for r in runs[:i])]
+        before, after = known_among(runs[:i]), known_among(runs[i + 1 :])
         if before and (cause := _Look.at(runs[i], before, volt, speed).change()):
-            return cause
+            # what breaks stays broken: the last run has to show it, too
+            last = _Look.at(after[-1], before, volt, speed).change() if after else cause
+            if last is not None and last.name == cause.name:
+                return cause
     return None
 
 

@@ -323,3 +323,15 @@ def test_a_run_of_two_samples_among_others_is_passed_over() -> None:
     whole = record(rig(Motor()), np.repeat([0.0, 5.0], 500), name="step")
     short = Recording(np.ones(2), np.arange(2.0), np.arange(2.0), None, TS, PER_TURN, "short")
     assert cause_among([whole, short, whole]) is None
+
+
+@pytest.mark.parametrize("lasts", [False, True])
+def test_what_an_earlier_run_shows_is_a_fault_only_if_it_lasts(lasts: bool) -> None:
+    def ran(motor: Motor, name: str) -> Recording:
+        return record(rig(motor), np.repeat([0.0, 3.0, 6.0, 2.0], 250), name=name)
+
+    braked = Motor(0.0, friction=1.5)
+    later = [ran(braked if lasts else Motor(), f"later {i}") for i in range(2)]
+    series = [ran(Motor(), "first"), ran(Motor(), "second"), ran(braked, "third"), *later]
+    found = cause_among(series)
+    assert (found is not None and found.name == "friction") == lasts
