@@ -307,8 +307,8 @@ def judged(
 ) -> list[str]:
     """What is wrong with the files and messages that a command left."""
     faults = []
-    if "Traceback" in text and "sewfast" not in text:
-        return EARLY  # Python had not begun to read the program
+    if "Traceback" in text and not re.search(r'File "[^"]*sewfast', text):
+        return EARLY  # Python had not begun to run the program
     if any(word in text for word in ("Traceback", "Exception ignored", "a fault in sewfast")):
         faults.append("a traceback or a fault: " + text.strip().splitlines()[-1][:160])
     after = contents(folder)

@@ -19,9 +19,12 @@ def main() -> int:
 
     interrupts.listen()
     try:
-        return run()
+        code = run()
     finally:
         interrupts.deaf()
+    if interrupts.is_pressed():
+        interrupts.leave(code)
+    return code
 
 
 if __name__ == "__main__":

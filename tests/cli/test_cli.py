@@ -360,6 +360,32 @@ def test_a_closed_pipe_is_no_fault(tmp_path: Path) -> None:
     assert err == b""
 
 
+BROKEN_BY_CTRL_C = """
+import builtins, os, signal, time
+class Left:
+    def __del__(self, abort=os.abort):
+        abort()
+builtins.left = Left()
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(1.0)
+except KeyboardInterrupt:
+    raise ImportError("half of it") from None
+"""
+"""A library that turns Ctrl-C into an error of its own and leaves what aborts the interpreter."""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of a terminal")
+def test_ctrl_c_while_a_library_is_imported_is_told_as_ctrl_c(tmp_path: Path) -> None:
+    (tmp_path / "matplotlib.py").write_text(BROKEN_BY_CTRL_C)
+    k = np.arange(50.0)
+    api.write_table(tmp_path / "one.csv", {"t": 0.001 * k, "u": k > 9, "y": np.sqrt(k)})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+        found = started(tmp_path, "look", "one.csv", "--plot", "one.png", done=130)
+    assert found.err == "sewfast look: interrupted; nothing was written\n"
+
+
 @pytest.mark.skipif(os.name != "posix", reason="needs a pseudo-terminal")
 def test_progress_is_drawn_on_a_terminal_only(tmp_path: Path, walk: Path) -> None:
     import pty

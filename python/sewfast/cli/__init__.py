@@ -53,6 +53,8 @@ def _carried_out(args: argparse.Namespace) -> int:
             sys.stdout.flush()
         return code or DONE
     except SewfastError as e:
+        if interrupts.is_pressed():  # as of a library that could not be imported to its end
+            return _fault(args, e)
         return _say(f"sewfast {args.name}: {e}", REFUSED)
     except KeyboardInterrupt:
         return _say(f"sewfast {args.name}: {interrupts.told()}", INTERRUPTED)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import _thread
+import atexit
 import os
 import signal
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -46,6 +47,18 @@ def deaf() -> None:
     """Ignore the signals from now on: the command is done, and its exit code is known."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
+
+
+def leave(code: int) -> None:
+    """End the process of an interrupted command at once: where the import of a library was
+    interrupted, what is left of it can abort the interpreter as it ends.
+    """
+    with suppress(Exception):
+        atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(Exception):  # a closed pipe
+            stream.flush()
+    os._exit(code)
 
 
 @contextmanager
