@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
+import math
 import os
 import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,7 @@ import sewfast as api
 from cli import PROGRAM, environment
 from cli import called as sewfast
 from cli import sewfast as started
+from sewfast.cli.arguments import time_left
 
 
 def lagged(u: np.ndarray) -> np.ndarray:
@@ -418,3 +422,35 @@ def _read_all(terminal: int) -> str:
             os.close(terminal)
             return found.decode()
         found += chunk
+
+
+# --- time budgets ---------------------------------------------------------------------------------
+
+
+def test_a_time_budget_counts_from_the_start_of_the_command() -> None:
+    def left(seconds: float | None, ago: float) -> float | None:
+        began = time.monotonic() - ago
+        return time_left(argparse.Namespace(time_budget=seconds, began=began))
+
+    assert left(10.0, 3.0) == pytest.approx(7.0, abs=0.1)
+    # modules that took longer than that to read leave half of it for the work
+    assert left(10.0, 30.0) == 5.0
+    assert left(None, 3.0) is None
+    for meaningless in (0.0, -1.0, math.inf):  # refused by the work
+        assert left(meaningless, 3.0) == meaningless
+
+
+def test_a_budget_of_the_command_is_what_is_left_of_it(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[float] = []
+
+    def noted(args: argparse.Namespace) -> None:
+        given.append(args.began)
+
+    for module in ("identify", "tune"):
+        monkeypatch.setattr(f"sewfast.cli.{module}.time_left", noted)
+    sewfast(walk, "tune", "drive.json", "--evaluations", 5, "--force", "-o", tmp_path / "c.json")
+    sewfast(walk, "identify", "one.csv", "--model", "oe", "-o", tmp_path / "m.json")
+    assert len(given) == 2
+    assert time.monotonic() - 600.0 < given[0] <= given[1] <= time.monotonic()

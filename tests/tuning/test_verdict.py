@@ -280,12 +280,19 @@ def test_the_runs_for_a_verdict_end_with_the_budget(monkeypatch: pytest.MonkeyPa
     assert found.grade == "fair"
     assert "left no time" in (found.warning or "")
     assert time.lost == ["the runs for the verdict"]
+    # nor is it found out then what a loop at a limit needs, which takes longer than its runs
+    ran.clear()
+    monkeypatch.setattr(verdicts, "_railed", lambda found: np.ones(len(found.r), dtype=bool))
+    monkeypatch.setattr(verdicts, "_at_limit", lambda *given: ran.append(given) or 0.0)
+    assert "left no time" in (verdict_of(task, QUIET, Budget(5.0)).warning or "")
+    assert len(ran) == 6
 
 
-def test_what_a_reference_needs_is_asked_only_of_a_loop_that_is_at_a_limit(
+def test_what_takes_long_is_asked_only_of_a_loop_that_shows_a_fault(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(verdicts, "command_for", lambda *_: pytest.fail("it takes long"))
+    for name in ("command_for", "_settling"):
+        monkeypatch.setattr(verdicts, name, lambda *_: pytest.fail("it takes long"))
     task = TuningTask.of(
         [drive()], [SHORT], start=QUIET, first={}, cost=None,
         aggregate="mean", constraints=None, variations=None,

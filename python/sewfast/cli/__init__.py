@@ -7,6 +7,7 @@ import errno
 import io
 import os
 import sys
+import time
 import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -18,6 +19,8 @@ from .drive import is_port
 from .output import DONE, FAULT, INTERRUPTED, REFUSED, logging_to_stderr
 from .parser import build_parser
 
+_READ = time.monotonic()
+"""When the program was started, nearly: the modules of the work are imported after this."""
 _UNUSABLE = (errno.EACCES, errno.ELOOP, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EPERM, errno.EROFS)
 """What is wrong with a name or a place, wherever it is used first, and not with sewfast."""
 
@@ -28,6 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     is done, 1 for a fault in sewfast, 2 if it is refused, 130 if it is interrupted.
     """
     forget()
+    began = _READ if argv is None else time.monotonic()
     try:
         args, found = _parsed(argv)
     except KeyboardInterrupt:
@@ -36,6 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _say(f"sewfast: {e}", REFUSED)
     with logging_to_stderr(quiet=args.quiet, verbose=args.verbose):
         found.fill(args)
+        args.began = began
         return _carried_out(args)
 
 

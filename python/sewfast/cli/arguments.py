@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -56,6 +57,18 @@ def add_command(
     parser.set_defaults(command=command, out_of=None)
     add_options(parser, options)
     return parser
+
+
+def time_left(args: argparse.Namespace) -> float | None:
+    """The time budget [s] without what the command has taken so far to read modules and files (many
+    seconds beside other work); half of it at least is for the work.
+    """
+    seconds: float | None = args.time_budget
+    # whether a number is a budget is for the work to say
+    if seconds is None or not seconds > 0.0:
+        return seconds
+    gone: float = time.monotonic() - args.began
+    return round(max(seconds - gone, 0.5 * seconds), 3)
 
 
 def whole(text: str) -> int:

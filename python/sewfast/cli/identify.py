@@ -25,6 +25,7 @@ from .arguments import (
     add_weights,
     require_place,
     require_plot,
+    time_left,
 )
 from .data import (
     add_hold,
@@ -277,7 +278,7 @@ def _identify(
         output=args.output_function,
         starts=args.starts,
         seed=args.seed,
-        time_budget=args.time_budget,
+        time_budget=time_left(args),
         select=args.select,
         validation=held,
         progress=progress,

@@ -21,6 +21,7 @@ from .arguments import (
     add_plot,
     require_place,
     require_plot,
+    time_left,
 )
 from .control import reference_of
 from .output import print_json, print_rows, suggested
@@ -341,7 +342,7 @@ def _tuned(
         return tune(
             models, references, **_started(args, models), **settings, rival=rival,
             feedforward=args.feedforward, loop=args.loop, method=args.method,
-            time_budget=args.time_budget, progress=progress,
+            time_budget=time_left(args), progress=progress,
         )  # fmt: skip
 
 
@@ -365,7 +366,7 @@ def _front(
     with Progress("tune", quiet=args.quiet) as progress:
         return pareto(
             models, references, objectives=args.pareto.split(","), start=start, **settings,
-            time_budget=args.time_budget, progress=progress,
+            time_budget=time_left(args), progress=progress,
         )  # fmt: skip
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -213,7 +214,7 @@ def _of_runs(task: TuningTask, controller: SampledController, time: Budget) -> l
     at_limit, outside, missed, found = 0.0, 0.0, "", []
     for r in task.references if _models(task) else ():
         try:
-            pairs = _in_time(task, controller, r, time)
+            pairs = _in_time(time, partial(_run_with, controller, r), _models(task))
         except FitError:
             return [
                 Objection(
@@ -221,18 +222,19 @@ def _of_runs(task: TuningTask, controller: SampledController, time: Budget) -> l
                     "begin with smaller gains, or check the model on new data",
                 )
             ]  # fmt: skip
-        if pairs is None:
+        # the samples that need no limit are more than MOST of all: with less than this at a limit,
+        # no more than MOST of them are, whatever the reference needs, which takes long to find
+        is_railed = pairs and np.mean([np.mean(_railed(one)) for one, _ in pairs]) > MOST * MOST
+        shares = _in_time(time, lambda pair: _at_limit(*pair), (is_railed and pairs) or [])
+        levels = _in_time(time, lambda pair: _missed(*pair), pairs or [])
+        if pairs is None or shares is None or levels is None:
             text = "the time budget left no time to run the references on the models"
             found.append(Objection("fair", text, "give more time, or run them (sewfast run)"))
             break
-        # the samples that need no limit are more than MOST of all: with less than this at a limit,
-        # no more than MOST of them are, whatever the reference needs, which takes long to find
-        if np.mean([np.mean(_railed(one)) for one, _ in pairs]) > MOST * MOST:
-            at_limit = max(at_limit, float(np.mean([_at_limit(*pair) for pair in pairs])))
+        at_limit = max(at_limit, float(np.mean(shares)) if shares else 0.0)
         outside = max(outside, float(np.mean([_outside(*pair) for pair in pairs])))
-        each = [_missed(*pair) for pair in pairs]
-        if sum(map(bool, each)) > MOST * len(each):
-            missed = next(filter(None, each))
+        if sum(map(bool, levels)) > MOST * len(levels):
+            missed = next(filter(None, levels))
     if missed:
         found.append(
             Objection(
@@ -263,16 +265,24 @@ def _of_runs(task: TuningTask, controller: SampledController, time: Budget) -> l
     return found
 
 
-def _in_time(
-    task: TuningTask, controller: SampledController, r: FloatArray, time: Budget
-) -> list[tuple[ClosedLoopRun, Model]] | None:
-    """A reference on every model; None if there is no time for all of them."""
-    pairs = []
-    for model in _models(task):
+Of = TypeVar("Of")
+Found = TypeVar("Found")
+
+
+def _in_time(time: Budget, look: Callable[[Of], Found], at: Sequence[Of]) -> list[Found] | None:
+    """A look at each of them; None if there is no time for all."""
+    found = []
+    for one in at:
         if time.over("the runs for the verdict"):
             return None
-        pairs.append((run(controller, model, r), model))
-    return pairs
+        found.append(look(one))
+    return found
+
+
+def _run_with(
+    controller: SampledController, r: FloatArray, model: Model
+) -> tuple[ClosedLoopRun, Model]:
+    return run(controller, model, r), model
 
 
 def _at_limit(found: ClosedLoopRun, model: Model) -> float:
@@ -297,10 +307,11 @@ def _missed(found: ClosedLoopRun, model: Model) -> str:
     """
     r, rest = found.r, model.rest.y
     span = max(float(r.max()), rest) - min(float(r.min()), rest)
-    least = _settling(model, found.controller)
     for mean, level, hold in missed_levels(found, MISSED * span):
-        # the last quarter of a hold that is long enough to be met
-        if 4 * (hold.stop - hold.start) >= least and not np.any(_railed(found)[hold]):
+        if np.any(_railed(found)[hold]):
+            continue
+        # the last quarter of a hold that is long enough to be met; how long takes long to find
+        if 4 * (hold.stop - hold.start) >= _settling(model, found.controller):
             return f"{mean:.4g} instead of {in_unit(f'{level:.4g}', found.controller.y_unit)}"
     return ""
 
