@@ -9,7 +9,6 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
-from .arrays import bridged
 from .control.controller import SampledController
 from .control.defaults import default_references
 from .control.loop import (
@@ -17,16 +16,15 @@ from .control.loop import (
     Plant,
     Plants,
     References,
-    check_fits,
     each_plant,
     each_reference,
+    outside_region,
     titles,
     trial,
 )
-from .dataset import Dataset, FloatArray
-from .errors import FitError, SettingError, SewfastError
+from .dataset import FloatArray
+from .errors import FitError, SettingError
 from .evidence.card import Line, VerdictTable
-from .evidence.region import region_runs
 from .evidence.verdicts import OUTSIDE
 from .gains import real
 from .models import Model
@@ -572,27 +570,6 @@ def _with_model(runs: list[_Run], models: list[Model]) -> list[_Run]:
 
 
 def _judged(found: ClosedLoopRun, model: Any) -> JudgedRun:
-    outside, farthest = _outside(found, model)
+    outside, farthest = outside_region(found, model)
     saturated = found.metrics()["saturated"] or 0.0
     return JudgedRun(found, outside, farthest, saturated, oscillation(found))
-
-
-def _outside(found: ClosedLoopRun, model: Model | None) -> tuple[float, float]:
-    """Share of samples outside, largest distance; NaN without a known region."""
-    if model is None or not len(found.u):
-        return math.nan, math.nan
-    check_fits(found.controller, model)
-    # the response to the command; of an unstable model as long as it stays with the output
-    data = Dataset.from_arrays(
-        bridged(found.u), bridged(found.y), model.Ts,
-        input_names=model.input_names, input_units=model.input_units,
-        output_name=model.output_name, output_unit=model.output_unit, name=found.reference,
-    )  # fmt: skip
-    try:
-        place = region_runs(model, data, init=0)
-    except SewfastError:
-        return 1.0, math.inf
-    if place is None:
-        return math.nan, math.nan
-    distances = place.distances[0]
-    return float(np.mean(distances > 1.0)), float(distances.max())

@@ -16,9 +16,12 @@ from sewfast import _core, pareto, signals
 from sewfast.control import Controller, Gains
 from sewfast.control.loop import run
 from sewfast.control.margins import levels_over, margins, operating_point
+from sewfast.dataset import Dataset
 from sewfast.errors import FitError, SettingError
+from sewfast.evidence.region import training_region
 from sewfast.machine import VirtualMachine
 from sewfast.models import Ensemble, LinearOE, Model
+from sewfast.trust import judge
 from sewfast.tuning import tune
 from sewfast.tuning import verdict as verdicts
 from sewfast.tuning.objective import LARGEST_MS, Constraints, Cost
@@ -230,6 +233,29 @@ def test_a_loop_outside_the_record_is_unfit(top: float, grade: str) -> None:
     found = tune(model, [r], start=QUIET, evaluations=40, threads=1)
     assert found.verdict.grade == grade
     assert ("outside the recorded" in (found.warning or "")) is (grade == "unfit")
+
+
+@pytest.mark.parametrize(("top", "grade"), [(300.0, "good"), (900.0, "poor")])
+def test_gains_are_no_better_than_their_runs_are_known(top: float, grade: str) -> None:
+    """What `run` warns of, by the same words."""
+    random = np.random.default_rng(0)
+    u = np.repeat(random.uniform(0.0, 1.0, 30), 500)[:, None]
+    y = drive().simulate(u)
+    data = Dataset.from_arrays(u, y, 0.001, output_unit="RPM", input_units=["V"])
+    known = {"input_range": [[-3.0, 3.0]], "output_range": [-1400.0, 1400.0]}
+    model = drive(**known, region=training_region(drive(), data))
+    r = top * np.minimum(1.0, np.arange(1500) / 500.0)
+    task = TuningTask.of(
+        [model], [r], start=QUIET, first={}, cost=None,
+        aggregate="mean", constraints=None, variations=None,
+    )  # fmt: skip
+    found = verdict_of(task.with_loops(Budget(None)), QUIET, Budget(None))
+    warned = judge(run(QUIET, model, r), model).warnings
+    assert found.grade == grade
+    assert ("where the model was not trained" in (found.warning or "")) is (grade == "poor")
+    assert any("where the model was not trained" in line.meaning for line in warned) is (
+        grade == "poor"
+    )
 
 
 def test_the_command_refuses_unfit_gains_unless_it_is_forced(tmp_path: Path) -> None:

@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import _core, signals
-from ..arrays import FloatArray
-from ..errors import DataError, FitError, SettingError
+from ..arrays import FloatArray, bridged
+from ..dataset import Dataset
+from ..errors import DataError, FitError, SettingError, SewfastError
+from ..evidence.region import region_runs
 from ..gains import Gains, real, vector
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
@@ -189,6 +191,29 @@ def missed_levels(found: ClosedLoopRun, within: float) -> list[tuple[float, floa
     """
     met = [(float(np.nanmean(found.y[hold])), level, hold) for level, hold in held_levels(found.r)]
     return [(mean, level, hold) for mean, level, hold in met if not abs(mean - level) <= within]
+
+
+def outside_region(found: ClosedLoopRun, model: Model | None) -> tuple[float, float]:
+    """How far a run leaves the region that a model was trained in: the share of samples outside,
+    and the largest distance; NaN without a known region.
+    """
+    if model is None or not len(found.u):
+        return math.nan, math.nan
+    check_fits(found.controller, model)
+    # the response to the command; of an unstable model as long as it stays with the output
+    data = Dataset.from_arrays(
+        bridged(found.u), bridged(found.y), model.Ts,
+        input_names=model.input_names, input_units=model.input_units,
+        output_name=model.output_name, output_unit=model.output_unit, name=found.reference,
+    )  # fmt: skip
+    try:
+        place = region_runs(model, data, init=0)
+    except SewfastError:
+        return 1.0, math.inf
+    if place is None:
+        return math.nan, math.nan
+    distances = place.distances[0]
+    return float(np.mean(distances > 1.0)), float(distances.max())
 
 
 def _rise(ms: float | None) -> str:

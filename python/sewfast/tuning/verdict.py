@@ -21,9 +21,10 @@ from ..control.defaults import (
     recorded_limits,
     recorded_outputs,
 )
-from ..control.loop import ClosedLoopRun, missed_levels, run
+from ..control.loop import ClosedLoopRun, missed_levels, outside_region, run
 from ..dataset import FloatArray
 from ..errors import FitError, SettingError
+from ..evidence.verdicts import OUTSIDE
 from ..models import Model
 from .objective import LARGEST_MS
 from .robustness import HAIR
@@ -211,7 +212,7 @@ def _of_runs(task: TuningTask, controller: SampledController, time: Budget) -> l
     """What the references show on the models as they are, each share in the mean of the models.
     References for which no time is left are not judged, which is an objection of its own.
     """
-    at_limit, outside, missed, found = 0.0, 0.0, "", []
+    at_limit, outside, unknown, missed, found = 0.0, 0.0, 0.0, "", []
     for r in task.references if _models(task) else ():
         try:
             pairs = _in_time(time, partial(_run_with, controller, r), _models(task))
@@ -227,12 +228,15 @@ def _of_runs(task: TuningTask, controller: SampledController, time: Budget) -> l
         is_railed = pairs and np.mean([np.mean(_railed(one)) for one, _ in pairs]) > MOST * MOST
         shares = _in_time(time, lambda pair: _at_limit(*pair), (is_railed and pairs) or [])
         levels = _in_time(time, lambda pair: _missed(*pair), pairs or [])
-        if pairs is None or shares is None or levels is None:
+        regions = _in_time(time, lambda pair: outside_region(*pair)[0], pairs or [])
+        if pairs is None or shares is None or levels is None or regions is None:
             text = "the time budget left no time to run the references on the models"
             found.append(Objection("fair", text, "give more time, or run them (sewfast run)"))
             break
         at_limit = max(at_limit, float(np.mean(shares)) if shares else 0.0)
         outside = max(outside, float(np.mean([_outside(*pair) for pair in pairs])))
+        if known := [share for share in regions if math.isfinite(share)]:
+            unknown = max(unknown, float(np.mean(known)))
         if sum(map(bool, levels)) > MOST * len(levels):
             missed = next(filter(None, levels))
     if missed:
@@ -260,6 +264,15 @@ def _of_runs(task: TuningTask, controller: SampledController, time: Budget) -> l
                 f"the loop is outside the recorded inputs and outputs for {100 * outside:.0f} % of "
                 "a run, where the model is a guess",
                 "record such operation, or lower the references and the limits",
+            )
+        )
+    elif unknown > OUTSIDE:
+        found.append(
+            Objection(
+                "fair" if unknown <= MOST else "poor",
+                f"the loop runs where the model was not trained for {100 * unknown:.0f} % of a "
+                "run, and its predictions there are a guess",
+                "record such operation, best in a closed loop, and identify again, or demand less",
             )
         )
     return found
