@@ -138,6 +138,18 @@ def test_ms_is_taken_on_both_sides_and_at_every_point() -> None:
     assert str(front.verdict) in str(front)
 
 
+def test_a_model_that_most_contradict_in_the_sign_of_its_gain_forbids_no_gains() -> None:
+    """No controller with an integral holds both signs."""
+    settings: dict[str, Any] = {"start": QUIET, "evaluations": 60, "threads": 1}
+    agreed = tune([drive(), drive(450.0)], [SHORT], **settings)
+    assert agreed.verdict.grade == "good"
+    found = tune([drive(), drive(450.0), drive(-30.0)], [SHORT], **settings)
+    assert "1 of 3 linear loops" in (found.warning or "")
+    assert not found.verdict.unfit
+    # of two nobody knows which is right
+    assert tune([drive(), drive(-490.0)], [SHORT], **settings).verdict.unfit
+
+
 def test_a_machine_and_state_feedback_have_no_default_limit() -> None:
     found = tune(VirtualMachine(), SHORT, start=QUIET, evaluations=5, threads=1)
     assert found.constraints == Constraints()

@@ -7,9 +7,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..control.controller import Controller, SampledController
 from ..control.margins import levels_over, margins, operating_point, sampled
 from ..errors import FitError, SettingError
+from ..evidence.operating import INTEGRATES
 from ..models import Model
 from .objective import LARGEST_MS
 
@@ -28,7 +31,8 @@ ROUNDING = 1e-6
 class LinearLoops:
     """The linear plants of a search: `looked_at`, with the output about which each is taken [y];
     `searched`, on which the core takes Ms of every candidate; `measured` responses, whose bands
-    count. `depends` says whether Ms depends on the output, `reason` why a plant was left out.
+    count. `depends` says whether Ms depends on the output, `reason` why a plant was left out;
+    `opposed` are those left out because most others answer a command the other way.
     """
 
     looked_at: tuple[tuple[Any, float | None], ...] = ()
@@ -36,6 +40,7 @@ class LinearLoops:
     measured: tuple[Any, ...] = ()
     depends: bool = False
     reason: Exception | None = None
+    opposed: tuple[tuple[Any, float | None], ...] = ()
 
     def __add__(self, other: LinearLoops) -> LinearLoops:
         return LinearLoops(
@@ -55,6 +60,25 @@ class LinearLoops:
             for plant, level in self.looked_at
         ]
         return max(found, key=lambda pair: pair[0])
+
+    def agreed(self) -> LinearLoops:
+        """Without the plants whose steady gain has the other sign than that of most about the same
+        output: no controller with an integral holds both. Of many networks that follow one record,
+        some may be lost at a level where it hardly is.
+        """
+        signs = [_sign(plant) for plant, _ in self.looked_at]
+        total: dict[float | None, int] = {}
+        for (_, level), sign in zip(self.looked_at, signs, strict=True):
+            total[level] = total.get(level, 0) + sign
+        opposed = tuple(
+            one for one, sign in zip(self.looked_at, signs, strict=True) if sign * total[one[1]] < 0
+        )
+        left = {id(plant) for plant, _ in opposed}
+        return replace(
+            self, opposed=opposed,
+            looked_at=tuple(one for one in self.looked_at if id(one[0]) not in left),
+            searched=tuple(plant for plant in self.searched if id(plant) not in left),
+        )  # fmt: skip
 
     def core(self, Ts: float) -> list[Any]:
         """The fractions in z^-1 for the core, or a `SettingError` if there is none."""
@@ -95,7 +119,18 @@ def linear_loops(task: TuningTask, time: Budget) -> LinearLoops:
     for plant in plants:
         if not hasattr(plant, "lines"):
             found += _of(plant, task, controller, time, ends)
-    return found
+    return found.agreed()
+
+
+def _sign(plant: Any) -> int:
+    """The sign of a plant's steady gain; 0 where it has none, as near a pole at 1, or if it is
+    unknown.
+    """
+    if not (hasattr(plant, "dc_gain") and hasattr(plant, "poles")):
+        return 0
+    if max(map(abs, plant.poles), default=0.0) >= 1.0 - INTEGRATES:
+        return 0
+    return int(np.sign(plant.dc_gain[0]))
 
 
 def _of(

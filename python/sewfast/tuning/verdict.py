@@ -168,6 +168,14 @@ def _of_loops(task: TuningTask, controller: SampledController, remedy: str) -> I
             "fair", "Ms is not known: no model has a stable linear loop about the levels of the "
             f"references{why}", "give references that the model reaches, or identify it again",
         )  # fmt: skip
+    if loops.opposed:
+        others, (_, at) = len(loops.opposed), loops.opposed[0]
+        place = "" if at is None else f", the first about {in_unit(f'{at:.4g}', controller.y_unit)}"
+        yield Objection(
+            "fair", f"{others} of {others + len(loops.looked_at)} linear loops{place}, are left "
+            "out of Ms: there a command moves the model the other way than most of the models",
+            "record more at that level, and identify again",
+        )  # fmt: skip
     Ms, level = loops.worst(controller)
     if Ms <= HAIR * LARGEST_MS:
         return
