@@ -14,6 +14,7 @@ from kinds import model_of
 from loops import QUIET
 from sewfast import _core, pareto, signals
 from sewfast.control import Controller, Gains
+from sewfast.control.defaults import drive_references
 from sewfast.control.loop import run
 from sewfast.control.margins import levels_over, margins, operating_point
 from sewfast.dataset import Dataset
@@ -24,6 +25,7 @@ from sewfast.models import Ensemble, LinearOE, Model
 from sewfast.trust import judge
 from sewfast.tuning import tune
 from sewfast.tuning import verdict as verdicts
+from sewfast.tuning.judge import verdict_on
 from sewfast.tuning.objective import LARGEST_MS, Constraints, Cost
 from sewfast.tuning.robustness import _levels
 from sewfast.tuning.task import Budget, TuningTask
@@ -268,6 +270,28 @@ def test_gains_are_no_better_than_their_runs_are_known(top: float, grade: str) -
     assert any("where the model was not trained" in line.meaning for line in warned) is (
         grade == "poor"
     )
+
+
+def test_a_step_that_gains_from_ramps_overshoot_is_said() -> None:
+    pole = math.exp(-10.0 / 400.0)
+    b = [0.0, 0.0, 0.0, 0.6 * (1.0 - pole)]
+    known = {"input_range": [[0.0, 100.0]], "output_range": [0.0, 60.0]}
+    oven = replace(LinearOE.from_tf(b, [1.0, -pole], 10.0), training=known)
+    calm = Controller(Gains.standard(2.0, 400.0), Ts=10.0, u_min=0.0, u_max=100.0)
+    assert verdict_on(calm, oven).grade == "good"
+    eager = replace(calm, gains=Gains.standard(1.0, 100.0))
+    (said,) = [o for o in verdict_on(eager, oven).objections if "a step of" in o.text]
+    assert said.grade == "fair"
+    assert "/s, as r_rate" in said.remedy
+    # the ramp that it names is one without
+    rate = float(said.remedy.split("at most ")[1].split()[0])
+    step = drive_references(oven, 0.0, 100.0)["step"]
+    assert run(eager, oven, step).y.max() > 1.05 * step[-1]
+    assert run(replace(eager, r_rate=rate), oven, step).y.max() < 1.05 * step[-1]
+    # who gives a reference knows what will be played
+    ramp = drive_references(oven, 0.0, 100.0)["trapezoid"]
+    found = tune(oven, [ramp], start=eager, **FIXED)
+    assert "a step of" not in (found.warning or "")
 
 
 def test_the_command_refuses_unfit_gains_unless_it_is_forced(tmp_path: Path) -> None:

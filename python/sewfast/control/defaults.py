@@ -351,7 +351,7 @@ def drive_references(
     -------
     dict of str to array, shape (N,)
         `trapezoid`, `chirp_hi_lo`, `chirp_lo_hi`, `random`, `trapezoids` at the model's sample
-        time [y].
+        time, and `step`, which the catalogue has not, from rest to their top [y].
 
     Raises
     ------
@@ -540,6 +540,9 @@ def _shapes(span: _Span, Ts: float, seed: int) -> dict[str, FloatArray]:
             smoothing=0.2 * pace * wider, seed=seed, start=span.rest,
         ),
         "trapezoids": drawn(steps),
+        "step": np.repeat(
+            [span.rest, span.top], [max(1, round(0.1 * pace / Ts)), max(2, round(0.9 * pace / Ts))]
+        ),
     }  # fmt: skip
 
 
@@ -557,3 +560,13 @@ def default_references(
     first, *others = (made[name] for name in names)
     # a reference with more samples is not used for tuning
     return [first, *(r for r in others if len(r) <= 60_000)]
+
+
+def default_step(plant: Any, controller: SampledController) -> FloatArray | None:
+    """The step that a user of a plant may ask for beside the default references: from rest to their
+    top [y]. None where the catalogue suits the plant, which has ramps.
+    """
+    low, high = controller.u_min, controller.u_max
+    if not isinstance(plant, Model) or catalogue_fits(plant, low, high, controller.y_unit):
+        return None
+    return drive_references(plant, low, high, pace=controller.pace)["step"]

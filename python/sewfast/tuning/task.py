@@ -18,6 +18,7 @@ from ..control.defaults import (
     beyond_record,
     command_limits,
     default_references,
+    default_step,
     drive_step,
     filter_length,
     growth_rate,
@@ -39,6 +40,7 @@ from ..control.loop import (
     reference_samples,
 )
 from ..control.margins import loop_response, margins
+from ..dataset import FloatArray
 from ..errors import FitError, SettingError
 from ..gains import Gains, real, vector, whole
 from ..models import Model
@@ -59,7 +61,7 @@ GAINS = (0.8, 1.25)
 
 @dataclass(frozen=True)
 class TuningTask:
-    """Everything that a search works on."""
+    """Everything that a search works on; `step` is for its verdict, with references by default."""
 
     plants: list[Any]
     references: list[Any]
@@ -71,6 +73,7 @@ class TuningTask:
     aggregate: str
     constraints: Constraints
     assumed: str
+    step: FloatArray | None = None
     loops: LinearLoops = field(default_factory=LinearLoops)
 
     @classmethod
@@ -103,7 +106,9 @@ class TuningTask:
             start = first_of(given[0], **first)
         for plant in given:
             check_fits(start, plant)
+        step = None
         if references is None:
+            step = default_step(given[0], start)
             references = default_references(given[0], start)
         return cls(
             plants=plants,
@@ -118,6 +123,7 @@ class TuningTask:
             aggregate=aggregate,
             constraints=_instance(constraints, Constraints, "Constraints(overshoot=2.0)"),
             assumed=_assumed(start, given, derived=derived),
+            step=step,
         )
 
     @property

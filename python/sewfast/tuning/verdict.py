@@ -152,6 +152,7 @@ def verdict_of(
     """
     found = [*others, *_of_loops(task, controller, _calmer(limit, searched))]
     found += _of_runs(task, controller, time)
+    found += _of_step(task, controller, time)
     found.sort(key=lambda o: GRADES.index(o.grade))
     return Verdict(tuple(found), model_grade(task.plants))
 
@@ -284,6 +285,30 @@ def _of_runs(task: TuningTask, controller: SampledController, time: Budget) -> l
             )
         )
     return found
+
+
+def _of_step(task: TuningTask, controller: SampledController, time: Budget) -> Iterator[Objection]:
+    """What the gains make of a step, which is what is asked of an oven or a tank, where they were
+    searched on ramps.
+    """
+    step, Ts = task.step, controller.Ts
+    if step is None:
+        return
+    try:
+        pairs = _in_time(time, partial(_run_with, controller, step), _models(task))
+    except FitError:
+        pairs = []
+    over = [one.metrics()["overshoot_percent"] or 0.0 for one, _ in pairs or ()]
+    if not over or np.mean(over) <= 100.0 * MISSED:
+        return
+    fastest = max(float(np.abs(np.diff(r)).max()) for r in task.references) / Ts
+    rate = in_unit(f"{fastest:.3g}", f"{controller.y_unit or 'y'}/s")
+    yield Objection(
+        "fair", f"a step of the reference to {in_unit(f'{step[-1]:.4g}', controller.y_unit)} is "
+        f"overshot by {np.mean(over):.0f} %, as the gains were searched on ramps",
+        f"ramp the reference by at most {rate}, as r_rate of the controller does, or search on the "
+        "reference that will be played (--reference)",
+    )  # fmt: skip
 
 
 Of = TypeVar("Of")
