@@ -120,6 +120,18 @@ def test_gains_above_the_limit_are_kept_and_said_if_there_are_no_others(
     assert max(margins(kept.pid, model, speed=lv).Ms for lv in worst) <= LARGEST_MS * 1.001
 
 
+def test_the_progress_of_searches_with_wider_limits_goes_on() -> None:
+    done: list[tuple[int, int]] = []
+    tune(
+        drive(), [SHORT], start=with_ms_of(2.4, drive(), 0.0, QUIET), variables=["alpha"],
+        evaluations=2000, feedforward="none",
+        progress=lambda now, total, _: done.append((now, total)),
+    )  # fmt: skip
+    assert done == sorted(done)
+    assert max(total for _, total in done) > 2000
+    assert all(now <= total for now, total in done)
+
+
 def test_ms_is_taken_on_both_sides_and_at_every_point() -> None:
     model = model_of("grey_box")
     r = 5.0 * np.repeat([0.0, 1.0, 0.0, -1.0], 100)

@@ -35,6 +35,7 @@ from .task import (
     Wanted,
     budget,
     cut_short,
+    shifted,
     threads_or_all,
 )
 from .verdict import Verdict, verdict_of
@@ -261,7 +262,7 @@ def pareto(
         seed=seed,
         threads=threads,
         time_budget=None if time.seconds is None else _TUNED * time.seconds,
-        progress=_shifted(progress, 0, total),
+        progress=shifted(progress, 0, total),
         **settings,
     )
     settings["constraints"] = tuned.constraints
@@ -274,7 +275,7 @@ def pareto(
     task = TuningTask.of(models, references, start=begun, first={}, **settings)
     task = task.with_loops(time)
     rest = max(1, total - first)
-    deadline = Deadline(time, time.share(1.0 - LOOK), _shifted(progress, first, total))
+    deadline = Deadline(time, time.share(1.0 - LOOK), shifted(progress, first, total))
     try:
         found = _core.pareto(
             task.core(variables, ms="Ms" in names),
@@ -319,12 +320,6 @@ def _checked(objectives: Sequence[str]) -> list[str]:
     if twice:
         raise SettingError(f"expected each objective once, got {twice[0]!r} twice")
     return list(objectives)
-
-
-def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
-    if progress is None:
-        return None
-    return lambda done, _, best: progress(before + done, total, best)
 
 
 def _front(found: Any, task: TuningTask, objectives: list[str], tuned: TuningResult) -> ParetoFront:

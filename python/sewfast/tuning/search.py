@@ -37,6 +37,7 @@ from .task import (
     Wanted,
     budget,
     cut_short,
+    shifted,
     threads_or_all,
 )
 from .verdict import Verdict, out_of_reach, verdict_of
@@ -432,9 +433,11 @@ class _Search:
     def within(self, task: TuningTask, variables: Sequence[Wanted] | None) -> TuningResult:
         """The search within the default limit of Ms, if the task has none and gains keep to it."""
         refused: FitError | None = None
-        for tried in within_default(task):
+        for k, tried in enumerate(within_default(task)):
+            # one search after the other is shown as one that goes on
+            one = replace(self, progress=shifted(self.progress, k * self.evaluations))
             try:
-                return self._on(tried, variables, is_strict=tried is task)
+                return one._on(tried, variables, is_strict=tried is task)
             except FitError as error:
                 if _KEEPS not in (error.expected or ""):
                     raise

@@ -294,6 +294,13 @@ class Deadline:
             raise TimeUp
 
 
+def shifted(progress: Progress | None, before: int, total: int | None = None) -> Progress | None:
+    """The progress of work that follows `before` others, of `total` together."""
+    if progress is None:
+        return None
+    return lambda done, own, best: progress(before + done, total or before + own, best)
+
+
 def _load_steps(given: Sequence[LoadStep]) -> list[LoadStep]:
     steps = [given] if isinstance(given, LoadStep) else list(given)
     return [_instance(step, LoadStep, "LoadStep(1500.0, -2.0)") for step in steps]
