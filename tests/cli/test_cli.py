@@ -18,6 +18,7 @@ import sewfast as api
 from cli import PROGRAM, environment
 from cli import called as sewfast
 from cli import sewfast as started
+from sewfast.cli import main
 from sewfast.cli.arguments import time_left
 
 
@@ -454,3 +455,7 @@ def test_a_budget_of_the_command_is_what_is_left_of_it(
     sewfast(walk, "identify", "one.csv", "--model", "oe", "-o", tmp_path / "m.json")
     assert len(given) == 2
     assert time.monotonic() - 600.0 < given[0] <= given[1] <= time.monotonic()
+    # the program says when it began, before it has read a module
+    asked = ["tune", str(walk / "drive.json"), "--evaluations", "5", "--force"]
+    assert main([*asked, "-o", str(tmp_path / "d.json")], began=7.0) == 0
+    assert given[2] == 7.0

@@ -19,19 +19,18 @@ from .drive import is_port
 from .output import DONE, FAULT, INTERRUPTED, REFUSED, logging_to_stderr
 from .parser import build_parser
 
-_READ = time.monotonic()
-"""When the program was started, nearly: the modules of the work are imported after this."""
 _UNUSABLE = (errno.EACCES, errno.ELOOP, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EPERM, errno.EROFS)
 """What is wrong with a name or a place, wherever it is used first, and not with sewfast."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, began: float | None = None) -> int:
     """Run one command.
-    `argv` are the arguments after the program's name; None takes the process's own. Return 0 if it
-    is done, 1 for a fault in sewfast, 2 if it is refused, 130 if it is interrupted.
+    `argv` are the arguments after the program's name; None takes the process's own. A time budget
+    counts from `began` (`time.monotonic`), by default from now on. Return 0 if it is done, 1 for a
+    fault in sewfast, 2 if it is refused, 130 if it is interrupted.
     """
     forget()
-    began = _READ if argv is None else time.monotonic()
+    began = time.monotonic() if began is None else began
     try:
         args, found = _parsed(argv)
     except KeyboardInterrupt:
