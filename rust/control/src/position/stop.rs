@@ -165,6 +165,10 @@ impl<T: Real> PositionLoop<T> {
         let Mode::Stop(Some(asked)) = self.mode else {
             return goal;
         };
+        // what was planned is over: a shaft that is pushed away comes back
+        if self.stands() {
+            return goal;
+        }
         let now = self.now();
         let moved = self.places.at(now) - self.places.at(now + 1);
         // at this sample, which the profile has yet to take

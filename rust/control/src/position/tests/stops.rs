@@ -354,3 +354,21 @@ fn a_shaft_at_rest_costs_half_of_one_that_moves() {
     let rests = (0..2000).map(|_| step()).last();
     assert!(rests.map(|rests| 2 * rests) < moves, "{rests:?} {moves:?}");
 }
+
+#[test]
+fn a_shaft_that_is_pushed_off_its_goal_comes_back_to_it() {
+    for from in [2000.0, -2000.0] {
+        for push in [20.0, -20.0] {
+            let mut own = law::<f64>(1.0, 20.0, 8);
+            stop(&mut own, from, 1.0, 0.0, 0.0, NEVER);
+            // as if its profile had only just come to stand
+            own.top = from.abs() * own.per_sample;
+            own.lost = 1000.0;
+            let goal = own.goal();
+            for _ in 0..100 {
+                own.step(0.0, push);
+            }
+            assert!(own.stands() && own.goal() == goal, "{from} {push}");
+        }
+    }
+}
