@@ -12,7 +12,7 @@
 //! measurement that is late by its filter with a reference that is late by the same filter. Otherwise it would fight the
 //! feedforward.
 
-use crate::ring::Ring;
+use crate::ring::{Ring, last_holding};
 use crate::{Feedback, Real, Refused};
 
 /// The longest preview, in samples: the ring also keeps the newest reference and the one before the delayed one.
@@ -159,14 +159,22 @@ impl<T: Real> Feedforward<T> {
 
     /// The command that holds the output `y`.
     pub fn held(&self, y: T) -> T {
-        let [first, ..] = &self.levels;
-        let levels = self.levels();
-        // of those between the first and the last, which grow
-        let inner = levels.get(1..levels.len().saturating_sub(1));
-        let passed = inner.unwrap_or_default().iter();
-        let passed = passed.take_while(|level| y >= level.y).count();
-        let low = levels.get(passed).unwrap_or(first);
-        let high = levels.get(passed + 1).unwrap_or(low);
+        self.held_from(y, self.passed(y, 0))
+    }
+
+    /// How many of the levels between the first and the last, which grow, `y` has passed; the search begins at `near`. (The remainders
+    /// only tell the compiler that no index is beyond the levels.)
+    fn passed(&self, y: T, near: usize) -> usize {
+        let last = usize::from(self.level_count).saturating_sub(2);
+        let holds = |place: usize| y >= self.levels[place % LEVELS].y;
+        last_holding(last, near.min(last), holds)
+    }
+
+    /// The command on the line from a level to the next one.
+    fn held_from(&self, y: T, level: usize) -> T {
+        let low = self.levels[level % LEVELS];
+        let next = (level + 1).min(usize::from(self.level_count).saturating_sub(1));
+        let high = self.levels[next % LEVELS];
         // one level alone: any distance, as the command does not change over it
         let apart = if high.y > low.y {
             high.y - low.y
@@ -192,6 +200,10 @@ impl<T: PartialEq> PartialEq for Feedforward<T> {
 pub(crate) struct Ahead<T> {
     kept: Ring<T>,
     pub(crate) started: bool,
+    /// For how many samples the reference has stood, up to [`TAPS`].
+    stood: u8,
+    /// The level that it had passed at the last sample.
+    level: u8,
     filter: Feedback<T>,
 }
 
@@ -201,6 +213,8 @@ impl<T: Real> Ahead<T> {
         Self {
             kept: Ring::filled(T::ZERO),
             started: false,
+            stood: 0,
+            level: 0,
             filter,
         }
     }
@@ -218,6 +232,7 @@ impl<T: Real> Ahead<T> {
     /// As if the reference had been `r` for ever.
     pub(crate) fn stand_at(&mut self, r: T) {
         self.kept = Ring::filled(r);
+        self.stood = TAPS as u8;
         self.started = true;
         self.filter.reset();
     }
@@ -230,13 +245,36 @@ impl<T: Real> Ahead<T> {
             }
             return;
         }
-        let r = if r.is_finite() { r } else { self.at(0) };
+        let last = self.at(0);
+        let r = if r.is_finite() { r } else { last };
+        self.stood = if r == last {
+            (self.stood + 1).min(TAPS as u8)
+        } else {
+            0
+        };
         self.kept.push(r);
     }
 
     /// The command for the references so far.
-    pub(crate) fn command(&self, of: &Feedforward<T>) -> T {
-        let (mut sum, mut newer, mut taps) = (T::ZERO, self.at(0), of.taps());
+    pub(crate) fn command(&mut self, of: &Feedforward<T>) -> T {
+        let newest = self.at(0);
+        // a reference that stands has no changes: their sum is 0 exactly
+        let sum = if self.stood >= of.tap_count {
+            T::ZERO
+        } else {
+            self.changes(of, newest)
+        };
+        if of.level_count == 0 {
+            return sum;
+        }
+        let level = of.passed(newest, self.level.into());
+        self.level = level as u8;
+        of.held_from(newest, level) + sum
+    }
+
+    /// The command for the last changes.
+    fn changes(&self, of: &Feedforward<T>, newest: T) -> T {
+        let (mut sum, mut newer, mut taps) = (T::ZERO, newest, of.taps());
         for part in self.kept.parts(1) {
             for (tap, older) in taps.iter().zip(part) {
                 sum += *tap * (newer - *older);
@@ -244,11 +282,7 @@ impl<T: Real> Ahead<T> {
             }
             taps = taps.get(part.len()..).unwrap_or_default();
         }
-        if of.levels().is_empty() {
-            sum
-        } else {
-            of.held(self.at(0)) + sum
-        }
+        sum
     }
 
     /// The measurement that is expected at this sample, after the feedback's filter. References so large that the

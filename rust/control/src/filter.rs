@@ -313,19 +313,18 @@ impl<T: Real> Observer<T> {
 
     /// Takes a measured speed and returns the observed one.
     pub fn step(&mut self, y: T) -> T {
-        let (from, left) = if self.started {
+        let (from, left) = if self.started && self.on {
             (self.speed, self.innovation)
         } else {
             (y, T::ZERO)
         };
-        let innovation = self.keep * left + (y - from);
-        let speed = from + self.gain * innovation;
-        (self.speed, self.innovation) = if self.on {
-            (speed, innovation)
-        } else {
-            (y, T::ZERO)
-        };
         self.started = true;
+        if self.on {
+            self.innovation = self.keep * left + (y - from);
+            self.speed = from + self.gain * self.innovation;
+        } else {
+            (self.speed, self.innovation) = (y, T::ZERO);
+        }
         self.speed
     }
 

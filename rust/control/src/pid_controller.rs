@@ -213,6 +213,11 @@ impl<T: Real> PidController<T> {
         self.ahead.take(ramped);
     }
 
+    /// The last command \[u\].
+    pub(crate) fn output(&self) -> T {
+        self.pid.output()
+    }
+
     /// The reference that was told `age` samples before the newest one, of a controller with feedforward.
     pub(crate) fn told(&self, age: usize) -> T {
         self.ahead.at(age)

@@ -27,6 +27,8 @@ use stop::Angle;
 pub use rates::{RATES, Rate, Rates};
 pub use turning::{FARTHEST, Turning};
 
+/// All values that a ring keeps.
+const ALL: u8 = KEPT as u8;
 /// The longest mean over the samples of a profile.
 pub const SMOOTHED: usize = 31;
 
@@ -90,9 +92,9 @@ impl<T: Real> PositionDesign<T> {
     }
 
     /// The speed of the next sample towards a goal at a distance of 0 or more, at this part of the rates, by which the landing makes
-    /// the way longer by `crept`.
-    fn towards(&self, distance: T, ts: T, part: T, crept: T) -> T {
-        let from = |distance| self.rates.from(distance, ts, part);
+    /// the way longer by `crept`; its row of the rates is looked for from `near` on.
+    fn towards(&self, distance: T, ts: T, part: T, crept: T, near: usize) -> T {
+        let from = |distance| self.rates.from(distance, ts, part, near);
         if crept == T::ZERO {
             return from(distance);
         }
@@ -154,16 +156,18 @@ pub struct PositionLoop<T> {
     /// Largest way of a sample of the profile since this move was planned, and all the way that braking has taken off \[counts\].
     top: T,
     lost: T,
+    /// Where among the rates its speed was at the last sample.
+    row: u8,
     /// Samples for which the speed is held before a move is planned anew.
-    unplanned: usize,
-    /// The last command \[u\].
-    u: T,
+    unplanned: u8,
     /// Samples since the last count.
-    still: usize,
+    still: u8,
     /// How many of the newest `places` are the goal.
-    stood: usize,
+    stood: u8,
+    /// So many of the newest positions before the mean are known to be the goal.
+    met: u8,
     /// Samples that the speed loop has yet to be told of the profile, beyond one at each sample.
-    untold: usize,
+    untold: u8,
 }
 
 impl<T: Real> PositionLoop<T> {
@@ -195,10 +199,11 @@ impl<T: Real> PositionLoop<T> {
             fastest: design.speed,
             top: T::ZERO,
             lost: T::ZERO,
+            row: 0,
             unplanned: 0,
-            u: T::ZERO,
             still: 0,
-            stood: KEPT,
+            stood: ALL,
+            met: 0,
             untold: 0,
             design,
             speed,
@@ -210,9 +215,9 @@ impl<T: Real> PositionLoop<T> {
         self.speed.reset();
         self.mode = Mode::Speed;
         (self.counts, self.rate, self.goal) = (T::ZERO, T::ZERO, T::ZERO);
-        (self.own, self.u, self.still, self.untold) = (T::ZERO, T::ZERO, 0, 0);
+        (self.own, self.still, self.untold) = (T::ZERO, 0, 0);
         (self.path, self.places) = (Ring::filled(T::ZERO), Ring::filled(T::ZERO));
-        self.stood = KEPT;
+        self.stood = ALL;
         self.planned(T::ONE, self.design.speed);
     }
 
@@ -223,7 +228,7 @@ impl<T: Real> PositionLoop<T> {
     pub fn step(&mut self, reference: T, moved: T) -> T {
         self.counts += moved;
         self.still = if moved == T::ZERO {
-            (self.still + 1).min(KEPT)
+            (self.still + 1).min(ALL)
         } else {
             0
         };
@@ -256,7 +261,7 @@ impl<T: Real> PositionLoop<T> {
         let error = self.place() - self.counts;
         let (one, stands) = (T::ONE, self.stands());
         let near = error <= one && error >= -one;
-        if stands && near && self.design.releases && self.still >= KEPT {
+        if stands && near && self.design.releases && self.still >= ALL {
             // always finite
             let _ = self.speed.set_manual(T::ZERO);
         }
@@ -269,7 +274,6 @@ impl<T: Real> PositionLoop<T> {
             // its integral term is now that of a command of 0 here
             self.speed.set_automatic();
         }
-        self.u = u;
         u
     }
 
@@ -318,31 +322,37 @@ impl<T: Real> PositionLoop<T> {
 
     #[inline(never)]
     fn set_goal(&mut self, goal: T) {
-        self.goal = goal;
+        (self.goal, self.met) = (goal, 0);
         let places = (0..KEPT).map(|age| self.places.at(age));
-        self.stood = places.take_while(|place| *place == goal).count();
+        self.stood = places.take_while(|place| *place == goal).count() as u8;
     }
 
     /// The profile one sample on towards a goal; its speed \[y\].
     fn profile(&mut self, goal: T) -> T {
-        if self.stood == KEPT && goal == self.goal && self.is_there() {
+        let samples = self.design.smoothing;
+        if goal == self.goal && self.is_there() {
             self.own = T::ZERO;
-            return T::ZERO;
-        }
-        if self.unplanned > 0 {
+            if usize::from(self.met) > samples || self.stood == ALL {
+                self.places.push(goal);
+                self.stood = (self.stood + 1).min(ALL);
+                return T::ZERO;
+            }
+            self.path.push(goal);
+            self.met += 1;
+        } else if self.unplanned > 0 {
             self.path
                 .push(self.path.at(0) + self.rate * self.per_sample);
         } else if self.arrives(goal) {
             (self.path, self.rate, self.own) = (Ring::filled(goal), T::ZERO, T::ZERO);
+            self.met = ALL;
         } else {
             self.advance(goal);
         }
-        let samples = self.design.smoothing;
         let (newest, oldest) = (self.path.at(0), self.path.at(samples));
         let place = self.mean();
         self.places.push(place);
         self.stood = if place == self.goal {
-            (self.stood + 1).min(KEPT)
+            (self.stood + 1).min(ALL)
         } else {
             0
         };
@@ -358,28 +368,33 @@ impl<T: Real> PositionLoop<T> {
     fn advance(&mut self, goal: T) {
         let goal = if goal.is_finite() { goal } else { self.goal };
         let (ts, rate) = (self.speed.settings().ts, self.rate);
-        let (row, _) = self.design.rates.at(size(rate), self.part);
+        let (design, part) = (&self.design, self.part);
+        let place = design.rates.place(size(rate), self.row.into());
+        let row = design.rates.at(place, part);
         let (up, down) = (row.up * ts, row.down * ts);
         // a goal that moves as the drive can is followed at its own speed, from its second sample on: before, it may be a step
         let (own, last) = ((goal - self.goal) / self.per_sample, self.own);
         let moves = last != T::ZERO && size(own) <= self.fastest;
         let follows = moves && size(own - last) <= up + down;
         let carried = if follows { own } else { T::ZERO };
+        self.row = place as u8;
         if goal != self.goal {
             self.set_goal(goal);
         }
         self.own = own;
         let at = self.path.at(0);
         let left = (goal - at) / self.design.counts_per_unit - carried * ts;
-        let (design, part) = (&self.design, self.part);
-        let towards = design.towards(size(left), ts, part, self.crept);
+        let design = &self.design;
+        let towards = design.towards(size(left), ts, part, self.crept, place);
         let wanted = carried + if left < T::ZERO { -towards } else { towards };
         let wanted = wanted.limit(-self.fastest, self.fastest);
         // on its way to a goal the speed may fall by the rate of the row below, and by an eighth more just before it, where the
         // last samples do not divide the way evenly
         let brakes = size(wanted) <= size(rate) && wanted * rate >= T::ZERO;
         let down = if brakes {
-            let (next, _) = design.rates.at(size(wanted), part);
+            let next = design
+                .rates
+                .at(design.rates.below(size(wanted), place), part);
             let steeper = if next.down > row.down {
                 next.down * ts
             } else {
@@ -422,7 +437,7 @@ impl<T: Real> PositionLoop<T> {
 
     /// The age of the position of this sample among those of the profile.
     fn now(&self) -> usize {
-        self.speed.design().feedforward.preview() - self.untold
+        self.speed.design().feedforward.preview() - usize::from(self.untold)
     }
 
     /// The profile's position at this sample \[counts\]. The speed of a sample is the mean over it, and the speed loop takes it
@@ -435,7 +450,7 @@ impl<T: Real> PositionLoop<T> {
 
     /// Whether the profile stands at its goal.
     pub fn stands(&self) -> bool {
-        self.mode != Mode::Speed && self.stood == KEPT
+        self.mode != Mode::Speed && self.stood == ALL
     }
 
     /// Whether it is the speed loop alone, as it begins.

@@ -47,3 +47,33 @@ impl<T: Real> Ring<T> {
         self.kept.iter_mut()
     }
 }
+
+/// The last place up to `last` that holds, as the first ones do and later ones do not; 0 if none holds. The search begins at `near`,
+/// as what is looked for at every sample is rarely far from where it was.
+pub(crate) fn last_holding(last: usize, near: usize, holds: impl Fn(usize) -> bool) -> usize {
+    let mut place = near;
+    if place > 0 && !holds(place) {
+        while place > 1 && !holds(place - 1) {
+            place -= 1;
+        }
+        return place - 1;
+    }
+    while place < last && holds(place + 1) {
+        place += 1;
+    }
+    place
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn a_search_finds_the_same_place_wherever_it_begins(last in 0..9_usize, near in 0..9_usize, holding in 0..10_usize) {
+            let found = last_holding(last, near.min(last), |place| place < holding);
+            prop_assert_eq!(found, holding.saturating_sub(1).min(last));
+        }
+    }
+}

@@ -1,5 +1,6 @@
 //! The rates of a drive's speed, over the speed, and the ways from a speed to rest at them.
 
+use crate::ring::last_holding;
 use crate::{Real, Refused};
 
 /// The most rows of rates.
@@ -88,25 +89,35 @@ impl<T: Real> Rates<T> {
         self.rows.get(..self.count.into()).unwrap_or_default()
     }
 
-    /// The row at a speed, as a magnitude, with this part of its rates, and the way from its own speed to rest.
-    pub(super) fn at(&self, speed: T, part: T) -> (Rate<T>, T) {
-        self.last(part, |row, _| row.speed <= speed)
+    /// The place of the row at a speed, as a magnitude; the search begins at the row `near`.
+    pub(super) fn place(&self, speed: T, near: usize) -> usize {
+        let last = usize::from(self.count) - 1;
+        last_holding(last, near, |place| self.row(place).speed <= speed)
     }
 
-    /// The last of the rows that hold, which are the first ones, and its way, with this part of the rates; the first row if none holds.
-    fn last(&self, part: T, holds: impl Fn(&Rate<T>, T) -> bool) -> (Rate<T>, T) {
-        let ([first, ..], [none, ..]) = (&self.rows, &self.ways);
-        let known = self.rows().iter().zip(&self.ways);
-        let (row, way) = known
-            .take_while(|(row, way)| holds(row, **way / part))
-            .last()
-            .unwrap_or((first, none));
-        let rate = Rate {
+    /// The same for a speed that is not above that of the row `near`.
+    pub(super) fn below(&self, speed: T, near: usize) -> usize {
+        last_holding(near, near, |place| self.row(place).speed <= speed)
+    }
+
+    /// A row by its place, which is below their number: the remainder only tells the compiler so.
+    fn row(&self, place: usize) -> Rate<T> {
+        self.rows[place % RATES]
+    }
+
+    /// A row with this part of its rates.
+    pub(super) fn at(&self, place: usize, part: T) -> Rate<T> {
+        let row = self.row(place);
+        Rate {
             speed: row.speed,
             up: row.up * part,
             down: row.down * part,
-        };
-        (rate, *way / part)
+        }
+    }
+
+    /// The way from the speed of a row to rest at this part of the rates.
+    fn passed(&self, place: usize, part: T) -> T {
+        self.ways[place % RATES] / part
     }
 
     /// The way from a speed, as a magnitude, to rest \[y s\].
@@ -116,21 +127,27 @@ impl<T: Real> Rates<T> {
 
     /// The same with this part of the rates.
     pub(super) fn way_by(&self, speed: T, part: T) -> T {
-        let (row, way) = self.at(speed, part);
-        way + (speed * speed - row.speed * row.speed) / (row.down + row.down)
+        let place = self.place(speed, 0);
+        let row = self.at(place, part);
+        self.passed(place, part) + (speed * speed - row.speed * row.speed) / (row.down + row.down)
     }
 
     /// The speed of the next sample from which a distance of 0 or more ends at rest, if the speed then falls from sample to sample
-    /// at this part of these rates: it solves `way(v) + v ts/2 = distance`, and is exact for sampled steps of one rate.
-    pub(super) fn from(&self, distance: T, ts: T, part: T) -> T {
+    /// at this part of these rates: it solves `way(v) + v ts/2 = distance`, and is exact for sampled steps of one rate. The search for
+    /// its row begins at the row `near`.
+    pub(super) fn from(&self, distance: T, ts: T, part: T, near: usize) -> T {
         let half = T::ONE / (T::ONE + T::ONE);
         let ([first, ..], last) = (&self.rows, distance / ts);
         // the last step of the speed, in which the distance is met in one sample
         if last <= first.down * part * ts {
             return last;
         }
-        let (row, way) = self.last(part, |row, way| way + half * row.speed * ts <= distance);
-        let (lost, left) = (half * row.down * ts, distance - way);
+        let top = usize::from(self.count) - 1;
+        let place = last_holding(top, near, |place| {
+            self.passed(place, part) + half * self.row(place).speed * ts <= distance
+        });
+        let row = self.at(place, part);
+        let (lost, left) = (half * row.down * ts, distance - self.passed(place, part));
         let v = (lost * lost + row.speed * row.speed + (row.down + row.down) * left).sqrt() - lost;
         v.limit(T::ZERO, last)
     }

@@ -67,10 +67,11 @@ impl<T: Real> PositionLoop<T> {
             self.shift();
         }
         // the profile is that of as many samples later
-        let missed = T::from_count(sooner.unwrap_or(0));
+        let missed = T::from_count(sooner.unwrap_or(0).into());
         self.move_by(-(missed * rate * self.per_sample));
         // what the drive loses within a sample is rest: at that speed a turn could take minutes
-        let (row, _) = self.design.rates.at(fast, T::ONE);
+        let rates = &self.design.rates;
+        let row = rates.at(rates.place(fast, 0), T::ONE);
         let moves = fast > row.down * self.speed.settings().ts;
         let fastest = if moves && onward {
             fast
@@ -133,7 +134,7 @@ impl<T: Real> PositionLoop<T> {
     /// to within half a count of way, so it may have been told to brake. The drive answers as late as it does to a step of the
     /// command: half of what the feedforward sends for a change of the rate comes by then. The loop is told two samples of the profile
     /// at each sample until it is told all that it has missed, so that the command does not jump, and half of that time is left.
-    fn sooner(&self) -> usize {
+    fn sooner(&self) -> u8 {
         let feedforward = &self.speed.design().feedforward;
         let (two, preview) = (T::ONE + T::ONE, feedforward.preview());
         let apart = (0..=preview).fold(T::ZERO, |sum, age| {
@@ -150,7 +151,7 @@ impl<T: Real> PositionLoop<T> {
             two * sum < T::ONE
         };
         let taps = feedforward.taps().iter().take_while(before).count();
-        (taps / 2).min(preview)
+        (taps / 2).min(preview) as u8
     }
 
     /// A move with this part of the rates and this largest speed begins.
@@ -213,13 +214,14 @@ impl<T: Real> PositionLoop<T> {
         let top = self.top / self.per_sample;
         let kept = top - (top - size(self.rate)) * has;
         let samples = self.design.smoothing;
-        let (row, _) = self.design.rates.at(kept, self.part);
+        let rates = &self.design.rates;
+        let row = rates.at(rates.place(kept, 0), self.part);
         if kept < row.down * self.speed.settings().ts * T::from_count(samples) {
             return false;
         }
         self.rate = if forwards { kept } else { -kept };
         self.planned(self.part * (has * has), kept);
-        self.unplanned = self.speed.design().feedforward.preview() + samples;
+        self.unplanned = (self.speed.design().feedforward.preview() + samples) as u8;
         true
     }
 
@@ -227,9 +229,9 @@ impl<T: Real> PositionLoop<T> {
     fn brakes_fully(&self, forwards: bool) -> bool {
         let limits = self.speed.settings();
         if forwards == (limits.gains.kp > T::ZERO) {
-            self.u <= limits.u_min
+            self.speed.output() <= limits.u_min
         } else {
-            self.u >= limits.u_max
+            self.speed.output() >= limits.u_max
         }
     }
 
