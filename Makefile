@@ -161,6 +161,7 @@ laws: $(DEV) ## every property of the crates under 20 seeds with 10,000 cases ea
 	  $(if $(STATE),--state $(STATE)) $(if $(MINUTES),--minutes $(MINUTES))
 
 no-std: ## links the controller crate without the standard library, and its frames without a path that can panic
+	cargo test --package sewfast-control --no-default-features --lib --profile built --quiet without_positions
 	cargo build --package sewfast-control --profile firmware --quiet
 	rustc --edition 2024 --crate-type staticlib -C panic=abort -D warnings \
 	  --extern sewfast_control=target/firmware/libsewfast_control.rlib \

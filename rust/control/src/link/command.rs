@@ -2,8 +2,8 @@
 
 use super::Fields;
 use super::device::State;
-use super::identity::{Limits, Travel};
-use super::positions::{self, Asked};
+use super::identity::Limits;
+use super::positions;
 use crate::{
     AnyController, AnyDesign, BIQUADS, Biquad, Cascade, Design, Feedforward, LEVELS, Level, POINTS,
     Point, PositionDesign, Refused, Schedule, Settings, Standard, TAPS,
@@ -220,10 +220,11 @@ pub(super) enum Command<'a> {
     Biquads(Result<Cascade<f32>, Refusal>),
     /// The feedforward if it is valid.
     Feedforward(Result<Feedforward<f32>, Refusal>),
-    /// The position loop if it is valid, but without its counts per unit.
-    Position(Result<PositionDesign<f32>, Refusal>),
-    Angle(Result<Asked, Refusal>),
-    Travel(Travel),
+    /// A command of positions, which only a device that has them reads.
+    Positions {
+        kind: u8,
+        body: &'a [u8],
+    },
 }
 
 impl<'a> Command<'a> {
@@ -246,9 +247,10 @@ impl<'a> Command<'a> {
             0x0C => biquads(&mut fields).map(Self::Biquads),
             0x0D => controller(&mut fields)?,
             0x0E => feedforward(&mut fields).map(Self::Feedforward),
-            0x0F if positions::HAS => positions::design(&mut fields).map(Self::Position),
-            0x10 if positions::HAS => positions::angle(&mut fields).map(Self::Angle),
-            0x11 if positions::HAS => positions::travel(&mut fields).map(Self::Travel),
+            positions::POSITION | positions::ANGLE | positions::TRAVEL => Some(Self::Positions {
+                kind,
+                body: fields.rest(),
+            }),
             _ => return Err(Refusal::unknown(kind)),
         };
         let whole = command.filter(|_| fields.is_empty());

@@ -8,6 +8,11 @@ use crate::{AnyController, Controller, FARTHEST, PositionDesign, RATES, Rate, Ra
 /// Whether the device can run a position loop: without it none of its code is linked.
 pub(super) const HAS: bool = cfg!(feature = "positions");
 
+/// The kinds of its commands.
+pub(super) const POSITION: u8 = 0x0F;
+pub(super) const ANGLE: u8 = 0x10;
+pub(super) const TRAVEL: u8 = 0x11;
+
 /// What a run steps at every sample.
 #[derive(Clone, Debug)]
 #[cfg_attr(
@@ -109,8 +114,32 @@ impl Gains {
     }
 }
 
+/// A command of positions with its fields, of the right length but otherwise unchecked.
+pub(super) enum Wish {
+    /// The position loop if it is valid, but without its counts per unit.
+    Position(Result<PositionDesign<f32>, Refusal>),
+    Angle(Result<Asked, Refusal>),
+    Travel(Travel),
+}
+
+impl Wish {
+    /// # Errors
+    /// An unknown kind, a body of the wrong length.
+    pub(super) fn of(kind: u8, body: &[u8]) -> Result<Self, Refusal> {
+        let mut fields = Fields::new(body);
+        let wish = match kind {
+            POSITION => design(&mut fields).map(Self::Position),
+            ANGLE => angle(&mut fields).map(Self::Angle),
+            TRAVEL => travel(&mut fields).map(Self::Travel),
+            _ => return Err(Refusal::unknown(kind)),
+        };
+        let whole = wish.filter(|_| fields.is_empty());
+        whole.ok_or(Refusal::length(body))
+    }
+}
+
 /// The body of POSITION, without the counts per unit, which are those of the gains; `None` if it is too short.
-pub(super) fn design(fields: &mut Fields<'_>) -> Option<Result<PositionDesign<f32>, Refusal>> {
+fn design(fields: &mut Fields<'_>) -> Option<Result<PositionDesign<f32>, Refusal>> {
     let (gain, speed) = (fields.f32()?, fields.f32()?);
     let (landing, creep) = (fields.f32()?, fields.f32()?);
     let (smoothing, releases) = (fields.u8()?, fields.u8()?);
@@ -157,7 +186,7 @@ pub(super) struct Asked {
 }
 
 /// The body of ANGLE; `None` if it is too short.
-pub(super) fn angle(fields: &mut Fields<'_>) -> Option<Result<Asked, Refusal>> {
+fn angle(fields: &mut Fields<'_>) -> Option<Result<Asked, Refusal>> {
     let (at, angle, way) = (fields.u32()?, fields.f32()?, fields.u8()?);
     let asked = Asked {
         at,
@@ -169,7 +198,7 @@ pub(super) fn angle(fields: &mut Fields<'_>) -> Option<Result<Asked, Refusal>> {
 }
 
 /// The body of TRAVEL; `None` if it is too short.
-pub(super) fn travel(fields: &mut Fields<'_>) -> Option<Travel> {
+fn travel(fields: &mut Fields<'_>) -> Option<Travel> {
     Some(Travel {
         low: fields.i32()?,
         high: fields.i32()?,

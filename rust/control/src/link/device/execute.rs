@@ -5,7 +5,7 @@ use crate::link::command::{
     Beat, Command, Gains, HELLO, Heartbeat, Refusal, STOP, Start, Upload, check_watchdog,
 };
 use crate::link::identity::{Limits, OLDEST, Travel, VERSION, capability};
-use crate::link::positions::{self, Asked};
+use crate::link::positions::{self, Asked, Wish};
 use crate::link::profile::Table;
 use crate::link::session::{Order, Reply, Session, key};
 use crate::link::{Body, Fields, Frame};
@@ -130,12 +130,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             Command::Gains(gains) => self.set_gains(gains),
             Command::Biquads(biquads) => self.set_biquads(biquads),
             Command::Feedforward(feedforward) => self.set_feedforward(feedforward),
-            Command::Position(design) if positions::HAS => self.set_position(design),
-            Command::Angle(asked) if positions::HAS => self.set_angle(asked),
-            Command::Travel(travel) if positions::HAS => self.set_travel(travel, body),
-            Command::Position(_) | Command::Angle(_) | Command::Travel(_) => {
-                Err(Refusal::unsupported(0))
-            }
+            Command::Positions { kind, body: wish } => self.positions(kind, wish, body),
             Command::Start(start) => self.start(start, body),
             Command::Echo(bytes) => {
                 body.add(bytes);
@@ -353,7 +348,17 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         self.set_part(needed, given, is_none, Gains::set_feedforward)
     }
 
+    /// Reads and carries out a command of positions, if the device was built with them.
     #[inline(never)]
+    fn positions(&mut self, kind: u8, wish: &[u8], body: &mut Body) -> Done {
+        Refusal::unsupported(0).unless(positions::HAS)?;
+        match Wish::of(kind, wish)? {
+            Wish::Position(design) => self.set_position(design),
+            Wish::Angle(asked) => self.set_angle(asked),
+            Wish::Travel(travel) => self.set_travel(travel, body),
+        }
+    }
+
     fn set_position(&mut self, design: Result<PositionDesign<f32>, Refusal>) -> Done {
         let (limits, turn) = (self.bounds(), self.identity.counts_per_rev);
         let within = |design: &_| {
