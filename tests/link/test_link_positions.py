@@ -75,6 +75,57 @@ def test_a_stop_on_a_device_is_the_simulations_bit_by_bit(speed: float, way: Any
     assert there.goal[-1] % 1572.0 == 393.0
 
 
+@pytest.mark.parametrize("fast", [True, False])
+def test_a_stop_that_is_asked_for_in_mid_run_is_the_laws_bit_by_bit(
+    fast: bool, tmp_path: Path
+) -> None:
+    asked = []
+
+    def pedal(first: int, u: Any, counts: Any) -> None:
+        if first > 300 and not asked:
+            asked.append(first)
+            with pytest.raises(SettingError, match="angle: expected a place within"):
+                drive.stop_at("5e6counts")
+            drive.stop_at("180deg")
+            with pytest.raises(SettingError, match="asked for already"):
+                drive.stop_at("180deg")
+
+    reference, file = np.minimum(8.0 * np.arange(1200), 1500.0), tmp_path / "stop.mcap"
+    with VirtualDevice(fast=fast) as device, connect(device.port) as drive:
+        drive.set_limits(volt=20.0, speed_rpm=4000.0)
+        there = stop_at(LAW, drive, "90deg", reference=reference, watch=pedal, file=file)
+        with pytest.raises(SettingError, match="received no run"):
+            drive.stop_at("90deg")
+    assert asked[0] < there.start < 1200
+    assert there.name == f"stop at 90deg, asked for at sample {there.start}"
+    playing = Playing.of(LAW, stop=(there.start, 786.0, 1572.0, True))
+    # what came after the stop had been asked for has no effect
+    require_same_bits(playing, np.append(reference, np.zeros(1000)), there.u, there.counts)
+    assert there.goal[-1] % 1572.0 == 786.0
+    (event,) = (e for e in read_recording(file).events if e["kind"] == "stop_at")
+    assert event["index"] == there.start
+
+
+def test_a_stop_in_mid_run_needs_a_run_before_its_own_stop() -> None:
+    refused: list[str] = []
+
+    def ask(first: int, u: Any, counts: Any) -> None:
+        with pytest.raises(SettingError) as found:
+            drive.stop_at("90deg")
+        refused.append(str(found.value))
+
+    with VirtualDevice(fast=True) as device, connect(device.port) as drive:
+        drive.set_limits(volt=20.0, speed_rpm=4000.0)
+        for angle, way in (("90", "onward"), ("90deg", "back")):
+            with pytest.raises(SettingError):
+                drive.stop_at(angle, way=way)  # type: ignore[arg-type]
+        found = stop_at(LAW, drive, "90deg", reference=np.zeros(20), after=0.3, watch=ask)
+        assert found.start == 20
+        follow_positions(LAW, drive, np.zeros(100), unit="counts", watch=ask)
+    assert "begins its own stop" in refused[0]
+    assert "a run without one" in refused[-1]
+
+
 def test_goals_on_a_device_are_followed_bit_by_bit() -> None:
     with VirtualDevice(fast=True) as device, connect(device.port) as drive:
         drive.set_limits(volt=20.0, speed_rpm=4000.0)

@@ -314,7 +314,8 @@ def stop_at(
     disturbance : array, shape (N,), optional
         For a model: a command added after the limiter, unknown to the controller [u].
     **drive
-        For a drive: `file`, `live`, `overwrite` and `cancel` as for `run`.
+        For a drive: `file`, `live`, `overwrite`, `watch` and `cancel` as for its `follow`. Its
+        `stop_at` begins the stop sooner.
 
     Raises
     ------
@@ -495,6 +496,12 @@ def _played(
     _require_counts(controller, machine)
     require_units(controller, ("", "RPM"))
     run = guarded(machine).follow(playing, r, name, **drive)
+    # the stop may have been asked for sooner
+    made = run.controller.stop if isinstance(run.controller, Playing) else stop
+    if made is not None and made != stop:
+        start = made[0]
+        shown[start:] = np.nan
+        common |= {"start": start, "name": f"{name}, asked for at sample {start}"}
     counts, place, goal = run.recording.counts, run.place, run.goal
     if place is None or goal is None:
         place, goal = _replayed(playing, counts, r, start)

@@ -18,11 +18,13 @@ from .. import _core
 from ..control.controller import Controller, SampledController
 from ..control.machine import RecordedRun, Watch
 from ..control.position import Playing, PositionController
+from ..control.stops import WAYS, Way, position_of
 from ..errors import LinkError, SettingError
 from ..gains import real
 from ..live import ViewKind
 from ..recording import Recording
 from ..speed import Method
+from ..units import counts_of
 from . import run as profiles
 from . import wire
 from .connection import ClockBounds, Connection, DeviceReset, Loan
@@ -40,6 +42,7 @@ from .plan import (
     moves,
     other_kind,
     require_capable,
+    require_near,
     require_positions,
 )
 from .ports import Unique, open_port
@@ -72,6 +75,7 @@ class Drive(Unique):
         self._channels = channels(link)
         #: Outcome of the last run, even of one that ended in an exception.
         self.outcome: Outcome | None = None
+        self._run: Run | None = None
         await_measurement(link)
 
     @classmethod
@@ -482,8 +486,45 @@ class Drive(Unique):
             cancel=cancel,
         )  # fmt: skip
 
+    def stop_at(self, angle: str, *, way: Way = "onward", zero: float = 0.0) -> None:
+        """Begin the stop of a run now: for another thread while `sewfast.stop_at` follows its
+        reference, or for the `watch` of that run.
+
+        It returns at once. The stop begins with the next sample that the device takes after it has
+        heard of it; the run goes on to its planned end, holds the shaft and tells this sample as
+        its `start`.
+
+        Parameters
+        ----------
+        angle, way, zero
+            As for `sewfast.stop_at`; they replace those that the run began with.
+
+        Raises
+        ------
+        SettingError
+            Without a run of `sewfast.stop_at`, once its stop was asked for or within two watchdog
+            times of its own; for an angle without a unit or beyond what a device can hold.
+        """
+        value, unit = position_of(angle)
+        if way not in WAYS:
+            raise SettingError(name="way", expected=" or ".join(WAYS), received=repr(way))
+        counts = real("zero", zero) + counts_of(value, unit, self.counts_per_rev)
+        require_near(counts)
+        if (run := self._run) is None:
+            raise SettingError(
+                name="stop_at", expected="a run of a stop at an angle", received="no run",
+                remedy="begin one in another thread: sewfast.stop_at(controller, drive, ...)",
+            )  # fmt: skip
+        run.stop_at(counts, way == "onward")
+
     def _stream(self, plan: Plan, sink: Sink, cancel: threading.Event | None) -> Outcome:
-        run = self._prepare(plan, sink)
+        self._run = run = self._prepare(plan, sink)
+        try:
+            return self._ran(run, cancel)
+        finally:
+            self._run = None
+
+    def _ran(self, run: Run, cancel: threading.Event | None) -> Outcome:
         try:
             run.upload()
             wanted = cancel is None or not cancel.is_set()

@@ -104,8 +104,8 @@ class Sink(Protocol):
     def event(self, kind: str, index: int, **detail: object) -> None:
         """Something happened at sample `index`.
 
-        Kinds: those of the device (armed, started, finished, stopped, tripped), and gap, port_lost,
-        resumed, reset, stop_unconfirmed.
+        Kinds: those of the device (armed, started, finished, stopped, tripped), and stop_at, gap,
+        port_lost, resumed, reset, stop_unconfirmed.
         """
 
 
@@ -135,6 +135,9 @@ class Outcome:
         Samples in a frame.
     counters : mapping
         Numbers of frames and samples, in and out of order.
+    stop : tuple or None
+        A stop that was asked for in mid-run (`Drive.stop_at`): the sample with which it began, its
+        angle [counts] and whether it went onward.
     """
 
     state: str
@@ -147,6 +150,7 @@ class Outcome:
     columns: tuple[str, ...] = ()
     batch: int = 0
     counters: Mapping[str, int] = field(default_factory=dict)
+    stop: tuple[int, float, bool] | None = None
 
     @property
     def is_complete(self) -> bool:
@@ -366,15 +370,21 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
     return wire.gains(values, c.filter_samples, design)
 
 
+def require_near(angle: float) -> None:
+    """Refuse an angle [counts] of a stop beyond what single precision holds."""
+    if not abs(angle) <= wire.FARTHEST:
+        raise SettingError(
+            name="angle", expected=f"a place within {wire.FARTHEST:g} counts on a device",
+            received=f"{angle:g} counts", remedy="give it in its turn",
+        )  # fmt: skip
+
+
 def moves(playing: Playing, identity: Identity, limits: Limits) -> bytes:
     """Body of POSITION for a position loop, whose moves must keep within the device's limits, and
     the angle of a stop within what single precision holds.
     """
-    if playing.stop is not None and not abs(playing.stop[1]) <= wire.FARTHEST:
-        raise SettingError(
-            name="angle", expected=f"a place within {wire.FARTHEST:g} counts on a device",
-            received=f"{playing.stop[1]:g} counts", remedy="give it in its turn",
-        )  # fmt: skip
+    if playing.stop is not None:
+        require_near(playing.stop[1])
     rows, unit = playing.rows(), playing.counts_per_unit
     rpm = 60.0 * unit / identity.counts_per_rev  # of one unit of speed
     steepest = max(max(up, down) for _, up, down in rows)

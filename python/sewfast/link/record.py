@@ -220,15 +220,24 @@ def follow(
     volt = math.inf if playing is None else drive.limits().volt
 
     def convert(run: RunResult) -> RecordedRun:
-        found = _run(run.columns, drive, controller, r, name)
-        if playing is None:
+        played = None if playing is None else _played(playing, run.outcome)
+        found = _run(run.columns, drive, played or controller, r, name)
+        if played is None:
             return found
-        place, goal = playing.on_device(r, found.recording.counts, volt)
+        place, goal = played.on_device(r, found.recording.counts, volt)
         return replace(found, place=place, goal=goal)
 
     goals = playing is not None and playing.stop is None
     plan = Plan("positions" if goals else "controller", controller.early(r), controller)
     return _converted(drive, plan, convert, name=name, **options)
+
+
+def _played(playing: Playing, outcome: Outcome) -> Playing:
+    """The controller with the stop that was asked for in mid-run, if one was."""
+    if outcome.stop is None or playing.stop is None:
+        return playing
+    (at, angle, onward), (_, _, turn, _) = outcome.stop, playing.stop
+    return replace(playing, stop=(at, angle, turn, onward))
 
 
 def _converted(drive: Drive, plan: Plan, convert: Callable[[RunResult], T], **options: Any) -> T:

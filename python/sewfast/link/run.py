@@ -157,6 +157,9 @@ class Run:
         self.received = 0
         self.gaps: list[tuple[int, int]] = []
         self.ended = False
+        #: The stop that was asked for in mid-run: its first sample, angle [counts], whether onward.
+        self.stop: tuple[int, float, bool] | None = None
+        self._wish: tuple[float, bool] | None = None
         self._sink_works = True
         self._last: Status | None = None
         # share of the watchdog time that a device on credit can run ahead
@@ -237,6 +240,27 @@ class Run:
                 self._ask(time.monotonic())
         return True
 
+    def stop_at(self, counts: float, onward: bool) -> None:
+        """Ask for the stop of a position loop now; for any thread. See `Drive.stop_at`."""
+        playing = self.plan.controller
+        own = playing.stop if isinstance(playing, Playing) else None
+        going = self.start_us is not None and not self.ended
+        # what is on its way is no longer than the watchdog's time, or the run trips
+        near = self.next + math.ceil(2e6 * self.link.watchdog / self.period)
+        for holds, received in (
+            (own is not None, "a run without one"),
+            (going, "one that has not begun or has ended"),
+            (self._wish is None, "a stop that has been asked for already"),
+            (own is not None and near < own[0], "one that begins its own stop"),
+        ):
+            if not holds:
+                raise SettingError(
+                    name="stop_at", expected="a run of a stop at an angle before this stop",
+                    received=received, remedy="ask once, while stop_at(controller, drive, ...) "
+                    "follows its reference",
+                )  # fmt: skip
+        self._wish = (counts, onward)
+
     def _wait(self) -> float:
         if self._on_credit:
             return AGAIN
@@ -311,6 +335,9 @@ class Run:
             self._asked = now
             self.link.begin(Kind.STATUS)
             return
+        if self._wish is not None and self.stop is None and self.next > 0:
+            self.link.begin(Kind.ANGLE, wire.angle(0, *self._wish))
+            return
         piece = None if self.profile is None else self.profile.piece(self._room())
         if piece is not None:
             self.link.begin(Kind.UPLOAD, piece)
@@ -323,9 +350,14 @@ class Run:
     def _answered(self, reply: Reply) -> None:
         if reply.kind == Kind.UPLOAD and self.profile is not None:
             _take_reply(self.profile, reply)
-            if reply.result:
-                # the run has ended, or the device disagrees: ask for STATUS next
-                self._heard = self._asked = -math.inf
+        if reply.result and reply.kind in (Kind.UPLOAD, Kind.ANGLE):
+            # the run has ended, or the device disagrees: ask for STATUS next
+            self._heard = self._asked = -math.inf
+        elif reply.kind == Kind.ANGLE and self._wish is not None:
+            counts, onward = self._wish
+            self.stop = (wire.begins(reply.body), counts, onward)
+            way = "onward" if onward else "shortest"
+            self._notify("stop_at", self.stop[0], angle=counts, way=way)
         elif reply.kind == Kind.STATUS:
             self._last = wire.status(reply)
             going = self._last.run == self.run and self._last.state in ("armed", "running")
@@ -494,5 +526,5 @@ class Run:
             state=state, reason=reason, received=self.received, taken=taken, gaps=tuple(self.gaps),
             anomalies=tuple(link.receiver.anomalies()),
             clock=None if self._on_credit else link.clock.bounds(),
-            columns=self.layout.names, batch=self.layout.batch, counters=counters,
+            columns=self.layout.names, batch=self.layout.batch, counters=counters, stop=self.stop,
         )  # fmt: skip

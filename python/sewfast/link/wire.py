@@ -304,6 +304,12 @@ def started(body: bytes) -> tuple[int, int]:
     return _whole(LinkBodies.started(body), body, "START")
 
 
+def begins(body: bytes) -> int:
+    """The sample with which the stop of an ANGLE begins."""
+    whole = body if len(body) == 4 else None
+    return int.from_bytes(_whole(whole, body, "ANGLE"), "little")
+
+
 def uploaded(body: bytes) -> tuple[int, int]:
     """End of the profile and room behind it [values]."""
     return _whole(LinkBodies.uploaded(body), body, "UPLOAD")

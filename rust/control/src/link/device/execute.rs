@@ -354,7 +354,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         Refusal::unsupported(0).unless(positions::HAS)?;
         match Wish::of(kind, wish)? {
             Wish::Position(design) => self.set_position(design),
-            Wish::Angle(asked) => self.set_angle(asked),
+            Wish::Angle(asked) => self.set_angle(asked, body),
             Wish::Travel(travel) => self.set_travel(travel, body),
         }
     }
@@ -371,7 +371,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         self.set_part(needed, design, |_| false, set)
     }
 
-    fn set_angle(&mut self, asked: Result<Asked, Refusal>) -> Done {
+    fn set_angle(&mut self, asked: Result<Asked, Refusal>, body: &mut Body) -> Done {
         self.allow(&[State::Armed, State::Running])?;
         Refusal::state(self.state).unless(self.run.planned.is_none())?;
         Refusal::unsupported(0).unless(self.can(capability::POSITIONS))?;
@@ -385,7 +385,9 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             (gains.is_some_and(|gains| gains.position.is_some()), 0)
         };
         Refusal::value(0).unless(ready && (asked.at == 0 || asked.at >= from))?;
-        self.asked = Some(asked);
+        let at = asked.at.max(from);
+        self.asked = Some(Asked { at, ..asked });
+        body.u32(at);
         Ok(())
     }
 

@@ -266,7 +266,9 @@ fn a_stop_can_be_asked_for_while_it_runs_and_once_more() {
     let goal = turning.and_then(|law| law.position()).unwrap().goal();
     // from rest, the shorter way
     assert_eq!(goal, Some(700));
-    assert_eq!(rig.turn_to(0, 800.0, 1).0, 0);
+    // the next sample, which the reply names
+    let next = rig.device.core.run.samples.to_le_bytes();
+    assert_eq!(rig.turn_to(0, 800.0, 1), (0, next.to_vec()));
     rig.watched(1);
     let turning = rig.device.core.run.law.as_mut();
     let goal = turning.and_then(|law| law.position()).unwrap().goal();
