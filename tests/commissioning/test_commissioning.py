@@ -44,6 +44,7 @@ from sewfast import (
     load_model,
     load_response,
     read_table,
+    stop_at,
 )
 from sewfast.causes import cause_after
 from sewfast.commissioning import STAGES, Refusal, gains, training, verification
@@ -56,7 +57,14 @@ from sewfast.commissioning.bench import (
 )
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.gains import Requirements
-from sewfast.commissioning.positions import Unsuited, position_loop, telling, unmet, verified_stops
+from sewfast.commissioning.positions import (
+    Stop,
+    Unsuited,
+    position_loop,
+    telling,
+    unmet,
+    verified_stops,
+)
 from sewfast.errors import LinkError
 from sewfast.link import VirtualDevice, connect
 from sewfast.report import commissioned, report
@@ -298,6 +306,8 @@ def test_a_position_loop_stops_where_it_is_predicted(whole: Commissioning, tmp_p
     missed = verified_stops(position.controller, MachineBench(weak), models, 2000.0, kept.append)
     assert "passed its goal" in unmet(missed)
     assert [s.measured is None for s in missed] == [False, True, True]
+    cut = stop_at(position.controller, VirtualMachine(), "90deg", speed=1500.0, after=0.05)
+    assert "has not come to rest" in unmet([Stop("cut", (), cut)])
     found = replace(whole, position=position, stops=stops)
     page = found.save(tmp_path / "positions").read_text()
     assert "Stops at an angle" in page

@@ -317,6 +317,15 @@ def test_a_search_finds_gain_and_share_within_its_limits(tuned: Any) -> None:
     assert (m["passed"] or 0.0) <= 360.0 / 1572.0
 
 
+def test_a_stop_of_a_slow_drive_is_followed_until_it_rests() -> None:
+    slow = drive(2.5)
+    slowly = np.repeat(RAMP, 4)
+    found = tune(slow, [slowly], counts_per_rev=1572.0, loop="position", evaluations=100)
+    assert found.position is not None
+    # it was judged while it braked, thousands of counts before its goal
+    assert found.position.off <= 1.5
+
+
 def test_the_command_line_tunes_stops_and_moves(
     tuned: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,7 +18,7 @@ from ..errors import FitError, SettingError
 from ..models import Ensemble, Model
 from ..recording import Recording
 from ..tuning.objective import Constraints, Cost
-from ..tuning.position import DYING, PositionTuning, with_position
+from ..tuning.position import PositionTuning, ending, with_position
 from ..tuning.task import Budget, TuningTask
 from .demands import Refusal
 
@@ -101,7 +101,7 @@ def verified_stops(
     asked = [(angle, min(share * speed, law.fastest)) for share, angle in STOPS]
 
     def run(on: Model | Machine, angle: str, begun: float) -> PositionRun:
-        return stop_at(law, on, angle, speed=begun, after=AFTER + DYING / law.gain)
+        return stop_at(law, on, angle, speed=begun, after=AFTER + ending(law))
 
     stops = [
         Stop(f"{angle} from {begun:.4g} RPM", tuple(run(m, angle, begun) for m in ensemble.members))
@@ -152,4 +152,6 @@ def unmet(stops: Sequence[Stop]) -> str:
     for stop in stops:
         if stop.measured is not None:
             found += [f"{stop.name}: {warning}" for warning in stop.measured.warnings]
+            if not found and stop.measured.metrics()["rest_counts"] is None:
+                found.append(f"{stop.name}: has not come to rest within its run")
     return "; ".join(found)

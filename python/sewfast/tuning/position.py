@@ -47,7 +47,8 @@ swing is then down to a quarter of a per cent."""
 SPEEDS = (0.1, 0.25, 0.5, 0.75, 0.95)
 """Speeds of the stops, as parts of the largest known one."""
 BEFORE, AFTER = 0.3, 0.4
-"""How long a stop's speed is held before it, and how long it is followed beyond its landing [s]."""
+"""How long a stop's speed is held before it, and how long it is followed beyond braking and landing
+[s]."""
 LOAD = 0.1
 """The load that is held, as a part of the command's range."""
 
@@ -156,7 +157,7 @@ def with_position(task: TuningTask, speed: Controller) -> PositionTuning:
     for share, k, landing in itertools.product(SHARES, np.argsort(held).tolist(), LANDINGS):
         law, own, both = stiff[k]
         law = replace(_landed(law, landing), share=share)
-        judged = _stops(task, [law], later, AFTER + DYING / law.gain)[0]
+        judged = _stops(task, [law], later, AFTER + ending(law))[0]
         tried += 1
         if least is None or judged.passed < least[1].passed:
             least = (law, judged, held[k], own, both)
@@ -167,6 +168,17 @@ def with_position(task: TuningTask, speed: Controller) -> PositionTuning:
     return PositionTuning(
         law, yields, judged.error, judged.passed, judged.off, own, both, len(stiff) + tried
     )
+
+
+def ending(law: PositionController) -> float:
+    """How long a stop from the largest speed brakes and lands [s]."""
+    rows = law.rows()
+    tops = [*(v for v, _, _ in rows[1:]), law.fastest]
+    braking = sum(
+        max(0.0, min(top, law.fastest) - v) / down
+        for (v, _, down), top in zip(rows, tops, strict=True)
+    )
+    return braking + DYING / law.gain
 
 
 def sound_speed_loop(task: TuningTask, result: TuningResult) -> Controller:
