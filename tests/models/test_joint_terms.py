@@ -119,6 +119,45 @@ def test_rate_backlash_and_cogging_are_found_where_they_are(
     assert term in " ".join(joint.to_model().describe())
 
 
+def _driven(
+    n: int, seed: int, size: float, hold: int, *, pull: float = 0.0, wave: float = 0.0
+) -> Dataset:
+    """Angle of a joint of .1 kg m^2 under levels of torque: .1 N m of friction, .1 N m s/rad, its
+    weight, which hangs, and cogging 14 times per turn."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-size, size, n // hold + 1), hold)[:n]
+    y, q, w, h = np.zeros(n), 0.0, 0.0, TS / 50
+    for k in range(n * 50):
+        if k % 50 == 0:
+            y[k // 50] = np.floor(q / STEP + 0.5) * STEP
+        load = pull * math.sin(q) + wave * math.cos(14.0 * q + 0.7)
+        free = w + h / 0.1 * (u[k // 50] - load - 0.1 * w)
+        w = math.copysign(max(abs(free) - h / 0.1 * 0.1, 0.0), free)
+        q += h * w
+    return Dataset.from_arrays(u, y, TS, input_units=("N m",), output_unit="rad")
+
+
+@pytest.mark.slow("fits with all terms")
+@pytest.mark.parametrize(
+    ("term", "size", "hold", "drawn"),
+    [
+        ("gravity", 1.5, 200, {"pull": 3.0}),
+        ("cogging", 0.5, 40, {"wave": 0.2}),
+        ("", 0.4, 60, {}),
+    ],
+)  # fmt: skip
+def test_forces_by_angle_without_which_a_joint_goes_elsewhere_are_found(
+    term: str, size: float, hold: int, drawn: dict[str, float]
+) -> None:
+    joint = physics(_driven(3000, 2, size, hold, **drawn), structure="joint")
+    assert {"gravity", "cogging"} & set(joint.terms) == {term} - {""}
+    truth = {"inertia": 0.1, "friction": 0.1, "viscous": 0.1}
+    truth |= dict(zip([term], drawn.values(), strict=False))
+    for name, value in truth.items():
+        assert joint.value(name) == pytest.approx(value, rel=0.02), name
+    assert joint.fit_percent > 99.5
+
+
 def test_a_step_after_a_standstill_has_no_inertia_of_nothing() -> None:
     u, q, w, h = np.r_[np.zeros(100), np.full(200, 3.0)], 0.0, 0.0, 1e-4
     y = np.zeros(300)

@@ -47,6 +47,8 @@ TERMS: dict[str, tuple[str, ...]] = {
     "cogging": ("cogging_c", "cogging_s", "cogging_order"),
 }
 """Terms that a joint may have beyond inertia, viscous and dry friction, offset and delay."""
+BY_ANGLE = ("gravity", "cogging")
+"""Terms without which a longer free run of a joint without a controller goes elsewhere."""
 WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the bells that smooth a start's signals [samples]."""
 DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
@@ -74,6 +76,9 @@ WAVES_TRIED, MOST_ORDERS = 2, 400
 """Orders from which a fit of cogging starts, of so many in which smoothed signals are searched."""
 GLANCE = 3
 """Iterations of each start of a term; the best start is fitted further."""
+DRIFT = 2.0**4
+"""Most growth of the squared error over pieces twice as long: a force that is off moves a joint
+with the square of time. A run whose error grows by more has gone another way than the joint."""
 STARTED, PIECES = 32, 4
 """Pieces over which starts are compared, and those of the last fit, beside which the drift of a
 whole record is another error."""
@@ -89,6 +94,8 @@ STOPPED = 0.1
 joint at one place if that is a stop: friction holds a joint too, but not twice at one count."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
 """Factor from each unit of a length to m."""
+MOST_STEPS = 32
+"""Most integration steps per sample."""
 STEPS_PER_RADIAN = 100.0
 """Integration steps while the fastest of the dynamics turns by one radian. With 12 a limit of the
 controller was seen as a lag besides (benches/joints.py, servos 0, 3 and 5)."""
@@ -142,12 +149,8 @@ def fitted(
     if not integrates:
         _require_following(data)
     fit = _Fit(data, look)
-    core = fit.started(integrates)
-    for share in (STARTED, 16, 8, PIECES):
-        fit.cut(share)
-        found = fit.descended(core)
-        core = found.core
-    found, terms, missing = fit.with_terms(fit.without_delay(found))
+    found, terms = fit.lengthened(fit.started(integrates))
+    found, terms, missing = fit.with_terms(fit.without_delay(found), terms)
     found = fit.settled(found)
     known: tuple[Any, Any] = (None, None)
     if covariance:
@@ -321,7 +324,7 @@ class _Fit:
         return _core.GreyBox(
             values=values, joint=own.tolist(), position=True,
             free=[PLACES[n] for n in free], Ts=self.data.Ts,
-            steps=int(np.clip(steps, 2, 32)), mean=False, unit=self.unit,
+            steps=int(np.clip(steps, 2, MOST_STEPS)), mean=False, unit=self.unit,
             speed_scale=max(float(np.nanstd(speeds)) * self.unit / (4.0 * self.data.Ts), 1e-12),
             command_scale=max(float(np.nanstd(drive)), 1e-12),
             residual_variance=max(1e-6 * float(np.nanvar(y)), 1e-300), process_noise=1e-6,
@@ -339,6 +342,27 @@ class _Fit:
             most=self.most,
         )  # fmt: skip
 
+    def lengthened(self, core: _core.GreyBox) -> tuple[Descent, tuple[str, ...]]:
+        """The fit over the longest pieces on which it holds, and its terms so far.
+
+        Forces by angle are sought over the shortest pieces: without one that is there, a joint goes
+        elsewhere in longer ones, and no descent from there comes back. A controller inside brings
+        it back.
+        """
+        self.cut(STARTED)
+        found, terms = self.descended(core), tuple[str, ...]()
+        if core.settings["integrator"]:
+            found, terms, _ = self.with_terms(found, among=BY_ANGLE)
+        for share in (16, 8, PIECES):
+            shorter = self.pieces
+            self.cut(share)
+            longer = self._tried(found.core, ITERATIONS)
+            if longer is None or longer.cost > DRIFT * found.cost:
+                self.pieces = shorter
+                break
+            found = longer
+        return found, terms
+
     def without_delay(self, found: Descent) -> Descent:
         """The fit, or the one that a descent without a delay finds: stops of dry friction give the
         delay more than one minimum.
@@ -349,21 +373,23 @@ class _Fit:
         other = self.descended(changed(found.core, theta=theta))
         return other if other.cost < found.cost else found
 
-    def with_terms(self, plain: Descent) -> tuple[Descent, tuple[str, ...], tuple[str, ...]]:
+    def with_terms(
+        self, plain: Descent, terms: Sequence[str] = (), among: Sequence[str] = tuple(TERMS)
+    ) -> tuple[Descent, tuple[str, ...], tuple[str, ...]]:
         """The fit with those of the terms that lower the cost by more than their number explains:
         one after the other, the best one first (Schwarz 1978, with the number of samples that the
-        residuals' correlation leaves).
+        residuals' correlation leaves). It has `terms` already.
         """
-        own, taken = plain, list[str]()
-        while found := self._more(own, taken):
+        own, taken = self.finer(plain), list(terms)
+        while found := self._more(own, [t for t in among if t not in taken]):
             term, one = found[0]
             if not self._explains(own, one, term, self.independent(own)):
                 break
-            own = one
+            own = self.finer(one)
             taken.append(term)
         own = self.descended(own.core)
         # one that another has made superfluous goes again
-        for term in taken[:-1]:
+        for term in (*terms, *taken[len(terms) : -1]):
             fewer = self._tried(_without(own.core, term, taken), ITERATIONS)
             if fewer and not self._explains(fewer, own, term, self.independent(own)):
                 own = fewer
@@ -371,7 +397,22 @@ class _Fit:
         missing = tuple(t for t in TERMS if t not in taken and self._may_have(t, own.core))
         return own, tuple(t for t in TERMS if t in taken), missing
 
-    def _more(self, own: Descent, taken: Sequence[str]) -> list[tuple[str, Descent]]:
+    def finer(self, own: Descent) -> Descent:
+        """The fit in integration steps so short that shorter ones explain no more than a parameter
+        does: what coarse ones leave looks like Stribeck's bump, creep or cogging. With a controller
+        inside, its dynamics have set them.
+        """
+        if not own.core.settings["integrator"]:
+            return own
+        while (steps := 2 * own.core.settings["steps"]) <= MOST_STEPS:
+            one = self._tried(changed(own.core, steps=steps), ITERATIONS)
+            n = self.independent(own)
+            if one is None or own.cost < one.cost * n ** (1.0 / n):
+                break
+            own = one
+        return own
+
+    def _more(self, own: Descent, among: Sequence[str]) -> list[tuple[str, Descent]]:
         """Fits with one more term, the best one first (Schwarz 1978)."""
         n = self.independent(own)
 
@@ -379,8 +420,8 @@ class _Fit:
             return n * math.log(max(of[1].cost, 1e-300)) + self._price(of[0], n)
 
         found: dict[str, Descent] = {}
-        for term in TERMS:
-            if term in taken or not self._may_have(term, own.core):
+        for term in among:
+            if not self._may_have(term, own.core):
                 continue
             for begun in self._begun(own.core, term):
                 if one := self._tried(begun, GLANCE):
@@ -405,7 +446,8 @@ class _Fit:
         found, determined = own.core.covariance(_arrays(self.pieces), own.states)
         n, p = self.independent(own), len(own.core.theta)
         finer = changed(own.core, steps=2 * own.core.settings["steps"])
-        others = [(len(TERMS[term]), f) for term, f in self._more(own, taken)]
+        left = [term for term in TERMS if term not in taken]
+        others = [(len(TERMS[term]), f) for term, f in self._more(own, left)]
         if one := self._tried(finer, 12):
             others.append((0, one))
         total, apart = 1.0, np.zeros((p, p))
