@@ -313,8 +313,8 @@ def _with_losses(model: Model, clock: Clock) -> Model:
         return model
     grade = model.training.get("verdict", {}).get("grade", "unknown")
     note = (
-        f"the time budget of {clock.budget:g} s cut short: {', '.join(clock.lost)}; the result, "
-        f"graded {grade}, depends on the speed of the machine and on what else runs on it"
+        f"the time budget cut short: {', '.join(clock.lost)}; the result, graded {grade}, depends "
+        "on the speed of the machine and on what else runs on it"
     )
     record = {"seconds": clock.budget, "lost": list(clock.lost), "grade": grade}
     notes = [*model.training.get("notes", []), note]
