@@ -248,26 +248,10 @@ pub trait Lagged {
         let mut search = StateSearch::new(self, lags, u, y, level);
         let starts = [level, known[0], 0.0];
         let run = |search: &mut StateSearch<Self>, start: f64| search.descend(vec![start; lags.na]);
-        let mut best = best_of(starts.iter().filter_map(|&s| run(&mut search, s)))?;
-        for _ in 0..RELAXATIONS {
-            if known.len() <= 2 * lags.na || !search.relax(&best.1, level, &known) {
-                break;
-            }
-            best = search.descend(best.1.clone()).unwrap_or(best);
-        }
-        let squares: f64 = known.iter().map(|y| (y - level) * (y - level)).sum();
-        let mut exact = search.squares(&best.1) <= EXACT * squares;
-        if !exact && known.len() > 2 * lags.na {
-            // a state far from `level` that is soon forgotten: its prior outweighs the few outputs that depend on it
-            let prior = std::mem::replace(&mut search.rho, LEAST_PRIOR);
-            match search.descend(best.1.clone()) {
-                Some(found) if search.squares(&found.1) <= EXACT * squares => {
-                    (best, exact) = (found, true);
-                }
-                _ => search.rho = prior,
-            }
-        }
+        let best = best_of(starts.iter().filter_map(|&s| run(&mut search, s)))?;
+        let (mut best, exact) = search.relaxed(best, &known);
         if known.len() <= SHORT && !exact {
+            let before = best.0;
             // a network need not be monotone: starts with equal past outputs can all miss the best state
             for start in spread_starts(lags.na, level, &known) {
                 best = match search.descend(start) {
@@ -275,6 +259,9 @@ pub trait Lagged {
                     Some(found) if found.0 < 0.5 * best.0 => found,
                     _ => best,
                 };
+            }
+            if best.0 < before {
+                best = search.relaxed(best, &known).0;
             }
         }
         Ok(best.1)
@@ -475,9 +462,34 @@ impl<'a, M: Lagged + ?Sized> StateSearch<'a, M> {
         squares
     }
 
+    /// The descent from a state on with the least prior that its residual allows, and whether it is exact.
+    fn relaxed(&mut self, mut best: (f64, Vec<f64>), known: &[f64]) -> ((f64, Vec<f64>), bool) {
+        let level = self.level;
+        let squares: f64 = known.iter().map(|y| (y - level) * (y - level)).sum();
+        let is_long = known.len() > 2 * self.lags.na;
+        for _ in 0..RELAXATIONS {
+            if !is_long || !self.relax(&best.1, known) {
+                break;
+            }
+            best = self.descend(best.1.clone()).unwrap_or(best);
+        }
+        if self.squares(&best.1) <= EXACT * squares {
+            return (best, true);
+        }
+        if is_long {
+            // a state far from `level` that is soon forgotten: its prior outweighs the few outputs that depend on it
+            let prior = std::mem::replace(&mut self.rho, LEAST_PRIOR);
+            match self.descend(best.1.clone()) {
+                Some(found) if self.squares(&found.1) <= EXACT * squares => return (found, true),
+                _ => self.rho = prior,
+            }
+        }
+        (best, false)
+    }
+
     /// Lowers the prior's weight to what the residual suggests; false if it is low enough already.
-    fn relax(&mut self, state: &[f64], level: f64, known: &[f64]) -> bool {
-        let (prior, samples) = (self.rho, known.len());
+    fn relax(&mut self, state: &[f64], known: &[f64]) -> bool {
+        let (prior, samples, level) = (self.rho, known.len(), self.level);
         let residual = self.squares(state) / (samples - self.lags.na) as f64;
         let spread = known.iter().map(|y| (y - level) * (y - level)).sum::<f64>() / samples as f64;
         self.rho = (residual / spread.max(f64::MIN_POSITIVE)).clamp(LEAST_PRIOR, prior);
