@@ -317,6 +317,8 @@ class _Look:
     found: dict[str, Any]
     volt: float
     speed: float
+    usual: float
+    """Largest speed of this run and of those before it [RPM, rms]."""
 
     @classmethod
     def at(
@@ -326,17 +328,13 @@ class _Look:
             *_columns(recording), [_columns(r) for r in before], Ts=recording.Ts,
             counts_per_rev=recording.counts_per_rev, most=volt,
         )  # fmt: skip
-        return cls(recording, found, volt, speed)
+        speeds = [float(np.sqrt(np.mean(np.nan_to_num(r.y) ** 2))) for r in before]
+        return cls(recording, found, volt, speed, max(found["size"], *speeds, 0.0))
 
     @property
     def is_alike(self) -> bool:
         """Whether its own motor explains the run well enough to be compared with."""
         return bool(self.found["error"] <= ALIKE * self.found["size"])
-
-    @property
-    def expected(self) -> float:
-        """About the speed that the motor has without a change [RPM, rms]; the run may show none."""
-        return math.hypot(self.found["size"], self.found["error"])
 
     @property
     def name(self) -> str:
@@ -364,7 +362,7 @@ class _Look:
         least = NOTED if is_alone else max(NOTED, TIMES * found["unsure"])
         least = max(least * found["size"], found["rounding"])
         findings = found["findings"]
-        if found["size"] < LOST * self.expected:
+        if found["size"] < LOST * self.usual:
             # next to nothing moves: a delay longer than the run explains that as well
             findings = [f for f in findings if f[0] in ("counts", "gain")]
         if found["error"] > least and findings:
@@ -386,7 +384,7 @@ class _Look:
         when = (
             f"from the start of {self.name!r}" if early else f"{at:.3g} s after {self.name!r} began"
         )
-        if change == "stuck" and abs(value * motor["gain"]) < LOST * self.expected:
+        if change == "stuck" and abs(value * motor["gain"]) < LOST * self.usual:
             change, value = "gain", 0.0
         words = partial(_jump, per_turn=r.counts_per_rev) if change == "jump" else _NAMED[change]
         name, text = words(value, when)
