@@ -337,6 +337,13 @@ class _Look:
         return bool(self.found["error"] <= ALIKE * self.found["size"])
 
     @property
+    def stands(self) -> bool:
+        """Whether next to nothing moves, and in the second half nothing."""
+        _, counts = _columns(self.recording)
+        late = counts[len(counts) // 2 :]
+        return bool(self.found["size"] < LOST * self.usual and np.ptp(late) <= 1.0)
+
+    @property
     def name(self) -> str:
         """The run's name; one that was ended early is saved under another."""
         return self.recording.name.removesuffix(ABORTED)
@@ -362,8 +369,8 @@ class _Look:
         least = NOTED if is_alone else max(NOTED, TIMES * found["unsure"])
         least = max(least * found["size"], found["rounding"])
         findings = found["findings"]
-        if found["size"] < LOST * self.usual:
-            # next to nothing moves: a delay longer than the run explains that as well
+        if self.stands:
+            # a delay longer than the run explains that as well
             findings = [f for f in findings if f[0] in ("counts", "gain")]
         if found["error"] > least and findings:
             most = min(explained * found["error"], ties * findings[0][3])
