@@ -179,20 +179,6 @@ def test_curves_and_printed_copies_of_the_input_are_refused() -> None:
     assert "no_dynamics" not in {f.kind for f in faults(data((u[3:], late)))}
 
 
-@pytest.mark.parametrize("of", ["centred mean", "gradient", "size"])
-def test_what_is_computed_from_an_input_that_moves_at_every_sample_is_refused(of: str) -> None:
-    u, plant = steps(5)[1], lag(steps(6)[1], pole=0.6, delay=0)
-    computed = {
-        "centred mean": np.convolve(u, np.full(41, 1 / 41), "same"),
-        "gradient": np.gradient(u),
-        "size": np.abs(u - u.mean()),
-    }[of]
-    with pytest.raises(api.DataError, match="computed from the other"):
-        api.identify(Dataset.from_arrays(u[20:-20], computed[20:-20], 0.01))
-    # a short memory of its own makes a plant, even one that answers at once and without noise
-    assert "no_dynamics" not in {f.kind for f in faults(data((steps(6)[1], plant)))}
-
-
 @pytest.mark.parametrize("of", ["mean", "difference", "sum"])
 def test_sums_of_the_input_are_refused(of: str) -> None:
     u = steps(5)[0]

@@ -9,7 +9,7 @@ fails on any numbers: columns are compared about their mean, in units of their d
 - A counter that wraps: the output jumps by its whole range against the way that it moves before and
   after.
 - No dynamics: for the whole record, the output is the input times a number or a curve of it, or it
-  or its change is a sum of an input in the same sample and in others.
+  or its change is a sum of an input in the same sample and in some before.
 - A change: one part of the record predicts the other with another sign, scale or time (`changes`).
 - The order in time: the past of a cause helps to predict its effect beyond the effect's own past,
   and not the other way (Granger 1969).
@@ -148,27 +148,21 @@ def _order_fault(data: Dataset) -> Iterator[Fault]:
         return
     if data.looks_ahead:
         return
-    sums = _core.computed(experiments)
-    order = _core.order_in_time(experiments) if sums in (None, "window") else None
-    # without noise, the command of a plant is a sum of its answers in samples after
-    if sums is not None and (order is None or order[0] != "exchanged"):
+    if (sums := _core.computed(experiments)) is not None:
         names = " and ".join(data.input_names)
-        what = {
-            "output": f"{y} is a sum of {names} in the same sample and in up to {PAST} before",
-            "change": f"each change of {y} is a sum of {names} in the same sample and in up to "
-            f"{PAST} before",
-            "window": f"{y} is a sum of {names} in samples before and after",
-            "curve": f"{y} is a curve of {names} in the same sample",
-        }[sums]
-        as_what = "" if sums == "curve" else ", as a mean, a difference or an integral is"
         yield Fault(
             "no_dynamics",
-            f"{what}, to rounding: the column was computed from the other{as_what}",
+            f"{y} is a curve of {names} in the same sample, to rounding: there are no dynamics "
+            "between the two, as the column was computed from the other"
+            if sums == "curve"
+            else f"{'each change of ' if sums == 'change' else ''}{y} is a sum of {names} in the "
+            f"same sample and in up to {PAST} before, to rounding: the column was computed from "
+            "the other, as a mean, a difference or an integral is",
             "name the column of a sensor as output",
             {"input": names, "sums": sums},
         )
         return
-    if order is None:
+    if (order := _core.order_in_time(experiments)) is None:
         return
     kind, j, late, likelihood = order
     name = data.input_names[j]

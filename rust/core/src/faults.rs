@@ -24,11 +24,7 @@ const SURE: f64 = 60.0;
 const PARTS: usize = 8;
 /// Means of an input over 10, 20, 40 .. samples before these: plants with long dead times.
 const OCTAVES: usize = 6;
-/// Columns of the inputs in a sum that reaches far, to either side.
-const REACH: usize = 64;
-/// Samples of the memory of a recursion.
-const MEMORY: usize = 3;
-/// Powers of an input of which an output is a curve, from one sample to the next few.
+/// Powers of the inputs of which an output is a curve.
 const POWERS: usize = 3;
 /// Singular values below this part of the largest count as 0.
 const DEPENDENT: f64 = 1e-10;
@@ -156,13 +152,11 @@ pub enum Sum {
     Output,
     /// Its change.
     Change,
-    /// The output itself, of inputs in samples before and after, or in more before.
-    Window,
-    /// The output itself, of a curve of one input in the same sample.
+    /// The output itself, of powers of the inputs in the same sample.
     Curve,
 }
 
-/// Whether the output, or its change, is a sum of inputs in the same sample and in others, or the output a curve of one, to rounding.
+/// Whether the output, or its change, is a sum of inputs in the same sample and in some before, or the output a curve of them, to rounding.
 ///
 /// A simulation without noise answers one sample later, and a plant has a memory of its own.
 pub fn computed(experiments: &[Samples]) -> Option<Sum> {
@@ -171,160 +165,83 @@ pub fn computed(experiments: &[Samples]) -> Option<Sum> {
     if pieces.iter().map(Rows::len).sum::<usize>() < 10 * PAST * (1 + channels) {
         return None;
     }
+    // u(k) of every input, u(k-1) .., 1; then y(k) and its change
+    let inputs = (1 + PAST) * channels;
+    let row = |p: &Rows, k: usize, c: usize| match c.checked_sub(inputs) {
+        None => p.at(k - c / channels, c % channels),
+        Some(0) => 1.0,
+        Some(1) => p.at(k, channels),
+        Some(_) => p.at(k, channels) - p.at(k - 1, channels),
+    };
+    let at: Vec<(&Rows, usize)> = pieces
+        .iter()
+        .flat_map(|p| (PAST..p.len()).map(move |k| (p, k)))
+        .collect();
+    let all = DMatrix::from_fn(at.len(), inputs + 3, |i, c| row(at[i].0, at[i].1, c));
     // any response fits a few moves
-    let moved = pieces.iter().map(|p| moves(p).count()).sum::<usize>();
-    if moved < 2 * PAST {
+    let moved = |i: &usize| (0..channels).any(|c| all[(*i, c)] != all[(*i - 1, c)]);
+    if (1..at.len()).filter(moved).count() < 2 * PAST {
         return None;
     }
-    let near = Columns::of(&pieces, PAST, 0, 0);
-    // an output that the inputs before predict alike, to ten times the rounding, is that of a plant
-    let is_sum = |columns: &Columns, target: usize| {
-        columns.is_exact(0, target, 1.0) && !columns.is_exact(columns.later, target, 10.0)
+    let column = |c: usize| all.as_slice()[c * at.len()..][..at.len()].iter().copied();
+    let span = |c: usize| {
+        let (low, high) = range(column(c));
+        high - low
     };
-    if is_sum(&near, 0) {
-        return Some(Sum::Output);
-    }
-    if is_sum(&near, 1) {
-        return Some(Sum::Change);
-    }
-    let reach = (moved / (4 * channels)).min(REACH / channels);
-    let is_window = |count: usize| {
-        let head = |p: &Rows| p.part(0, p.len().min(count));
-        let heads: Vec<Rows> = pieces.iter().map(head).collect();
-        // a recursion with a short memory is a plant
-        is_sum(&Columns::of(&heads, reach, reach, 0), 0)
-            && !Columns::of(&heads, MEMORY, 0, MEMORY).is_exact(0, 0, 1.0)
-    };
-    // most records show in their beginning that they are none
-    if reach > PAST && is_window(20 * REACH) && is_window(MOST) {
-        return Some(Sum::Window);
-    }
-    (0..channels)
-        .any(|j| is_curve(&pieces, j))
-        .then_some(Sum::Curve)
-}
-
-/// Samples in which an input moves.
-fn moves(p: &Rows) -> impl Iterator<Item = usize> {
-    let channels = p.width() - 1;
-    (1..p.len()).filter(move |&k| (0..channels).any(|j| p.at(k, j) != p.at(k - 1, j)))
-}
-
-/// Inputs beside each sample, and what may be a sum of them.
-struct Columns {
-    all: DMatrix<f64>,
-    /// Its triangular factor.
-    r: DMatrix<f64>,
-    /// Columns of the inputs and of outputs before, and those of inputs of the same sample and of later ones, which come first.
-    given: usize,
-    later: usize,
-    /// Range of each column.
-    spans: Vec<f64>,
-    /// What half of a step of the output may be.
-    roundings: [f64; 2],
-}
-
-impl Columns {
-    /// Inputs of `after` samples later, .., in the same, .. and `before` earlier, the last outputs, 1, the output and its change.
-    fn of(pieces: &[Rows], before: usize, after: usize, outputs: usize) -> Self {
-        let channels = pieces[0].width() - 1;
-        let inputs = (after + 1 + before) * channels;
-        let given = inputs + outputs;
-        let row = |p: &Rows, k: usize, c: usize| match c {
-            c if c < inputs => p.at(k + after - c / channels, c % channels),
-            c if c < given => p.at(k - 1 - (c - inputs), channels),
-            c if c == given => 1.0,
-            c if c == given + 1 => p.at(k, channels),
-            _ => p.at(k, channels) - p.at(k - 1, channels),
-        };
-        let at: Vec<(&Rows, usize)> = pieces
-            .iter()
-            .flat_map(|p| (before..p.len().saturating_sub(after)).map(move |k| (p, k)))
-            .collect();
-        let all = DMatrix::from_fn(at.len(), given + 3, |i, c| row(at[i].0, at[i].1, c));
-        let span = |c: usize| {
-            let (low, high) = range(all.column(c).iter().copied());
-            high - low
-        };
-        let spans: Vec<f64> = (0..given + 3).map(span).collect();
-        let y: Vec<f64> = all.column(given + 1).iter().copied().collect();
-        Self {
-            roundings: [0.5e-5 * spans[given + 1], rounding(&y)],
-            later: (after + 1) * channels,
-            r: triangle_of(&all),
-            all,
-            given,
-            spans,
-        }
-    }
-
-    /// Whether the output (0) or its change (1) is a sum of the columns from this one on, to so many times what rounding explains.
-    fn is_exact(&self, first: usize, target: usize, times: f64) -> bool {
-        let (used, target) = (self.given + 1 - first, self.given + 1 + target);
-        let goal = self.r.column(target).into_owned();
-        let theta = solve(self.r.columns(first, used).into_owned(), &goal, DEPENDENT).theta;
-        let of_columns: f64 = (first..self.given)
-            .map(|c| theta[c - first].abs() * 0.5e-5 * self.spans[c])
+    let y: Vec<f64> = column(inputs + 1).collect();
+    let roundings = [0.5e-5 * span(inputs + 1), rounding(&y)];
+    let r = triangle_of(&all);
+    let is_exact = |target: usize, first: usize| {
+        let used = inputs + 1 - first;
+        let goal = r.column(target).into_owned();
+        let theta = solve(r.columns(first, used).into_owned(), &goal, DEPENDENT).theta;
+        let of_u: f64 = (first..inputs)
+            .map(|c| theta[c - first].abs() * 0.5e-5 * span(c))
             .sum();
-        let size = moments(self.all.column(target).iter().copied()).1;
-        let allowed = self.roundings.map(|r| 2.0 * r + of_columns);
+        let size = moments(column(target)).1;
+        let allowed = roundings.map(|r| 2.0 * r + of_u);
         let allowed = allowed
             .into_iter()
             .filter(|v| *v < 0.02 * size)
             .fold(0.0, f64::max);
-        let off = self.all.column(target) - self.all.columns(first, used) * theta;
-        off.amax() <= times * allowed
-    }
+        (all.column(target) - all.columns(first, used) * theta).amax() <= allowed
+    };
+    let found = [(Sum::Output, inputs + 1), (Sum::Change, inputs + 2)];
+    let mut found = found.into_iter();
+    found
+        .find(|(_, target)| is_exact(*target, 0) && !is_exact(*target, channels))
+        .map(|(sum, _)| sum)
+        .or_else(|| is_curve(&pieces, &y).then_some(Sum::Curve))
 }
 
-/// Whether the output is a curve of one input of the same sample, to rounding: with its samples in the order of the input, it is a
-/// polynomial from each few to the next, but where the curve has a corner.
-fn is_curve(pieces: &[Rows], j: usize) -> bool {
+/// Whether the output is a polynomial of the inputs of the same sample, to rounding.
+fn is_curve(pieces: &[Rows], y: &[f64]) -> bool {
     let channels = pieces[0].width() - 1;
-    // before and after each move: where the input stays, a plant that has settled is a curve of it as well
-    let mut pairs: Vec<(f64, f64)> = pieces
+    let used = channels * POWERS + 1;
+    let rows = pieces
         .iter()
-        .flat_map(|p| {
-            moves(p)
-                .flat_map(|k| [k - 1, k])
-                .map(move |k| (p.at(k, j), p.at(k, channels)))
+        .flat_map(|p| (PAST..p.len()).map(move |k| (p, k)));
+    let u: Vec<f64> = rows
+        .flat_map(|(p, k)| {
+            let powers = (1..=POWERS as i32).flat_map(move |i| (0..channels).map(move |j| (i, j)));
+            { powers }.map(move |(i, j)| p.at(k, j).powi(i))
         })
         .collect();
-    pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let (u, y): (Vec<f64>, Vec<f64>) = pairs.into_iter().unzip();
-    let (of_u, of_y) = (rounding(&u), rounding(&y));
-    let few = (3 * (POWERS + 1)).max(u.len() / (10 * PAST));
-    // each with the last sample of those before
-    let groups = (few..u.len())
-        .step_by(few)
-        .map(|k| k - few..(k + 1).min(u.len()));
-    let count = groups.len();
-    let told: Vec<bool> = groups
-        .filter_map(|g| is_polynomial(&u[g.clone()], &y[g], of_u, of_y))
-        .collect();
-    let fit = told.iter().filter(|is| **is).count();
-    2 * told.len() >= count && 10 * fit >= 9 * told.len()
-}
-
-/// Whether the output is a polynomial of the input, to rounding; none if rounding hides whether it is.
-fn is_polynomial(u: &[f64], y: &[f64], of_u: f64, of_y: f64) -> Option<bool> {
-    let ((low, high), (least, most)) = (range(u.iter().copied()), range(y.iter().copied()));
-    let half = 0.5 * (high - low);
-    // all of the same input: the mean is the curve
-    let powers = if half > 0.0 { POWERS } else { 0 };
     let value = |i: usize, c: usize| match c {
-        c if c <= powers => ((u[i] - low) / half - 1.0).powi(c as i32),
+        c if c < used - 1 => u[i * (used - 1) + c],
+        c if c < used => 1.0,
         _ => y[i],
     };
-    let all = DMatrix::from_fn(u.len(), powers + 2, value);
+    let all = DMatrix::from_fn(y.len(), used + 1, value);
     let r = triangle_of(&all);
-    let goal = r.column(powers + 1).into_owned();
-    let theta = solve(r.columns(0, powers + 1).into_owned(), &goal, DEPENDENT).theta;
-    // the steepest that the polynomial can be, over half of the inputs' range
-    let slope: f64 = (1..=powers).map(|c| c as f64 * theta[c].abs()).sum();
-    let allowed = 2.0 * of_y + if powers > 0 { slope / half * of_u } else { 0.0 };
-    let off = all.column(powers + 1) - all.columns(0, powers + 1) * theta;
-    (most - least > 10.0 * allowed).then(|| off.amax() <= allowed)
+    let goal = r.column(used).into_owned();
+    let theta = solve(r.columns(0, used).into_owned(), &goal, DEPENDENT).theta;
+    let of_u = |c: usize| {
+        let (low, high) = range(all.column(c).iter().copied());
+        theta[c].abs() * 0.5e-5 * (high - low)
+    };
+    let allowed = 2.0 * rounding(y) + (0..used - 1).map(of_u).sum::<f64>();
+    (all.column(used) - all.columns(0, used) * theta).amax() <= allowed
 }
 
 fn triangle_of(all: &DMatrix<f64>) -> DMatrix<f64> {
@@ -568,15 +485,6 @@ mod tests {
         let square: Vec<f64> = u.iter().map(|u| 3.0 * u + u * u).collect();
         assert_eq!(computed(&samples(&u, &square)), Some(Sum::Curve));
         assert_eq!(computed(&samples(&u[..1999], &square[1..])), None);
-        let size: Vec<f64> = u.iter().map(|u| u.abs()).collect();
-        assert_eq!(computed(&samples(&u, &size)), Some(Sum::Curve));
-        let mean = |k: usize| u[k.max(20) - 20..(k + 21).min(2000)].iter().sum::<f64>() / 41.0;
-        let mean: Vec<f64> = (0..2000).map(mean).collect();
-        assert_eq!(computed(&samples(&u, &mean)), Some(Sum::Window));
-        assert_eq!(
-            computed(&samples(&u[20..], &mean[..1980])),
-            Some(Sum::Window)
-        );
         assert_eq!(computed(&samples(&u, &integral)), Some(Sum::Change));
         assert_eq!(computed(&samples(&u[..20], &sum[..20])), None);
     }

@@ -50,7 +50,6 @@ pub fn computed(py: Python<'_>, experiments: Experiments<'_>) -> PyResult<Option
     Ok(found.map(|sum| match sum {
         faults::Sum::Output => "output",
         faults::Sum::Change => "change",
-        faults::Sum::Window => "window",
         faults::Sum::Curve => "curve",
     }))
 }
