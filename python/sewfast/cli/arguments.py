@@ -68,7 +68,7 @@ def time_left(args: argparse.Namespace) -> float | None:
     if seconds is None or not seconds > 0.0:
         return seconds
     gone: float = time.monotonic() - args.began
-    return round(max(seconds - gone, 0.5 * seconds), 3)
+    return max(seconds - gone, 0.5 * seconds)
 
 
 def whole(text: str) -> int:
